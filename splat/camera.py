@@ -1,0 +1,46 @@
+"""A pinhole camera.
+
+World to camera: `x_cam = R (x_world - centre)`, +x right, +y down, +z forward (OpenCV, COLMAP).  Pixels: the centre of
+pixel (column i, row j) lies at (i + 0.5, j + 0.5); focal lengths and principal point are in pixels.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """rotation: world to camera, float64; centre: camera centre in world units, float64; the rest in pixels."""
+
+    rotation: Float[Tensor, "3 3"]
+    centre: Float[Tensor, "3"]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        error = (self.rotation @ self.rotation.T - torch.eye(3, dtype=self.rotation.dtype)).abs().max().item()
+        if not error < 1e-4 or torch.linalg.det(self.rotation) < 0:
+            raise ValueError(f"expected a rotation matrix, got one with |R R^T - 1| = {error:.1e}: {self.rotation.tolist()}")
+        if not (self.fx > 0 and self.fy > 0 and self.width > 0 and self.height > 0):
+            raise ValueError(
+                f"expected positive focal lengths and image size, got {self.fx}, {self.fy}, {self.width}, {self.height}"
+            )
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same camera with its image resampled to width x height pixels."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
+
+    @property
+    def forward(self) -> Float[Tensor, "3"]:
+        """The viewing direction (unit, world frame): R^T e_z."""
+        return self.rotation[2]

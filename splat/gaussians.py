@@ -1,0 +1,130 @@
+"""The five attributes of a set of 3-D Gaussians, stored as one flat vector.
+
+    means           (n, 3)      world units
+    log_scales      (n, 3)      natural logarithm of the standard deviations, world units
+    quats           (n, 4)      rotation, order w x y z, normalised where it is used, not where it is stored
+    opacity_logits  (n,)        opacity = sigmoid(logit)
+    sh              (n, k, 3)   spherical harmonics, k = (degree + 1)^2, bands in order, colour channel last
+
+All curvature in this project is with respect to these stored parameters.  The flat vector holds the attributes one after
+the other in the order above; each attribute is a view of it, so neither direction copies and autograd passes through.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isqrt
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
+
+
+def attribute_shapes(n: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """Shape of every attribute of n Gaussians, in the order of the flat vector."""
+    return {
+        "means": (n, 3),
+        "log_scales": (n, 3),
+        "quats": (n, 4),
+        "opacity_logits": (n,),
+        "sh": (n, (sh_degree + 1) ** 2, 3),
+    }
+
+
+def parameters_per_gaussian(sh_degree: int) -> int:
+    """59 at SH degree 3."""
+    return 11 + 3 * (sh_degree + 1) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """n Gaussians over one flat vector of n (11 + 3 (sh_degree + 1)^2) stored parameters."""
+
+    flat: Float[Tensor, " p"]
+    sh_degree: int
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
+        each = parameters_per_gaussian(self.sh_degree)
+        if self.flat.ndim != 1 or self.flat.numel() % each:
+            raise ValueError(
+                f"expected a vector of n x {each} parameters at SH degree {self.sh_degree}, got {tuple(self.flat.shape)}"
+            )
+
+    @classmethod
+    def pack(cls, attributes: Mapping[str, Tensor]) -> "Gaussians":
+        """One flat vector from the five attributes (copies); their shapes are checked against each other."""
+        n, bands = attributes["sh"].shape[:2]
+        degree = isqrt(bands) - 1
+        for name, shape in attribute_shapes(n, degree).items():
+            if tuple(attributes[name].shape) != shape:
+                raise ValueError(f"expected {name} of shape {shape}, got {tuple(attributes[name].shape)}")
+        return cls(torch.cat([attributes[name].reshape(-1) for name in ATTRIBUTES]), degree)
+
+    def __len__(self) -> int:
+        return self.flat.numel() // parameters_per_gaussian(self.sh_degree)
+
+    @property
+    def blocks(self) -> dict[str, slice]:
+        """Where each attribute lies in the flat vector."""
+        result, start = {}, 0
+        for name, shape in attribute_shapes(len(self), self.sh_degree).items():
+            size = int(torch.Size(shape).numel())
+            result[name] = slice(start, start + size)
+            start += size
+        return result
+
+    @property
+    def attributes(self) -> dict[str, Tensor]:
+        """The five attributes as views of the flat vector."""
+        shapes = attribute_shapes(len(self), self.sh_degree)
+        return {name: self.flat[block].view(shapes[name]) for name, block in self.blocks.items()}
+
+    @property
+    def means(self) -> Float[Tensor, "n 3"]:
+        return self.attributes["means"]
+
+    @property
+    def log_scales(self) -> Float[Tensor, "n 3"]:
+        return self.attributes["log_scales"]
+
+    @property
+    def quats(self) -> Float[Tensor, "n 4"]:
+        return self.attributes["quats"]
+
+    @property
+    def opacity_logits(self) -> Float[Tensor, " n"]:
+        return self.attributes["opacity_logits"]
+
+    @property
+    def sh(self) -> Float[Tensor, "n k 3"]:
+        return self.attributes["sh"]
+
+    def with_flat(self, flat: Tensor) -> "Gaussians":
+        """The same layout over another vector of parameters."""
+        return Gaussians(flat, self.sh_degree)
+
+    def to(self, dtype: torch.dtype) -> "Gaussians":
+        return self.with_flat(self.flat.to(dtype))
+
+    def select(self, index: Tensor, sh_degree: int | None = None) -> "Gaussians":
+        """The Gaussians at index (a mask or indices, may repeat), with the SH bands up to sh_degree (zero-padded above)."""
+        degree = self.sh_degree if sh_degree is None else sh_degree
+        chosen = {name: value[index] for name, value in self.attributes.items()}
+        bands = (degree + 1) ** 2
+        missing = bands - chosen["sh"].shape[1]
+        chosen["sh"] = torch.nn.functional.pad(chosen["sh"], (0, 0, 0, max(missing, 0)))[:, :bands]
+        return Gaussians.pack(chosen)
+
+    def require_finite(self) -> None:
+        """Raise ValueError that names the attribute and the first Gaussian whose parameters are not finite."""
+        for name, value in self.attributes.items():
+            bad = ~torch.isfinite(value.reshape(len(self), -1)).all(dim=1)
+            if bad.any():
+                first = int(bad.nonzero()[0])
+                raise ValueError(
+                    f"expected finite {name}, got {value[first].tolist()} at Gaussian {first} "
+                    f"({int(bad.sum())} of {len(self)} are not finite); remove them from the checkpoint"
+                )

@@ -1,0 +1,94 @@
+"""Image losses and metrics, in plain torch: the specification of the loss kernels.
+
+Images are (3, h, w) in [0, 1].  Every loss is a mean over pixels and channels.
+
+    l1          |r|                            r = image - target
+    charbonnier sqrt(r^2 + eps^2)              a smooth l1; its second derivative is eps^2 / (r^2 + eps^2)^(3/2)
+    l2          r^2
+    SSIM        11 x 11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, as in 3DGS
+    photometric (1 - lambda) pixel + lambda (1 - SSIM), lambda = 0.2: Eq. (2) as 3DGS weighs it;
+                literal: pixel + lambda (1 - SSIM), Eq. (2) as printed
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+WINDOW, SIGMA = 11, 1.5
+C1, C2 = 0.01**2, 0.03**2
+PixelLoss = Literal["l1", "charbonnier", "l2"]
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Which loss a view contributes.  eps: Charbonnier's, in units of intensity."""
+
+    pixel: PixelLoss = "l1"
+    ssim_weight: float = 0.2
+    eps: float = 0.01
+    literal: bool = False
+
+    def __post_init__(self) -> None:
+        if self.pixel not in ("l1", "charbonnier", "l2"):
+            raise ValueError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
+        if not 0 <= self.ssim_weight <= 1 or self.eps <= 0:
+            raise ValueError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
+
+    @property
+    def pixel_weight(self) -> float:
+        return 1.0 if self.literal else 1.0 - self.ssim_weight
+
+
+def window(dtype: torch.dtype) -> Float[Tensor, "11"]:
+    """The normalised 1-D Gaussian; the 2-D window is its outer product."""
+    offset = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    weight = torch.exp(-(offset**2) / (2 * SIGMA**2))
+    return (weight / weight.sum()).to(dtype)
+
+
+def blur(fields: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
+    """The window's weighted mean round every pixel; zero outside the image.  Its own adjoint."""
+    weight, channels = window(fields.dtype), fields.shape[0]
+    rows = F.conv2d(fields[None], weight.view(1, 1, 1, -1).expand(channels, 1, 1, -1), padding=(0, 5), groups=channels)
+    return F.conv2d(rows, weight.view(1, 1, -1, 1).expand(channels, 1, -1, 1), padding=(5, 0), groups=channels)[0]
+
+
+def ssim_map(image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
+    """Structural similarity of every pixel and channel (Wang et al. 2004)."""
+    mu_x, mu_y, xx, yy, xy = blur(torch.cat([image, target, image * image, target * target, image * target])).chunk(5)
+    var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
+    luminance = (2 * mu_x * mu_y + C1) / (mu_x * mu_x + mu_y * mu_y + C1)
+    return luminance * (2 * cov + C2) / (var_x + var_y + C2)
+
+
+def pixel_loss(image: Tensor, target: Tensor, kind: PixelLoss, eps: float) -> Tensor:
+    residual = image - target
+    if kind == "l1":
+        return residual.abs().mean()
+    if kind == "l2":
+        return residual.square().mean()
+    return (residual.square() + eps * eps).sqrt().mean()
+
+
+def photometric_loss(
+    image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], settings: LossSettings = LossSettings()
+) -> Float[Tensor, ""]:
+    """The loss of one view, Eq. (2)."""
+    loss = settings.pixel_weight * pixel_loss(image, target, settings.pixel, settings.eps)
+    if settings.ssim_weight:
+        loss = loss + settings.ssim_weight * (1 - ssim_map(image, target).mean())
+    return loss
+
+
+def psnr(image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"]) -> float:
+    """Peak signal-to-noise ratio in dB, peak 1."""
+    return float(-10 * torch.log10((image.clamp(0, 1) - target).square().mean()))
+
+
+def ssim(image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"]) -> float:
+    """Mean structural similarity."""
+    return float(ssim_map(image.clamp(0, 1), target).mean())

@@ -1,0 +1,50 @@
+"""The thresholds of the renderer, in one frozen object.
+
+Every one of them makes the image a discontinuous or merely piecewise smooth function of the parameters.  The values are
+those of the original 3DGS rasterizer (Kerbl et al. 2023); `SMOOTH` switches off what can be switched off, so that a study
+can measure what the thresholds do to the landscape.
+"""
+
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """Thresholds of projection and compositing.
+
+    blur: variance added to the diagonal of every 2-D covariance, in px^2.
+    fov_clamp: the projection's Jacobian is taken at x/z and y/z clamped to this multiple of tan(fov / 2).
+    near: Gaussians whose centre is nearer than this to the camera plane (world units) are not drawn.
+    alpha_max: cap of a Gaussian's alpha in a pixel, below 1 (at 1 the transmittance behind it would be 0).
+    alpha_min: a Gaussian is skipped in the pixels where its alpha is below this; 0 draws it in every pixel.
+    transmittance_min: a pixel stops before its transmittance would fall below this; 0 never stops.
+    contour_sigma: an additional cut at this Mahalanobis distance (the original cuts at 3); None keeps alpha_min's contour.
+    gradient_through_cap: pass gradients through the cap as the original CUDA code does, instead of the true 0.
+    """
+
+    blur: float = 0.3
+    fov_clamp: float = 1.3
+    near: float = 0.2
+    alpha_max: float = 0.99
+    alpha_min: float = 1 / 255
+    transmittance_min: float = 1e-4
+    contour_sigma: float | None = None
+    gradient_through_cap: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.alpha_max < 1:
+            raise ValueError(
+                f"expected 0 < alpha_max < 1, got {self.alpha_max}: at 1 a Gaussian would hide all behind it exactly, "
+                "and the backward pass divides by 1 - alpha; use e.g. 0.999"
+            )
+        if not 0 <= self.alpha_min < self.alpha_max:
+            raise ValueError(f"expected 0 <= alpha_min < alpha_max = {self.alpha_max}, got {self.alpha_min}")
+        if not 0 <= self.transmittance_min < 1:
+            raise ValueError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
+        if self.blur < 0 or self.near <= 0 or self.fov_clamp <= 0:
+            raise ValueError(f"expected blur >= 0, near > 0, fov_clamp > 0, got {self}")
+        if self.contour_sigma is not None and self.contour_sigma <= 0:
+            raise ValueError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
+
+
+SMOOTH = replace(RenderSettings(), alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)
