@@ -1,0 +1,262 @@
+"""Checkpoints: a training under way and where its scene lies, in one file.
+
+The file is a `torch.save` of tensors and plain types, loaded with `weights_only=True` (nothing in it can run code), and
+written whole or not at all.  The same training gives the same bytes.  Keys (p parameters, n Gaussians):
+
+    format, version     "splat-landscape checkpoint", 1
+    torch               version of torch that wrote it
+    step, extent        steps made; radius of the scene's cameras, world units
+    sh_degree, flat     the Gaussians: bands in use, (p,) stored parameters
+    adam                {"first": (p,), "second": (p,), "updates": int}
+    screen_gradients    {"total": (n,), "renders": (n,)}
+    generator, order    state of the random generator, uint8; views still to come in this epoch
+    config              `TrainConfig` as nested plain types
+    scene               `SceneReference` as plain types
+"""
+
+import io
+import os
+import pickle
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import torch
+from torch import Tensor
+
+from splat.adam import Adam
+from splat.densify import ScreenGradients
+from splat.gaussians import Gaussians
+from splat.scenes.scene import Scene, load_scene
+from splat.scenes.splits import Split
+from splat.train import TrainConfig, Training
+
+FORMAT, VERSION = "splat-landscape checkpoint", 1
+
+
+@dataclass(frozen=True)
+class SceneReference:
+    """Which scene a training belongs to, and how to load it as it was.
+
+    absolute, relative: the scene's folder, and the same from the checkpoint's folder.  images: the folder of images in
+    it, where one was named; downscale: by which its images were reduced further.  train, test: names of the views;
+    sizes: (width, height) of the training views, px.
+    """
+
+    absolute: str
+    relative: str
+    images: str | None
+    downscale: float
+    train: list[str]
+    test: list[str]
+    sizes: list[list[int]]
+
+    @classmethod
+    def to(cls, scene: Scene, checkpoint: Path, split: Split, images: str | None, downscale: float) -> "SceneReference":
+        """The scene, loaded with these images and downscale, as seen from where the checkpoint will lie."""
+        return cls(
+            absolute=str(scene.root),
+            relative=os.path.relpath(scene.root, checkpoint.parent.resolve()),
+            images=images,
+            downscale=float(downscale),
+            train=list(split.train),
+            test=list(split.test),
+            sizes=[[frame.camera.width, frame.camera.height] for frame in scene.select(split.train)],
+        )
+
+    def find(self, checkpoint: Path) -> Path:
+        """The scene's folder: seen from the checkpoint, else where it lay.  FileNotFoundError if in neither."""
+        candidates = [(checkpoint.parent / self.relative).resolve(), Path(self.absolute)]
+        for folder in candidates:
+            if folder.is_dir():
+                return folder
+        raise FileNotFoundError(
+            f"expected the scene of {checkpoint} at {' or '.join(str(c) for c in dict.fromkeys(candidates))}, "
+            "found no such folder; pass where it is now with --scene"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """A training as it was saved, the scene that it belongs to, and the version of torch that wrote it."""
+
+    training: Training
+    scene: SceneReference
+    torch_version: str
+
+    def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
+        """The scene of the checkpoint at path, or the one in the folder scene, with the views of the training.
+
+        FileNotFoundError where there is none; ValueError where it lacks a view or has one of another size.
+        """
+        reference = self.scene
+        folder = reference.find(path) if scene is None else scene
+        found = load_scene(folder, reference.images, reference.downscale, self.training.config.background)
+        found.select(reference.test)
+        for frame, size in zip(found.select(reference.train), reference.sizes, strict=True):
+            if [frame.camera.width, frame.camera.height] != size:
+                raise ValueError(
+                    f"expected view {frame.name!r} of {folder} at {size[0]} x {size[1]} px, as in the training, got "
+                    f"{frame.camera.width} x {frame.camera.height}; its images have changed, restore them or train anew"
+                )
+        return found
+
+
+def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> None:
+    """Write the checkpoint, replacing one that is there only once the new one is complete on disk."""
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "torch": str(torch.__version__),
+        "step": training.step,
+        "extent": training.extent,
+        "sh_degree": training.gaussians.sh_degree,
+        "flat": training.gaussians.flat,
+        "adam": {
+            "first": training.adam.first.flat,
+            "second": training.adam.second.flat,
+            "updates": training.adam.updates,
+        },
+        "screen_gradients": {
+            "total": training.screen_gradients.total,
+            "renders": training.screen_gradients.renders,
+        },
+        "generator": training.generator.get_state(),
+        "order": training.order,
+        "config": asdict(training.config),
+        "scene": asdict(scene),
+    }
+    buffer = io.BytesIO()  # a file's own name would be among the bytes
+    torch.save(content, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Put content at path, so that a reader or a crash sees either what was there before or all of it."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint.  FileNotFoundError where there is none; ValueError that says what is wrong with it."""
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found no such file")
+    try:
+        with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, OSError):
+        raise ValueError(
+            f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
+        ) from None
+    try:
+        return _checkpoint(content)
+    except ValueError as error:
+        raise ValueError(f"expected a checkpoint written by landscape train, got {path}: {error}") from None
+
+
+def _checkpoint(content: Any) -> Checkpoint:
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"it does not hold the format {FORMAT!r}")
+    if content.get("version") != VERSION:
+        raise ValueError(f"its format version is {content.get('version')!r}, this program reads {VERSION}")
+    flat = _get(content, "flat", Tensor)
+    gaussians = Gaussians(_tensor(content, "flat", (flat.numel(),), flat.dtype), _get(content, "sh_degree", int))
+    gaussians.require_finite()
+    config = _dataclass(TrainConfig, _get(content, "config", dict), "config")
+    scene = _dataclass(SceneReference, _get(content, "scene", dict), "scene")
+    adam, screen = _get(content, "adam", dict), _get(content, "screen_gradients", dict)
+    training = Training(
+        config=config,
+        extent=_get(content, "extent", float),
+        gaussians=gaussians,
+        adam=Adam(
+            gaussians.with_flat(_tensor(adam, "first", flat.shape, flat.dtype)),
+            gaussians.with_flat(_tensor(adam, "second", flat.shape, flat.dtype)),
+            _get(adam, "updates", int),
+        ),
+        screen_gradients=ScreenGradients(
+            _tensor(screen, "total", (len(gaussians),), flat.dtype),
+            _tensor(screen, "renders", (len(gaussians),), flat.dtype),
+        ),
+        generator=_generator(_get(content, "generator", Tensor)),
+        order=_get(content, "order", list),
+        step=_get(content, "step", int),
+    )
+    if not 0 <= training.step <= config.iterations:
+        raise ValueError(f"its step {training.step} is not among its {config.iterations} iterations")
+    if not 0 < training.extent < float("inf"):
+        raise ValueError(f"its extent is {training.extent}")
+    if len(scene.sizes) != len(scene.train):
+        raise ValueError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
+    if not all(type(index) is int and 0 <= index < len(scene.train) for index in training.order):
+        raise ValueError(f"its order does not index its {len(scene.train)} training views")
+    return Checkpoint(training, scene, _get(content, "torch", str))
+
+
+T = TypeVar("T")
+
+
+def _get(content: dict, key: str, kind: type[T]) -> T:
+    if key not in content:
+        raise ValueError(f"{key!r} is missing")
+    value = content[key]
+    if not isinstance(value, kind):
+        raise ValueError(f"{key!r} is {type(value).__name__}, expected {kind.__name__}")
+    return value
+
+
+def _tensor(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
+    value = _get(content, key, Tensor)
+    if tuple(value.shape) != tuple(shape) or value.dtype != dtype or not dtype.is_floating_point:
+        raise ValueError(f"{key!r} is {value.dtype} of shape {tuple(value.shape)}, expected {dtype} {tuple(shape)}")
+    return value
+
+
+def _generator(state: Tensor) -> torch.Generator:
+    generator = torch.Generator()
+    try:
+        return generator.set_state(state)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"'generator' is not the state of a random generator ({error})") from None
+
+
+def _dataclass(kind: type[T], content: dict, where: str) -> T:
+    """A dataclass, and those in it, from what `asdict` made of it; its own checks apply."""
+    hints = get_type_hints(kind)
+    if set(content) != set(hints):
+        different = sorted(map(str, set(content) ^ set(hints)))
+        raise ValueError(f"{where!r} has missing or unknown keys: {', '.join(different)}")
+    values = {}
+    for key, hint in hints.items():
+        value = content[key]
+        if isinstance(hint, type) and is_dataclass(hint):
+            value = _dataclass(hint, _get(content, key, dict), f"{where}.{key}")
+        elif not _fits(value, hint):
+            raise ValueError(f"'{where}.{key}' is {value!r}, expected {getattr(hint, '__name__', hint)}")
+        values[key] = value
+    return kind(**values)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a plain value is of a type: int, float (or an int), bool, str, list, tuple, Literal, X | None."""
+    if get_origin(hint) in (Union, UnionType):
+        return any(_fits(value, option) for option in get_args(hint))
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
+    if get_origin(hint) is list:
+        return type(value) is list and all(_fits(item, get_args(hint)[0]) for item in value)
+    if get_origin(hint) is tuple:
+        options = get_args(hint)
+        return type(value) is tuple and len(value) == len(options) and all(map(_fits, value, options))
+    return type(value) is hint or (hint is float and type(value) is int)

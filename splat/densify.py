@@ -1,0 +1,166 @@
+"""Adaptive density control of 3DGS (Kerbl et al. 2023, Sec. 5.2, and its published code).
+
+Every `every` steps after `start` and before `stop`, a Gaussian whose mean screen-space gradient is above the threshold
+
+    is cloned  if its largest scale is at most clone_scale x extent: an exact copy beside it, opacity included;
+    is split   if it is larger: replaced by two drawn from it, mean ~ N(mean, R S S R^T), scales / 1.6, all else copied.
+
+Then Gaussians that are nearly transparent are removed, and, once opacities have been reset, those larger than
+prune_scale x extent.  (The published code also means to remove what is large on screen, but zeroes the radii before it
+looks at them, so that it never does.)  Opacities are lowered to reset_opacity every `reset_every` steps before `stop`.
+
+The screen-space gradient is the norm of dL / d(mean) in normalised device coordinates, in which the image is 2 wide and
+2 high, averaged over the renders in which the Gaussian's 3-sigma box meets the image.  Splat means here are in pixels,
+so that gradient is (w/2 dL/dx, h/2 dL/dy).  extent: radius of the cameras' bounding sphere, world units.
+"""
+
+from dataclasses import dataclass
+from math import log
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splat.camera import Camera
+from splat.gaussians import Gaussians
+from splat.projection import Splats, rotation_matrices
+
+SPLIT_INTO = 2
+SPLIT_SHRINK = 0.8 * SPLIT_INTO
+
+
+@dataclass(frozen=True)
+class DensifySettings:
+    """When and what to densify, in a run of T steps: after min(start, start_share T), before min(stop, stop_share T).
+
+    3DGS trains for 30,000 steps, where the shares change nothing; they make short runs densify too, and end settled.
+    """
+
+    enabled: bool = True
+    start: int = 500
+    stop: int = 15000
+    start_share: float = 0.25
+    stop_share: float = 0.5
+    every: int = 100
+    gradient_threshold: float = 2e-4
+    clone_scale: float = 0.01
+    prune_scale: float = 0.1
+    min_opacity: float = 0.005
+    reset_every: int = 3000
+    reset_opacity: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or self.reset_every < 1:
+            raise ValueError(f"expected every and reset_every of at least 1, got {self.every} and {self.reset_every}")
+        if min(self.start, self.stop) < 0 or not (0 <= self.start_share <= 1 and 0 <= self.stop_share <= 1):
+            raise ValueError(f"expected start and stop of at least 0 and their shares in [0, 1], got {self}")
+        if not (self.gradient_threshold > 0 and self.clone_scale > 0 and self.prune_scale > 0):
+            raise ValueError(f"expected gradient_threshold, clone_scale and prune_scale above 0, got {self}")
+        if not 0 <= self.min_opacity < self.reset_opacity < 1:
+            raise ValueError(
+                "expected 0 <= min_opacity < reset_opacity < 1 (else a reset would remove every Gaussian), "
+                f"got {self.min_opacity} and {self.reset_opacity}"
+            )
+
+    def collects(self, step: int, iterations: int) -> bool:
+        """Whether density control is under way, and wants the screen-space gradient, at a step (1, 2, ...)."""
+        return self.enabled and step < min(self.stop, self.stop_share * iterations)
+
+    def densifies(self, step: int, iterations: int) -> bool:
+        begun = step > min(self.start, self.start_share * iterations)
+        return begun and step % self.every == 0 and self.collects(step, iterations)
+
+    def resets_opacity(self, step: int, iterations: int) -> bool:
+        return step % self.reset_every == 0 and self.collects(step, iterations)
+
+    def prunes_large(self, step: int) -> bool:
+        """3DGS removes large Gaussians only after the first opacity reset."""
+        return step > self.reset_every
+
+
+@dataclass(eq=False)
+class ScreenGradients:
+    """Sum of the screen-space gradient's norms and number of renders that they come from, per Gaussian."""
+
+    total: Float[Tensor, " n"]
+    renders: Float[Tensor, " n"]
+
+    @classmethod
+    def zero(cls, n: int, dtype: torch.dtype) -> "ScreenGradients":
+        return cls(torch.zeros(n, dtype=dtype), torch.zeros(n, dtype=dtype))
+
+    @torch.no_grad()
+    def add(self, gradient: Float[Tensor, "n 2"], splats: Splats, camera: Camera) -> None:
+        """Take in dL / d(splats.means) of one render."""
+        half_size = gradient.new_tensor([camera.width / 2, camera.height / 2])
+        visible = on_screen(splats, camera)
+        self.total += torch.where(visible, (gradient * half_size).norm(dim=1), 0)
+        self.renders += visible
+
+    @property
+    def mean(self) -> Float[Tensor, " n"]:
+        """Zero for Gaussians that no render showed."""
+        return self.total / self.renders.clamp_min(1)
+
+
+def on_screen(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:
+    """Which Gaussians are drawn and have a 3-sigma bounding box that meets the image."""
+    a, b, c = splats.conics.unbind(-1)
+    det = (a * c - b * b).clamp_min(torch.finfo(a.dtype).tiny)  # cancels for needles: the box is then too large
+    reach = 3 * torch.stack([c / det, a / det], dim=-1).sqrt()
+    size = reach.new_tensor([camera.width, camera.height])
+    inside = (splats.means + reach > 0) & (splats.means - reach < size)
+    return splats.drawn & inside.all(dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Densified:
+    """gaussians: the new set; parents: which old Gaussian each comes from; fresh: which are new, not carried over."""
+
+    gaussians: Gaussians
+    parents: Int[Tensor, " n"]
+    fresh: Bool[Tensor, " n"]
+    cloned: int
+    split: int
+    pruned: int
+
+
+@torch.no_grad()
+def densify(
+    gaussians: Gaussians,
+    gradients: Float[Tensor, " m"],
+    extent: float,
+    settings: DensifySettings,
+    generator: torch.Generator,
+    *,
+    prune_large: bool,
+) -> Densified:
+    """Clone, split and prune.  gradients: `ScreenGradients.mean`.  Kept Gaussians come first, in their order."""
+    high = gradients > settings.gradient_threshold
+    small = gaussians.log_scales.amax(dim=1) <= log(settings.clone_scale * extent)
+    keep, clone, split = (mask.nonzero()[:, 0] for mask in (~(high & ~small), high & small, high & ~small))
+    parents = torch.cat([keep, clone, split.repeat_interleave(SPLIT_INTO)])
+    result = gaussians.select(parents)
+    fresh = torch.arange(len(parents)) >= len(keep)
+    draw_from_parents(result, len(keep) + len(clone), generator)
+
+    remain = result.opacity_logits.sigmoid() >= settings.min_opacity
+    if prune_large:
+        remain &= result.log_scales.amax(dim=1) <= log(settings.prune_scale * extent)
+    return Densified(
+        result.select(remain), parents[remain], fresh[remain], len(clone), len(split), int((~remain).sum())
+    )
+
+
+def draw_from_parents(gaussians: Gaussians, start: int, generator: torch.Generator) -> None:
+    """Turn the exact copies from `start` on into draws from the Gaussians they copy, smaller by 1.6; in place."""
+    means, log_scales = gaussians.means[start:], gaussians.log_scales[start:]
+    noise = torch.randn(means.shape, dtype=means.dtype, generator=generator) * log_scales.exp()
+    means += (rotation_matrices(gaussians.quats[start:]) @ noise[:, :, None])[:, :, 0]
+    log_scales -= log(SPLIT_SHRINK)
+
+
+@torch.no_grad()
+def reset_opacities(gaussians: Gaussians, opacity: float) -> None:
+    """Lower every opacity to at most this, in place."""
+    gaussians.opacity_logits.clamp_max_(log(opacity / (1 - opacity)))

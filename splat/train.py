@@ -1,0 +1,223 @@
+"""Training of 3D Gaussian Splatting (Kerbl et al. 2023): settings, state, and the loop, which reads top to bottom.
+
+One step renders one view, takes the gradient of its photometric loss, updates every stored parameter with Adam, and,
+while density control is under way, clones, splits and prunes.  Steps are counted from 1.  Views come in epochs, each a
+new random order.  All randomness is drawn from one generator, and `Training` holds all that the next step depends on: a
+training that is saved and loaded (`splat/checkpoint.py`) continues to the same bits.
+
+    position rate(step) = extent * position^(1 - s) * position_final^s,   s = step / iterations
+    SH degree(step)     = min(sh_degree, (step - 1) // sh_degree_every)
+
+The Gaussians hold only the SH bands in use; a band joins as zeros.  That is the same as carrying bands whose gradient
+is zero, and spares their cost.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splat.adam import Adam
+from splat.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
+from splat.gaussians import Gaussians
+from splat.losses import LossSettings, photometric_loss
+from splat.render import render
+from splat.scenes.view import View
+from splat.settings import RenderSettings
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's rates of 3DGS.  position: per unit of the scene's extent, at the first step and at the last."""
+
+    position: float = 1.6e-4
+    position_final: float = 1.6e-6
+    log_scales: float = 5e-3
+    quats: float = 1e-3
+    opacity_logits: float = 0.05
+    sh_constant: float = 2.5e-3
+    sh_higher: float = 2.5e-3 / 20
+
+    def __post_init__(self) -> None:
+        if not (self.position > 0 and self.position_final > 0):
+            raise ValueError(
+                f"expected position rates above 0 (decay is exponential), got {self.position}, {self.position_final}"
+            )
+        if min(self.log_scales, self.quats, self.opacity_logits, self.sh_constant, self.sh_higher) < 0:
+            raise ValueError(f"expected learning rates of at least 0, got {self}")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that a training's result depends on beside its start and its views.
+
+    background: the colour that the views were composited over, RGB in [0, 1], drawn behind the Gaussians.
+    random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
+    """
+
+    iterations: int = 2000
+    seed: int = 0
+    sh_degree: int = 3
+    sh_degree_every: int = 1000
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    random_background: bool = False
+    loss: LossSettings = field(default_factory=LossSettings)
+    rates: LearningRates = field(default_factory=LearningRates)
+    densify: DensifySettings = field(default_factory=DensifySettings)
+    render: RenderSettings = field(default_factory=RenderSettings)
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"expected at least 1 iteration, got {self.iterations}")
+        if not 0 <= self.seed < 2**63:
+            raise ValueError(f"expected a seed in [0, 2^63), got {self.seed}")
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
+        if self.sh_degree_every < 1:
+            raise ValueError(f"expected sh_degree_every of at least 1, got {self.sh_degree_every}")
+        if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
+            raise ValueError(f"expected a background of three numbers in [0, 1], got {self.background}")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One step done: its number, the loss before its update, the Gaussians after it, and the view's name."""
+
+    step: int
+    loss: float
+    gaussians: int
+    view: str
+
+
+@dataclass(eq=False)
+class Training:
+    """A training under way: all that its next step depends on.  order: the epoch's views still to come, last first."""
+
+    config: TrainConfig
+    extent: float
+    gaussians: Gaussians
+    adam: Adam
+    screen_gradients: ScreenGradients
+    generator: torch.Generator
+    order: list[int] = field(default_factory=list)
+    step: int = 0
+
+    @classmethod
+    def start(cls, gaussians: Gaussians, extent: float, config: TrainConfig) -> "Training":
+        """A training before its first step.  The Gaussians are copied; extent: world units, see `splat/densify.py`."""
+        if len(gaussians) == 0:
+            raise ValueError("expected at least one Gaussian to start from, got none; use a random start")
+        if gaussians.sh_degree > config.sh_degree:
+            raise ValueError(
+                f"expected a start of at most the training's SH degree {config.sh_degree}, got {gaussians.sh_degree}; "
+                "drop bands with Gaussians.select or raise sh_degree"
+            )
+        if not 0 < extent < float("inf"):
+            raise ValueError(f"expected a finite extent above 0, got {extent}")
+        gaussians.require_finite()
+        flat = gaussians.flat.detach().clone()
+        return cls(
+            config=config,
+            extent=extent,
+            gaussians=gaussians.with_flat(flat),
+            adam=Adam.zero(gaussians),
+            screen_gradients=ScreenGradients.zero(len(gaussians), flat.dtype),
+            generator=torch.Generator().manual_seed(config.seed),
+        )
+
+    def next_view(self, count: int) -> int:
+        """Index of the next view; every view once before any again."""
+        if not self.order:
+            self.order = torch.randperm(count, generator=self.generator).tolist()
+        return self.order.pop()
+
+    def follow(self, change: Densified) -> None:
+        """Take over densified Gaussians: moments follow their Gaussian, new ones start from zero."""
+        self.gaussians = change.gaussians
+        self.adam.select(change.parents, change.fresh)
+        self.screen_gradients = ScreenGradients.zero(len(change.gaussians), change.gaussians.flat.dtype)
+
+    def raise_sh_degree(self, degree: int) -> None:
+        """Add bands of zeros up to this degree."""
+        if degree > self.gaussians.sh_degree:
+            everyone = torch.arange(len(self.gaussians))
+            self.gaussians = self.gaussians.select(everyone, degree)
+            self.adam.select(everyone, sh_degree=degree)
+
+
+def position_rate(rates: LearningRates, extent: float, step: int, iterations: int) -> float:
+    """Position learning rate at a step, world units."""
+    s = step / iterations
+    return extent * rates.position ** (1 - s) * rates.position_final**s
+
+
+def learning_rates(gaussians: Gaussians, rates: LearningRates, position: float) -> Float[Tensor, " p"]:
+    """The rate of every stored parameter."""
+    result = gaussians.with_flat(torch.empty_like(gaussians.flat))
+    each = result.attributes
+    each["means"].fill_(position)
+    each["log_scales"].fill_(rates.log_scales)
+    each["quats"].fill_(rates.quats)
+    each["opacity_logits"].fill_(rates.opacity_logits)
+    each["sh"][:, :1] = rates.sh_constant
+    each["sh"][:, 1:] = rates.sh_higher
+    return result.flat
+
+
+def with_background(view: View, old: Float[Tensor, "3"], new: Float[Tensor, "3"]) -> Float[Tensor, "3 h w"]:
+    """The view's image, composited over another colour where it is transparent; photographs are opaque."""
+    if view.alpha is None:
+        return view.image
+    return view.image + (1 - view.alpha) * (new - old)[:, None, None]
+
+
+def train(training: Training, views: Sequence[View]) -> Iterator[Progress]:
+    """Make the steps that are left of config.iterations, one each time the next item is asked for.
+
+    Between two items `training` is whole, so that it can be saved, evaluated or left there.
+    """
+    config, schedule = training.config, training.config.densify
+    if not views:
+        raise ValueError("expected at least one view to train on, got none")
+    while training.step < config.iterations:
+        step = training.step + 1
+        training.raise_sh_degree(min(config.sh_degree, (step - 1) // config.sh_degree_every))
+        view = views[training.next_view(len(views))]
+        gaussians = training.gaussians
+        background, target = torch.tensor(config.background, dtype=gaussians.flat.dtype), view.image
+        if config.random_background:
+            drawn = torch.rand(3, generator=training.generator, dtype=background.dtype)
+            background, target = drawn, with_background(view, background, drawn)
+
+        flat = gaussians.flat.detach().requires_grad_()
+        rendering = render(gaussians.with_flat(flat), view.camera, background, config.render)
+        loss = photometric_loss(rendering.image, target, config.loss)
+        if not torch.isfinite(loss):
+            gaussians.require_finite()
+            raise ValueError(
+                f"expected a finite loss, got {loss.item()} at step {step} on view {view.name}; lower the rates"
+            )
+        gradient, screen_gradient = torch.autograd.grad(loss, [flat, rendering.splats.means])
+
+        position = position_rate(config.rates, training.extent, step, config.iterations)
+        rates = learning_rates(gaussians, config.rates, position)
+        training.adam.update(gaussians.flat, gradient, rates)
+
+        if schedule.collects(step, config.iterations):
+            training.screen_gradients.add(screen_gradient, rendering.splats, view.camera)
+        if schedule.densifies(step, config.iterations):
+            gradients = training.screen_gradients.mean
+            large = schedule.prunes_large(step)
+            training.follow(
+                densify(gaussians, gradients, training.extent, schedule, training.generator, prune_large=large)
+            )
+            if not len(training.gaussians):
+                raise ValueError(f"every Gaussian became transparent or too large by step {step}; lower the rates")
+        if schedule.resets_opacity(step, config.iterations):
+            reset_opacities(training.gaussians, schedule.reset_opacity)
+            training.adam.forget("opacity_logits")
+
+        training.step = step
+        yield Progress(step, loss.item(), len(training.gaussians), view.name)

@@ -1,0 +1,180 @@
+"""Checkpoints: whole or not at all, read back as they were, refused with the reason where they are not ours."""
+
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
+
+from splat.checkpoint import load_checkpoint, save_checkpoint, write_atomically
+from splat.train import Training, train
+
+
+@pytest.fixture(scope="module")
+def training() -> Training:
+    training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
+    for done in train(training, tiny_views()):
+        if done.step == 8:
+            break
+    return training
+
+
+@pytest.fixture
+def path(tmp_path, training) -> Path:
+    save_checkpoint(tmp_path / "checkpoint.pt", training, REFERENCE)
+    return tmp_path / "checkpoint.pt"
+
+
+def test_what_is_saved_is_what_is_loaded(path, training):
+    loaded = load_checkpoint(path)
+    assert loaded.scene == REFERENCE and loaded.torch_version == torch.__version__
+    got = loaded.training
+    assert got.config == training.config
+    assert (got.step, got.extent, got.order) == (8, EXTENT, training.order)
+    assert got.gaussians.sh_degree == training.gaussians.sh_degree == 1
+    assert torch.equal(got.gaussians.flat, training.gaussians.flat)
+    assert torch.equal(got.adam.first.flat, training.adam.first.flat) and got.adam.updates == 8
+    assert torch.equal(got.adam.second.flat, training.adam.second.flat)
+    assert torch.equal(got.screen_gradients.total, training.screen_gradients.total)
+    assert torch.equal(got.screen_gradients.renders, training.screen_gradients.renders)
+    assert torch.equal(got.generator.get_state(), training.generator.get_state())
+
+
+def test_a_checkpoint_holds_no_more_than_its_tensors(path, training):
+    values = sum(t.numel() for t in (training.gaussians.flat, training.adam.first.flat, training.adam.second.flat))
+    assert path.stat().st_size < 4 * values + training.generator.get_state().numel() + 16_000
+
+
+def test_the_same_training_gives_the_same_bytes_under_any_name(path, training):
+    other = path.with_name("other.pt")
+    save_checkpoint(other, training, REFERENCE)
+    assert other.read_bytes() == path.read_bytes()
+
+
+def test_a_write_that_fails_leaves_what_was_there_and_nothing_beside_it(path, monkeypatch):
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="no space left"):
+        write_atomically(path, b"something else")
+    assert path.read_bytes() == before and [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def refused(path: Path, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        load_checkpoint(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_reported(tmp_path):
+    with pytest.raises(FileNotFoundError, match="found no such file"):
+        load_checkpoint(tmp_path / "checkpoint.pt")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 nor a zip file", b"\x80\x02}q\x00."])
+def test_a_file_of_another_kind_is_refused(tmp_path, content):
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(content)
+    refused(path, "expected a checkpoint written by landscape train")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_checkpoint_is_refused(path, share):
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    refused(path, "not one or is damaged")
+
+
+def test_a_file_that_would_run_code_is_refused_and_runs_nothing(tmp_path):
+    marker = tmp_path / "ran"
+
+    class Attack:
+        def __reduce__(self):
+            return os.mkdir, (str(marker),)
+
+    path = tmp_path / "checkpoint.pt"
+    torch.save({"format": Attack()}, path)
+    refused(path, "not one or is damaged")
+    path.write_bytes(pickle.dumps(Attack()))
+    refused(path, "not one or is damaged")
+    assert not marker.exists()
+
+
+CHANGES = {
+    "format": ("something else", "does not hold the format"),
+    "version": (99, "format version is 99"),
+    "torch": (2, "'torch' is int, expected str"),
+    "step": (1000, "step 1000 is not among its 12"),
+    "extent": (float("inf"), "extent is inf"),
+    "sh_degree": (7, "sh_degree 0, 1, 2 or 3, got 7"),
+    "flat": (torch.zeros(7), "expected a vector of n x 23 parameters"),
+    "adam": ({"first": torch.zeros(3), "second": torch.zeros(3), "updates": 1}, "'first' is torch.float32 of shape"),
+    "screen_gradients": ([], "'screen_gradients' is list, expected dict"),
+    "generator": (torch.zeros(5, dtype=torch.uint8), "not the state of a random generator"),
+    "order": ([3], "does not index its 3 training views"),
+    "config": ({"iterations": 5}, "'config' has missing or unknown keys: background"),
+    "scene": ({}, "'scene' has missing or unknown keys"),
+}
+
+
+@pytest.mark.parametrize("key", CHANGES)
+def test_every_key_is_checked(path, key):
+    content = torch.load(path, weights_only=True)
+    assert set(content) == set(CHANGES)
+    value, message = CHANGES[key]
+    torch.save({**content, key: value}, path)
+    refused(path, message)
+    del content[key]
+    torch.save(content, path)
+    refused(path, "missing|format")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("iterations", "many", "'config.iterations' is 'many', expected int"),
+        ("background", (0.0, 1.0), "'config.background' is"),
+        ("seed", -1, "expected a seed"),
+        ("loss", {"pixel": "l1"}, "'config.loss' has missing or unknown keys"),
+    ],
+)
+def test_settings_in_a_checkpoint_are_checked_like_any_others(path, key, value, message):
+    content = torch.load(path, weights_only=True)
+    content["config"][key] = value
+    torch.save(content, path)
+    refused(path, message)
+
+
+def test_parameters_that_are_not_finite_are_refused_by_name(path):
+    content = torch.load(path, weights_only=True)
+    content["flat"][4] = torch.nan
+    torch.save(content, path)
+    refused(path, "expected finite means.*at Gaussian 1")
+
+
+def test_a_checkpoint_of_float64_comes_back_in_float64(tmp_path):
+    training = Training.start(tiny_gaussians(dtype=torch.float64), EXTENT, tiny_config())
+    save_checkpoint(tmp_path / "checkpoint.pt", training, REFERENCE)
+    assert load_checkpoint(tmp_path / "checkpoint.pt").training.gaussians.flat.dtype == torch.float64
+
+
+def test_the_scene_is_found_from_the_checkpoint_else_where_it_was_else_not_at_all(tmp_path):
+    there, run, moved = tmp_path / "scene", tmp_path / "run", tmp_path / "elsewhere"
+    for folder in (there, run):
+        folder.mkdir()
+    reference = replace(REFERENCE, absolute=str(there), relative="../scene")
+    assert reference.find(run / "checkpoint.pt") == there
+    moved.mkdir()
+    run = run.rename(moved / "run")
+    assert reference.find(run / "checkpoint.pt") == there
+    there.rename(moved / "scene")
+    assert reference.find(run / "checkpoint.pt") == moved / "scene"
+    (moved / "scene").rmdir()
+    with pytest.raises(FileNotFoundError, match="pass where it is now with --scene"):
+        reference.find(run / "checkpoint.pt")
