@@ -1,0 +1,94 @@
+"""Scenes from COLMAP models, binary or text, read with pycolmap.
+
+A model is three files, cameras, images and points3D (.bin or .txt), in `sparse/0`, `sparse` or the scene folder itself.
+COLMAP's frames are ours: world to camera, +x right, +y down, +z forward, pixel centres at + 0.5.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+
+from splat.scenes.images import Photo, image_files, image_folder
+from splat.scenes.view import Points
+
+MODEL_FOLDERS = ("sparse/0", "sparse", ".")
+MODEL_FILES = ("cameras", "images", "points3D")
+SMALLEST_RECORD = {"cameras": 40, "images": 73, "points3D": 51}  # bytes in a binary model, after a count of 8 bytes
+
+
+def find_model(root: Path) -> Path | None:
+    """The folder with the model's three files, if there is one."""
+    for folder in (root / name for name in MODEL_FOLDERS):
+        for suffix in (".bin", ".txt"):
+            if all((folder / (name + suffix)).is_file() for name in MODEL_FILES):
+                return folder
+    return None
+
+
+def read_colmap(root: Path, model: Path, images: str | None = None) -> tuple[list[Photo], Points | None]:
+    """Photographs sorted by name, and the model's points with their tracks."""
+    _require_plausible_counts(model)
+    try:
+        reconstruction = pycolmap.Reconstruction(model)
+    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
+        raise ValueError(
+            f"expected a COLMAP model, cannot read the one in {model}: {error}; export it again"
+        ) from error
+    posed = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
+    if not posed:
+        raise ValueError(
+            f"expected images with poses in the COLMAP model {model}, got none among {len(reconstruction.images)}; "
+            "run `colmap mapper` to compute them"
+        )
+    paths = _paths([image.name for image in posed], image_folder(root, images))
+    photos = []
+    for image, path in zip(posed, paths):
+        rotation = torch.from_numpy(image.cam_from_world().rotation.matrix().copy())
+        centre = torch.from_numpy(image.projection_center().copy())
+        photos.append(Photo(image.name, path, reconstruction.cameras[image.camera_id], rotation, centre))
+    return photos, _points(reconstruction, posed)
+
+
+def _require_plausible_counts(model: Path) -> None:
+    """COLMAP allocates what a file's first 8 bytes promise, and ends the process when it is not one of its files."""
+    for name, record in SMALLEST_RECORD.items():
+        path = model / f"{name}.bin"
+        if path.is_file():
+            with path.open("rb") as file:
+                count = int.from_bytes(file.read(8), "little")
+            if path.stat().st_size < 8 + count * record:
+                raise ValueError(
+                    f"expected a COLMAP model, {path} promises {count} {name} but has only {path.stat().st_size} bytes; "
+                    "it is cut short or no COLMAP file: export the model again"
+                )
+
+
+def _paths(names: list[str], folder: Path) -> list[Path]:
+    """The file of every image.
+
+    LLFF's down-sampled folders rename the photographs to image000.png, image001.png ... in the order of their names,
+    and other tools change the suffix (IMG_1.JPG to IMG_1.png); both count where no file has the model's own name.
+    """
+    if any((folder / name).is_file() for name in names):
+        return [folder / name for name in names]
+    files = image_files(folder)
+    if len(files) == len(names) and all(re.fullmatch(r"image\d+", path.stem) for path in files):
+        return files
+    by_stem = {path.stem: path for path in files}
+    return [by_stem.get(Path(name).stem, folder / name) for name in names]
+
+
+def _points(reconstruction: pycolmap.Reconstruction, posed: list[pycolmap.Image]) -> Points | None:
+    points = list(reconstruction.points3D.values())
+    if not points:
+        return None
+    index = {image.image_id: i for i, image in enumerate(posed)}
+    seen = [(i, index[e.image_id]) for i, p in enumerate(points) for e in p.track.elements if e.image_id in index]
+    # a track may meet one image twice; the rows are unique
+    observations = np.unique(np.array(seen, dtype=np.int64).reshape(-1, 2), axis=0)
+    xyz = torch.from_numpy(np.array([point.xyz for point in points], dtype=np.float64))
+    rgb = torch.from_numpy(np.array([point.color for point in points], dtype=np.float32) / 255)
+    return Points(xyz, rgb, torch.from_numpy(observations), tuple(image.name for image in posed))

@@ -1,0 +1,196 @@
+"""Photographs on disk: where they are, whether they fit their cameras, and how they are read.
+
+A `Photo` is what a reader of a scene format knows of an image: its file, its lens (a pycolmap camera, pixel centres at
++ 0.5 as everywhere here) and its pose.  `frame` checks the file's header against the lens and fixes the final camera:
+
+    stored size    the lens is scaled to the file's size where the aspect ratio is the same within rounding (`images_8`)
+    undistortion   radial and tangential lenses are resampled bilinearly into the largest pinhole image without blank
+                   pixels, with the pinhole camera that pycolmap (as `colmap image_undistorter`) chooses
+    downscale      area averaging: a pixel becomes the mean of the light that fell on its footprint, as on a sensor with
+                   larger pixels; values stay in [0, 1], and at a fractional ratio nothing shifts (a box filter that
+                   takes whole pixels only, as most libraries' does, moves edges by up to a quarter of a pixel)
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from splat.camera import Camera
+from splat.scenes.view import Frame, Picture, Subset
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
+UNDISTORTED_HERE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """An image file with its lens and pose (rotation: world to camera; centre: world units), both float64."""
+
+    name: str
+    path: Path
+    lens: pycolmap.Camera
+    rotation: Float[Tensor, "3 3"]
+    centre: Float[Tensor, "3"]
+    subset: Subset | None = None
+    depth_range: tuple[float, float] | None = None
+
+
+def image_folder(root: Path, images: str | None = None) -> Path:
+    """The folder of a scene's photographs: `images` if named, else `images`, else `images_K` with the smallest K."""
+    if images is not None:
+        if not (root / images).is_dir():
+            raise FileNotFoundError(f"expected the image folder {root / images}, which does not exist; {_offers(root)}")
+        return root / images
+    if (root / "images").is_dir():
+        return root / "images"
+    reduced = _reduced_folders(root)
+    if not reduced:
+        raise FileNotFoundError(
+            f"expected a folder images or images_K (K = 2, 4, 8 ...) in {root}, found neither; "
+            "name the folder of the photographs with images=..."
+        )
+    return reduced[0]
+
+
+def _reduced_folders(root: Path) -> list[Path]:
+    found = [
+        (int(m[1]), path)
+        for path in root.iterdir()
+        if path.is_dir() and (m := re.fullmatch(r"images_(\d+)", path.name))
+    ]
+    return [path for _, path in sorted(found)]
+
+
+def _offers(root: Path) -> str:
+    found = [path.name for path in [root / "images", *_reduced_folders(root)] if path.is_dir()]
+    return f"choose from {', '.join(found)}" if found else "the scene has no folder images or images_K either"
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The image files of a folder, sorted by name."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def require_files(paths: Sequence[Path]) -> None:
+    """Raise FileNotFoundError that counts the missing image files and names the first."""
+    missing = [path for path in paths if not path.is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"expected {len(paths)} image files, {len(missing)} are missing, the first is {missing[0]}; "
+            "restore them, or choose another image folder with images=..."
+        )
+
+
+def image_header(path: Path) -> tuple[tuple[int, int], bool]:
+    """((width, height), whether it has an alpha channel), without reading the pixels."""
+    try:
+        with Image.open(path) as file:
+            if file.mode.startswith(("I", "F")):
+                raise ValueError(f"expected an image of 8 bits a channel, got mode {file.mode} in {path}; convert it")
+            return file.size, _has_alpha(file)
+    except (UnidentifiedImageError, OSError) as error:
+        raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
+
+
+def _has_alpha(file: Image.Image) -> bool:
+    return "A" in file.getbands() or "transparency" in file.info
+
+
+def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Frame:
+    """The final camera of a photograph, and how to read it.  ValueError where file and lens cannot belong together."""
+    size, _ = image_header(photo.path)
+    lens = _scaled_to(photo.lens, size, photo)
+    pinhole = _pinhole(lens, photo)
+    width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
+    fx, fy, cx, cy = pinhole.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    full = Camera(photo.rotation, photo.centre, fx, fy, cx, cy, pinhole.width, pinhole.height)
+    camera = full.resized(width, height)
+    read = partial(_read, photo.path, lens, pinhole, (width, height), background)
+    return Frame(photo.name, camera, read, photo.subset, photo.depth_range)
+
+
+def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> pycolmap.Camera:
+    """The lens at the file's size; the scale s must round s (w, h) to it, whichever way the tool rounded."""
+    width, height = size
+    if (lens.width, lens.height) == size:
+        return lens
+    low = max((width - 1) / lens.width, (height - 1) / lens.height)
+    high = min((width + 1) / lens.width, (height + 1) / lens.height)
+    if not low < high:
+        raise ValueError(
+            f"expected image {photo.name!r} at the {lens.width} x {lens.height} px of its camera or scaled from it, "
+            f"got {width} x {height} px in {photo.path}; it was cropped, rotated or stretched: use the images that the "
+            "cameras were computed from, or compute the cameras anew"
+        )
+    scaled = pycolmap.Camera(lens.todict())
+    scaled.rescale(width, height)
+    return scaled
+
+
+def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
+    """The lens itself where it is a pinhole, else the pinhole camera of its undistorted image."""
+    model = lens.model_name
+    if model in PINHOLE_MODELS:
+        return lens
+    if model not in UNDISTORTED_HERE:
+        raise ValueError(
+            f"expected a pinhole lens or radial and tangential distortion ({', '.join(UNDISTORTED_HERE)}), got "
+            f"{model} for image {photo.name!r}; make pinhole images first: colmap image_undistorter --image_path "
+            f"{photo.path.parent} --input_path MODEL --output_path NEW_SCENE, where MODEL is the folder of cameras.bin"
+        )
+    return lens if lens.is_undistorted() else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+
+
+def _read(
+    path: Path, lens: pycolmap.Camera, pinhole: pycolmap.Camera, size: tuple[int, int], background: Float[Tensor, "3"]
+) -> Picture:
+    """Composite over the background, undistort, downscale: in this order, no transparent colour bleeds in."""
+    with Image.open(path) as file:
+        has_alpha = _has_alpha(file)
+        pixels = np.array(file.convert("RGBA" if has_alpha else "RGB"))
+    layers = torch.from_numpy(pixels).permute(2, 0, 1).to(torch.float32) / 255
+    if has_alpha:
+        rgb, alpha = layers[:3], layers[3:]
+        layers = torch.cat([rgb * alpha + background[:, None, None] * (1 - alpha), alpha])
+    if pinhole is not lens:
+        layers = _undistort(layers, lens, pinhole)
+    layers = resize_by_area(layers, *size).clamp(0, 1)
+    return layers[:3], layers[3] if has_alpha else None
+
+
+def _undistort(layers: Float[Tensor, "c h w"], lens: pycolmap.Camera, pinhole: pycolmap.Camera) -> Tensor:
+    """The picture that the pinhole camera would have taken: look up where each of its rays meets the stored image."""
+    column, row = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    rays = np.asarray(pinhole.cam_from_img(np.stack([column, row], axis=-1).reshape(-1, 2)))
+    source = np.asarray(lens.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], axis=1)))
+    # grid_sample's coordinates with align_corners=False: -1 and 1 are the outer edges of the image
+    grid = torch.from_numpy(source / [lens.width, lens.height] * 2 - 1).to(layers)
+    grid = grid.view(1, pinhole.height, pinhole.width, 2)
+    return F.grid_sample(layers[None], grid, mode="bilinear", padding_mode="border", align_corners=False)[0]
+
+
+def resize_by_area(layers: Float[Tensor, "c h w"], width: int, height: int) -> Float[Tensor, "c height width"]:
+    """Every new pixel is the mean over its footprint, fractions of old pixels included."""
+    if layers.shape[1:] == (height, width):
+        return layers
+    rows, columns = (_footprints(old, new).to(layers) for old, new in zip(layers.shape[1:], (height, width)))
+    return rows @ layers @ columns.T
+
+
+def _footprints(old: int, new: int) -> Float[Tensor, "new old"]:
+    """The share of each old pixel [j, j + 1] in each new pixel [i, i + 1] old / new; rows sum to 1."""
+    edges = torch.arange(new + 1, dtype=torch.float64) * (old / new)
+    start = torch.arange(old, dtype=torch.float64)
+    overlap = torch.minimum(edges[1:, None], start + 1) - torch.maximum(edges[:-1, None], start)
+    return overlap.clamp_min(0) * (new / old)

@@ -1,0 +1,48 @@
+"""Scenes from LLFF's `poses_bounds.npy`: one row of 17 numbers for each image, in the order of the sorted file names.
+
+The first 15 are a 3 x 5 matrix [R | t | h w f]: the columns of R are the camera's axes in the world, in the order
+[down, right, backwards]; t is the camera's centre; h, w (px) and f (px) are those of the image that the poses were
+computed from, principal point in the middle.  The last two are the nearest and the farthest depth of the content.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+
+from splat.scenes.images import Photo, image_files, image_folder
+
+POSES = "poses_bounds.npy"
+
+
+def read_llff(root: Path, images: str | None = None) -> list[Photo]:
+    """Photographs sorted by name, with the depth range of each."""
+    path = root / POSES
+    try:
+        rows = np.load(path, allow_pickle=False).astype(np.float64)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(
+            f"expected an array in {path}, cannot read it: {error}; make it again with LLFF's imgs2poses"
+        ) from error
+    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
+        raise ValueError(f"expected finite rows of 17 numbers in {path}, got shape {rows.shape}; see LLFF's imgs2poses")
+    folder = image_folder(root, images)
+    files = image_files(folder)
+    if len(files) != len(rows):
+        raise ValueError(
+            f"expected one image for each of the {len(rows)} poses in {path}, got {len(files)} in {folder}; "
+            "restore the images that the poses were computed from, or choose their folder with images=..."
+        )
+    return [_photo(path, row) for path, row in zip(files, rows)]
+
+
+def _photo(path: Path, row: np.ndarray) -> Photo:
+    matrix = row[:15].reshape(3, 5)
+    down, right, backwards, centre, (height, width, focal) = matrix.T
+    lens = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=round(width), height=round(height), params=[focal, width / 2, height / 2]
+    )
+    rotation = torch.from_numpy(np.stack([right, down, -backwards]))
+    depth_range = (float(row[15]), float(row[16]))
+    return Photo(path.name, path, lens, rotation, torch.from_numpy(centre.copy()), depth_range=depth_range)

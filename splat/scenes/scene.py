@@ -1,0 +1,154 @@
+"""A scene: posed pictures and, where the files have them, points.  `load_scene` recognises the format of a folder:
+
+    COLMAP      cameras, images, points3D (.bin or .txt) in sparse/0, sparse or the folder itself     `colmap.py`
+    LLFF        poses_bounds.npy                                                                      `llff.py`
+    Blender     transforms_train.json with transforms_test.json                                       `transforms.py`
+    transforms  transforms.json of instant-ngp or nerfstudio                                          `transforms.py`
+
+in this order: a COLMAP model beside poses_bounds.npy wins, because it has points.  Every image file is looked up and
+its size compared with its camera's here, before any training; the pixels are read when a split asks for them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import cos, radians
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splat.camera import Camera
+from splat.scenes.colmap import MODEL_FOLDERS, find_model, read_colmap
+from splat.scenes.images import Photo, frame, image_header, require_files
+from splat.scenes.llff import POSES, read_llff
+from splat.scenes.transforms import BLENDER_FILES, SINGLE_FILE, read_blender, read_transforms
+from splat.scenes.view import Frame, Points, View
+
+__all__ = ["Frame", "Points", "Scene", "View", "camera_extent", "load_scene"]
+
+Kind = Literal["colmap", "llff", "blender", "transforms", "synthetic"]
+FORWARD_FACING_ANGLE = 45.0  # degrees; LLFF captures stay within about 20, inward orbits exceed 90
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Frames sorted by name (Blender: in the order of its files), points if any, and the background colour."""
+
+    name: str
+    root: Path
+    kind: Kind
+    frames: tuple[Frame, ...]
+    points: Points | None
+    background: Float[Tensor, "3"]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(frame.name for frame in self.frames)
+
+    def select(self, names: Sequence[str]) -> list[Frame]:
+        """The frames of these names, in the order asked for."""
+        by_name = {frame.name: frame for frame in self.frames}
+        unknown = [name for name in names if name not in by_name]
+        if unknown:
+            raise ValueError(
+                f"expected names of images of {self.root}, got {unknown[0]!r} ({len(unknown)} unknown); the scene has "
+                f"{len(self.frames)} images from {self.names[0]!r} to {self.names[-1]!r}"
+            )
+        return [by_name[name] for name in names]
+
+    def load(self, names: Sequence[str] | None = None) -> list[View]:
+        """Read the pictures of these frames (all by default)."""
+        return [frame.view() for frame in (self.frames if names is None else self.select(names))]
+
+    def extent(self, names: Sequence[str] | None = None) -> float:
+        """`camera_extent` of these frames (all by default)."""
+        return camera_extent([frame.camera for frame in (self.frames if names is None else self.select(names))])
+
+    @property
+    def forward_facing(self) -> bool:
+        """Whether all cameras look the same way: within 45 degrees of their mean viewing direction."""
+        directions = torch.stack([frame.camera.forward for frame in self.frames])
+        mean = directions.mean(dim=0)
+        return bool((directions @ mean > cos(radians(FORWARD_FACING_ANGLE)) * mean.norm()).all())
+
+
+def camera_extent(cameras: Sequence[Camera]) -> float:
+    """1.1 x the largest distance of a camera from the mean of all, world units: 3DGS's unit of position steps.
+
+    3DGS takes it over the training cameras.
+    """
+    centres = torch.stack([camera.centre for camera in cameras])
+    extent = 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
+    if not extent > 0:
+        raise ValueError(
+            f"expected cameras at different places, got {len(cameras)} at the same one: the scene has no scale; "
+            "choose at least two views from different places"
+        )
+    return extent
+
+
+def load_scene(
+    path: str | Path,
+    images: str | None = None,
+    downscale: float = 1,
+    background: Sequence[float] | None = None,
+) -> Scene:
+    """Recognise and load the scene in a folder; pixels are read later.
+
+    images: folder of the photographs inside the scene (default: `images`, else the largest `images_K`).
+    downscale: both sides of every picture are divided by this and rounded.
+    background: RGB in [0, 1] that transparent pictures are composited over and renders are drawn on; by default white
+        where the pictures have an alpha channel (as 3DGS does for Blender scenes), else black.
+
+    Raises FileNotFoundError for what is missing and ValueError for what cannot be used, in one sentence.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise FileNotFoundError(
+            f"expected a scene folder, {root} {'is not a folder' if root.exists() else 'does not exist'}"
+        )
+    if not 1 <= downscale < float("inf"):
+        raise ValueError(f"expected downscale of at least 1, got {downscale}")
+    kind, photos, points, own_background = _read(root, images)
+    require_files([photo.path for photo in photos])
+    _require_distinct(photos, root)
+    if background is None:
+        background = own_background
+    if background is None:
+        background = (1.0,) * 3 if image_header(photos[0].path)[1] else (0.0,) * 3
+    colour = torch.tensor(background, dtype=torch.float32)
+    if colour.shape != (3,) or not bool(((colour >= 0) & (colour <= 1)).all()):
+        raise ValueError(f"expected a background of three numbers in [0, 1], got {background}")
+    frames = tuple(frame(photo, downscale, colour) for photo in photos)
+    return Scene(root.resolve().name, root.resolve(), kind, frames, points, colour)
+
+
+def _read(root: Path, images: str | None) -> tuple[Kind, list[Photo], Points | None, list[float] | None]:
+    model = find_model(root)
+    if model is not None:
+        return "colmap", *read_colmap(root, model, images), None
+    if (root / POSES).is_file():
+        return "llff", read_llff(root, images), None, None
+    if all((root / name).is_file() for _, name in BLENDER_FILES):
+        if images is not None:
+            raise ValueError(f"expected no image folder for {root}, whose transforms files name theirs, got {images!r}")
+        return "blender", read_blender(root), None, None
+    for name in (SINGLE_FILE, BLENDER_FILES[0][1]):
+        if (root / name).is_file():
+            return "transforms", *read_transforms(root, root / name, images)
+    found = sorted(path.name for path in root.iterdir())
+    raise FileNotFoundError(
+        f"expected a scene with camera poses in {root}: looked for a COLMAP model (cameras, images and points3D, .bin "
+        f"or .txt) in {', '.join(MODEL_FOLDERS)}, for {POSES}, {BLENDER_FILES[0][1]} and {SINGLE_FILE}; found "
+        f"{', '.join(found[:6]) + (' ...' if len(found) > 6 else '') if found else 'an empty folder'}; "
+        "run COLMAP on the photographs first"
+    )
+
+
+def _require_distinct(photos: Sequence[Photo], root: Path) -> None:
+    names = [photo.name for photo in photos]
+    twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    if twice:
+        raise ValueError(f"expected every image of {root} once, got {twice[0]!r} more than once ({len(twice)} such)")

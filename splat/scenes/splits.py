@@ -1,0 +1,121 @@
+"""Which views train and which test: the sparse-view protocols of the field.
+
+LLFF       names sorted; every 8th, from the first, is a test view; n training views at the rounded, evenly spaced
+           places of the rest, np.linspace(0, m - 1, n): RegNeRF, FreeNeRF, FSGS and their followers
+Blender    training views r_26, r_86, r_2, r_55, r_75, r_93, r_16, r_73, the first n of them; every 8th test view,
+           25 of 200: DietNeRF, FreeNeRF.  A folder already reduced to these images gives the same split
+explicit   training (and test) views by name or by number
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from splat.scenes.scene import Scene
+from splat.scenes.view import Frame
+
+HOLD_OUT = 8
+BLENDER_TRAINING = (26, 86, 2, 55, 75, 93, 16, 73)
+
+
+@dataclass(frozen=True)
+class Split:
+    """Names of the training and the test views, and the protocol that chose them."""
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    protocol: str
+
+
+def split_scene(
+    scene: Scene,
+    views: int | None = None,
+    train: Sequence[str | int] | None = None,
+    test: Sequence[str | int] | None = None,
+) -> Split:
+    """The protocol of the scene's kind with that many training views (all by default), or the explicit lists."""
+    if train is not None:
+        if views is not None:
+            raise ValueError(
+                f"expected a number of views or a list of training views, got both: {views} and {list(train)}"
+            )
+        return explicit_split(scene.names, train, test)
+    if test is not None:
+        raise ValueError("expected a list of training views beside the list of test views, got none; give both")
+    return blender_split(scene.frames, views) if scene.kind == "blender" else llff_split(scene.names, views)
+
+
+def evenly_spaced(names: Sequence[str], n: int | None) -> tuple[str, ...]:
+    """n of the names at equal steps, ends included; all where n is None."""
+    if n is None:
+        return tuple(names)
+    if n < 1:
+        raise ValueError(f"expected at least 1 training view, got {n}")
+    if n > len(names):
+        raise ValueError(f"expected at most {len(names)} training views, which the scene has, got {n}; ask for fewer")
+    return tuple(names[int(place)] for place in np.rint(np.linspace(0, len(names) - 1, n)))
+
+
+def llff_split(names: Sequence[str], n: int | None = None) -> Split:
+    """Every 8th of the sorted names tests, n evenly spaced of the others train."""
+    names = sorted(names)
+    others = [name for i, name in enumerate(names) if i % HOLD_OUT]
+    if not others:
+        raise ValueError(f"expected at least 2 images, one to train and one to test, got {len(names)}")
+    return Split(evenly_spaced(others, n), tuple(names[::HOLD_OUT]), "llff")
+
+
+def blender_split(frames: Sequence[Frame], n: int | None = None) -> Split:
+    """The 8-view protocol for n <= 8 where the scene has its views, else n evenly spaced training views."""
+    train = [frame.name for frame in frames if frame.subset == "train"]
+    test = [frame.name for frame in frames if frame.subset == "test"]
+    by_number = {_number(name): name for name in train}
+    chosen = [by_number.get(number) for number in BLENDER_TRAINING[:n]]
+    if n is None or n > len(BLENDER_TRAINING) or n < 1 or None in chosen:
+        return Split(evenly_spaced(train, n), _every_eighth(test), "blender, evenly spaced")
+    return Split(tuple(name for name in chosen if name is not None), _every_eighth(test), "blender, 8 views")
+
+
+def _every_eighth(names: Sequence[str]) -> tuple[str, ...]:
+    """By the number in the name, so that a folder of only these stays as it is; by place where there is none."""
+    numbers = [_number(name) for name in names]
+    return tuple(name for i, (name, k) in enumerate(zip(names, numbers)) if (i if k is None else k) % HOLD_OUT == 0)
+
+
+def _number(name: str) -> int | None:
+    match = re.search(r"(\d+)(\.\w+)?$", name)
+    return int(match[1]) if match else None
+
+
+def explicit_split(names: Sequence[str], train: Sequence[str | int], test: Sequence[str | int] | None = None) -> Split:
+    """These views train; `test`, or else all others, test.  A view is a name, its last part, or a number."""
+    chosen = tuple(_resolve(names, key) for key in train)
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise ValueError(f"expected training views, each once, got {list(train)}")
+    held_out = (
+        tuple(name for name in names if name not in chosen) if test is None else tuple(_resolve(names, k) for k in test)
+    )
+    both = sorted(set(chosen) & set(held_out))
+    if both:
+        raise ValueError(f"expected test views that do not train, got {both[0]!r} in both lists")
+    return Split(chosen, held_out, "explicit")
+
+
+def _resolve(names: Sequence[str], key: str | int) -> str:
+    if isinstance(key, int):
+        if not 0 <= key < len(names):
+            raise ValueError(f"expected the number of a view from 0 to {len(names) - 1}, got {key}")
+        return names[key]
+    if key in names:
+        return key
+    matches = [
+        name for name in names if key in (name.rsplit("/", 1)[-1], re.sub(r"\.\w+$", "", name.rsplit("/", 1)[-1]))
+    ]
+    if len(matches) != 1:
+        problem = f"{len(matches)} views have it: {', '.join(matches[:3])}" if matches else "no view has it"
+        raise ValueError(
+            f"expected the name of one view, got {key!r}: {problem}; the names go from {names[0]!r} to {names[-1]!r}"
+        )
+    return matches[0]

@@ -1,0 +1,159 @@
+"""Scenes from `transforms*.json`: Blender (NeRF-synthetic), instant-ngp, nerfstudio.
+
+`transform_matrix` is camera to world with the camera's axes +x right, +y up, +z backwards (OpenGL), so that the world
+to camera rotation here is diag(1, -1, -1) R^T.  Intrinsics stand at the top or in the frame, which wins:
+
+    fl_x fl_y cx cy w h          px, pixel centres at + 0.5; cx, cy default to the middle, fl_y to fl_x
+    camera_angle_x               horizontal field of view, radians, where fl_x is not given
+    k1 k2 k3 p1 p2               OpenCV's radial and tangential distortion (k4 ... of a rational model are refused)
+    camera_model, is_fisheye     PINHOLE, SIMPLE_PINHOLE, OPENCV and the like; fisheye and panoramas are refused
+    ply_file_path                points; an integer list property `views` of a vertex numbers the frames that see it
+    background                   (this project) the colour that the pictures were composited over
+
+Blender scenes have two files, `transforms_train.json` and `transforms_test.json`; the frames keep their order in the
+files, because the sparse-view protocols count them.  Frames of a single file are sorted by name.
+"""
+
+import json
+from collections.abc import Mapping
+from math import tan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import torch
+from plyfile import PlyData, PlyParseError
+from torch import Tensor
+
+from splat.scenes.images import PINHOLE_MODELS, UNDISTORTED_HERE, Photo, image_folder, image_header, require_files
+from splat.scenes.view import Points, Subset
+
+BLENDER_FILES: tuple[tuple[Subset, str], ...] = (("train", "transforms_train.json"), ("test", "transforms_test.json"))
+SINGLE_FILE = "transforms.json"
+REFUSED_TERMS = ("k4", "k5", "k6")
+
+
+def read_blender(root: Path) -> list[Photo]:
+    """Training photographs, then test photographs, named by their path (`train/r_26`)."""
+    photos = []
+    for subset, name in BLENDER_FILES:
+        data = _load(root / name)
+        paths = [_image_path(root, frame["file_path"]) for frame in data["frames"]]
+        photos += _photos(root / name, data, paths, subset)
+    return photos
+
+
+def read_transforms(
+    root: Path, path: Path, images: str | None = None
+) -> tuple[list[Photo], Points | None, list[float] | None]:
+    """Photographs sorted by name, the points of `ply_file_path`, and the background, where the file has them."""
+    data = _load(path)
+    data["frames"].sort(key=lambda frame: frame["file_path"])
+    paths = [_image_path(root, frame["file_path"]) for frame in data["frames"]]
+    if images is not None or (not any(p.is_file() for p in paths) and not (root / "images").exists()):
+        folder = image_folder(root, images)
+        paths = [_image_path(folder, Path(frame["file_path"]).name) for frame in data["frames"]]
+    photos = _photos(path, data, paths, None)
+    points = None
+    if "ply_file_path" in data:
+        points = read_points(root / data["ply_file_path"], tuple(photo.name for photo in photos))
+    return photos, points, data.get("background")
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise ValueError(f"expected a JSON file with frames, cannot read {path}: {error}") from error
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise ValueError(f"expected a non-empty list 'frames' in {path}; every frame is an image with its pose")
+    for i, frame in enumerate(frames):
+        if not (isinstance(frame, dict) and "transform_matrix" in frame and isinstance(frame.get("file_path"), str)):
+            raise ValueError(f"expected 'file_path' and 'transform_matrix' in frame {i} of {path}")
+    return data
+
+
+def _image_path(folder: Path, file_path: str) -> Path:
+    """The file itself or, as Blender's exporter leaves the suffix away, the file with a suffix."""
+    path = folder / file_path
+    candidates = [path] + [path.with_name(path.name + suffix) for suffix in (".png", ".jpg", ".jpeg")]
+    return next((candidate for candidate in candidates if candidate.is_file()), path)
+
+
+def _photos(path: Path, data: dict[str, Any], paths: list[Path], subset: Subset | None) -> list[Photo]:
+    require_files(paths)  # before their headers are read, which say the size of a Blender scene's images
+    shared = {key: value for key, value in data.items() if key != "frames"}
+    photos = []
+    for frame, image in zip(data["frames"], paths):
+        name = Path(frame["file_path"]).as_posix()
+        rotation, centre = _pose(frame["transform_matrix"], name, path)
+        lens = _lens({**shared, **frame}, image_header(image)[0], name, path)
+        photos.append(Photo(name, image, lens, rotation, centre, subset))
+    return photos
+
+
+def _pose(matrix: Any, name: str, path: Path) -> tuple[Tensor, Tensor]:
+    """World to camera rotation and camera centre of an OpenGL camera-to-world matrix."""
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
+        raise ValueError(f"expected a finite 4 x 4 transform_matrix for {name!r} in {path}, got {matrix!r}")
+    rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3].T
+    return torch.from_numpy(rotation), torch.from_numpy(pose[:3, 3].copy())
+
+
+def _lens(values: Mapping[str, Any], size: tuple[int, int], name: str, path: Path) -> pycolmap.Camera:
+    """The pycolmap camera of one frame's intrinsics."""
+    model = str(values.get("camera_model", "OPENCV"))
+    if values.get("is_fisheye") or model not in PINHOLE_MODELS + UNDISTORTED_HERE:
+        kind = "a fisheye lens" if values.get("is_fisheye") else f"camera_model {model}"
+        raise ValueError(
+            f"expected pinhole images or radial and tangential distortion, got {kind} for {name!r} in {path}: a "
+            "pinhole renderer cannot draw it; undistort the photographs to pinhole images first"
+        )
+    rational = [key for key in REFUSED_TERMS if values.get(key)]
+    if rational:
+        raise ValueError(
+            f"expected at most k1, k2, k3, p1 and p2, got {', '.join(rational)} for {name!r} in {path}, whose meaning "
+            "differs between tools; undistort the photographs to pinhole images first"
+        )
+    width, height = int(values.get("w", size[0])), int(values.get("h", size[1]))
+    fx = _focal(values, width, name, path)
+    fy = float(values.get("fl_y", fx))
+    centre = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
+    k1, k2, p1, p2, k3 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3"))
+    if not any((k1, k2, p1, p2, k3)):
+        return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, *centre])
+    params = [fx, fy, *centre, k1, k2, p1, p2, k3, 0, 0, 0]
+    return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+
+
+def _focal(values: Mapping[str, Any], width: int, name: str, path: Path) -> float:
+    if "fl_x" in values:
+        return float(values["fl_x"])
+    if "camera_angle_x" in values:
+        return width / (2 * tan(float(values["camera_angle_x"]) / 2))
+    raise ValueError(f"expected fl_x or camera_angle_x for {name!r} in {path}, got neither; add the focal length in px")
+
+
+def read_points(path: Path, names: tuple[str, ...]) -> Points:
+    """Points of a PLY file: x y z, red green blue (0 to 255; grey where there are none), and `views` if it is there."""
+    try:
+        vertex = PlyData.read(path)["vertex"]
+        present = {prop.name for prop in vertex.properties}
+        xyz = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+        rgb = np.full(xyz.shape, 0.5, dtype=np.float32)
+        if {"red", "green", "blue"} <= present:
+            rgb = np.stack([np.asarray(vertex[c], dtype=np.float32) for c in ("red", "green", "blue")], axis=1) / 255
+        observations = None
+        if "views" in present:
+            seen = [np.asarray(views, dtype=np.int64) for views in vertex["views"]]
+            point = np.repeat(np.arange(len(seen)), [len(views) for views in seen])
+            observations = torch.from_numpy(np.stack([point, np.concatenate(seen)], axis=1)) if seen else None
+    except (OSError, PlyParseError, KeyError, ValueError) as error:
+        raise ValueError(f"expected a PLY file of points, cannot read {path}: {error}; restore or remove it") from error
+    return Points(torch.from_numpy(xyz), torch.from_numpy(rgb), observations, names)

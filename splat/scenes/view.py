@@ -1,0 +1,116 @@
+"""What a scene is made of: views, frames that have not been read yet, and points.
+
+    View    a camera with its picture, as training and evaluation use it
+    Frame   the same, whose picture is read from disk when `view()` is called; its camera and size are already final
+    Points  coloured points of the scene, from structure from motion or a scanner, and which images see each of them
+
+Pictures are (3, h, w) float32 in [0, 1], in the encoding of the file (no linearisation), composited over the scene's
+background where the file has an alpha channel.  World units and axes are those of the scene's files.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splat.camera import Camera
+
+Subset = Literal["train", "test"]
+Picture = tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"] | None]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera and its picture.  alpha: coverage in [0, 1] where the file has an alpha channel."""
+
+    name: str
+    camera: Camera
+    image: Float[Tensor, "3 h w"]
+    alpha: Float[Tensor, "h w"] | None = None
+
+    def __post_init__(self) -> None:
+        size = (self.camera.height, self.camera.width)
+        if self.image.shape != (3, *size) or (self.alpha is not None and self.alpha.shape != size):
+            raise ValueError(
+                f"expected the picture of {self.name!r} to be (3, {size[0]}, {size[1]}) as its camera, got "
+                f"{tuple(self.image.shape)}; resize the picture, or the camera with Camera.resized"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A posed picture that is read on demand.
+
+    subset: the part that the scene's own files assign it to; depth_range: nearest and farthest depth of the scene
+    content, world units.  Both None where the files do not say.
+    """
+
+    name: str
+    camera: Camera
+    read: Callable[[], Picture]
+    subset: Subset | None = None
+    depth_range: tuple[float, float] | None = None
+
+    def view(self) -> View:
+        """Read the picture."""
+        return View(self.name, self.camera, *self.read())
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """n coloured points.
+
+    xyz: float64, world units; rgb: float32 in [0, 1].  observations: rows (point, image), each once, where image counts
+    `names`; None where the file does not say which images see a point.
+    """
+
+    xyz: Float[Tensor, "n 3"]
+    rgb: Float[Tensor, "n 3"]
+    observations: Int[Tensor, "m 2"] | None = None
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.xyz.ndim != 2 or self.xyz.shape[1] != 3 or self.rgb.shape != self.xyz.shape:
+            raise ValueError(
+                f"expected xyz and rgb of shape (n, 3), got {tuple(self.xyz.shape)} and {tuple(self.rgb.shape)}"
+            )
+        if not bool(torch.isfinite(self.xyz).all()):
+            raise ValueError("expected finite points, got some that are not; remove them from the scene's point file")
+        if self.observations is not None and self.observations.numel():
+            point, image = self.observations.amax(dim=0).tolist()
+            if point >= len(self.xyz) or image >= len(self.names) or int(self.observations.min()) < 0:
+                raise ValueError(
+                    f"expected observations of {len(self.xyz)} points in {len(self.names)} images, "
+                    f"got point {point} in image {image}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def sightings(self, views: Sequence[View | Frame]) -> Int[Tensor, " n"]:
+        """In how many of these views each point is seen: by its track, or, where there are none, inside the image."""
+        if self.observations is None:
+            inside = [inside_image(view.camera, self.xyz) for view in views]
+            return torch.stack(inside).sum(dim=0) if inside else torch.zeros(len(self), dtype=torch.int64)
+        wanted = {view.name for view in views}
+        counts = torch.tensor([name in wanted for name in self.names], dtype=torch.bool)[self.observations[:, 1]]
+        return torch.bincount(self.observations[counts, 0], minlength=len(self))
+
+
+def pixel_coordinates(camera: Camera, xyz: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+    """Where points fall in the image (px) and their depth z (world units); meaningless where z <= 0."""
+    x, y, z = ((xyz - camera.centre.to(xyz)) @ camera.rotation.to(xyz).T).unbind(-1)
+    return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1), z
+
+
+def inside_image(
+    camera: Camera, xyz: Float[Tensor, "n 3"], depth_range: tuple[float, float] | None = None
+) -> Bool[Tensor, " n"]:
+    """Which points lie in front of the camera (within the depth range) and fall inside its image."""
+    pixel, z = pixel_coordinates(camera, xyz)
+    near, far = depth_range or (0.0, float("inf"))
+    u, v = pixel.unbind(-1)
+    return (z > near) & (z < far) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
