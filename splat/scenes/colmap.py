@@ -61,7 +61,7 @@ def _require_plausible_counts(model: Path) -> None:
                 count = int.from_bytes(file.read(8), "little")
             if path.stat().st_size < 8 + count * record:
                 raise ValueError(
-                    f"expected a COLMAP model, {path} promises {count} {name} but has only {path.stat().st_size} bytes; "
+                    f"expected a COLMAP model, {path} promises {count} {name} but has {path.stat().st_size} bytes; "
                     "it is cut short or no COLMAP file: export the model again"
                 )
 

@@ -1,0 +1,97 @@
+"""Write a scene as `transforms.json`, PNG pictures and a PLY file of points, the format that `transforms.py` reads."""
+
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from splat.camera import Camera
+from splat.scenes.scene import Scene
+from splat.scenes.transforms import SINGLE_FILE
+from splat.scenes.view import Frame, Points
+
+POINTS_FILE = "points.ply"
+COLOURS = ("red", "green", "blue")
+
+
+def write_transforms_scene(scene: Scene, folder: Path) -> None:
+    """Write a scene so that `load_scene` finds it again, in a folder that appears when it is complete.
+
+    Pictures are rounded to 8 bits and keep their background; an alpha channel is not written.  Cameras keep every
+    digit.  FileExistsError if the folder exists already.
+    """
+    folder = Path(folder)
+    if folder.exists():
+        raise FileExistsError(f"expected a folder that does not exist yet, got {folder}; remove it or choose another")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        _write_into(scene, building)
+        building.chmod(0o755)  # mkdtemp's own is private
+        os.replace(building, folder)
+    except BaseException:
+        shutil.rmtree(building, ignore_errors=True)
+        raise
+
+
+def _write_into(scene: Scene, folder: Path) -> None:
+    files = {_file(frame): frame for frame in scene.frames}
+    content = {"camera_model": "PINHOLE", "background": scene.background.tolist()}
+    if scene.points is not None:
+        content["ply_file_path"] = POINTS_FILE
+        _write_points(scene.points, tuple(files[file].name for file in sorted(files)), folder / POINTS_FILE)
+    for file, frame in files.items():
+        path = folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pixels = (frame.view().image * 255).round().to(torch.uint8)
+        Image.fromarray(pixels.permute(1, 2, 0).numpy()).save(path)
+    entries = [
+        {"file_path": file, **_intrinsics(f.camera), "transform_matrix": _pose(f.camera)} for file, f in files.items()
+    ]
+    (folder / SINGLE_FILE).write_text(json.dumps({**content, "frames": entries}, indent=1), encoding="utf-8")
+
+
+def _file(frame: Frame) -> str:
+    """images/NAME.png"""
+    name = frame.name.removeprefix("images/")
+    return f"images/{name}" if name.lower().endswith(".png") else f"images/{name}.png"
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    pixels = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return {**pixels, "w": camera.width, "h": camera.height}
+
+
+def _pose(camera: Camera) -> list[list[float]]:
+    """Camera to world, OpenGL axes."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = camera.rotation.T * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    pose[:3, 3] = camera.centre
+    return pose.tolist()
+
+
+def _write_points(points: Points, names: tuple[str, ...], path: Path) -> None:
+    """x y z, red green blue, and, where tracks are known, the list `views` of the frames that see the point."""
+    kinds = [(axis, "f8") for axis in "xyz"] + [(colour, "u1") for colour in COLOURS]
+    if points.observations is not None:
+        kinds.append(("views", "O"))
+    rows = np.empty(len(points), dtype=kinds)
+    for i, (axis, colour) in enumerate(zip("xyz", COLOURS)):
+        rows[axis] = points.xyz[:, i].numpy()
+        rows[colour] = (points.rgb[:, i] * 255).round().to(torch.uint8).numpy()
+    if points.observations is not None:
+        place = {name: i for i, name in enumerate(names)}
+        seen: list[list[int]] = [[] for _ in range(len(points))]
+        for point, image in points.observations.tolist():
+            if points.names[image] in place:
+                seen[point].append(place[points.names[image]])
+        for i, views in enumerate(seen):
+            rows["views"][i] = np.array(sorted(views), dtype=np.int32)
+    element = PlyElement.describe(rows, "vertex", val_types={"views": "i4"}, len_types={"views": "u4"})
+    PlyData([element]).write(path)

@@ -1,0 +1,147 @@
+"""The Gaussians that a training starts from.
+
+points      from structure from motion, those seen by at least two of the training views; or random where the scene
+            has none: a random pixel of a random training view at a depth uniform between near and far, kept where at
+            least two views see it, in that pixel's colour.  near, far: the scene files' depth range, else half and
+            one and a half times the camera's distance to the place that all cameras look at
+means       the points                          quats   the identity
+log_scales  isotropic: log of the root mean square distance to the three nearest neighbours (3DGS)
+opacity     0.1                                 sh      band 0 gives the point's colour, the others 0
+"""
+
+from collections.abc import Sequence
+from math import log, sqrt
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from splat.camera import Camera
+from splat.gaussians import Gaussians
+from splat.harmonics import Y00
+from splat.scenes.scene import Scene
+from splat.scenes.view import Frame, Points, View, inside_image
+
+OPACITY = 0.1
+NEIGHBOURS = 3
+SMALLEST_SCALE = sqrt(1e-7)  # of the median scale: for points that coincide with three others
+NEAR, FAR = 0.5, 1.5  # of the distance to the cameras' common target; Blender's 4 gives its usual 2 and 6
+MAX_DRAWS = 200  # per random point wanted
+
+
+def initial_gaussians(
+    scene: Scene,
+    views: Sequence[View],
+    sh_degree: int = 3,
+    *,
+    generator: torch.Generator,
+    random_points: int = 10_000,
+    min_views: int = 2,
+) -> Gaussians:
+    """From the scene's points where it has any, else from random ones.  Same generator state, same Gaussians."""
+    if scene.points is not None:
+        return gaussians_from_points(scene.points, views, sh_degree, min_views)
+    ranges = [frame.depth_range for frame in scene.select([view.name for view in views])]
+    points = points_in_common_volume(views, random_points, generator, ranges, min_views)
+    return gaussians_from_points(points, views, sh_degree, min_views)
+
+
+def gaussians_from_points(
+    points: Points, views: Sequence[View | Frame], sh_degree: int = 3, min_views: int = 2
+) -> Gaussians:
+    """float32 Gaussians at the points that at least min_views (or all, if they are fewer) of the views see."""
+    needed = min(min_views, len(views))
+    seen = points.sightings(views) >= needed
+    kept, n = points.xyz[seen], int(seen.sum())
+    if n <= NEIGHBOURS:
+        raise ValueError(
+            f"expected more than {NEIGHBOURS} points seen by at least {needed} of the {len(views)} training views, "
+            f"got {n} of {len(points)}; choose views that overlap more, or more of them"
+        )
+    scales = _neighbour_distances(kept)
+    sh = torch.zeros(n, (sh_degree + 1) ** 2, 3, dtype=torch.float64)
+    sh[:, 0] = (points.rgb[seen].double() - 0.5) / Y00
+    attributes = {
+        "means": kept,
+        "log_scales": scales.log()[:, None].expand(n, 3),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).expand(n, 4),
+        "opacity_logits": torch.full((n,), log(OPACITY / (1 - OPACITY)), dtype=torch.float64),
+        "sh": sh,
+    }
+    return Gaussians.pack(attributes).to(torch.float32)
+
+
+def _neighbour_distances(xyz: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Root mean square distance to the three nearest other points."""
+    distances, _ = KDTree(xyz.numpy()).query(xyz.numpy(), k=NEIGHBOURS + 1)
+    scales = torch.from_numpy(np.sqrt(np.square(distances[:, 1:]).mean(axis=1)))
+    median = float(scales.median())
+    if not median > 0:
+        raise ValueError(f"expected distinct points, got {len(xyz)} of which most coincide with {NEIGHBOURS} others")
+    return scales.clamp_min(SMALLEST_SCALE * median)
+
+
+def points_in_common_volume(
+    views: Sequence[View],
+    n: int,
+    generator: torch.Generator,
+    depth_ranges: Sequence[tuple[float, float] | None] | None = None,
+    min_views: int = 2,
+) -> Points:
+    """n random points that at least min_views (or all, if they are fewer) of the views see.
+
+    depth_ranges: (near, far) of each view, world units; None derives it from where the cameras look.
+    """
+    if n < 1:
+        raise ValueError(f"expected at least 1 random point, got {n}")
+    given = depth_ranges or [None] * len(views)
+    ranges = [own or _range_around_target(views, view.camera) for view, own in zip(views, given, strict=True)]
+    needed, kept, draws = min(min_views, len(views)), [], 0
+    while (found := sum(len(xyz) for xyz, _ in kept)) < n:
+        if draws >= MAX_DRAWS * n:
+            raise ValueError(
+                f"expected {needed} of {len(views)} views to see the same places, got {found} such places in {draws} "
+                "random draws; choose views that overlap more"
+            )
+        xyz, rgb = _random_batch(views, ranges, n, generator)
+        sightings = torch.stack([inside_image(v.camera, xyz, r) for v, r in zip(views, ranges)]).sum(dim=0)
+        kept.append((xyz[sightings >= needed], rgb[sightings >= needed]))
+        draws += n
+    return Points(torch.cat([xyz for xyz, _ in kept])[:n], torch.cat([rgb for _, rgb in kept])[:n])
+
+
+def _random_batch(
+    views: Sequence[View], ranges: Sequence[tuple[float, float]], n: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Random pixels of random views, lifted to random depths, with the pixels' colours."""
+    which = torch.randint(len(views), (n,), generator=generator)
+    uniform = torch.rand(n, 3, generator=generator, dtype=torch.float64)
+    xyz, rgb = torch.empty(n, 3, dtype=torch.float64), torch.empty(n, 3)
+    for i, (view, (near, far)) in enumerate(zip(views, ranges)):
+        camera, mine = view.camera, which == i
+        u, v = (uniform[mine, :2] * torch.tensor([camera.width, camera.height])).unbind(-1)
+        z = near + (far - near) * uniform[mine, 2]
+        local = torch.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], dim=-1)
+        xyz[mine] = camera.centre + local @ camera.rotation
+        rgb[mine] = view.image[:, v.long(), u.long()].T
+    return xyz, rgb
+
+
+def _range_around_target(views: Sequence[View], camera: Camera) -> tuple[float, float]:
+    """Depths round the point that is nearest to all optical axes, in the least-squares sense."""
+    axes = torch.stack([view.camera.forward for view in views])
+    centres = torch.stack([view.camera.centre for view in views])
+    across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]  # removes what lies along an axis
+    normal = across.sum(dim=0)
+    if float(torch.linalg.eigvalsh(normal)[0]) > 1e-6 * len(views):
+        target = torch.linalg.solve(normal, (across @ centres[:, :, None]).sum(dim=0)[:, 0])
+        depths = ((target - centres) * axes).sum(dim=1)
+        if bool((depths > 0).all()):
+            depth = float((target - camera.centre) @ camera.forward)
+            return NEAR * depth, FAR * depth
+    raise ValueError(
+        f"expected {len(views)} cameras that look at a common place, got parallel or diverging ones: the scene's depth "
+        "is unknown; give the scene points (COLMAP), or depth ranges (poses_bounds.npy)"
+    )
