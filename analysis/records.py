@@ -1,0 +1,311 @@
+"""Record folders: what a probe found, written so that a crash never leaves a mixture, and read back with clear errors.
+
+A record is a folder `RUN/probe/` with `probe.json` (every number), one `.npz` per group of arrays, and whatever
+pictures and pages were drawn from them.  `record_folder` makes the whole folder appear at once.  Needs no torch.
+
+Numbers.  `probe.json` is strict JSON.  What is not finite is a string, "NaN", "Infinity" or "-Infinity" (the convention
+of protobuf's JSON), and comes back as a float.  `null` means *not determined*, and the `note` beside it says why.
+Losses are dimensionless; curvatures are loss per squared parameter unit, with respect to the stored parameters.
+
+Keys (frozen: within a format version keys may be added, none renamed or removed; * marks those that must be there):
+
+format*           name*, version*: see `FORMAT`
+objective         loss: its name; operator: "hessian" or "gauss-newton"; value: L at the checkpoint;
+                  gradient_norm: |dL/dTheta|
+traces*           one entry per attribute (means, log_scales, quats, opacity_logits, sh):
+    value*            trace of the attribute's diagonal block over its active parameters
+    standard_error*   of value; 0 where the method is exact
+    low, high         the ends of a t interval at `confidence`, e.g. 0.95
+    confidence
+    sign*             "positive", "negative", "zero", or "undetermined" where the interval does not decide it
+    tau*              sqrt(max(value, 0) / dim): the attribute's curvature scale
+    dim*              parameters over which tau takes the mean
+    probes*           probe vectors used; 0 where the method is exact
+    matvecs           products H v spent
+    method*           e.g. "rademacher", "gaussian", "exact"
+    reason            why it stopped: "tolerance", "noise floor", "matvec budget", "time budget" or "exact"
+    note              why value is null, what was capped, ...
+eigenvalues*      max*, min* (of the active operator, signed) and power_max, power_min (the paper's power iteration):
+    value*            the eigenvalue (Ritz value)
+    residual*         |H v - value v| with |v| = 1: a true eigenvalue lies within it
+    vector_error      about the sine of the angle between v and the true eigenvector
+    method, matvecs, reason, note     as for the traces
+    shares            attribute -> share of the eigenvector's squared mass
+anisotropy*       literal, saddle, share, effective_rank, mass_quantile, each with:
+    value*, low*, high*   the index and its bracket; null where undefined (see note) or unbounded
+    note*             why, or ""
+slice             null, or:
+    directions*       two of {name*, curvature*, residual, unit*}: the unit vectors of the x and the y axis, the
+                      curvature along each, and `unit` = sqrt(2 loss_scale / |curvature|), in parameter units
+    loss_scale*       a change of loss: along a direction the curvature alone makes it within one `unit`
+    center_loss*      L at the centre, a render of the slice's own
+    evaluations       renders of all views that the slice took
+    note
+counts*           gaussians*, visible_gaussians*, parameters*, active_parameters*, sh_degree_stored*, sh_degree_active*,
+                  views*; any further integer under a name that says what was counted
+checks*           e.g. symmetry, repeatability, finite_difference, finiteness, each with:
+    value*, bound*    what was measured and what it must not exceed
+    passed*           true, false, or null where the check could not run (see note)
+    note
+timing*           stage -> seconds, in the order run; total*
+notes             sentences: what was skipped, capped, or not reached
+provenance*       created*, seed*, versions*, machine* (see `analysis.provenance`); checkpoint, scene, iteration,
+                  command, settings
+arrays*           written by `write_record`: group -> name -> shape, one file `group.npz` each
+
+Arrays (all optional):
+
+spectrum          ritz_values [k], residuals [k]: approximate eigenvalues, the two ends among them; and, where the
+                  density was estimated, nodes, weights [starts, steps]: a quadrature for each start vector
+traces            attribute -> [probes]: the samples whose mean is the trace
+slice             x [nx], y [ny]: steps along the two directions in parameter units; loss [nx, ny]: L at each point, a
+                  true render; where known, model [nx, ny]: the quadratic model there, and crossed [nx, ny]: true where
+                  the order of the splats or the set of visible ones is not that of the centre
+"""
+
+import json
+import math
+import os
+import secrets
+import shutil
+import time
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT = {"name": "landscape probe", "version": 1}
+FILE = "probe.json"
+
+_REQUIRED = {
+    "traces": ("value", "standard_error", "tau", "dim", "probes", "sign", "method"),
+    "eigenvalues": ("value", "residual"),
+    "anisotropy": ("value", "low", "high", "note"),
+    "checks": ("value", "bound", "passed"),
+}
+_REQUIRED_KEYS = {
+    "eigenvalues": ("max", "min"),
+    "counts": (
+        "gaussians",
+        "visible_gaussians",
+        "parameters",
+        "active_parameters",
+        "sh_degree_stored",
+        "sh_degree_active",
+        "views",
+    ),
+    "timing": ("total",),
+    "provenance": ("created", "seed", "versions", "machine"),
+}
+_NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+_ABANDONED_AFTER = 3600.0  # seconds; filling a folder takes seconds: an older partial one is a killed process's
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record as read: `data` is probe.json with non-finite numbers as floats, `arrays` is group -> name -> array."""
+
+    folder: Path
+    data: dict[str, Any]
+    arrays: dict[str, dict[str, np.ndarray]]
+
+
+@contextmanager
+def record_folder(folder: str | Path) -> Iterator[Path]:
+    """A new, empty folder that becomes `folder` when the block ends, all at once; nothing changes if the block fails.
+
+    An old record at `folder` is replaced.  Killed at any point, `folder` is the old record, the new one, or (between
+    two renames) absent with the old record complete in `.NAME.previous` beside it, from where the next use restores it.
+    """
+    folder = Path(folder).absolute()
+    _refuse_foreign(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    previous = folder.with_name(f".{folder.name}.previous")
+    _clean_up_after_kills(folder, previous)
+    partial = folder.with_name(f".{folder.name}.partial-{secrets.token_hex(4)}")
+    partial.mkdir()
+    try:
+        yield partial
+        for file in (path for path in partial.rglob("*") if path.is_file()):
+            with file.open("rb") as stream:
+                os.fsync(stream.fileno())
+        if folder.exists():
+            folder.rename(previous)
+        partial.rename(folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        if previous.exists() and not folder.exists():
+            previous.rename(folder)
+        raise
+    shutil.rmtree(previous, ignore_errors=True)
+
+
+def write_record(folder: str | Path, data: Mapping[str, Any], arrays: Mapping[str, Mapping[str, np.ndarray]]) -> Path:
+    """Write probe.json and the arrays into `folder` (which `record_folder` gave); returns the path of probe.json.
+
+    `data` holds the keys of the module's glossary save `format` and `arrays`, which are added here.
+    Raises ValueError where a required key is missing or a value has no place in JSON.
+    """
+    folder = Path(folder)
+    shapes = {group: {name: list(np.shape(array)) for name, array in names.items()} for group, names in arrays.items()}
+    whole = {"format": dict(FORMAT), **data, "arrays": shapes}
+    check_layout(whole)
+    text = json.dumps(_encoded(whole, ""), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    for group, names in arrays.items():
+        numeric: dict[str, Any] = {name: np.asarray(array) for name, array in names.items()}
+        if objects := [name for name, array in numeric.items() if array.dtype.hasobject]:
+            raise ValueError(f"expected numbers in the array {group}.{objects[0]}, got objects")
+        np.savez_compressed(folder / f"{group}.npz", **numeric)
+    path = folder / FILE
+    temporary = path.with_suffix(".json.tmp")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
+    return path
+
+
+def read_record(folder: str | Path) -> Record:
+    """Read the record in `folder` (or the probe.json given).  FileNotFoundError or ValueError say what is wrong."""
+    folder = Path(folder)
+    folder = folder.parent if folder.name == FILE else folder
+    path = folder / FILE
+    if not path.is_file():
+        raise FileNotFoundError(_why_not_found(folder))
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except ValueError as error:
+        raise ValueError(
+            f"expected JSON in {path}, got a file that is damaged or truncated ({error}); probe again"
+        ) from None
+    match raw:
+        case {"format": {"name": name, "version": version}} if name == FORMAT["name"]:
+            pass
+        case _:
+            raise ValueError(f'expected a record of `landscape probe` in {path}, got JSON without "format": {FORMAT}')
+    if not isinstance(version, int) or version > FORMAT["version"]:
+        raise ValueError(
+            f"expected a record of format version {FORMAT['version']} or older in {path}, got version {version}; "
+            "update splat-landscape or probe the checkpoint again"
+        )
+    try:
+        check_layout(raw)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; probe again") from None
+    arrays = {group: _read_arrays(folder / f"{group}.npz", shapes) for group, shapes in raw["arrays"].items()}
+    return Record(folder, _decoded(raw), arrays)
+
+
+def check_layout(data: Mapping[str, Any]) -> None:
+    """Raise ValueError naming the first required key of the module's glossary that `data` lacks."""
+    for section in (*_REQUIRED, "counts", "timing", "provenance", "arrays"):
+        entries = data.get(section)
+        if not isinstance(entries, Mapping):
+            raise ValueError(f'expected an object "{section}", got {type(entries).__name__}')
+        missing = [f"{section}.{key}" for key in _REQUIRED_KEYS.get(section, ()) if key not in entries]
+        for name, entry in entries.items():
+            required = _REQUIRED.get(section, ())
+            if required and not isinstance(entry, Mapping):
+                raise ValueError(f'expected an object "{section}.{name}", got {type(entry).__name__}')
+            missing += [f"{section}.{name}.{key}" for key in required if key not in entry]
+        if missing:
+            raise ValueError(f'expected the key "{missing[0]}", got none')
+    plane = data.get("slice")
+    if plane is not None:
+        if not {"loss_scale", "center_loss"} <= set(plane) or len(plane.get("directions", ())) != 2:
+            raise ValueError('expected "slice" to be null or to hold "loss_scale", "center_loss" and two "directions"')
+        for direction in plane["directions"]:
+            if missing := {"name", "curvature", "unit"} - set(direction):
+                raise ValueError(f'expected the key "slice.directions.{min(missing)}", got none')
+
+
+def _encoded(value: Any, where: str) -> Any:
+    """`value` as plain JSON types; ValueError names the key of what is none."""
+    match value:
+        case None | bool() | int():
+            return value
+        case np.bool_() | np.integer():
+            return value.item()
+        case float() | np.floating():
+            number = float(value)
+            return (
+                number if math.isfinite(number) else ("NaN" if math.isnan(number) else f"{'-' * (number < 0)}Infinity")
+            )
+        case str():
+            if value in _NOT_FINITE:
+                raise ValueError(f'expected text at "{where}", got "{value}", which would be read back as a number')
+            return value
+        case Path():
+            return str(value)
+        case Mapping():
+            if wrong := [key for key in value if not isinstance(key, str)]:
+                raise ValueError(f'expected text as keys of "{where}", got {wrong[0]!r}')
+            return {key: _encoded(item, f"{where}.{key}".lstrip(".")) for key, item in value.items()}
+        case list() | tuple():
+            return [_encoded(item, f"{where}[{i}]") for i, item in enumerate(value)]
+    raise ValueError(
+        f'expected a number, text, list or mapping at "{where}", got {type(value).__name__}; arrays belong in an .npz'
+    )
+
+
+def _decoded(value: Any) -> Any:
+    match value:
+        case str():
+            return _NOT_FINITE.get(value, value)
+        case dict():
+            return {key: _decoded(item) for key, item in value.items()}
+        case list():
+            return [_decoded(item) for item in value]
+    return value
+
+
+def _read_arrays(path: Path, shapes: Mapping[str, list[int]]) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise FileNotFoundError(f"expected the arrays of {FILE} in {path}, got no such file; probe again")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"expected arrays in {path}, got a damaged or truncated file ({error}); probe again") from None
+    for name, shape in shapes.items():
+        got = list(arrays[name].shape) if name in arrays else None
+        if got != shape:
+            raise ValueError(f"expected {name} of shape {shape} in {path}, got {got}; probe again")
+    return arrays
+
+
+def _why_not_found(folder: Path) -> str:
+    expected = f"expected a folder written by `landscape probe` (with {FILE}), got {folder}, "
+    if (folder / "probe" / FILE).is_file():
+        return f"{expected}which is a run; name {folder / 'probe'}"
+    if (previous := folder.with_name(f".{folder.name}.previous")).is_dir():
+        return f"{expected}whose replacement was interrupted; rename {previous} to {folder.name}, or probe again"
+    state = "which has none" if folder.is_dir() else "which is a file" if folder.exists() else "which does not exist"
+    return f"{expected}{state}; run `landscape probe CHECKPOINT` first"
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Replacing deletes: only an empty folder or an older record may be replaced."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / FILE).is_file():
+        raise ValueError(
+            f"expected an empty folder or an older record to replace, got {folder} without {FILE}; move it away"
+        )
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"expected a folder to write a record to, got the file {folder}; move it away")
+
+
+def _clean_up_after_kills(folder: Path, previous: Path) -> None:
+    if previous.is_dir():
+        if folder.exists():
+            shutil.rmtree(previous)
+        else:
+            previous.rename(folder)
+    for partial in folder.parent.glob(f".{folder.name}.partial-*"):
+        if time.time() - partial.stat().st_mtime > _ABANDONED_AFTER:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+def _refuse_constant(constant: str) -> float:
+    raise ValueError(f"{constant} is not JSON")

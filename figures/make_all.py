@@ -1,0 +1,47 @@
+"""All figures of a recorded probe: `python -m figures.make_all RUN/probe` or `draw_probe(folder)`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from analysis.records import Record, read_record
+from figures import slice2d, spectrum, surface, traces
+from figures.style import save
+
+FIGURES = {"traces": traces.draw, "spectrum": spectrum.draw, "slice2d": slice2d.draw, "surface": surface.draw}
+
+
+def recorded_figures(record: Record) -> tuple[str, ...]:
+    """Names of the figures that the record has the numbers for."""
+    without = {"spectrum": "spectrum" not in record.arrays}
+    without |= dict.fromkeys(("slice2d", "surface"), record.data.get("slice") is None or "slice" not in record.arrays)
+    return tuple(name for name in FIGURES if not without.get(name, False))
+
+
+def draw_probe(folder: str | Path, suffix: str = "png") -> list[Path]:
+    """Draw every figure that the record in `folder` has the numbers for into it; returns the files.
+
+    Warns with `figures.surface.RendererMissing` where the surface had to be drawn without the off-screen renderer.
+    Raises FileNotFoundError or ValueError for a folder that holds no readable record.
+    """
+    record = read_record(folder)
+    names = recorded_figures(record)
+    return [save(FIGURES[name](record), record.folder / f"{name}.{suffix}") for name in names]
+
+
+def main() -> None:
+    """`python -m figures.make_all RUN/probe`"""
+    parser = argparse.ArgumentParser(description="Draw all figures of a recorded probe into its folder.")
+    parser.add_argument("folder", type=Path, help="a folder written by `landscape probe`, e.g. runs/fern/probe")
+    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
+    arguments = parser.parse_args()
+    try:
+        paths = draw_probe(arguments.folder, arguments.format)
+    except (FileNotFoundError, ValueError) as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+    print(*paths, sep="\n")
+
+
+if __name__ == "__main__":
+    main()

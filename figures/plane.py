@@ -1,0 +1,103 @@
+"""The recorded 2-D slice as the figures want it: losses relative to the centre, axes with their names and units.
+
+x, y        steps along the two directions, unit vectors e, so in units of the stored parameters
+change      loss minus the loss at the centre
+unit        sqrt(2 loss_scale / |curvature|): the step within which the curvature alone changes the loss by loss_scale
+crossed     a point whose order of splats or set of visible ones is not the centre's: the loss may jump on the way there
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.quantities import quantity
+from analysis.records import Record
+from figures.style import exponent_of, literal, unit_suffix
+
+
+@dataclass(frozen=True)
+class Direction:
+    """One axis of the slice; `exponent` is the power of ten taken out of its labels."""
+
+    name: str
+    curvature: float
+    unit: float
+    steps: np.ndarray
+    exponent: int
+
+    @property
+    def label(self) -> str:
+        return f"step along {self.name}, param. units{unit_suffix(self.exponent)}"
+
+    @property
+    def short_label(self) -> str:
+        return f"step along {self.name}{unit_suffix(self.exponent)}"
+
+    @property
+    def scaled(self) -> np.ndarray:
+        return self.steps / 10.0**self.exponent
+
+    @property
+    def centre(self) -> int:
+        """The index of the step nearest to 0."""
+        return int(np.argmin(np.abs(self.steps)))
+
+
+@dataclass(frozen=True)
+class Plane:
+    """change, model [nx, ny], masked where not finite, in units of 10**exponent; model and crossed may be absent."""
+
+    x: Direction
+    y: Direction
+    change: np.ma.MaskedArray
+    model: np.ma.MaskedArray | None
+    crossed: np.ndarray | None
+    exponent: int
+    loss_scale: float
+
+    @property
+    def label(self) -> str:
+        return f"change of loss{unit_suffix(self.exponent)}"
+
+    @property
+    def crossed_share(self) -> float | None:
+        return None if self.crossed is None else float(np.mean(self.crossed))
+
+
+def plane(record: Record) -> Plane:
+    """The slice of a record.  Raises ValueError where none was recorded, or none of its points is finite."""
+    about = record.data.get("slice")
+    if about is None or "slice" not in record.arrays:
+        raise ValueError(f"expected a recorded slice in {record.folder / 'slice.npz'}, got none; probe with a slice")
+    arrays = record.arrays["slice"]
+    changes = [arrays[name] - about["center_loss"] for name in ("loss", "model") if name in arrays]
+    if not np.isfinite(changes[0]).any():
+        raise ValueError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
+    exponent = exponent_of(changes[0])
+    masked = [np.ma.masked_invalid(change / 10.0**exponent) for change in changes]
+    common = exponent_of(arrays["x"], arrays["y"])
+    directions = [
+        Direction(
+            literal(d["name"]), d["curvature"], d["unit"], steps, common if _alike(arrays) else exponent_of(steps)
+        )
+        for d, steps in zip(about["directions"], (arrays["x"], arrays["y"]), strict=True)
+    ]
+    return Plane(
+        *directions,
+        change=masked[0],
+        model=masked[1] if len(masked) == 2 else None,
+        crossed=arrays.get("crossed"),
+        exponent=exponent,
+        loss_scale=about["loss_scale"],
+    )
+
+
+def _alike(arrays: dict[str, np.ndarray]) -> bool:
+    """Whether both axes read well with the same power of ten taken out."""
+    spans = sorted((np.ptp(arrays["x"]), np.ptp(arrays["y"])))
+    return spans[1] < 100 * spans[0]
+
+
+def curvature_text(direction: Direction) -> str:
+    """`e₁: curvature 3.1 × 10⁴`."""
+    return f"{direction.name}: curvature {quantity(direction.curvature)}"

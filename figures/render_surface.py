@@ -1,0 +1,67 @@
+"""Render a height field off-screen with PyVista: `python render_surface.py FIELD.npz OUT.png`.
+
+A program of its own: where a machine has no usable OpenGL, VTK may end the process that renders.  FIELD.npz holds
+`height` [nx, ny] in [0, 1], nan where there is none, `colour` [256, 3] as bytes, and `levels`, the heights of the
+contour lines.  The scene is the box of `Box`, seen from `Box.EYE` in parallel projection.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+
+class Box:
+    """x, y in [-1, 1], z in [0, TOP], and the camera, whose image is EXTENT wide and high."""
+
+    TOP = 1.0
+    EYE = np.array([1.0, -1.55, 1.35])
+    TARGET = np.array([0.0, 0.0, 0.4])
+    EXTENT = 3.2
+    PIXELS = 900
+
+    @classmethod
+    def project(cls, points: np.ndarray) -> np.ndarray:
+        """Points [..., 3] of the scene to [..., 2] of the image, (0, 0) its lower left corner, (1, 1) the opposite."""
+        forward = -cls.EYE / np.linalg.norm(cls.EYE)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        up = np.cross(right, forward)
+        return 0.5 + (np.asarray(points) - cls.TARGET) @ np.stack([right, up], axis=1) / cls.EXTENT
+
+
+def render(height: np.ndarray, colour: np.ndarray, levels: np.ndarray, out: Path) -> None:
+    """Write the picture of the surface with its contour lines, and the lines once more on the floor, on white."""
+    import pyvista as pv
+    from matplotlib.colors import ListedColormap
+
+    x, y = np.meshgrid(np.linspace(-1, 1, height.shape[0]), np.linspace(-1, 1, height.shape[1]), indexing="ij")
+    grid = pv.StructuredGrid(x, y, np.nan_to_num(height) * Box.TOP)
+    grid["height"] = height.ravel(order="F")
+    surface = grid.threshold([0.0, 1.0], scalars="height", all_scalars=True).extract_surface(
+        algorithm="dataset_surface"
+    )
+    plotter = pv.Plotter(off_screen=True, window_size=[Box.PIXELS, Box.PIXELS])
+    plotter.background_color = pv.Color("white")
+    plotter.enable_anti_aliasing("ssaa")
+    plotter.add_mesh(
+        surface, scalars="height", cmap=ListedColormap(colour / 255.0), clim=[0, 1], smooth_shading=True,
+        ambient=0.35, diffuse=0.7, specular=0.1, show_scalar_bar=False,
+    )  # fmt: skip
+    lines = surface.contour(levels.tolist(), scalars="height") if len(levels) else pv.PolyData()
+    if lines.n_points:
+        plotter.add_mesh(lines.translate([0, 0, 0.004]), color="black", line_width=2)
+        plotter.add_mesh(lines.scale([1, 1, 0]), color="#808080", line_width=2)
+    plotter.camera.parallel_projection = True
+    plotter.camera.position = tuple(Box.TARGET + 10 * Box.EYE)
+    plotter.camera.focal_point = tuple(Box.TARGET)
+    plotter.camera.up = (0, 0, 1)
+    plotter.camera.parallel_scale = Box.EXTENT / 2
+    plotter.camera.clipping_range = (1, 100)
+    plotter.screenshot(str(out))
+    plotter.close()
+
+
+if __name__ == "__main__":
+    with np.load(sys.argv[1], allow_pickle=False) as field:
+        render(field["height"], field["colour"], field["levels"], Path(sys.argv[2]))

@@ -1,0 +1,117 @@
+"""Figure: the loss on a plane through the checkpoint, as contours, and its two cross-sections through the centre.
+
+Every point is a true render.  White dashed lines: the quadratic model at the contours' levels.  Dots: crossed points,
+where the order of the splats or the set of visible ones is not the centre's.  Grey: no finite loss.  The cross-sections
+share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes count steps in
+curvature units, within one of which the curvature alone changes the loss by the amount named.
+"""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.contour import QuadContourSet
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from analysis.quantities import quantity
+from analysis.records import Record
+from figures.plane import Direction, Plane, curvature_text, plane
+from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
+
+LEVELS = 12
+CROSSED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": SKY, "markeredgewidth": 0}
+TRUE_PROPORTIONS = 2.5  # ranges whose ratio is below this are drawn to the same scale
+
+
+def draw(record: Record) -> Figure:
+    """The slice of one record.  Raises ValueError where none was recorded."""
+    field = plane(record)
+    with style():
+        figure = new_figure(4.7)
+        above, below = figure.subfigures(2, 1, height_ratios=[1.35, 1], squeeze=False)[:, 0]
+        axes = above.subplots()
+        contours = _draw_plane(axes, field)
+        if contours is not None:
+            above.colorbar(contours, ax=axes, label=field.label, pad=0.02, aspect=25)
+        first, second = below.subplots(1, 2, sharey=True)
+        _draw_section(first, field.x, field, axis=0)
+        _draw_section(second, field.y, field, axis=1)
+        first.set_ylabel(field.label)
+        below.legend(handles=_legend(field), loc="outside lower center", ncols=2, columnspacing=1, handlelength=1.6)
+    return figure
+
+
+def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
+    x, y = field.x.scaled, field.y.scaled
+    axes.set_facecolor(MISSING)
+    levels = _levels(field)
+    filled = None
+    if len(levels) > 1:
+        filled = axes.contourf(x, y, field.change.T, levels=levels, cmap=FIELD_MAP)
+        axes.contour(x, y, field.change.T, levels=levels, colors=BLACK, linewidths=0.4)
+        if field.model is not None:
+            axes.contour(x, y, field.model.T, levels=levels, colors="white", linewidths=0.7, linestyles="dashed")
+    else:
+        axes.text(0.5, 0.65, "the loss is the same at every point", transform=axes.transAxes, ha="center")
+        axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+    if field.crossed is not None:
+        rows, columns = np.nonzero(field.crossed)
+        axes.plot(x[rows], y[columns], **CROSSED)
+    axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
+    axes.set_xlabel(field.x.label)
+    axes.set_ylabel(field.y.label)
+    ratio = np.ptp(field.x.steps) / np.ptp(field.y.steps)
+    same = 1 / TRUE_PROPORTIONS < ratio < TRUE_PROPORTIONS
+    if same:
+        axes.set_aspect(10.0 ** (field.y.exponent - field.x.exponent))
+    axes.set_title("Loss around the checkpoint" + ("" if same else " (axes differ in scale)"), loc="left")
+    return filled
+
+
+def _levels(field: Plane) -> np.ndarray:
+    low, high = float(field.change.min()), float(field.change.max())
+    if not high > low:
+        return np.array([low])
+    return np.asarray(MaxNLocator(LEVELS).tick_values(low, high))
+
+
+def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> None:
+    """The grid's line through the centre along one direction."""
+    other = field.y if axis == 0 else field.x
+    line = field.change.take(other.centre, axis=1 - axis)
+    axes.plot(direction.scaled, line, color=BLACK)
+    if field.model is not None:
+        axes.plot(direction.scaled, field.model.take(other.centre, axis=1 - axis), "--", color=VERMILION, linewidth=0.9)
+    axes.axvline(0, color="0.7", linewidth=0.5, zorder=0)
+    axes.set_xlabel(direction.short_label)
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.grid(True)
+    step = direction.unit / 10.0**direction.exponent
+    if np.isfinite(step) and step > 0:
+        upper = axes.secondary_xaxis("top", functions=(lambda x: np.divide(x, step), lambda u: np.multiply(u, step)))
+        upper.xaxis.set_major_locator(MaxNLocator(4))
+        upper.set_xlabel(f"{curvature_text(direction)}\nsteps in curvature units", linespacing=1.4)
+
+
+def _legend(field: Plane) -> list[Line2D]:
+    handles = [Line2D([], [], color=BLACK, label="loss, true renders")]
+    if field.model is not None:
+        handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
+    if field.crossed_share:
+        handles.append(
+            Line2D([], [], label=f"sorts crossed: {field.crossed_share:.0%}", **{**CROSSED, "markersize": 6})
+        )
+    handles.append(Line2D([], [], linestyle="none", label=f"1 curvature unit: ΔL = {quantity(field.loss_scale)}"))
+    return handles
+
+
+def main() -> None:
+    """`python -m figures.slice2d RUN/probe`"""
+    script(draw, "slice2d")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Figure: the Ritz values of the Lanczos run, which are the operator's eigenvalues seen through so many products.
+
+Above, value against rank on a symmetric logarithmic axis (linear within the band about 0), bars: residual norms, within
+each of which lies a true eigenvalue.  Filled: the residual is under a tenth of the value.  The ends are written out.
+Below, where a density was recorded, the share of directions whose curvature is at most x, a line for each start vector.
+"""
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator, NullLocator
+
+from analysis.quantities import power_of_ten, quantity
+from analysis.records import Record
+from figures.style import BLACK, NEGATIVE, POSITIVE, new_figure, script, style
+
+DECADES = 5  # shown on either side of 0
+CONVERGED = 0.1  # residual over |value|
+
+
+def draw(record: Record) -> Figure:
+    """The spectrum of one record.  Raises ValueError where no spectrum was recorded."""
+    if "spectrum" not in record.arrays:
+        raise ValueError(f"expected the arrays ritz_values and residuals in {record.folder / 'spectrum.npz'}, got none")
+    arrays = record.arrays["spectrum"]
+    order = np.argsort(arrays["ritz_values"])
+    values, residuals = arrays["ritz_values"][order], arrays["residuals"][order]
+    rows = 2 if "nodes" in arrays else 1
+    with style():
+        figure = new_figure(1.5 + 1.2 * rows)
+        panels = figure.subplots(rows, 1, squeeze=False, height_ratios=[2, 1][:rows])
+        _draw_values(panels[0, 0], values, residuals)
+        _label_ends(panels[0, 0], record)
+        figure.legend(handles=_legend(), loc="outside lower center", ncols=2, handletextpad=0.1)
+        if rows == 2:
+            _draw_distribution(panels[1, 0], arrays["nodes"], arrays["weights"])
+    return figure
+
+
+def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
+    ranks = np.arange(1, len(values) + 1)
+    converged = residuals < CONVERGED * np.abs(values)
+    for sign, colour in ((values >= 0, POSITIVE), (values < 0, NEGATIVE)):
+        axes.errorbar(ranks[sign], values[sign], residuals[sign], fmt="none", ecolor=colour, elinewidth=0.7, alpha=0.6)
+        for chosen, face in ((converged, colour), (~converged, "white")):
+            axes.plot(
+                ranks[sign & chosen], values[sign & chosen], "o", color=colour, markerfacecolor=face, markersize=3
+            )
+    axes.axhline(0, color=BLACK, linewidth=0.6)
+    _symmetric_log(axes, "y", values)
+    axes.set_xlim(0, len(values) + 1)
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    axes.set_xlabel(f"rank among the {len(values)} Ritz values")
+    axes.set_ylabel("eigenvalue (loss per\nsquared parameter unit)")
+    axes.set_title("Spectrum of the active operator", loc="left")
+    axes.grid(True)
+
+
+def _label_ends(axes: Axes, record: Record) -> None:
+    ends = record.data["eigenvalues"]
+    lines = [f"{name} {quantity(ends[name]['value'], ends[name]['residual'])}" for name in ("max", "min")]
+    axes.text(0.03, 0.96, "\n".join(lines), transform=axes.transAxes, va="top", linespacing=1.4)
+
+
+def _draw_distribution(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> None:
+    _symmetric_log(axes, "x", nodes)
+    left, right = axes.get_xlim()
+    for row, masses in zip(nodes, weights, strict=True):
+        order = np.argsort(row)
+        shares = np.concatenate([[0.0], np.cumsum(masses[order]), [1.0]])
+        axes.step(np.concatenate([[left], row[order], [right]]), shares, where="post", color=BLACK, linewidth=0.7)
+    axes.axvline(0, color=BLACK, linewidth=0.6)
+    axes.set_ylim(-0.03, 1.03)
+    axes.set_xlabel("curvature x (loss per squared parameter unit)")
+    axes.set_ylabel("share of\ndirections ≤ x")
+    axes.grid(True)
+
+
+def _symmetric_log(axes: Axes, axis: str, values: np.ndarray) -> None:
+    """A symmetric logarithmic axis: `DECADES` decades to each side that has values, linear between, few labels."""
+    largest = float(np.max(np.abs(values[np.isfinite(values)]), initial=0.0))
+    top = math.ceil(math.log10(largest)) if largest > 0 else 0
+    threshold = 10.0 ** (top - DECADES)
+    getattr(axes, f"set_{axis}scale")("symlog", linthresh=threshold, linscale=0.6)
+    negative, positive = np.any(values < 0), np.any(values >= 0)
+    getattr(axes, f"set_{axis}lim")(
+        -(10.0**top) * 1.6 if negative else -threshold, 10.0**top * 1.6 if positive else threshold
+    )
+    exponents = range(top, top - DECADES, -2)
+    ticks = [(0.0, "0")]
+    ticks += [(10.0**k, power_of_ten(k)) for k in exponents if positive]
+    ticks += [(-(10.0**k), f"−{power_of_ten(k)}") for k in exponents if negative]
+    getattr(axes, f"set_{axis}ticks")([tick for tick, _ in ticks], [label for _, label in ticks])
+    getattr(axes, f"{axis}axis").set_minor_locator(NullLocator())
+
+
+def _legend() -> list[Line2D]:
+    return [
+        Line2D([], [], linestyle="none", marker="o", markersize=3, color="0.3", markerfacecolor=face, label=label)
+        for face, label in (("0.3", f"residual < {CONVERGED:.0%} of the value"), ("white", "not converged"))
+    ]
+
+
+def main() -> None:
+    """`python -m figures.spectrum RUN/probe`"""
+    script(draw, "spectrum")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""One look for every figure: legible at column width, safe for colour-blind readers, the same in PNG and PDF.
+
+Sizes are in inches, fonts in points.  Categories use the palette of Okabe and Ito (2008), fields the perceptually
+uniform map cividis.  Figures are made without pyplot, so drawing has no global state.
+"""
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from analysis.quantities import power_of_ten
+from analysis.records import Record, read_record
+
+COLUMN = 3.3
+FIELD_MAP = "cividis"
+MISSING = "0.85"  # grey of points without a value
+
+BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
+    "#000000",
+    "#E69F00",
+    "#56B4E9",
+    "#009E73",
+    "#F0E442",
+    "#0072B2",
+    "#D55E00",
+    "#CC79A7",
+)
+POSITIVE, NEGATIVE, UNDETERMINED = BLUE, VERMILION, "0.45"
+
+ATTRIBUTES = {
+    "means": "position",
+    "log_scales": "log scale",
+    "quats": "rotation",
+    "opacity_logits": "opacity",
+    "sh": "colour (SH)",
+}
+
+_RC: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 7,
+    "axes.titlesize": 7.5,
+    "axes.labelsize": 7,
+    "xtick.labelsize": 6.5,
+    "ytick.labelsize": 6.5,
+    "legend.fontsize": 6.5,
+    "axes.linewidth": 0.6,
+    "axes.formatter.useoffset": False,
+    "axes.unicode_minus": True,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "lines.linewidth": 1.1,
+    "lines.markersize": 4,
+    "legend.frameon": False,
+    "grid.linewidth": 0.4,
+    "grid.color": "0.88",
+    "axes.axisbelow": True,
+    "figure.dpi": 300,
+    "savefig.dpi": 300,
+    "pdf.fonttype": 42,  # text stays text
+    "hatch.linewidth": 0.4,
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """The project's matplotlib settings, within the block."""
+    with mpl.rc_context(_RC):
+        yield
+
+
+def new_figure(height: float) -> Figure:
+    """A figure of column width that lays itself out without overlaps."""
+    return Figure(figsize=(COLUMN, height), layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.05))
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write the figure (PNG, PDF or SVG by its suffix) so that `path` is the old file or the whole new one."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
+    with style():
+        figure.savefig(temporary)
+    temporary.replace(path)
+    return path
+
+
+def exponent_of(*values: np.ndarray | float) -> int:
+    """The power of ten to take out of an axis: a multiple of three, 0 for numbers that read well as they are.
+
+    >>> exponent_of(4.2e-7), exponent_of(np.array([0.0, 30.0])), exponent_of(-8.1e9)
+    (-9, 0, 9)
+    """
+    finite = np.concatenate([np.abs(np.ravel(v)) for v in values])
+    largest = np.max(finite[np.isfinite(finite)], initial=0.0)
+    if largest == 0 or 0.05 <= largest < 5000:
+        return 0
+    return 3 * math.floor(math.log10(largest) / 3)
+
+
+def unit_suffix(exponent: int) -> str:
+    """What an axis label says about a power that was taken out.
+
+    >>> unit_suffix(-6), unit_suffix(0)
+    (' (×10⁻⁶)', '')
+    """
+    return f" (×{power_of_ten(exponent)})" if exponent else ""
+
+
+def literal(text: str) -> str:
+    """Text from a record, with nothing in it read as mathematics."""
+    return text.replace("$", r"\$")
+
+
+def attribute_name(attribute: str) -> str:
+    """The attribute in the paper's words; a name that is none of the five stays as it is."""
+    return ATTRIBUTES.get(attribute, literal(attribute))
+
+
+def script(draw: Callable[[Record], Figure], name: str) -> None:
+    """The command line of one figure: `python -m figures.NAME RUN/probe [--format pdf]`."""
+    parser = argparse.ArgumentParser(description=f"Draw the figure {name} of a recorded probe into its folder.")
+    parser.add_argument("folder", type=Path, help="a folder written by `landscape probe`, e.g. runs/fern/probe")
+    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
+    arguments = parser.parse_args()
+    try:
+        record = read_record(arguments.folder)
+        path = save(draw(record), record.folder / f"{name}.{arguments.format}")
+    except (FileNotFoundError, ValueError) as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+    print(path)

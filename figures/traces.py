@@ -1,0 +1,133 @@
+"""Figure: the trace of the Hessian's diagonal block of every attribute, and the curvature scale tau that follows.
+
+Magnitudes are on a logarithmic axis; the sign is in the marker (filled circle: positive; open square: negative; open
+diamond: the interval does not decide it).  An arrow at the left edge is a zero, or an interval that reaches 0.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from analysis.quantities import power_of_ten, quantity
+from analysis.records import Record
+from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, attribute_name, new_figure, script, style
+
+SIGNS: dict[str, dict[str, Any]] = {
+    "positive": {"color": POSITIVE, "marker": "o", "markerfacecolor": POSITIVE},
+    "negative": {"color": NEGATIVE, "marker": "s", "markerfacecolor": "white"},
+    "zero": {"color": UNDETERMINED, "marker": "<", "markerfacecolor": UNDETERMINED},
+    "undetermined": {"color": UNDETERMINED, "marker": "D", "markerfacecolor": "white"},
+}
+
+
+def draw(record: Record) -> Figure:
+    """Traces above, tau below, one row an attribute."""
+    entries: dict[str, dict[str, Any]] = record.data["traces"]
+    samples = record.arrays.get("traces", {})
+    with style():
+        figure = new_figure(0.75 + 0.62 * len(entries))
+        above, below = figure.subplots(2, 1)
+        _rows(above, entries, [_signed(entry) for entry in entries.values()])
+        _draw_traces(above, entries, samples)
+        above.set_xlabel("|trace| (loss per squared parameter unit)")
+        above.set_title("Curvature by attribute: trace and scale", loc="left")
+        _rows(below, entries, [quantity(entry["tau"]) for entry in entries.values()])
+        _draw_taus(below, entries)
+        below.set_xlabel("curvature scale τ = √(max(trace, 0) / dim)")
+        figure.legend(handles=_legend(entries), loc="outside lower center", ncols=3, handletextpad=0.2, columnspacing=1)
+    return figure
+
+
+def _draw_traces(axes: Axes, entries: dict[str, dict[str, Any]], samples: dict[str, np.ndarray]) -> None:
+    magnitudes = [abs(n) for e in entries.values() for n in (e["value"], e["standard_error"]) if _drawable(n)]
+    left = _logarithmic(axes, magnitudes)
+    for row, (name, entry) in enumerate(entries.items()):
+        look = SIGNS[_sign(entry)]
+        drawn = np.abs(samples.get(name, np.empty(0)))
+        axes.plot(drawn, np.full(len(drawn), row), "|", color=look["color"], alpha=0.35, markersize=6, zorder=1)
+        if not _drawable(entry["value"]):
+            if entry["value"] == 0:
+                _arrow(axes, left, row, look)
+            continue
+        value = abs(entry["value"])
+        low, high = sorted(abs(end) for end in _interval(entry))
+        low = left if _interval(entry)[0] * _interval(entry)[1] <= 0 else max(low, left)
+        axes.plot([low, max(high, value)], [row, row], "-", color=look["color"], linewidth=1.4)
+        if low == left:
+            _arrow(axes, left, row, {**look, "markerfacecolor": look["color"]})
+        axes.plot([value], [row], linestyle="none", **look)
+
+
+def _draw_taus(axes: Axes, entries: dict[str, dict[str, Any]]) -> None:
+    left = _logarithmic(axes, [entry["tau"] for entry in entries.values() if _drawable(entry["tau"])])
+    for row, entry in enumerate(entries.values()):
+        look = SIGNS[_sign(entry)]
+        if entry["tau"] == 0:
+            _arrow(axes, left, row, look)
+        elif _drawable(entry["tau"]):
+            axes.plot([entry["tau"]], [row], linestyle="none", **look)
+
+
+def _rows(axes: Axes, entries: dict[str, dict[str, Any]], numbers: list[str]) -> None:
+    axes.set_yticks(range(len(entries)), [f"{attribute_name(k)}\n{n}" for k, n in zip(entries, numbers, strict=True)])
+    axes.set_ylim(len(entries) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(True, axis="both")
+
+
+def _logarithmic(axes: Axes, magnitudes: list[float]) -> float:
+    """A logarithmic x axis around the magnitudes, with at most six labelled decades; returns its left end."""
+    low, high = (min(magnitudes), max(magnitudes)) if magnitudes else (1.0, 1.0)
+    first, last = math.floor(math.log10(low) - 0.5), math.ceil(math.log10(high) + 0.5)
+    axes.set_xscale("log")
+    axes.set_xlim(10.0**first, 10.0**last)
+    stride = max(1, math.ceil((last - first) / 5))
+    exponents = range(first, last + 1, stride)
+    axes.set_xticks([10.0**k for k in exponents], [power_of_ten(k) for k in exponents])
+    axes.xaxis.set_minor_locator(LogLocator(numticks=50) if stride > 1 else LogLocator(subs=range(2, 10)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    return 10.0**first
+
+
+def _arrow(axes: Axes, left: float, row: int, look: dict[str, Any]) -> None:
+    axes.plot([left], [row], linestyle="none", clip_on=False, zorder=5, **{**look, "marker": "<"})
+
+
+def _sign(entry: dict[str, Any]) -> str:
+    return "undetermined" if entry["value"] is None or math.isnan(entry["value"]) else entry["sign"]
+
+
+def _signed(entry: dict[str, Any]) -> str:
+    return quantity(entry["value"], entry["standard_error"])
+
+
+def _interval(entry: dict[str, Any]) -> tuple[float, float]:
+    """The recorded interval; where there is none, one standard error to either side."""
+    low, high = entry.get("low"), entry.get("high")
+    if low is None or high is None or not math.isfinite(high - low):
+        error = entry["standard_error"] if _drawable(entry["standard_error"]) else 0.0
+        low, high = entry["value"] - error, entry["value"] + error
+    return low, high
+
+
+def _drawable(number: float | None) -> bool:
+    return number is not None and math.isfinite(number) and number != 0
+
+
+def _legend(entries: dict[str, dict[str, Any]]) -> list[Line2D]:
+    present = {_sign(entry) for entry in entries.values()}
+    return [Line2D([], [], linestyle="none", label=sign, **look) for sign, look in SIGNS.items() if sign in present]
+
+
+def main() -> None:
+    """`python -m figures.traces RUN/probe`"""
+    script(draw, "traces")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""Synthetic records for the tests of what reads records: a quartic valley with known numbers."""
+
+from typing import Any
+
+import numpy as np
+
+from analysis.provenance import provenance
+
+ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
+
+
+def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:
+    """(data, arrays) as `write_record` takes them; every curvature is multiplied by `scale`."""
+    random = np.random.default_rng(seed)
+    traces, samples = {}, {}
+    for attribute, value in zip(ATTRIBUTES, (4.1e5, 8.3e3, 52.0, -310.0, 12.0), strict=True):
+        draws = scale * (value + 0.1 * abs(value) * random.standard_normal(16))
+        traces[attribute] = _trace(draws, dim=3000)
+        samples[attribute] = draws
+    top, second, bottom = 3.1e4 * scale, 1.2e4 * scale, -2.2e2 * scale
+    ritz = np.concatenate([-np.geomspace(-bottom, 1e-3 * scale, 20), np.geomspace(1e-3 * scale, top, 40)])
+    ritz.sort()
+    residuals = np.abs(ritz) * np.minimum(1.0, 1e-4 * np.exp(np.minimum(np.arange(60), 59 - np.arange(60)) / 1.5))
+    data = {
+        "objective": {"loss": "0.8 L1 + 0.2 (1 - SSIM)", "operator": "hessian", "value": 0.0832, "gradient_norm": 0.41},
+        "traces": traces,
+        "eigenvalues": {
+            "max": {"value": top, "residual": 12.0 * scale, "matvecs": 60, "method": "lanczos", "reason": "tolerance"},
+            "min": {
+                "value": bottom,
+                "residual": 3.0 * scale,
+                "matvecs": 60,
+                "method": "lanczos",
+                "reason": "time budget",
+            },
+        },
+        "anisotropy": {
+            "literal": {"value": top / bottom, "low": -143.0, "high": -139.0, "note": ""},
+            "saddle": {"value": -top / bottom, "low": 139.0, "high": 143.0, "note": ""},
+            "share": {"value": None, "low": None, "high": None, "note": "needs the spectral density"},
+        },
+        "slice": _plane(scale),
+        "counts": {
+            "gaussians": 10091,
+            "visible_gaussians": 9874,
+            "parameters": 595369,
+            "active_parameters": 136682,
+            "sh_degree_stored": 3,
+            "sh_degree_active": 0,
+            "views": 3,
+            "matvecs": 140,
+        },
+        "checks": {
+            "symmetry": {"value": 3e-7, "bound": 1e-5, "passed": True},
+            "repeatability": {"value": 0.0, "bound": 1e-6, "passed": True},
+            "finite_difference": {
+                "value": None,
+                "bound": 1e-3,
+                "passed": None,
+                "note": "every direction crosses a sort",
+            },
+        },
+        "timing": {"load": 0.4, "linearise": 0.9, "traces": 8.2, "eigenvalues": 21.5, "slice": 14.0, "total": 45.0},
+        "notes": ["SH bands 1 to 3 are not in use and were left out"],
+        "provenance": provenance(seed, lanes=16, checkpoint="checkpoint.pt", scene="fern", iteration=2000),
+    }
+    arrays = {
+        "traces": samples,
+        "spectrum": {
+            "ritz_values": ritz,
+            "residuals": residuals,
+            "nodes": ritz * random.uniform(0.9, 1.0, (3, 60)),
+            "weights": random.dirichlet(np.ones(60), 3),
+        },
+        "slice": _grid(top, second),
+    }
+    return data, arrays
+
+
+def _trace(draws: np.ndarray, dim: int) -> dict[str, Any]:
+    value, error = float(draws.mean()), float(draws.std(ddof=1) / np.sqrt(len(draws)))
+    low, high = value - 2.13 * error, value + 2.13 * error
+    return {
+        "value": value,
+        "standard_error": error,
+        "low": low,
+        "high": high,
+        "confidence": 0.95,
+        "tau": float(np.sqrt(max(value, 0.0) / dim)),
+        "dim": dim,
+        "probes": len(draws),
+        "sign": "undetermined" if low * high <= 0 else "positive" if low > 0 else "negative",
+        "method": "rademacher",
+        "reason": "tolerance",
+    }
+
+
+def _plane(scale: float) -> dict[str, Any]:
+    curvatures = {"e₁": 3.1e4 * scale, "e₂": 1.2e4 * scale}
+    return {
+        "directions": [
+            {"name": name, "curvature": c, "residual": 1e-3 * c, "unit": float(np.sqrt(2 * 8e-4 / c))}
+            for name, c in curvatures.items()
+        ],
+        "loss_scale": 8e-4,
+        "center_loss": 0.0832,
+        "evaluations": 357,
+    }
+
+
+def _grid(top: float, second: float) -> dict[str, np.ndarray]:
+    """A tilted, slightly quartic valley on 21 x 17 points, three units to either side of the centre."""
+    x = np.linspace(-3, 3, 21) * np.sqrt(2 * 8e-4 / top)
+    y = np.linspace(-3, 3, 17) * np.sqrt(2 * 8e-4 / second)
+    u, v = np.meshgrid(x * np.sqrt(top / 2), y * np.sqrt(second / 2), indexing="ij")
+    slope = 0.02 * u - 0.01 * v
+    model = 0.0832 + slope + u**2 + v**2
+    loss = model + 0.004 * np.abs(u) ** 1.5 - 40 * v**4
+    return {"x": x, "y": y, "loss": loss, "model": model, "crossed": np.hypot(u, v) > 0.03}
