@@ -66,3 +66,16 @@ def test_forgetting_an_attribute_leaves_the_others():
     adam.forget("opacity_logits")
     assert not adam.first.opacity_logits.any() and not adam.second.opacity_logits.any()
     assert adam.first.means.all() and adam.second.sh.all()
+
+
+def test_moments_of_gaussians_no_longer_seen_never_become_subnormal_numbers():
+    gaussians = tiny_gaussians(n=3)
+    adam = Adam.zero(gaussians)
+    zero, rates = torch.zeros_like(gaussians.flat), torch.zeros_like(gaussians.flat)
+    adam.update(gaussians.flat, torch.full_like(zero, -1e-9), rates)
+    smallest = torch.finfo(torch.float32).tiny
+    for _ in range(700):  # 1e-10 * 0.9^700 lies below the smallest normal number
+        adam.update(gaussians.flat, zero, rates)
+        moments = adam.first.flat.abs()
+        assert ((moments == 0) | (moments >= smallest)).all()
+    assert moments.max() < 1e-33

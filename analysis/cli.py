@@ -1,0 +1,68 @@
+"""The `landscape` command: subcommands, and how errors become exit codes.
+
+    0    done
+    2    bad input: one sentence on stderr that says what was expected, what came and what to do
+    130  interrupted with Ctrl-C
+
+Every subcommand imports what it needs when it runs, so that `landscape --help` does not wait for torch.
+"""
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from analysis.options import BenchOptions, DemoOptions, ProbeOptions, TrainOptions
+
+Options = (
+    Annotated[TrainOptions, tyro.conf.subcommand("train")]
+    | Annotated[ProbeOptions, tyro.conf.subcommand("probe")]
+    | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
+    | Annotated[BenchOptions, tyro.conf.subcommand("bench")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; arguments: those of the command line where None.  Returns the exit code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    options = tyro.cli(
+        Options,  # pyright: ignore[reportArgumentType]
+        prog="landscape",
+        description="See the loss landscape of a 3D Gaussian Splatting scene.",
+        args=arguments,
+        config=(tyro.conf.DisallowNone,),
+    )
+    try:
+        return run(options, arguments)
+    except (ValueError, OSError) as error:
+        print(f"landscape: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("landscape: interrupted", file=sys.stderr)
+        return 130
+
+
+def run(options: Options, arguments: Sequence[str]) -> int:
+    """Hand over to the subcommand."""
+    match options:
+        case TrainOptions():
+            from analysis.training import run_training
+
+            return run_training(options, ["landscape", *arguments])
+        case ProbeOptions():
+            from analysis.probe import run_probe
+
+            return run_probe(options)
+        case DemoOptions():
+            from analysis.demo import run_demo
+
+            return run_demo(options)
+        case BenchOptions():
+            from analysis.bench import run_bench
+
+            return run_bench(options)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,73 @@
+"""What the subcommands of `landscape` accept.  Plain dataclasses that import nothing heavy, so that help is quick."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Train 3D Gaussian Splatting on a few views of a scene and score it on the views held out."""
+
+    scene: Positional[Path]
+    """Folder of the scene: COLMAP, LLFF, Blender, instant-ngp or nerfstudio."""
+    out: Path | None = None
+    """Folder of the run, which must not exist yet.  Default: runs/NAME, after the scene."""
+    views: int | Literal["all"] = 3
+    """Training views, chosen by the scene's protocol; all: every view that is not held out."""
+    iterations: int = 2000
+    """Steps, one view each."""
+    seed: int = 0
+    """Of everything random: the same seed gives the same checkpoint, bit for bit."""
+    images: str | None = None
+    """Folder of images within the scene.  Default: images, else the largest images_K."""
+    downscale: float = 1.0
+    """Reduce the images further by this factor."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue the run in OUT; the other options must be those that it was started with."""
+    sh_degree: int = 3
+    """Highest degree of spherical harmonics; a degree joins every 1000 steps."""
+    background: Literal["scene", "black", "white", "random"] = "scene"
+    """Colour behind the Gaussians.  scene: white where the images are transparent, else black."""
+    densify: bool = True
+    """Whether to clone, split and prune Gaussians and reset opacities, as 3DGS does."""
+    pixel_loss: Literal["l1", "charbonnier", "l2"] = "l1"
+    """Loss of a pixel, beside 1 - SSIM."""
+    ssim_weight: float = 0.2
+    """Weight of 1 - SSIM; the pixel loss has the rest."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints: what a killed run loses at most."""
+
+
+@dataclass(frozen=True)
+class ProbeOptions:
+    """Measure the loss landscape at a checkpoint: traces, extreme eigenvalues, anisotropy, a slice."""
+
+    checkpoint: Positional[Path]
+    """RUN/checkpoint.pt, as written by landscape train."""
+    scene: Path | None = None
+    """Folder of the scene, where it has moved since the training."""
+    out: Path | None = None
+    """Folder of the results.  Default: probe, beside the checkpoint."""
+    seed: int = 0
+    """Of the probe vectors."""
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Train and probe an embedded synthetic scene, and say which pictures to open."""
+
+    out: Path = Path("demo")
+    """Folder of the demo's run."""
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """Measure the speed of the kernels."""
+
+    study: Positional[Literal["kernels"]]
+    """What to measure."""
+    prototype: Path | None = None
+    """Folder of a prototype of the kernels to measure beside them."""

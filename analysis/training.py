@@ -1,0 +1,257 @@
+"""`landscape train`: a run folder that appears at once, a progress bar, checkpoints, scores of the held-out views.
+
+RUN/checkpoint.pt   the latest checkpoint, see `splat/checkpoint.py`; written at the start, every so many steps, on
+                    Ctrl-C and at the end
+RUN/test/NAME.png   the held-out views as rendered at the end
+RUN/metrics.json    {"step", "gaussians", "train": scores, "test": scores or null, "provenance"}, where scores are
+                    {"psnr", "ssim", "views": {NAME: {"psnr", "ssim"}}}, psnr in dB; "Infinity" for a perfect image
+"""
+
+import io
+import json
+import math
+import os
+import shlex
+import shutil
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import torch
+from PIL import Image
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+from torch import Tensor
+
+from analysis.options import TrainOptions
+from analysis.provenance import provenance
+from splat.checkpoint import SceneReference, load_checkpoint, save_checkpoint, write_atomically
+from splat.densify import DensifySettings
+from splat.evaluate import Evaluation, evaluate
+from splat.losses import LossSettings
+from splat.scenes.images import IMAGE_SUFFIXES
+from splat.scenes.scene import Scene, load_scene
+from splat.scenes.splits import split_scene
+from splat.scenes.view import View
+from splat.start import initial_gaussians
+from splat.train import TrainConfig, Training, train
+
+CHECKPOINT, METRICS, RENDERS = "checkpoint.pt", "metrics.json", "test"
+COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
+
+
+def run_training(options: TrainOptions, command: Sequence[str]) -> int:
+    """Train, or continue, a run; returns the exit code.  command: as typed, for the message on how to resume."""
+    if options.checkpoint_every < 1:
+        raise ValueError(f"expected checkpoint_every of at least 1, got {options.checkpoint_every}")
+    out = options.out or Path("runs") / options.scene.resolve().name
+    _require_run(out, options.resume)
+    colour = COLOURS.get(options.background)
+    scene = load_scene(options.scene, options.images, options.downscale, colour)
+    split = split_scene(scene, None if options.views == "all" else options.views)
+    config = _config(options, scene)
+    reference = SceneReference.to(scene, out / CHECKPOINT, split, options.images, options.downscale)
+    views, held_out = scene.load(split.train), scene.load(split.test)
+    if options.resume:
+        training = _resumed(out / CHECKPOINT, config, reference)
+    else:
+        start = initial_gaussians(scene, views, 0, generator=torch.Generator().manual_seed(config.seed))
+        training = Training.start(start, scene.extent(split.train), config)
+        _create_run(out, training, reference)
+
+    console = Console(stderr=True)
+    camera = views[0].camera
+    console.print(
+        f"{scene.name}: {len(views)} views to train on, {len(held_out)} held out, {camera.width} x {camera.height} px, "
+        f"{len(training.gaussians)} Gaussians"
+    )
+    if not _follow(training, views, out / CHECKPOINT, reference, options.checkpoint_every, console):
+        again = shlex.join([*command, *([] if options.resume else ["--resume"])])
+        console.print(f"stopped after step {training.step}; to continue: {again}", soft_wrap=True, highlight=False)
+        return 130
+    _report(training, views, held_out, out)
+    return 0
+
+
+def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
+    red, green, blue = scene.background.tolist()
+    return TrainConfig(
+        iterations=options.iterations,
+        seed=options.seed,
+        sh_degree=options.sh_degree,
+        background=(red, green, blue),
+        random_background=options.background == "random",
+        loss=LossSettings(pixel=options.pixel_loss, ssim_weight=options.ssim_weight),
+        densify=DensifySettings(enabled=options.densify),
+    )
+
+
+def _require_run(out: Path, resume: bool) -> None:
+    """The folder must exist for a run to resume, and must not for a new one."""
+    if resume and not (out / CHECKPOINT).is_file():
+        raise FileNotFoundError(f"expected a run to resume in {out}, found no {CHECKPOINT} there; leave out --resume")
+    if not resume and out.exists():
+        raise FileExistsError(
+            f"expected a new folder for the run, but {out} exists; choose another --out or add --resume"
+        )
+
+
+def _create_run(out: Path, training: Training, reference: SceneReference) -> None:
+    """Make the folder with its first checkpoint appear at once."""
+    partial = out.absolute().with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        save_checkpoint(partial / CHECKPOINT, training, reference)
+        os.rename(partial, out)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _resumed(path: Path, config: TrainConfig, reference: SceneReference) -> Training:
+    """The training of a checkpoint, which must have been started with the same settings on the same views."""
+    loaded = load_checkpoint(path)
+    asked = {**_flat(asdict(config)), **_flat(asdict(replace(reference, absolute="", relative="")))}
+    saved = {**_flat(asdict(loaded.training.config)), **_flat(asdict(replace(loaded.scene, absolute="", relative="")))}
+    for key, value in saved.items():
+        if asked[key] != value:
+            raise ValueError(
+                f"expected the settings that the run in {path.parent} was started with, {key} = {value}, got "
+                f"{asked[key]}; repeat its command with --resume, or choose another --out"
+            )
+    return loaded.training
+
+
+def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+    """Nested settings as one level, by the names of the leaves joined with dots."""
+    result = {}
+    for key, value in settings.items():
+        inner = {f"{key}.{name}": v for name, v in _flat(value).items()} if isinstance(value, dict) else {key: value}
+        result.update(inner)
+    return result
+
+
+def _follow(
+    training: Training, views: list[View], path: Path, reference: SceneReference, every: int, console: Console
+) -> bool:
+    """Train to the end with a progress bar and checkpoints; False where Ctrl-C ended it, after a checkpoint."""
+    total = training.config.iterations
+    with _interrupt() as interrupted, _progress(console) as progress:
+        bar = progress.add_task("training", total=total, completed=training.step, loss=math.nan, gaussians=0)
+        loss = math.nan
+        for done in train(training, views):
+            loss = done.loss if math.isnan(loss) else loss + SMOOTHING * (done.loss - loss)
+            progress.update(bar, completed=done.step, loss=loss, gaussians=done.gaussians)
+            stop = interrupted.is_set()
+            if stop or done.step % every == 0 or done.step == total:
+                save_checkpoint(path, training, reference)
+            if stop:
+                return done.step == total
+    return True
+
+
+class _Rate(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.speed:5.1f} it/s" if task.speed else "  --- it/s")
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Rate(),
+        TextColumn("loss {task.fields[loss]:.4f}"),
+        TextColumn("{task.fields[gaussians]} Gaussians"),
+        TimeRemainingColumn(),
+        console=console,
+        refresh_per_second=4,
+    )
+
+
+@contextmanager
+def _interrupt() -> Iterator[Event]:
+    """The first Ctrl-C only sets the event, so that the step under way ends; a second one interrupts at once."""
+    event = Event()
+    before = signal.getsignal(signal.SIGINT)
+
+    def first(*_: object) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, first)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _report(training: Training, views: list[View], held_out: list[View], out: Path) -> None:
+    """Score the views, write renders and metrics, print the table."""
+    config = training.config
+    background = torch.tensor(config.background, dtype=training.gaussians.flat.dtype)
+    renders = out / RENDERS
+
+    def keep(name: str, image: Tensor) -> None:
+        write_atomically(renders / render_name(name), _png(image))
+
+    seen = evaluate(training.gaussians, views, background, config.render)
+    tested = None
+    if held_out:
+        renders.mkdir(exist_ok=True)
+        tested = evaluate(training.gaussians, held_out, background, config.render, on_image=keep)
+    metrics = {
+        "step": training.step,
+        "gaussians": len(training.gaussians),
+        "train": _scores(seen),
+        "test": _scores(tested) if tested else None,
+        "provenance": provenance(config.seed, checkpoint=str(out / CHECKPOINT)),
+    }
+    write_atomically(out / METRICS, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
+    console = Console()
+    console.print(_table(seen, tested))
+    if tested is None:
+        console.print("no view was held out, so nothing was tested")
+    console.print(f"next: landscape probe {shlex.quote(str(out / CHECKPOINT))}", soft_wrap=True, highlight=False)
+
+
+def render_name(view: str) -> str:
+    """File name of a view's render: `train/r_3` becomes `train_r_3.png`, `IMG_1.JPG` becomes `IMG_1.png`."""
+    flat = Path(view.replace("/", "_"))
+    return f"{flat.stem if flat.suffix.lower() in IMAGE_SUFFIXES else flat.name}.png"
+
+
+def _png(image: Tensor) -> bytes:
+    pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def _scores(evaluation: Evaluation) -> dict[str, Any]:
+    def number(value: float) -> float | str:
+        return "Infinity" if value == math.inf else value
+
+    each = {view.name: {"psnr": number(view.psnr), "ssim": view.ssim} for view in evaluation.views}
+    return {"psnr": number(evaluation.psnr), "ssim": evaluation.ssim, "views": each}
+
+
+def _table(seen: Evaluation, tested: Evaluation | None) -> Table:
+    table = Table("view", title="held-out views" if tested else "training views")
+    table.add_column("PSNR (dB)", justify="right")
+    table.add_column("SSIM", justify="right")
+    if tested:
+        for view in tested.views:
+            table.add_row(view.name, f"{view.psnr:.2f}", f"{view.ssim:.4f}")
+        table.add_section()
+        table.add_row("mean", f"{tested.psnr:.2f}", f"{tested.ssim:.4f}", style="bold")
+    table.add_row("mean of the training views", f"{seen.psnr:.2f}", f"{seen.ssim:.4f}")
+    return table
