@@ -156,9 +156,12 @@ def _read(
     path: Path, lens: pycolmap.Camera, pinhole: pycolmap.Camera, size: tuple[int, int], background: Float[Tensor, "3"]
 ) -> Picture:
     """Composite over the background, undistort, downscale: in this order, no transparent colour bleeds in."""
-    with Image.open(path) as file:
-        has_alpha = _has_alpha(file)
-        pixels = np.array(file.convert("RGBA" if has_alpha else "RGB"))
+    try:
+        with Image.open(path) as file:
+            has_alpha = _has_alpha(file)
+            pixels = np.array(file.convert("RGBA" if has_alpha else "RGB"))
+    except OSError as error:
+        raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
     layers = torch.from_numpy(pixels).permute(2, 0, 1).to(torch.float32) / 255
     if has_alpha:
         rgb, alpha = layers[:3], layers[3:]
