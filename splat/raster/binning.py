@@ -1,0 +1,202 @@
+"""Tile lists: which splats touch which tiles of an image, in order of depth, and in which rows.
+
+A splat is drawn where its alpha is at least alpha_min, inside the ellipse a dx^2 + 2 b dx dy + c dy^2 <= 2 ln(o / alpha_min)
+(or contour_sigma^2, where that is less).  Its rows in a tile are those of the ellipse within the tile's columns, found in
+double precision and rounded outwards.  Splats are (n, 9) arrays: mean x, y; conic a, b, c; opacity; colour.
+"""
+
+from math import ceil, floor, inf, log, sqrt
+
+import numpy as np
+from numba import prange
+
+from splat.raster.compositing import CAPPED, TILE_ROWS, Lists, formula, kernel, worker
+from splat.raster.simd import lanes_of
+from splat.settings import RenderSettings
+
+WIDEN = 1e-4  # relative widening of an ellipse's level, so that no active pixel is missed
+RADIX_BITS = 11
+
+
+def depth_order(depths: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """Indices of the drawn splats, nearest first, equal depths in the order of their index."""
+    index = np.flatnonzero(drawn).astype(np.int32)
+    if depths.dtype == np.float32:  # positive floats sort as the integers of their bits
+        return radix_argsort(depths[index].view(np.uint32), index)
+    return index[np.argsort(depths[index], kind="stable")]
+
+
+@worker
+def radix_argsort(keys, index):
+    """index, reordered so that the 32-bit keys ascend; stable. Overwrites both."""
+    n = keys.size
+    buckets = 1 << RADIX_BITS
+    other_keys, other_index = np.empty_like(keys), np.empty_like(index)
+    for digit in range(3):
+        shift = np.uint32(digit * RADIX_BITS)
+        place = np.zeros(buckets + 1, np.int64)
+        for i in range(n):
+            place[((keys[i] >> shift) & np.uint32(buckets - 1)) + 1] += 1
+        for d in range(buckets):
+            place[d + 1] += place[d]
+        for i in range(n):
+            d = (keys[i] >> shift) & np.uint32(buckets - 1)
+            other_keys[place[d]], other_index[place[d]] = keys[i], index[i]
+            place[d] += 1
+        keys, other_keys = other_keys, keys
+        index, other_index = other_index, index
+    return index
+
+
+@formula
+def ellipse_of(splat, alpha_min, contour):
+    """Half-extents of a splat's ellipse and its widened level; a level of 0 where it is nowhere drawn."""
+    a, b, c, opacity = np.float64(splat[2]), np.float64(splat[3]), np.float64(splat[4]), np.float64(splat[5])
+    if opacity < alpha_min or opacity <= 0:
+        return 0.0, 0.0, 0.0, 0.0
+    level = contour * contour
+    if alpha_min > 0:
+        level = min(level, 2 * log(opacity / alpha_min))
+    level = level * (1 + WIDEN) + WIDEN
+    det = a * c - b * b
+    if level == inf or det <= 0:
+        return inf, inf, inf, det
+    return sqrt(level * c / det), sqrt(level * a / det), level, det
+
+
+@formula
+def pixels_within(centre, reach, size):
+    """First and last pixel index whose centre lies within reach, clipped to the image; empty if first > last."""
+    first = ceil(min(max(centre - reach, 0.0), size))
+    last = floor(max(min(centre + reach, size - 1.0), -1.0))
+    return int(first), int(last)
+
+
+@formula
+def rows_in_strip(splat, level, det, ex, ey, left, right):
+    """Lowest and highest y, relative to the mean, of the ellipse in the strip left <= x <= right (relative too)."""
+    if level == inf:
+        return -inf, inf
+    b, c = np.float64(splat[3]), np.float64(splat[4])
+    x_top = -b * ey / splat[2]  # where the ellipse is highest; it is lowest at -x_top
+    x = min(max(x_top, left), right)
+    high = (-b * x + sqrt(max(0.0, c * level - det * x * x))) / c
+    x = min(max(-x_top, left), right)
+    low = (-b * x - sqrt(max(0.0, c * level - det * x * x))) / c
+    return low, high
+
+
+@kernel
+def count_tiles(threads, splats, order, tile, width, height, alpha_min, contour, bound):
+    """An upper bound of the number of tiles each splat touches: those of its ellipse's box."""
+    for t in prange(threads):
+        for i in range(order.size * t // threads, order.size * (t + 1) // threads):
+            splat = splats[order[i]]
+            ex, ey, level, _det = ellipse_of(splat, alpha_min, contour)
+            bound[i] = 0
+            if level > 0:
+                x0, x1 = pixels_within(splat[0] - 0.5, ex, width)
+                y0, y1 = pixels_within(splat[1] - 0.5, ey, height)
+                if x0 <= x1 and y0 <= y1:
+                    bound[i] = (x1 // tile - x0 // tile + 1) * (y1 // TILE_ROWS - y0 // TILE_ROWS + 1)
+
+
+@kernel
+def list_tiles(threads, splats, order, tile, columns, width, height, alpha_min, contour, cap, place, count, tiles, rows, histogram):
+    """The tiles that each splat touches and its rows in them, at place[i], place[i] + 1, ...; count[i] of them."""
+    for t in prange(threads):
+        for i in range(order.size * t // threads, order.size * (t + 1) // threads):
+            count[i] = 0
+            if place[i + 1] > place[i]:
+                count[i] = list_splat(
+                    splats[order[i]], tile, columns, width, height, alpha_min, contour, cap,
+                    tiles[place[i] :], rows[place[i] :], histogram[t],
+                )  # fmt: skip
+
+
+@worker
+def list_splat(splat, tile, columns, width, height, alpha_min, contour, cap, tiles, rows, histogram):
+    ex, ey, level, det = ellipse_of(splat, alpha_min, contour)
+    mx, my = splat[0] - 0.5, splat[1] - 0.5
+    x0, x1 = pixels_within(mx, ex, width)
+    flags = CAPPED if splat[5] > cap else 0
+    k = 0
+    for column in range(x0 // tile, x1 // tile + 1):
+        left, right = max(column * tile, x0) - mx, min(column * tile + tile - 1, x1) - mx
+        low, high = rows_in_strip(splat, level, det, ex, ey, left, right)
+        y0, y1 = pixels_within(my + (low + high) / 2 if level < inf else my, (high - low) / 2, height)
+        if y0 <= y1:
+            for row in range(y0 // TILE_ROWS, y1 // TILE_ROWS + 1):
+                top, bottom = max(y0 - row * TILE_ROWS, 0), min(y1 - row * TILE_ROWS, TILE_ROWS - 1)
+                tiles[k] = row * columns + column
+                rows[k] = top | bottom << 8 | flags
+                histogram[tiles[k]] += 1
+                k += 1
+    return k
+
+
+@kernel
+def fill_lists(threads, order, place, count, tiles, rows, first, splat_of, entry_rows):
+    """Scatter into the tiles' lists. first: (threads, tiles), where each thread's entries of a tile begin; advanced."""
+    for t in prange(threads):
+        for i in range(order.size * t // threads, order.size * (t + 1) // threads):
+            for k in range(place[i], place[i] + count[i]):
+                e = first[t, tiles[k]]
+                first[t, tiles[k]] = e + 1
+                splat_of[e] = order[i]
+                entry_rows[e] = rows[k]
+
+
+def bin_splats(
+    threads: int, splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, settings: RenderSettings
+) -> Lists:
+    """The tile lists of a view; the tiles are ordered heaviest first.  Their slots are assigned by `assign_slots`."""
+    tile = lanes_of(splats.dtype)
+    columns = -(-width // tile)
+    tile_count = columns * -(-height // TILE_ROWS)
+    order = depth_order(depths, drawn)
+    contour = inf if settings.contour_sigma is None else settings.contour_sigma
+    where = (tile, width, height, settings.alpha_min, contour)
+    bound = np.empty(order.size, np.int64)
+    count_tiles(threads, splats, order, *where, bound)
+    place = np.zeros(order.size + 1, np.int64)
+    np.cumsum(bound, out=place[1:])
+    count = np.empty(order.size, np.int32)
+    tiles, rows = np.empty(place[-1], np.int32), np.empty(place[-1], np.int32)
+    histogram = np.zeros((threads, tile_count), np.int32)
+    cap = np.inf if settings.gradient_through_cap else settings.alpha_max
+    list_tiles(threads, splats, order, tile, columns, *where[1:], cap, place, count, tiles, rows, histogram)
+    start = np.zeros(tile_count + 1, np.int64)
+    per_tile = histogram.sum(axis=0)
+    np.cumsum(per_tile, out=start[1:])
+    first = start[:-1] + np.cumsum(histogram, axis=0) - histogram
+    splat_of, entry_rows = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
+    fill_lists(threads, order, place, count, tiles, rows, first, splat_of, entry_rows)
+    return Lists(start, splat_of, entry_rows, np.empty(0, np.int32), heaviest_first(per_tile))
+
+
+@worker
+def assign_slots(start, splat_of, reached, slot_start, slots):
+    """Number the entries that some pixel reaches, splat-major: splat i's are slot_start[i], ..., slot_start[i + 1] - 1.
+
+    reached: (tiles,) how many entries of each tile count.  Returns the number of slots.
+    """
+    n = slot_start.size - 1
+    slot_start[:] = 0
+    for t in range(reached.size):
+        for e in range(start[t], start[t] + reached[t]):
+            slot_start[splat_of[e] + 1] += 1
+    for i in range(n):
+        slot_start[i + 1] += slot_start[i]
+    next_slot = slot_start[:-1].copy()
+    for t in range(reached.size):
+        for e in range(start[t], start[t] + reached[t]):
+            i = splat_of[e]
+            slots[e] = next_slot[i]
+            next_slot[i] += 1
+    return slot_start[n]
+
+
+def heaviest_first(work: np.ndarray) -> np.ndarray:
+    """Tiles with the most work first, so that threads finish together."""
+    return np.argsort(-work, kind="stable")

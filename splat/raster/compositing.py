@@ -1,0 +1,656 @@
+"""The compositing kernels: one view's pixels, front to back and back to front, at first and second order.
+
+A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  Per pixel, splats in order of depth, offset
+d = p - mean, conic (a, b, c), opacity o, colour c:
+
+    l = log2 alpha = log2 o - log2(e) (a dx^2 / 2 + b dx dy + c dy^2 / 2)      alpha = min(cap, 2^l)
+    active where l >= cut and the pixel has not stopped; elsewhere alpha = 0 and every update below is a no-op
+
+`forward`     w = alpha T;  image += w c;  T <- T - w;  at the end image += T background, alpha plane = 1 - T.
+
+`backward`    given g = dloss/dimage and, for the alpha plane, g_A.  Back to front, T starts at the final T and R, the
+              sum over the splats behind of w_j (g . c_j) plus the background's part, at T (g . background - g_A):
+              r = 1 / (1 - alpha);  T <- T r;  w = alpha T;  beta = alpha r;  e = g . c
+              s = w e - beta R, the derivative in q = ln alpha, 0 where the cap holds;  R <- R + w e
+              per splat: moments S, Sx, Sy, Sxx, Sxy, Syy of s over the offsets, and G = sum w g.
+
+`tangent`     (J u) given tangents of the splats; q' is one quadratic in the offset, 0 where the cap holds:
+              w' = w q' + alpha T';  image' += w' c + w c';  T' <- T' - w';  at the end image' += T' background.
+
+`curvature`   (the tangent of `backward`) given q', c' and g' = dg.  With tau = T' / T, r, w, beta, R as above:
+              tau <- tau + beta q';  nu = q' + tau;  h = nu g + g';  z = w (h . c + g . c')
+              s' = z - beta R' - beta r R q', 0 where the cap holds;  R' <- R' + z;  moments of s' and G' = sum w h.
+
+A dash marks a tangent.  K tangents share the primal quantities of a splat's rows, which stay in L1 between them; for
+K = 1 the two loops are one.  Every entry (a splat in a tile) writes its nine sums to its own slot, splat-major, so that no
+sum depends on the order in which threads finish.
+
+Arrays are flat: `params` holds PARAMS floats a splat, `tangents` K x TANGENTS floats a splat, a plane stride x height floats.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from splat.raster.simd import (
+    any_lane,
+    broadcast,
+    exp2,
+    fetch_and_increment,
+    fma,
+    iota,
+    lanes,
+    load,
+    maximum,
+    minimum,
+    prefetch,
+    select,
+    store,
+    store_sums,
+)
+
+TILE_ROWS = 16
+NEVER = 1e30  # the stop index of a pixel that does not stop
+AHEAD = 6  # entries between a prefetch and its use
+
+PARAMS = 16  # one cache line in float32: mean x, y (pixel index units); log2 alpha = LO + LXX dx^2 + LXY dx dy + LYY dy^2
+MX, MY, LXX, LXY, LYY, LO, RED, GREEN, BLUE, CUT = range(10)
+CAPPED = 1 << 16  # in an entry's rows: its splat's alpha can reach the cap
+TANGENTS = 12  # q' = Q0 + QX dx + QY dy + QXX dx^2 + QXY dx dy + QYY dy^2, colour'
+Q0, QX, QY, QXX, QXY, QYY, DRED, DGREEN, DBLUE = range(9)
+SUMS = 9  # S, Sx, Sy, Sxx, Sxy, Syy, G (3)
+
+
+class Lists(NamedTuple):
+    """Which splats touch which tiles. An entry is a splat in a tile; the entries of a tile are in order of depth.
+
+    start: (tiles + 1,) first entry of each tile; splat: (entries,); rows: (entries,) first row | last row << 8 within the
+    tile, and CAPPED; slots: (entries,) where an entry's sums go, splat-major; order: the tiles in the order in which they are handed out.
+    """
+
+    start: np.ndarray
+    splat: np.ndarray
+    rows: np.ndarray
+    slots: np.ndarray
+    order: np.ndarray
+
+
+class Frame(NamedTuple):
+    """What all pixels share: tiles in a row, floats in a row of a plane, floats in a plane, cap, floor, background (3,).
+
+    row_offsets: 0, ..., TILE_ROWS - 1, each `lanes` times: read as vectors, they cost the kernels less than a conversion.
+    """
+
+    columns: int
+    stride: int
+    size: int
+    cap: float
+    floor: float
+    background: np.ndarray
+    row_offsets: np.ndarray
+
+
+class Pixels(NamedTuple):
+    """What `forward` leaves in each pixel: planes (red, green, blue, alpha), the final T, the entry at which it stopped."""
+
+    planes: np.ndarray
+    transmittance: np.ndarray
+    stop: np.ndarray
+
+
+kernel = njit(cache=True, parallel=True, nogil=True, error_model="numpy", boundscheck=False)
+worker = njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+formula = njit(cache=True, forceinline=True, error_model="numpy", boundscheck=False)
+
+
+# --- formulas that the kernels share ----------------------------------------------------------------------------------
+
+
+@formula
+def scratch(like, size):
+    """A new array of like's dtype that starts on a cache line."""
+    buffer = np.empty(size + 16, like.dtype)
+    start = ((64 - (buffer.ctypes.data & 63)) & 63) // buffer.itemsize
+    return buffer[start : start + size]
+
+
+@formula
+def next_tile(counter, lists):
+    """The next tile that no thread has taken, or -1."""
+    turn = fetch_and_increment(counter)
+    return lists.order[turn] if turn < lists.order.size else np.int64(-1)
+
+
+@formula
+def corner_of(tile, lanes, columns, stride):
+    """Column and row of a tile's first pixel, and its index in a plane."""
+    x0, y0 = (tile % columns) * lanes, (tile // columns) * TILE_ROWS
+    return x0, y0, y0 * stride + x0
+
+
+@formula
+def row_range(packed):
+    """First row and one past the last row of an entry."""
+    return packed & 255, ((packed >> 8) & 255) + 1
+
+
+@formula
+def alpha_terms(params, o, x0):
+    """dx of a tile's columns, and log2 alpha = A + dy (B + dy C) as (A, B, C, cut)."""
+    dx = iota(params) + (x0 - params[o + MX])
+    constant = fma(dx * dx, broadcast(params, params[o + LXX]), broadcast(params, params[o + LO]))
+    terms = (constant, dx * params[o + LXY], broadcast(params, params[o + LYY]), broadcast(params, params[o + CUT]))
+    return dx, terms
+
+
+@formula
+def alpha_row(dy, terms, running, cap):
+    """alpha of a row and 2^l before the cap; running: the mask of the pixels that have not stopped.
+
+    l decides, so it is rounded alike in every kernel: fma.
+    """
+    l = fma(dy, fma(dy, terms[2], terms[1]), terms[0])
+    uncapped = exp2(l)
+    return select((l >= terms[3]) & running, minimum(uncapped, cap), 0.0), uncapped
+
+
+@formula
+def tangent_terms(tangents, j, dx):
+    """q' = A + dy (B + dy C) as (A, B, C)."""
+    constant = dx * (dx * tangents[j + QXX] + tangents[j + QX]) + tangents[j + Q0]
+    return constant, dx * tangents[j + QXY] + tangents[j + QY], broadcast(tangents, tangents[j + QYY])
+
+
+@formula
+def quadratic(dy, terms):
+    return terms[0] + dy * (terms[1] + dy * terms[2])
+
+
+@formula
+def broadcast3(array, i):
+    return broadcast(array, array[i]), broadcast(array, array[i + 1]), broadcast(array, array[i + 2])
+
+
+@formula
+def load3(array, i, step):
+    return load(array, i), load(array, i + step), load(array, i + 2 * step)
+
+
+@formula
+def store3(array, i, step, values):
+    store(array, i, values[0])
+    store(array, i + step, values[1])
+    store(array, i + 2 * step, values[2])
+
+
+@formula
+def dot(x, y):
+    return x[0] * y[0] + (x[1] * y[1] + x[2] * y[2])
+
+
+@formula
+def dot_plus(x, y, z):
+    """x . y + z, as a chain of fused multiply-adds."""
+    return x[0] * y[0] + (x[1] * y[1] + (x[2] * y[2] + z))
+
+
+@formula
+def plus(x, y, c):
+    """x + y c, for colours x and c."""
+    return x[0] + y * c[0], x[1] + y * c[1], x[2] + y * c[2]
+
+
+@formula
+def behind_all(planes, p, size, background):
+    """What the final transmittance is multiplied by in the loss: g . background - g_A."""
+    g = load3(planes, p, size)
+    return g[0] * background[0] + g[1] * background[1] + g[2] * background[2] - load(planes, p + 3 * size)
+
+
+@formula
+def reached(lists, tile, pixels, corner, stride):
+    """The first entry of a tile, and how many of its entries some pixel reaches before it stops."""
+    furthest = load(pixels.stop, corner)
+    for y in range(1, TILE_ROWS):
+        furthest = maximum(furthest, load(pixels.stop, corner + y * stride))
+    row = np.empty(lanes(pixels.stop), pixels.stop.dtype)
+    store(row, 0, furthest)
+    first = np.int64(lists.start[tile])
+    return first, np.int64(min(lists.start[tile + 1] - first, row.max()))
+
+
+@formula
+def no_moments(params):
+    zero = broadcast(params, 0.0)
+    return zero, zero, zero, zero, zero, zero
+
+
+@formula
+def add_row(moments, dy, s, w, h):
+    """Add a row to the sums over rows (s, s dy, s dy^2, w h)."""
+    sy = s * dy
+    return (
+        moments[0] + s,
+        moments[1] + sy,
+        moments[2] + sy * dy,
+        moments[3] + w * h[0],
+        moments[4] + w * h[1],
+        moments[5] + w * h[2],
+    )
+
+
+@formula
+def store_moments(sums, slot, moments, dx):
+    S, Sy, Syy, G0, G1, G2 = moments
+    Sx = S * dx
+    store_sums(sums, slot * SUMS, (S, Sx, Sy, Sx * dx, Sy * dx, Syy, G0, G1, G2))
+
+
+# --- forward ----------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def forward(threads, params, lists, frame, pixels):
+    """Render: fill `pixels`."""
+    counter = np.zeros(1, np.int64)
+    for _ in prange(threads):
+        forward_tiles(counter, params, lists, frame, pixels)
+
+
+@worker
+def forward_tiles(counter, params, lists, frame, pixels):
+    L = lanes(params)
+    state = scratch(params, 5 * L * TILE_ROWS)  # a row: T (negative once stopped), image (3), stop
+    tile = next_tile(counter, lists)
+    while tile >= 0:
+        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        for y in range(TILE_ROWS):
+            b = 5 * L * y
+            store(state, b, 1.0)
+            for j in range(1, 4):
+                store(state, b + j * L, 0.0)
+            store(state, b + 4 * L, NEVER)
+        first = np.int64(lists.start[tile])
+        count = lists.start[tile + 1] - first
+        some_stopped = False
+        for k in range(count):
+            prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
+            some_stopped |= forward_entry(params, lists, first + k, k, x0, y0, frame, state)
+            if some_stopped and (k & 15) == 15:
+                some_stopped = False
+                if all_stopped(state, L):
+                    break
+        for y in range(TILE_ROWS):
+            b, p = 5 * L * y, corner + y * frame.stride
+            T = maximum(load(state, b), -load(state, b))
+            store(pixels.transmittance, p, T)
+            store(pixels.stop, p, load(state, b + 4 * L))
+            for c in range(3):
+                store(pixels.planes, c * frame.size + p, load(state, b + (1 + c) * L) + T * frame.background[c])
+            store(pixels.planes, 3 * frame.size + p, 1.0 - T)
+        tile = next_tile(counter, lists)
+
+
+@formula
+def forward_entry(params, lists, e, k, x0, y0, frame, state):
+    """Composite one entry; True if it stopped a pixel."""
+    L = lanes(params)
+    o = np.int64(lists.splat[e]) * PARAMS
+    _dx, terms = alpha_terms(params, o, x0)
+    colour = broadcast3(params, o + RED)
+    dy0 = broadcast(params, y0 - params[o + MY])
+    top, bottom = row_range(lists.rows[e])
+    stopped = False
+    for y in range(top, bottom):
+        b = 5 * L * y
+        T = load(state, b)
+        alpha, _uncapped = alpha_row(dy0 + load(frame.row_offsets, L * y), terms, T > 0.0, frame.cap)
+        w = alpha * T
+        after = T - w
+        ends = (after < frame.floor) & (T > 0.0)
+        if any_lane(ends):
+            w = select(ends, 0.0, w)
+            after = select(ends, -T, after)
+            store(state, b + 4 * L, select(ends, k, load(state, b + 4 * L)))
+            stopped = True
+        store(state, b, after)
+        store3(state, b + L, L, plus(load3(state, b + L, L), w, colour))
+    return stopped
+
+
+@formula
+def all_stopped(state, L):
+    for y in range(TILE_ROWS):
+        if any_lane(load(state, 5 * L * y) > 0.0):
+            return False
+    return True
+
+
+# --- backward ---------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def backward(threads, params, lists, frame, pixels, cotangent, sums):
+    """Moments of every entry, (entries, SUMS), from the cotangent of the planes."""
+    counter = np.zeros(1, np.int64)
+    for _ in prange(threads):
+        backward_tiles(counter, params, lists, frame, pixels, cotangent, sums)
+
+
+@worker
+def backward_tiles(counter, params, lists, frame, pixels, cotangent, sums):
+    L = lanes(params)
+    state = scratch(params, 6 * L * TILE_ROWS)  # a row: T, R, g (3), stop
+    tile = next_tile(counter, lists)
+    while tile >= 0:
+        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        for y in range(TILE_ROWS):
+            begin_backward_row(state, 6 * L * y, L, frame, pixels, cotangent, corner + y * frame.stride)
+        first, count = reached(lists, tile, pixels, corner, frame.stride)
+        for k in range(count - 1, -1, -1):
+            later = first + max(k - AHEAD, 0)
+            prefetch(params, np.int64(lists.splat[later]) * PARAMS)
+            prefetch(sums, np.int64(lists.slots[later]) * SUMS)
+            backward_entry(params, lists, first + k, k, x0, y0, frame, state, sums)
+        tile = next_tile(counter, lists)
+
+
+@formula
+def begin_backward_row(state, b, L, frame, pixels, cotangent, p):
+    T = load(pixels.transmittance, p)
+    store(state, b, T)
+    store(state, b + L, T * behind_all(cotangent, p, frame.size, frame.background))
+    store3(state, b + 2 * L, L, load3(cotangent, p, frame.size))
+    store(state, b + 5 * L, load(pixels.stop, p))
+
+
+@formula
+def backward_entry(params, lists, e, k, x0, y0, frame, state, sums):
+    L = lanes(params)
+    o = np.int64(lists.splat[e]) * PARAMS
+    dx, terms = alpha_terms(params, o, x0)
+    colour = broadcast3(params, o + RED)
+    capped = lists.rows[e] & CAPPED
+    dy0 = broadcast(params, y0 - params[o + MY])
+    index = broadcast(params, k)
+    moments = no_moments(params)
+    top, bottom = row_range(lists.rows[e])
+    for y in range(top, bottom):
+        b = 6 * L * y
+        dy = dy0 + load(frame.row_offsets, L * y)
+        alpha, uncapped = alpha_row(dy, terms, index < load(state, b + 5 * L), frame.cap)
+        r = 1.0 / (1.0 - alpha)
+        T = load(state, b) * r
+        R = load(state, b + L)
+        g = load3(state, b + 2 * L, L)
+        w = alpha * T
+        we = w * dot(g, colour)
+        s = we - alpha * r * R
+        if capped:
+            s = select(uncapped <= frame.cap, s, 0.0)
+        store(state, b, T)
+        store(state, b + L, R + we)
+        moments = add_row(moments, dy, s, w, g)
+    store_moments(sums, np.int64(lists.slots[e]), moments, dx)
+
+
+# --- tangent: J u -----------------------------------------------------------------------------------------------------
+
+
+@kernel
+def tangent(threads, params, tangents, lists, frame, pixels, planes, transmittances):
+    """J u for K tangents: their planes (K, 4 planes) and the tangents of the final transmittance (K planes)."""
+    counter = np.zeros(1, np.int64)
+    for _ in prange(threads):
+        tangent_tiles(counter, params, tangents, lists, frame, pixels, planes, transmittances)
+
+
+@worker
+def tangent_tiles(counter, params, tangents, lists, frame, pixels, planes, transmittances):
+    L = lanes(params)
+    K = transmittances.size // frame.size
+    width = (2 + 4 * K) * L
+    state = scratch(params, width * TILE_ROWS)  # a row: T, stop, for each tangent T', image' (3)
+    shared = scratch(params, 3 * L * TILE_ROWS)  # a row: alpha, w, w where the cap does not hold
+    tile = next_tile(counter, lists)
+    while tile >= 0:
+        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        for y in range(TILE_ROWS):
+            b = width * y
+            store(state, b, 1.0)
+            store(state, b + L, load(pixels.stop, corner + y * frame.stride))
+            for j in range(2, 2 + 4 * K):
+                store(state, b + j * L, 0.0)
+        first, count = reached(lists, tile, pixels, corner, frame.stride)
+        for k in range(count):
+            later = np.int64(lists.splat[first + min(k + AHEAD, count - 1)])
+            prefetch(params, later * PARAMS)
+            for i in range(K):
+                prefetch(tangents, (later * K + i) * TANGENTS)
+            if K == 1:
+                tangent_entry_single(params, tangents, lists, first + k, k, x0, y0, frame, state)
+            else:
+                tangent_entry_block(params, tangents, K, lists, first + k, k, x0, y0, frame, state, shared)
+        for y in range(TILE_ROWS):
+            p = corner + y * frame.stride
+            for i in range(K):
+                end_tangent_row(state, width * y + (2 + 4 * i) * L, L, frame, planes, transmittances, i, p)
+        tile = next_tile(counter, lists)
+
+
+@formula
+def end_tangent_row(state, b, L, frame, planes, transmittances, i, p):
+    dT = load(state, b)
+    store(transmittances, i * frame.size + p, dT)
+    for c in range(3):
+        store(planes, (4 * i + c) * frame.size + p, load(state, b + (1 + c) * L) + dT * frame.background[c])
+    store(planes, (4 * i + 3) * frame.size + p, -dT)
+
+
+@formula
+def tangent_row(state, b, L, alpha, w, w_dq, colour, dcolour):
+    """w' = w q' + alpha T';  T' <- T' - w';  image' += w c' + w' c."""
+    dT = load(state, b)
+    dw = w_dq + alpha * dT
+    store(state, b, dT - dw)
+    store3(state, b + L, L, plus(plus(load3(state, b + L, L), w, dcolour), dw, colour))
+
+
+@formula
+def tangent_entry_single(params, tangents, lists, e, k, x0, y0, frame, state):
+    L = lanes(params)
+    splat = np.int64(lists.splat[e])
+    o = splat * PARAMS
+    dx, terms = alpha_terms(params, o, x0)
+    colour, dcolour = broadcast3(params, o + RED), broadcast3(tangents, splat * TANGENTS + DRED)
+    dterms = tangent_terms(tangents, splat * TANGENTS, dx)
+    capped = lists.rows[e] & CAPPED
+    dy0 = broadcast(params, y0 - params[o + MY])
+    index = broadcast(params, k)
+    top, bottom = row_range(lists.rows[e])
+    for y in range(top, bottom):
+        b = 6 * L * y
+        dy = dy0 + load(frame.row_offsets, L * y)
+        alpha, uncapped = alpha_row(dy, terms, index < load(state, b + L), frame.cap)
+        T = load(state, b)
+        w = alpha * T
+        store(state, b, T - w)
+        dq = quadratic(dy, dterms)
+        if capped:
+            dq = select(uncapped <= frame.cap, dq, 0.0)
+        tangent_row(state, b + 2 * L, L, alpha, w, w * dq, colour, dcolour)
+
+
+@formula
+def tangent_entry_block(params, tangents, K, lists, e, k, x0, y0, frame, state, shared):
+    L = lanes(params)
+    width = (2 + 4 * K) * L
+    splat = np.int64(lists.splat[e])
+    o = splat * PARAMS
+    dx, terms = alpha_terms(params, o, x0)
+    colour = broadcast3(params, o + RED)
+    dy0 = broadcast(params, y0 - params[o + MY])
+    index = broadcast(params, k)
+    top, bottom = row_range(lists.rows[e])
+    for y in range(top, bottom):
+        b = width * y
+        alpha, uncapped = alpha_row(dy0 + load(frame.row_offsets, L * y), terms, index < load(state, b + L), frame.cap)
+        T = load(state, b)
+        w = alpha * T
+        store(state, b, T - w)
+        free = select(uncapped <= frame.cap, w, 0.0) if lists.rows[e] & CAPPED else w
+        store3(shared, 3 * L * y, L, (alpha, w, free))
+    for i in range(K):
+        j = (splat * K + i) * TANGENTS
+        dterms, dcolour = tangent_terms(tangents, j, dx), broadcast3(tangents, j + DRED)
+        for y in range(top, bottom):
+            dq = quadratic(dy0 + load(frame.row_offsets, L * y), dterms)
+            alpha, w, free = load3(shared, 3 * L * y, L)
+            tangent_row(state, width * y + (2 + 4 * i) * L, L, alpha, w, free * dq, colour, dcolour)
+
+
+# --- curvature: the tangent of backward -------------------------------------------------------------------------------
+
+
+@kernel
+def curvature(threads, params, tangents, lists, frame, pixels, cotangent, transmittances, cotangents, sums):
+    """Moments of the tangent of `backward` for K tangents, (entries, K, SUMS).
+
+    cotangent: g, 4 planes; cotangents: g' of every tangent, (K, 4 planes); transmittances: as `tangent` left them.
+    """
+    counter = np.zeros(1, np.int64)
+    for _ in prange(threads):
+        curvature_tiles(counter, params, tangents, lists, frame, pixels, cotangent, transmittances, cotangents, sums)
+
+
+@worker
+def curvature_tiles(counter, params, tangents, lists, frame, pixels, cotangent, transmittances, cotangents, sums):
+    L = lanes(params)
+    K = transmittances.size // frame.size
+    width = (6 + 5 * K) * L
+    state = scratch(params, width * TILE_ROWS)  # a row: T, R, g (3), stop, for each tangent tau, R', g' (3)
+    shared = scratch(params, 4 * L * TILE_ROWS)  # a row: w, beta, beta r R, 1 where the cap does not hold
+    tile = next_tile(counter, lists)
+    while tile >= 0:
+        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        for y in range(TILE_ROWS):
+            p = corner + y * frame.stride
+            begin_backward_row(state, width * y, L, frame, pixels, cotangent, p)
+            for i in range(K):
+                b = width * y + (6 + 5 * i) * L
+                begin_curvature_row(state, b, L, frame, pixels, cotangent, transmittances, cotangents, i, p)
+        first, count = reached(lists, tile, pixels, corner, frame.stride)
+        for k in range(count - 1, -1, -1):
+            later = first + max(k - AHEAD, 0)
+            splat = np.int64(lists.splat[later])
+            prefetch(params, splat * PARAMS)
+            for i in range(K):
+                prefetch(tangents, (splat * K + i) * TANGENTS)
+                prefetch(sums, (np.int64(lists.slots[later]) * K + i) * SUMS)
+            if K == 1:
+                curvature_entry_single(params, tangents, lists, first + k, k, x0, y0, frame, state, sums)
+            else:
+                curvature_entry_block(params, tangents, K, lists, first + k, k, x0, y0, frame, state, shared, sums)
+        tile = next_tile(counter, lists)
+
+
+@formula
+def begin_curvature_row(state, b, L, frame, pixels, cotangent, transmittances, cotangents, i, p):
+    q = 4 * i * frame.size + p
+    T, dT = load(pixels.transmittance, p), load(transmittances, i * frame.size + p)
+    behind = behind_all(cotangent, p, frame.size, frame.background)
+    dbehind = behind_all(cotangents, q, frame.size, frame.background)
+    store(state, b, dT / T)
+    store(state, b + L, dT * behind + T * dbehind)
+    store3(state, b + 2 * L, L, load3(cotangents, q, frame.size))
+
+
+@formula
+def curvature_row(state, b, L, w, beta, betarR, dq, g, colour, dcolour):
+    """s' and h of a row, and the update of tau and R'."""
+    dR = load(state, b + L)
+    tau = load(state, b) + beta * dq
+    h = plus(load3(state, b + 2 * L, L), dq + tau, g)
+    z = w * dot_plus(h, colour, dot(g, dcolour))
+    store(state, b, tau)
+    store(state, b + L, dR + z)
+    return (z - beta * dR) - betarR * dq, h
+
+
+@formula
+def backward_row(state, b, L, alpha, g, colour):
+    """Restore T and advance R; w, beta and beta r R of a row."""
+    r = 1.0 / (1.0 - alpha)
+    T, R = load(state, b) * r, load(state, b + L)
+    w, beta = alpha * T, alpha * r
+    store(state, b, T)
+    store(state, b + L, R + w * dot(g, colour))
+    return w, beta, beta * r * R
+
+
+@formula
+def curvature_entry_single(params, tangents, lists, e, k, x0, y0, frame, state, sums):
+    L = lanes(params)
+    splat = np.int64(lists.splat[e])
+    o = splat * PARAMS
+    dx, terms = alpha_terms(params, o, x0)
+    colour, dcolour = broadcast3(params, o + RED), broadcast3(tangents, splat * TANGENTS + DRED)
+    dterms = tangent_terms(tangents, splat * TANGENTS, dx)
+    capped = lists.rows[e] & CAPPED
+    dy0 = broadcast(params, y0 - params[o + MY])
+    index = broadcast(params, k)
+    moments = no_moments(params)
+    top, bottom = row_range(lists.rows[e])
+    for y in range(top, bottom):
+        b = 11 * L * y
+        dy = dy0 + load(frame.row_offsets, L * y)
+        alpha, uncapped = alpha_row(dy, terms, index < load(state, b + 5 * L), frame.cap)
+        g = load3(state, b + 2 * L, L)
+        w, beta, betarR = backward_row(state, b, L, alpha, g, colour)
+        dq = quadratic(dy, dterms)
+        if capped:
+            dq = select(uncapped <= frame.cap, dq, 0.0)
+        ds, h = curvature_row(state, b + 6 * L, L, w, beta, betarR, dq, g, colour, dcolour)
+        if capped:
+            ds = select(uncapped <= frame.cap, ds, 0.0)
+        moments = add_row(moments, dy, ds, w, h)
+    store_moments(sums, np.int64(lists.slots[e]), moments, dx)
+
+
+@formula
+def curvature_entry_block(params, tangents, K, lists, e, k, x0, y0, frame, state, shared, sums):
+    L = lanes(params)
+    width = (6 + 5 * K) * L
+    splat = np.int64(lists.splat[e])
+    o = splat * PARAMS
+    dx, terms = alpha_terms(params, o, x0)
+    colour = broadcast3(params, o + RED)
+    capped = lists.rows[e] & CAPPED
+    dy0 = broadcast(params, y0 - params[o + MY])
+    index = broadcast(params, k)
+    top, bottom = row_range(lists.rows[e])
+    for y in range(top, bottom):
+        b, x = width * y, 4 * L * y
+        alpha, uncapped = alpha_row(dy0 + load(frame.row_offsets, L * y), terms, index < load(state, b + 5 * L), frame.cap)
+        g = load3(state, b + 2 * L, L)
+        store3(shared, x, L, backward_row(state, b, L, alpha, g, colour))
+        if capped:
+            store(shared, x + 3 * L, select(uncapped <= frame.cap, broadcast(params, 1.0), 0.0))
+    for i in range(K):
+        j = (splat * K + i) * TANGENTS
+        dterms, dcolour = tangent_terms(tangents, j, dx), broadcast3(tangents, j + DRED)
+        moments = no_moments(params)
+        for y in range(top, bottom):
+            b, x = width * y, 4 * L * y
+            dy = dy0 + load(frame.row_offsets, L * y)
+            w, beta, betarR = load3(shared, x, L)
+            g = load3(state, b + 2 * L, L)
+            dq = quadratic(dy, dterms)
+            if capped:
+                dq *= load(shared, x + 3 * L)
+            ds, h = curvature_row(state, b + (6 + 5 * i) * L, L, w, beta, betarR, dq, g, colour, dcolour)
+            if capped:
+                ds *= load(shared, x + 3 * L)
+            moments = add_row(moments, dy, ds, w, h)
+        store_moments(sums, np.int64(lists.slots[e]) * K + i, moments, dx)

@@ -1,0 +1,153 @@
+"""The compositing of splats on the CPU: a view held still, and the same as a torch function.
+
+`Raster` has done all that depends on the splats alone (order, tile lists, final transmittances, stops); its methods are
+passes over the pixels.  Images are padded planes: (planes, padded height, padded width), whole tiles of `lanes` x TILE_ROWS
+pixels; a splat is nine numbers (`packing.py`).  `rasterize` wraps it for autograd, with a double backward.
+"""
+
+from math import log2
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splat.raster import binning, compositing, packing
+from splat.raster.simd import lanes_of
+from splat.settings import RenderSettings
+
+LEAST_TRANSMITTANCE = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}  # beneath it T would underflow
+LEAST_LOG2_ALPHA = {np.dtype(np.float32): -126.0, np.dtype(np.float64): -1022.0}  # the range of exp2
+
+
+def aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An uninitialised array that starts on a cache line."""
+    size, item = int(np.prod(shape)), np.dtype(dtype).itemsize
+    buffer = np.empty(size * item + 64, np.uint8)
+    start = -buffer.ctypes.data % 64
+    return buffer[start : start + size * item].view(dtype).reshape(shape)
+
+
+class Raster:
+    """One view of one set of splats, composited and held still.
+
+    splats: (n, 9), finite; depths: (n,) positive where drawn; background: (3,).  With transmittance_min = 0 a pixel still
+    stops at LEAST_TRANSMITTANCE, an error of the image far beneath round-off.
+    """
+
+    def __init__(
+        self,
+        splats: np.ndarray,
+        depths: np.ndarray,
+        drawn: np.ndarray,
+        background: np.ndarray,
+        width: int,
+        height: int,
+        settings: RenderSettings,
+    ):
+        self.splats, self.width, self.height = splats, width, height
+        dtype, n = splats.dtype, len(splats)
+        self.threads, lanes = numba.get_num_threads(), lanes_of(dtype)
+        self.lists = binning.bin_splats(self.threads, splats, depths, drawn, width, height, settings)
+        columns, tile_rows = -(-width // lanes), -(-height // compositing.TILE_ROWS)
+        self.plane = (tile_rows * compositing.TILE_ROWS, columns * lanes)
+        size = self.plane[0] * self.plane[1]
+        scalar = dtype.type
+        self.frame = compositing.Frame(
+            columns,
+            self.plane[1],
+            size,
+            scalar(settings.alpha_max),
+            scalar(max(settings.transmittance_min, LEAST_TRANSMITTANCE[dtype])),
+            np.ascontiguousarray(background, dtype),
+            np.repeat(np.arange(compositing.TILE_ROWS, dtype=dtype), lanes),
+        )
+        self.params = aligned((n * compositing.PARAMS,), dtype)
+        least = log2(settings.alpha_min) if settings.alpha_min else -np.inf
+        contour = np.inf if settings.contour_sigma is None else settings.contour_sigma
+        packing.pack_splats(splats, max(least, LEAST_LOG2_ALPHA[dtype]), contour, self.params)
+        self.pixels = compositing.Pixels(aligned((4 * size,), dtype), aligned((size,), dtype), aligned((size,), dtype))
+        compositing.forward(self.threads, self.params, self.lists, self.frame, self.pixels)
+        self._moments: np.ndarray | None = None
+        self._cotangent: np.ndarray | None = None
+        self._slot_start: np.ndarray | None = None
+
+    @property
+    def planes(self) -> np.ndarray:
+        """Red, green, blue and accumulated alpha: (4, padded height, padded width)."""
+        return self.pixels.planes.reshape(4, *self.plane)
+
+    def crop(self, planes: np.ndarray) -> np.ndarray:
+        """A view of padded planes without the padding."""
+        return planes[..., : self.height, : self.width]
+
+    def pad(self, planes: np.ndarray) -> np.ndarray:
+        """Padded copies of planes, 0 outside the image, so that pixels outside it have no weight in any derivative."""
+        padded = aligned((*planes.shape[:-2], *self.plane), self.splats.dtype)
+        padded[..., : self.height, : self.width] = planes
+        padded[..., self.height :, :] = 0
+        padded[..., self.width :] = 0
+        return padded
+
+    @property
+    def slot_start(self) -> np.ndarray:
+        """(n + 1,) where each splat's entries begin among the slots of the sums."""
+        if self._slot_start is None:
+            per_tile = np.diff(self.lists.start)
+            tile_rows, lanes = compositing.TILE_ROWS, self.plane[1] // self.frame.columns
+            stops = self.pixels.stop.reshape(-1, tile_rows, self.frame.columns, lanes).max(axis=(1, 3)).reshape(-1)
+            reached = np.minimum(per_tile, stops).astype(np.int64)
+            slot_start, slots = np.empty(len(self.splats) + 1, np.int64), np.empty(self.lists.splat.size, np.int32)
+            binning.assign_slots(self.lists.start, self.lists.splat, reached, slot_start, slots)
+            self.lists = self.lists._replace(slots=slots, order=binning.heaviest_first(reached))
+            self._slot_start = slot_start
+        return self._slot_start
+
+    def backward(self, cotangent: np.ndarray) -> np.ndarray:
+        """The gradient in the splats, (n, 9), from padded cotangent planes (4, ...), which are kept for `curvature`."""
+        slot_start = self.slot_start
+        sums = aligned((slot_start[-1] * compositing.SUMS,), self.splats.dtype)
+        self._cotangent = np.ascontiguousarray(cotangent, self.splats.dtype).reshape(-1)
+        compositing.backward(self.threads, self.params, self.lists, self.frame, self.pixels, self._cotangent, sums)
+        self._moments, gradient = np.empty((len(self.splats), 3), self.splats.dtype), np.empty_like(self.splats)
+        packing.reduce_gradient(self.splats, slot_start, sums, self._moments, gradient)
+        return gradient
+
+    def jvp(self, directions: np.ndarray) -> "Tangent":
+        """J u for directions (n, K, 9) of the splats."""
+        return Tangent(self, directions)
+
+
+class Tangent:
+    """J u of K directions: `planes` (K, 4, padded height, padded width), and what the second-order pass needs of it."""
+
+    def __init__(self, raster: Raster, directions: np.ndarray):
+        self.raster, self.directions = raster, np.ascontiguousarray(directions, raster.splats.dtype)
+        K, dtype, size = directions.shape[1], raster.splats.dtype, raster.frame.size
+        self._packed = aligned((len(directions) * K * compositing.TANGENTS,), dtype)
+        packing.pack_tangents(raster.splats, self.directions, self._packed)
+        _ = raster.slot_start  # reorders the tiles by the entries that are reached
+        planes, self._transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
+        compositing.tangent(
+            raster.threads, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, planes, self._transmittances
+        )
+        self.planes = planes.reshape(K, 4, *raster.plane)
+
+    def curvature(self, cotangents: np.ndarray) -> np.ndarray:
+        """The tangent of `Raster.backward`, (n, K, 9): its cotangent held at the last one passed, with tangents cotangents.
+
+        cotangents: padded planes (K, 4, ...), the tangent of the cotangent (0 for the second derivative of R alone).
+        """
+        raster = self.raster
+        if raster._cotangent is None or raster._moments is None:
+            raise RuntimeError("expected backward(cotangent) before curvature(...): it needs the first-order adjoint")
+        K, slot_start = self.directions.shape[1], raster.slot_start
+        sums = aligned((slot_start[-1] * K * compositing.SUMS,), raster.splats.dtype)
+        compositing.curvature(
+            raster.threads, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, raster._cotangent,
+            self._transmittances, np.ascontiguousarray(cotangents, raster.splats.dtype).reshape(-1), sums,
+        )  # fmt: skip
+        product = np.empty_like(self.directions)
+        packing.reduce_curvature(raster.splats, self.directions, slot_start, sums, raster._moments, product)
+        return product
