@@ -106,6 +106,11 @@ def test_the_tiny_run_clones_splits_prunes_resets_and_raises_the_degree(monkeypa
     for done in train(training, tiny_views()):
         assert done.gaussians == len(training.gaussians)
         highest_opacity.append(training.gaussians.opacity_logits.sigmoid().max().item())
+        moments = training.adam.second
+        if changes and training.gaussians is changes[-1].gaussians and not training.screen_gradients.renders.any():
+            assert not moments.select(changes[-1].fresh).flat.any()
+        assert bool(moments.opacity_logits.any()) == (done.step != 5)
+        assert moments.means.any()
     assert all(sum(getattr(change, what) for change in changes) for what in ("cloned", "split", "pruned"))
     assert highest_opacity[4] <= 0.010001 < highest_opacity[3]
     assert training.gaussians.sh_degree == 2
