@@ -1,10 +1,10 @@
 """Adam over a flat vector, against torch's own."""
 
 import torch
-from tiny import tiny_gaussians
 
 from splat.adam import EPS, Adam
 from splat.train import LearningRates, learning_rates
+from tests.splat.tiny import tiny_gaussians
 
 
 def test_one_adam_over_the_flat_vector_is_torch_adam_with_a_rate_per_attribute_and_band():

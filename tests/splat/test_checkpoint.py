@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
 from splat.checkpoint import load_checkpoint, save_checkpoint, write_atomically
 from splat.train import Training, train
+from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
 
 @pytest.fixture(scope="module")

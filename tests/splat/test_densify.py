@@ -5,12 +5,12 @@ from math import exp, log
 
 import pytest
 import torch
-from tiny import EXTENT, HEIGHT, WIDTH, tiny_gaussians, tiny_views
 
 from splat.densify import DensifySettings, ScreenGradients, densify, on_screen, reset_opacities
 from splat.gaussians import ATTRIBUTES, Gaussians
 from splat.projection import Splats
 from splat.render import render
+from tests.splat.tiny import EXTENT, HEIGHT, WIDTH, tiny_gaussians, tiny_views
 
 SETTINGS = DensifySettings()
 LIMIT = SETTINGS.clone_scale * EXTENT

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from tiny import tiny_gaussians, tiny_views
 
 from splat.evaluate import evaluate
 from splat.losses import psnr, ssim
 from splat.render import render
+from tests.splat.tiny import tiny_gaussians, tiny_views
 
 
 def test_scores_are_those_of_each_render_and_their_means():

@@ -1,6 +1,5 @@
 """The training loop: schedules, determinism, and what a killed training resumes to."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -10,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
 from splat.adam import EPS
 from splat.checkpoint import load_checkpoint, save_checkpoint
@@ -28,6 +26,7 @@ from splat.train import (
     train,
     with_background,
 )
+from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
 ONLY_ADAM = DensifySettings(enabled=False)
 
@@ -135,7 +134,7 @@ def test_the_same_seed_gives_the_same_checkpoint_bit_for_bit_and_another_seed_do
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
+from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 from splat.checkpoint import save_checkpoint
 from splat.train import Training, train
 training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
@@ -149,10 +148,8 @@ for done in train(training, tiny_views()):
 
 def test_a_training_killed_and_resumed_ends_with_the_same_bytes_as_one_that_was_not(tmp_path):
     path = tmp_path / "checkpoint.pt"
-    root, here = Path(__file__).parents[2], Path(__file__).parent
-    environment = {**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{here}"}
     command = [sys.executable, "-c", KILLED, str(path)]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    result = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=120)
     assert result.returncode == -signal.SIGKILL, result.stderr
 
     loaded = load_checkpoint(path)
