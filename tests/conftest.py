@@ -1,0 +1,27 @@
+"""Fixtures that several folders share."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+def _real_scene(name: str) -> Path:
+    """A folder of the real data: $LANDSCAPE_DATA, else shared/data beside the repository."""
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("LANDSCAPE_DATA", beside)) / name
+    if not folder.is_dir():
+        pytest.skip(f"needs the {name} scene; name the folder that holds {name}/ with LANDSCAPE_DATA")
+    return folder
+
+
+@pytest.fixture
+def fern() -> Path:
+    """LLFF fern with its COLMAP model."""
+    return _real_scene("fern")
+
+
+@pytest.fixture
+def lego() -> Path:
+    """Blender lego, reduced to the 8-view protocol."""
+    return _real_scene("lego")

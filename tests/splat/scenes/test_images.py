@@ -1,0 +1,178 @@
+"""Photographs: found, fitted to their cameras, undistorted, composited and reduced."""
+
+import shutil
+from pathlib import Path
+
+import folders
+import numpy as np
+import pytest
+import torch
+from folders import CENTRE, FOCAL, NAMES, SIZE, intrinsics
+from PIL import Image
+
+from splat.scenes.images import resize_by_area
+from splat.scenes.scene import load_scene
+from tests.oracles import distorted_picture, opencv_distortion
+
+LENS = {"k1": -0.22, "k2": 0.07, "p1": 0.004, "p2": -0.003}
+LENS_SIZE, LENS_INTRINSICS = (160, 120), (130.0, 128.0, 78.0, 61.5)
+
+
+def waves(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A smooth coloured pattern on the plane z = 1, values in [0.1, 0.9]."""
+    phases = np.stack([7 * x + 3 * y, 8 * y - 2 * x, 5 * x * x + 6 * y], axis=-1)
+    return 0.5 + 0.4 * np.sin(phases)
+
+
+@pytest.mark.parametrize("kind", ["transforms", "colmap"])
+def test_a_distorted_picture_becomes_what_the_pinhole_camera_would_have_seen(tmp_path: Path, kind: str) -> None:
+    lens = {**LENS, "k3": 0.02} if kind == "transforms" else LENS
+    exact = distorted_picture(waves, LENS_INTRINSICS, LENS_SIZE, lens)
+    if kind == "transforms":
+        intrinsics_of_lens = dict(zip(("fl_x", "fl_y", "cx", "cy"), LENS_INTRINSICS))
+        folders.write_transforms(tmp_path, **intrinsics_of_lens, w=LENS_SIZE[0], h=LENS_SIZE[1], **lens)
+    else:
+        model = folders.reconstruction("OPENCV", (*LENS_INTRINSICS, *lens.values()))
+        model.cameras[1].width, model.cameras[1].height = LENS_SIZE
+        folders.write_colmap(tmp_path, model=model)
+    for name in NAMES:
+        Image.fromarray((exact * 255).round().astype(np.uint8)).save(tmp_path / "images" / name)
+    view = load_scene(tmp_path).load()[0]
+
+    camera = view.camera
+    column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    wanted = waves((column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy)
+    # rounding to 8 bits, and bilinear interpolation: an eighth of the second derivatives along both sides of a pixel
+    bent = sum(np.abs(np.diff(exact, n=2, axis=axis)).max() for axis in (0, 1))
+    error = np.abs(view.image.permute(1, 2, 0).numpy() - wanted)
+    assert error.max() <= 0.5 / 255 + bent / 8
+    half_a_pixel = np.abs(waves((column + 0.5 - camera.cx) / camera.fx, (row - camera.cy) / camera.fy) - wanted)
+    assert half_a_pixel.max() > 5 * error.max()  # the pattern would show a shift
+
+    edge = np.stack([column, row], -1)[[0, 0, -1, -1], [0, -1, 0, -1]]
+    rays = (edge - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    x, y = opencv_distortion(rays[:, 0], rays[:, 1], lens)
+    fx, fy, cx, cy = LENS_INTRINSICS
+    for pixel, side in ((fx * x + cx, LENS_SIZE[0]), (fy * y + cy, LENS_SIZE[1])):
+        assert pixel.min() > -0.5 and pixel.max() < side + 0.5  # the corners lie in the photograph, or on its edge
+
+
+def test_a_distorted_picture_stored_smaller_than_its_camera_is_scaled_first(tmp_path: Path) -> None:
+    twice = [2 * value for value in LENS_INTRINSICS]
+    model = folders.reconstruction("OPENCV", (*twice, *LENS.values()))
+    model.cameras[1].width, model.cameras[1].height = 2 * LENS_SIZE[0], 2 * LENS_SIZE[1]
+    folders.write_colmap(tmp_path / "small", model=model)
+    model = folders.reconstruction("OPENCV", (*LENS_INTRINSICS, *LENS.values()))
+    model.cameras[1].width, model.cameras[1].height = LENS_SIZE
+    folders.write_colmap(tmp_path / "same", model=model)
+    for folder in ("small", "same"):
+        folders.write_pictures(tmp_path / folder / "images", size=LENS_SIZE)
+    small, same = (load_scene(tmp_path / folder).load()[0] for folder in ("small", "same"))
+    assert small.camera.fx == pytest.approx(same.camera.fx, rel=folders.ROUND_OFF)
+    torch.testing.assert_close(small.image, same.image, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("old", "new"), [((7, 5), (3, 2)), ((12, 8), (4, 4)), ((9, 9), (9, 2)), ((5, 4), (1, 1))])
+def test_reducing_averages_over_each_pixels_footprint(old: tuple[int, int], new: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).random((2, old[1], old[0]))
+    fine = image.repeat(new[1], axis=1).repeat(new[0], axis=2)  # every old pixel as new[0] x new[1] equal ones
+    wanted = fine.reshape(2, new[1], old[1], new[0], old[0]).mean(axis=(2, 4))
+    np.testing.assert_allclose(resize_by_area(torch.from_numpy(image), *new).numpy(), wanted, atol=1e-14)
+
+
+def test_downscale_reduces_picture_and_camera_alike(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    view = load_scene(tmp_path, downscale=2).load()[0]
+    full = np.array(Image.open(tmp_path / "images/a.png")) / 255
+    blocks = full.reshape(9, 2, 12, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(view.image.permute(1, 2, 0).numpy(), blocks, atol=1e-6)
+    assert (view.camera.fx, view.camera.cy, view.camera.width) == (FOCAL[0] / 2, CENTRE[1] / 2, 12)
+
+
+def test_downscale_rounds_the_size_and_keeps_the_field_of_view(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    camera = load_scene(tmp_path, downscale=5).frames[0].camera
+    assert (camera.width, camera.height) == (5, 4)
+    assert camera.fx / camera.width == pytest.approx(FOCAL[0] / SIZE[0], rel=folders.ROUND_OFF)
+    assert camera.fy / camera.height == pytest.approx(FOCAL[1] / SIZE[1], rel=folders.ROUND_OFF)
+
+
+def test_transparent_pixels_show_the_background_and_never_their_own_colour(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    pixels = np.zeros((SIZE[1], SIZE[0], 4), dtype=np.uint8)
+    pixels[..., 0] = 255
+    pixels[:, 12:, 3] = 255
+    pixels[:, 11, 3] = 51
+    for name in NAMES:
+        Image.fromarray(pixels).save(tmp_path / "images" / name)
+    white = load_scene(tmp_path).load()[0]
+    blue = load_scene(tmp_path, background=(0, 0, 1), downscale=2).load()[0]
+    assert white.alpha is not None and blue.alpha is not None
+    assert white.image[:, 0, 0].tolist() == [1, 1, 1] and white.image[:, 0, 12].tolist() == [1, 0, 0]
+    torch.testing.assert_close(white.image[:, 0, 11], torch.tensor([1.0, 0.8, 0.8]))
+    torch.testing.assert_close(blue.image[:, 0, 5], torch.tensor([0.1, 0.0, 0.9]))
+    torch.testing.assert_close(blue.alpha[0], torch.tensor([0.0] * 5 + [0.1] + [1.0] * 6))
+
+
+def test_the_background_is_black_where_pictures_have_no_alpha(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    scene = load_scene(tmp_path)
+    assert scene.background.tolist() == [0, 0, 0] and scene.load()[0].alpha is None
+
+
+@pytest.mark.parametrize("size", [(SIZE[0], SIZE[1] - 2), (SIZE[1], SIZE[0]), (SIZE[0] // 2, SIZE[1])])
+def test_a_picture_that_cannot_be_its_cameras_is_refused_with_both_sizes(tmp_path: Path, size: tuple[int, int]) -> None:
+    folders.write_transforms(tmp_path)
+    folders.write_pictures(tmp_path / "images", NAMES[1:2], size)
+    message = rf"'images/b.png' at the {SIZE[0]} x {SIZE[1]} px .* got {size[0]} x {size[1]} px"
+    with pytest.raises(ValueError, match=message):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("size", [(7, 5), (8, 6), (72, 54), (15, 11)])
+def test_a_picture_of_the_same_shape_scales_its_camera(tmp_path: Path, size: tuple[int, int]) -> None:
+    folders.write_transforms(tmp_path)
+    folders.write_pictures(tmp_path / "images", size=size)
+    x, y = size[0] / SIZE[0], size[1] / SIZE[1]
+    wanted = (FOCAL[0] * x, FOCAL[1] * y, CENTRE[0] * x, CENTRE[1] * y, *size)
+    np.testing.assert_allclose(intrinsics(load_scene(tmp_path)), [wanted] * 3, rtol=folders.ROUND_OFF)
+
+
+def test_the_largest_image_folder_is_taken_and_images_overrides(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    for k, size in ((8, (3, 2)), (2, (12, 9)), (16, (2, 1))):
+        folders.write_pictures(tmp_path / f"images_{k}", size=size)
+    assert load_scene(tmp_path).frames[0].camera.width == 12
+    assert load_scene(tmp_path, images="images_8").frames[0].camera.width == 3
+    with pytest.raises(FileNotFoundError, match="images_4, which does not exist; choose from images_2, "):
+        load_scene(tmp_path, images="images_4")
+
+
+def test_files_that_are_no_pictures_or_have_more_than_8_bits_are_refused(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    path = tmp_path / "images/c.png"
+    path.write_bytes(b"no picture")
+    with pytest.raises(ValueError, match=r"cannot read .*c\.png"):
+        load_scene(tmp_path)
+    Image.fromarray(np.zeros((SIZE[1], SIZE[0]), dtype=np.uint16)).save(path)
+    with pytest.raises(ValueError, match=r"8 bits a channel, got mode I;16 in .*c\.png"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("mode", ["L", "P", "LA", "1"])
+def test_grey_and_palette_pictures_become_colour(tmp_path: Path, mode: str) -> None:
+    folders.write_transforms(tmp_path)
+    image = Image.open(tmp_path / "images/a.png").convert(mode)
+    image.save(tmp_path / "images/a.png")
+    wanted = np.array(image.convert("RGB")) / 255
+    np.testing.assert_allclose(load_scene(tmp_path).load()[0].image.permute(1, 2, 0).numpy(), wanted, atol=1e-7)
+
+
+def test_a_picture_cut_short_is_refused_when_it_is_read(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    path = tmp_path / "images/a.png"
+    path.write_bytes(path.read_bytes()[:-300])
+    scene = load_scene(tmp_path)
+    with pytest.raises(ValueError, match=r"cannot read .*a\.png"):
+        scene.load()
