@@ -50,10 +50,11 @@ def lanes_of(dtype: np.dtype | type) -> int:
 
 
 class VectorType(types.Type):
-    """Numba's type of a vector: lanes of float32 or float64."""
+    """Numba's type of a vector: lanes of float32 or float64, one register where `lanes` does not say otherwise."""
 
-    def __init__(self, dtype: types.Float):
-        self.dtype, self.lanes, self.bits = dtype, REGISTER_BITS // dtype.bitwidth, dtype.bitwidth
+    def __init__(self, dtype: types.Float, lanes: int | None = None):
+        self.dtype, self.bits = dtype, dtype.bitwidth
+        self.lanes = REGISTER_BITS // self.bits if lanes is None else lanes
         super().__init__(name=f"Vector({dtype} x {self.lanes})")
 
     @property
@@ -206,7 +207,7 @@ def load(typing, array, index):
 
 @intrinsic
 def store(typing, array, index, value):
-    vector = VectorType(array.dtype)
+    vector = value if isinstance(value, VectorType) else VectorType(array.dtype)
 
     def generate(context, builder, sig, args):
         address = _address(context, builder, sig.args[0], args[0], args[1], sig.args[1])
