@@ -1,0 +1,106 @@
+"""The sparse-view protocols against their published lists."""
+
+from pathlib import Path
+
+import folders
+import pytest
+
+from splat.scenes.scene import load_scene
+from splat.scenes.splits import explicit_split, llff_split, split_scene
+
+FERN = tuple(f"image{i:03d}.png" for i in range(20))
+
+
+def test_llff_holds_out_every_eighth_and_spreads_n_over_the_rest() -> None:
+    split = llff_split(FERN[::-1], 3)
+    assert split.test == (FERN[0], FERN[8], FERN[16])
+    assert split.train == (FERN[1], FERN[10], FERN[19])  # places 0, 8, 16 of the other 17
+
+
+def test_llff_rounds_half_to_even_as_the_public_code_does() -> None:
+    names = tuple(f"{i:02d}" for i in range(14))  # 12 to train on; linspace(0, 11, 3) = 0, 5.5, 11
+    others = [name for i, name in enumerate(names) if i % 8]
+    assert llff_split(names, 3).train == (others[0], others[6], others[11])
+
+
+def test_without_a_number_all_but_the_test_views_train() -> None:
+    split = llff_split(FERN)
+    assert sorted(split.train + split.test) == list(FERN) and len(split.test) == 3
+
+
+@pytest.mark.parametrize(
+    ("n", "message"), [(18, "at most 17 training views, .* got 18"), (0, "at least 1"), (-1, "at least 1")]
+)
+def test_more_views_than_there_are_or_none_are_refused(n: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        llff_split(FERN, n)
+
+
+def test_one_image_cannot_be_split() -> None:
+    with pytest.raises(ValueError, match="at least 2 images"):
+        llff_split(["a"])
+
+
+def test_blender_takes_the_published_views_from_a_full_scene_and_from_a_reduced_one_alike(tmp_path: Path) -> None:
+    folders.write_blender(tmp_path / "full", tuple(range(100)), tuple(range(200)))
+    folders.write_blender(tmp_path / "reduced", (2, 16, 26, 55, 73, 75, 86, 93), tuple(range(0, 200, 8)))
+    full, reduced = (split_scene(load_scene(tmp_path / name), 8) for name in ("full", "reduced"))
+    assert full == reduced
+    assert full.train == tuple(f"train/r_{k}" for k in (26, 86, 2, 55, 75, 93, 16, 73))
+    assert full.test == tuple(f"test/r_{k}" for k in range(0, 200, 8)) and len(full.test) == 25
+    assert split_scene(load_scene(tmp_path / "reduced"), 3).train == full.train[:3]
+
+
+def test_blender_refuses_more_views_than_there_are(tmp_path: Path) -> None:
+    folders.write_blender(tmp_path, (2, 16, 26, 55, 73, 75, 86, 93), (0, 8))
+    with pytest.raises(ValueError, match="at most 8 training views"):
+        split_scene(load_scene(tmp_path), 9)
+    with pytest.raises(ValueError, match="at least 1"):
+        split_scene(load_scene(tmp_path), 0)
+
+
+def test_a_blender_scene_with_other_views_spreads_them_evenly_and_says_so(tmp_path: Path) -> None:
+    folders.write_blender(tmp_path, tuple(range(5)), tuple(range(3)))
+    split = split_scene(load_scene(tmp_path), 3)
+    assert split.train == ("train/r_0", "train/r_2", "train/r_4") and split.test == ("test/r_0",)
+    assert "evenly spaced" in split.protocol
+
+
+def test_explicit_views_are_named_by_name_last_part_or_number() -> None:
+    names = ("images/a.png", "images/b.png", "other/b.jpg", "other/c.png")
+    split = explicit_split(names, ["images/b.png", "a", 3])
+    assert split.train == ("images/b.png", "images/a.png", "other/c.png") and split.test == ("other/b.jpg",)
+    assert explicit_split(names, [0], ["c.png"]).test == ("other/c.png",)
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "message"),
+    [
+        (["b"], None, "'b': 2 views have it"),
+        (["z"], None, "'z': no view has it"),
+        ([4], None, "from 0 to 3, got 4"),
+        ([-1], None, "from 0 to 3, got -1"),
+        ([0, "a"], None, "each once"),
+        ([], None, "each once"),
+        ([0], [0], "'images/a.png' in both lists"),
+    ],
+)
+def test_lists_that_cannot_be_are_refused(train: list[str | int], test: list[str | int] | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        explicit_split(("images/a.png", "images/b.png", "other/b.jpg", "other/c.png"), train, test)
+
+
+def test_a_number_and_a_list_together_are_refused(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path)
+    scene = load_scene(tmp_path)
+    with pytest.raises(ValueError, match="got both"):
+        split_scene(scene, 2, train=["a"])
+    with pytest.raises(ValueError, match="give both"):
+        split_scene(scene, test=["a"])
+    assert split_scene(scene, train=["a"]).test == ("b.png", "c.png")
+
+
+def test_the_protocols_fit_the_real_scenes(fern: Path, lego: Path) -> None:
+    assert split_scene(load_scene(fern), 3).train == ("image001.png", "image010.png", "image019.png")
+    split = split_scene(load_scene(lego), 8)
+    assert len(split.train) == 8 and len(split.test) == 25

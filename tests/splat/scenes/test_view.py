@@ -1,0 +1,65 @@
+"""Views, points and what sees them."""
+
+import pytest
+import torch
+
+from splat.camera import Camera
+from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
+
+
+def camera(x: float = 0.0) -> Camera:
+    centre = torch.tensor([x, 0.0, 0.0], dtype=torch.float64)
+    return Camera(torch.eye(3, dtype=torch.float64), centre, 10.0, 20.0, 4.0, 3.0, 8, 6)
+
+
+def frame(name: str, x: float = 0.0) -> Frame:
+    return Frame(name, camera(x), lambda: (torch.zeros(3, 6, 8), None))
+
+
+def xyz(*rows: tuple[float, float, float]) -> torch.Tensor:
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def test_a_picture_of_another_size_than_its_camera_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"'a' to be \(3, 6, 8\) as its camera, got \(3, 8, 6\)"):
+        View("a", camera(), torch.zeros(3, 8, 6))
+    with pytest.raises(ValueError, match="as its camera"):
+        View("a", camera(), torch.zeros(3, 6, 8), torch.zeros(8, 6))
+
+
+def test_a_point_falls_where_the_pinhole_equation_says() -> None:
+    pixel, depth = pixel_coordinates(camera(1.0), xyz((2.0, 0.5, 5.0)))
+    assert pixel.tolist() == [[10 * 1 / 5 + 4, 20 * 0.5 / 5 + 3]] and depth.tolist() == [5.0]
+
+
+def test_only_points_before_the_camera_inside_the_frame_and_the_depth_range_are_inside() -> None:
+    points = xyz((0, 0, 1), (0, 0, -1), (0.5, 0, 1), (0.39, 0, 1), (0, 0, 9))
+    assert inside_image(camera(), points).tolist() == [True, False, False, True, True]
+    assert inside_image(camera(), points, (2.0, 10.0)).tolist() == [False, False, False, False, True]
+
+
+def test_sightings_follow_the_tracks_and_only_the_views_asked_for() -> None:
+    observations = torch.tensor([[0, 0], [0, 1], [0, 2], [2, 1]])
+    points = Points(xyz((0, 0, 1), (0, 0, 1), (0, 0, 1)), torch.zeros(3, 3), observations, ("a", "b", "c"))
+    assert points.sightings([frame("a"), frame("b")]).tolist() == [2, 0, 1]
+    assert points.sightings([frame("c"), frame("not of this model")]).tolist() == [1, 0, 0]
+
+
+def test_without_tracks_a_point_is_seen_by_the_views_whose_image_it_falls_into() -> None:
+    points = Points(xyz((0, 0, 1), (1, 0, 1), (0.5, 0, 2)), torch.zeros(3, 3))
+    assert points.sightings([frame("a", 0.0), frame("b", 1.0)]).tolist() == [1, 1, 2]
+    assert points.sightings([frame("a", 0.0), frame("b", 0.5)]).tolist() == [1, 0, 2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((torch.zeros(2, 3), torch.zeros(3, 3)), "shape"),
+        ((torch.full((2, 3), torch.nan), torch.zeros(2, 3)), "finite points"),
+        ((torch.zeros(2, 3), torch.zeros(2, 3), torch.tensor([[2, 0]]), ("a",)), "got point 2 in image 0"),
+        ((torch.zeros(2, 3), torch.zeros(2, 3), torch.tensor([[1, 1]]), ("a",)), "got point 1 in image 1"),
+    ],
+)
+def test_points_that_cannot_be_are_refused(arguments: tuple, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Points(*arguments)
