@@ -1,6 +1,6 @@
 """Adaptive density control of 3DGS (Kerbl et al. 2023, Sec. 5.2, and its published code).
 
-Every `every` steps after `start` and before `stop`, a Gaussian whose mean screen-space gradient is above the threshold
+At an interval, after `start` and before `stop`, a Gaussian whose mean screen-space gradient is above the threshold
 
     is cloned  if its largest scale is at most clone_scale x extent: an exact copy beside it, opacity included;
     is split   if it is larger: replaced by two drawn from it, mean ~ N(mean, R S S R^T), scales / 1.6, all else copied.
@@ -33,7 +33,8 @@ SPLIT_SHRINK = 0.8 * SPLIT_INTO
 class DensifySettings:
     """When and what to densify, in a run of T steps: after min(start, start_share T), before min(stop, stop_share T).
 
-    3DGS trains for 30,000 steps, where the shares change nothing; they make short runs densify too, and end settled.
+    The interval is `every`, but at most every_share T.  3DGS trains for 30,000 steps, where the shares change nothing; with
+    them short runs densify too, and have half of their steps to settle.
     """
 
     enabled: bool = True
@@ -42,6 +43,7 @@ class DensifySettings:
     start_share: float = 0.25
     stop_share: float = 0.5
     every: int = 100
+    every_share: float = 0.05
     gradient_threshold: float = 2e-4
     clone_scale: float = 0.01
     prune_scale: float = 0.1
@@ -52,8 +54,11 @@ class DensifySettings:
     def __post_init__(self) -> None:
         if self.every < 1 or self.reset_every < 1:
             raise ValueError(f"expected every and reset_every of at least 1, got {self.every} and {self.reset_every}")
-        if min(self.start, self.stop) < 0 or not (0 <= self.start_share <= 1 and 0 <= self.stop_share <= 1):
-            raise ValueError(f"expected start and stop of at least 0 and their shares in [0, 1], got {self}")
+        if min(self.start, self.stop) < 0:
+            raise ValueError(f"expected start and stop of at least 0, got {self.start} and {self.stop}")
+        shares = self.start_share, self.stop_share, self.every_share
+        if not all(0 <= share <= 1 for share in shares):
+            raise ValueError(f"expected start_share, stop_share and every_share in [0, 1], got {shares}")
         if not (self.gradient_threshold > 0 and self.clone_scale > 0 and self.prune_scale > 0):
             raise ValueError(f"expected gradient_threshold, clone_scale and prune_scale above 0, got {self}")
         if not 0 <= self.min_opacity < self.reset_opacity < 1:
@@ -68,7 +73,8 @@ class DensifySettings:
 
     def densifies(self, step: int, iterations: int) -> bool:
         begun = step > min(self.start, self.start_share * iterations)
-        return begun and step % self.every == 0 and self.collects(step, iterations)
+        interval = max(1, min(self.every, round(self.every_share * iterations)))
+        return begun and step % interval == 0 and self.collects(step, iterations)
 
     def resets_opacity(self, step: int, iterations: int) -> bool:
         return step % self.reset_every == 0 and self.collects(step, iterations)

@@ -144,7 +144,8 @@ def test_a_run_of_30000_steps_densifies_and_resets_when_3dgs_does():
 
 def test_short_runs_densify_in_their_second_quarter():
     assert steps(2000, "densifies") == [600, 700, 800, 900]
-    assert steps(1000, "densifies") == [300, 400]
+    assert steps(400, "densifies") == [120, 140, 160, 180]
+    assert steps(4, "densifies") == []
     assert steps(2000, "resets_opacity") == []
 
 
@@ -157,7 +158,14 @@ def test_density_control_that_is_switched_off_does_nothing():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"every": 0}, {"start": -1}, {"stop_share": 1.5}, {"gradient_threshold": 0.0}, {"min_opacity": 0.02}],
+    [
+        {"every": 0},
+        {"start": -1},
+        {"stop_share": 1.5},
+        {"every_share": -0.1},
+        {"gradient_threshold": 0.0},
+        {"min_opacity": 0.02},
+    ],
 )
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match="expected"):

@@ -46,6 +46,12 @@ def tiny_views(dtype: torch.dtype = torch.float32) -> list[View]:
 def tiny_config(iterations: int = 12, seed: int = 0) -> TrainConfig:
     """Every part of training happens within a dozen steps: densification, opacity reset, more bands, random colours."""
     densify = DensifySettings(
-        every=2, reset_every=5, stop_share=0.75, gradient_threshold=1e-3, clone_scale=0.11, prune_scale=0.14
+        every=2,
+        every_share=1.0,
+        reset_every=5,
+        stop_share=0.75,
+        gradient_threshold=1e-3,
+        clone_scale=0.11,
+        prune_scale=0.14,
     )
     return TrainConfig(iterations, seed, sh_degree=2, sh_degree_every=4, random_background=True, densify=densify)
