@@ -18,9 +18,9 @@ def test_llff_holds_out_every_eighth_and_spreads_n_over_the_rest() -> None:
 
 
 def test_llff_rounds_half_to_even_as_the_public_code_does() -> None:
-    names = tuple(f"{i:02d}" for i in range(14))  # 12 to train on; linspace(0, 11, 3) = 0, 5.5, 11
+    names = tuple(f"{i:02d}" for i in range(16))  # 14 to train on; linspace(0, 13, 3) = 0, 6.5, 13
     others = [name for i, name in enumerate(names) if i % 8]
-    assert llff_split(names, 3).train == (others[0], others[6], others[11])
+    assert llff_split(names, 3).train == (others[0], others[6], others[13])
 
 
 def test_without_a_number_all_but_the_test_views_train() -> None:
