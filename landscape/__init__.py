@@ -1,0 +1,78 @@
+"""Curvature of any objective from products with its Hessian: traces, eigenpairs, densities, anisotropy, slices.
+
+Everything here sees a `SymmetricOperator` and a `torch.Generator`, and returns a frozen result that carries its error.
+"""
+
+from landscape.anisotropy import anisotropy, effective_rank, literal, saddle, share
+from landscape.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
+from landscape.density import absolute_sum, spectral_density
+from landscape.eigen import EigenSettings, PowerSettings, extreme_eigenpairs, power_ends, power_iteration
+from landscape.lanczos import LanczosFactorization, lanczos
+from landscape.objective import ObjectiveHessian
+from landscape.operator import (
+    CountingOperator,
+    DenseOperator,
+    ProjectedOperator,
+    RestrictedOperator,
+    ScaledOperator,
+    SumOperator,
+    SymmetricOperator,
+)
+from landscape.results import (
+    Anisotropy,
+    Bracket,
+    EigenEnds,
+    Eigenpairs,
+    Progress,
+    Slice,
+    SpectralDensity,
+    StopReason,
+    TraceEstimate,
+)
+from landscape.slices import curvature_reach, evaluate_slice, symmetric_axis
+from landscape.trace import PAPER, TraceSettings, estimate_traces
+
+__all__ = [
+    "PAPER",
+    "Anisotropy",
+    "Bracket",
+    "CountingOperator",
+    "DenseOperator",
+    "DerivativeCheck",
+    "EigenEnds",
+    "EigenSettings",
+    "Eigenpairs",
+    "LanczosFactorization",
+    "ObjectiveHessian",
+    "OperatorCheck",
+    "PowerSettings",
+    "Progress",
+    "ProjectedOperator",
+    "RestrictedOperator",
+    "ScaledOperator",
+    "Slice",
+    "SpectralDensity",
+    "StopReason",
+    "SumOperator",
+    "SymmetricOperator",
+    "TraceEstimate",
+    "TraceSettings",
+    "absolute_sum",
+    "anisotropy",
+    "check_gradient",
+    "check_objective",
+    "check_operator",
+    "curvature_reach",
+    "effective_rank",
+    "estimate_traces",
+    "evaluate_slice",
+    "extreme_eigenpairs",
+    "lanczos",
+    "literal",
+    "power_ends",
+    "power_iteration",
+    "saddle",
+    "share",
+    "spectral_density",
+    "symmetric_axis",
+]

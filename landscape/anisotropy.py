@@ -1,0 +1,99 @@
+"""How unequal the curvatures are: indices of the spectrum lambda_1 >= ... >= lambda_n (signed), each with a bracket.
+
+    literal         lambda_1 / lambda_n                            the condition number as the paper writes it, signed
+    saddle          lambda_1 / |lambda_n|                          of an indefinite operator only
+    share           lambda_1 / sum |lambda_i|                      how much of all curvature is in one direction
+    effective_rank  (sum |lambda_i|)^2 / sum lambda_i^2            over how many directions it is spread, 1 to n
+
+Brackets follow from the eigenvalues' residuals, the round-off and the sums' intervals (each at a level that gives the
+quotient 95%).  The literal index is negative for an indefinite operator; where lambda_n may be zero it has no upper bound.
+"""
+
+from math import inf
+
+import torch
+
+from landscape.density import absolute_sum
+from landscape.results import Anisotropy, Bracket, EigenEnds, SpectralDensity
+
+CONFIDENCE = 0.95
+JOINT = 1 - (1 - CONFIDENCE) / 2  # each of two intervals, so that both hold with CONFIDENCE (Bonferroni)
+
+
+def anisotropy(ends: EigenEnds, density: SpectralDensity | None = None) -> Anisotropy:
+    """The whole family, as far as what is given carries it."""
+    return Anisotropy(
+        literal=literal(ends),
+        saddle=saddle(ends),
+        share=None if density is None else share(ends, density),
+        effective_rank=None if density is None else effective_rank(ends, density),
+    )
+
+
+def literal(ends: EigenEnds) -> Bracket:
+    """lambda_max / lambda_min, Eq. (3), signed: always the quotient as found, with what is certain of it."""
+    top, bottom = _intervals(ends)
+    smallest = float(ends.smallest.values[0])
+    value = float(ends.largest.values[0]) / smallest if smallest else None
+    if bottom[0] <= 0 <= bottom[1]:
+        return Bracket(
+            value, _at_least(top, bottom), inf, "lambda_min is not resolved from zero: the bracket is for |A|"
+        )
+    quotients = [a / b for a in top for b in bottom]
+    return Bracket(value, min(quotients), max(quotients), "definite" if top[0] * bottom[0] > 0 else "indefinite")
+
+
+def saddle(ends: EigenEnds) -> Bracket:
+    """lambda_max / |lambda_min| of an operator with curvatures of both signs."""
+    top, bottom = _intervals(ends)
+    if bottom[0] >= 0:
+        return Bracket(None, inf, inf, "no negative curvature: the operator is positive semi-definite")
+    if top[1] <= 0:
+        return Bracket(None, inf, inf, "no positive curvature: the operator is negative semi-definite")
+    if bottom[1] >= 0:
+        return Bracket(None, _at_least(top, bottom), inf, "if lambda_min is negative at all: not resolved from zero")
+    low, high = max(top[0], 0.0) / -bottom[0], top[1] / -bottom[1]
+    return Bracket(float(ends.largest.values[0] / -ends.smallest.values[0]), low, high)
+
+
+def share(ends: EigenEnds, density: SpectralDensity) -> Bracket:
+    """lambda_max / sum |lambda|, at most 1."""
+    top, total = _intervals(ends)[0], absolute_sum(density, JOINT)
+    if not total.value:
+        return Bracket(None, inf, inf, "the operator is zero")
+    sums = max(total.low, _farthest(ends)), total.high
+    quotients = [a / b if b else inf for a in top for b in sums]
+    value = min(float(ends.largest.values[0]) / total.value, 1.0)
+    return Bracket(value, min(quotients), min(max(quotients), 1.0), total.note)
+
+
+def effective_rank(ends: EigenEnds, density: SpectralDensity) -> Bracket:
+    """(sum |lambda|)^2 / sum lambda^2, between 1 and n."""
+    total, squares = absolute_sum(density, JOINT), density.integral(lambda x: x.square(), JOINT)
+    if not total.value or not squares.value:
+        return Bracket(None, inf, inf, "the operator is zero")
+    known = _farthest(ends)
+    low = max(total.low, known) ** 2 / squares.high
+    square = max(squares.low, known**2)
+    high = total.high**2 / square if square else inf
+    value = min(max(total.value**2 / squares.value, 1.0), float(density.dim))
+    return Bracket(value, max(low, 1.0), min(high, float(density.dim)), total.note)
+
+
+def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Where lambda_max and lambda_min lie: residuals, plus one unit of round-off of the larger magnitude."""
+    (a, b), (c, d) = ends.largest.interval(), ends.smallest.interval()
+    slack = torch.finfo(ends.largest.vectors.dtype).eps * max(abs(a), abs(b), abs(c), abs(d))
+    return (a - slack, b + slack), (c - slack, d + slack)
+
+
+def _farthest(ends: EigenEnds) -> float:
+    """A magnitude that some eigenvalue has at least: what both sums are bounded by from below."""
+    return max(0.0, *(max(low, -high) for low, high in _intervals(ends)))
+
+
+def _at_least(top: tuple[float, float], bottom: tuple[float, float]) -> float:
+    """The smallest |lambda_max / lambda_min| that both intervals allow."""
+    nearest = 0.0 if top[0] <= 0 <= top[1] else min(abs(top[0]), abs(top[1]))
+    farthest = max(abs(bottom[0]), abs(bottom[1]))
+    return nearest / farthest if farthest else inf

@@ -1,0 +1,381 @@
+"""Eigenpairs at the two ends of the spectrum: Lanczos with thick restarts, and the paper's power iteration.
+
+`extreme_eigenpairs` runs one (block) Lanczos recurrence for both ends (Wu and Simon 2000).  The projected matrix
+T = Q^T H Q is kept whole, so that nothing is assumed of its shape after a restart.  When the memory budget of basis
+vectors is full, the Ritz vectors next to both ends are kept and the recurrence goes on from them.
+
+A run ends when every wanted pair has an estimated residual |B s| under max(rtol |lambda|, atol), or under the round-off
+of the matvec, or at its budget.  The residuals reported are measured afterwards with the operator itself:
+|H v - lambda v|.
+"""
+
+from dataclasses import dataclass
+from math import inf, isfinite, log, nan, sqrt
+from time import monotonic
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from landscape.checks import matvec_noise
+from landscape.lanczos import is_dust, norm, orthogonalise
+from landscape.operator import SymmetricOperator
+from landscape.probes import draw_probes
+from landscape.results import EigenEnds, Eigenpairs, Progress, StopReason
+
+KEEP = 0.6  # share of the basis that a restart keeps
+CHUNK = 1 << 16  # rows of vectors that a restart recombines at a time
+WARM_NOISE = 0.01  # share of a random vector in a warm start: an end that the old vectors miss is still found
+
+
+@dataclass(frozen=True)
+class EigenSettings:
+    """How many pairs at each end, to which residual, with how much memory and work.
+
+    basis: vectors kept at a time (the memory budget).  block: vectors per application of the operator; more than one
+    helps with multiple eigenvalues and where the operator is cheaper per vector in blocks.
+    """
+
+    largest: int = 1
+    smallest: int = 1
+    rtol: float = 1e-3
+    atol: float = 0.0
+    basis: int = 64
+    block: int = 1
+    max_matvecs: int = 1000
+    max_seconds: float = inf
+
+    def __post_init__(self) -> None:
+        if min(self.largest, self.smallest) < 0 or self.wanted < 1 or self.block < 1:
+            raise ValueError(
+                f"expected largest, smallest >= 0 (not both 0) and block >= 1, "
+                f"got {self.largest}, {self.smallest} and {self.block}"
+            )
+        if self.rtol < 0 or self.atol < 0:
+            raise ValueError(f"expected rtol and atol >= 0, got {self.rtol} and {self.atol}")
+        if self.basis < self.wanted + 3 * self.block:
+            raise ValueError(f"expected a basis of at least {self.wanted + 3 * self.block} vectors, got {self.basis}")
+        if self.max_matvecs < 2 * self.wanted + self.block + 2:
+            raise ValueError(f"expected max_matvecs >= {2 * self.wanted + self.block + 2}, got {self.max_matvecs}")
+
+    @property
+    def wanted(self) -> int:
+        return self.largest + self.smallest
+
+
+def extreme_eigenpairs(
+    operator: SymmetricOperator,
+    generator: torch.Generator,
+    settings: EigenSettings = EigenSettings(),
+    start: Float[Tensor, "n *k"] | None = None,
+    progress: Progress | None = None,
+) -> EigenEnds:
+    """The largest and smallest eigenvalues with vectors and residuals.
+
+    start: vectors to begin from (those of an earlier checkpoint, say); the recurrence begins at the sum of their
+    directions with a little noise.  Progress counts matvecs.
+
+    >>> from landscape.operator import DenseOperator
+    >>> H = DenseOperator(torch.diag(torch.linspace(-1, 3, 50, dtype=torch.float64)))
+    >>> ends = extreme_eigenpairs(H, torch.Generator().manual_seed(0), EigenSettings(rtol=1e-8))
+    >>> print(f"{float(ends.largest.values):.6f} {float(ends.smallest.values):.6f} {ends.largest.reason}")
+    3.000000 -1.000000 tolerance
+    """
+    n = operator.dim
+    if settings.wanted > n:
+        raise ValueError(f"expected at most {n} eigenpairs of an operator with {n} rows, got {settings.wanted}")
+    krylov = _Krylov(operator, generator, settings, start)
+    deadline = monotonic() + settings.max_seconds
+    strictness = 1.0
+    while True:
+        krylov.expand()
+        if krylov.size < settings.wanted:
+            continue
+        ritz = krylov.ritz()
+        if progress:
+            progress(krylov.matvecs, settings.max_matvecs, ritz.state())
+        spent = krylov.matvecs + settings.block + settings.wanted > settings.max_matvecs
+        late = monotonic() > deadline
+        goal = strictness * settings.rtol, max(strictness * settings.atol, krylov.floor(ritz))
+        if ritz.converged(*goal) or spent or late:
+            ends, more = krylov.measured(ritz, "time budget" if late else "matvec budget")
+            if not more or spent or late:
+                return ends
+            strictness /= 2
+        if krylov.full:
+            krylov.restart(ritz)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ritz:
+    """Ritz values (ascending), their coordinates in the basis, estimated residuals, and which of them are wanted."""
+
+    values: Float64[Tensor, " m"]
+    coordinates: Float64[Tensor, "m m"]
+    residuals: Float64[Tensor, " m"]
+    largest: list[int]
+    smallest: list[int]
+
+    @property
+    def wanted(self) -> list[int]:
+        return self.largest + self.smallest
+
+    def converged(self, rtol: float, floor: float) -> bool:
+        goal = (rtol * self.values[self.wanted].abs()).clamp_min(floor)
+        return bool((self.residuals[self.wanted] <= goal).all())
+
+    def gaps(self) -> Float64[Tensor, " k"]:
+        """Distance of each wanted value to the nearest other one."""
+        steps = torch.diff(self.values, prepend=torch.tensor([-inf]), append=torch.tensor([inf]))
+        return torch.minimum(steps[:-1], steps[1:])[self.wanted]
+
+    def state(self) -> str:
+        parts = [
+            f"{name} {float(self.values[i]):.4g} +- {float(self.residuals[i]):.1e}"
+            for name, indices in (("largest", self.largest), ("smallest", self.smallest))
+            for i in indices[:1]
+        ]
+        return ", ".join(parts)
+
+
+class _Krylov:
+    """The growing basis: rows 0..size orthonormal with T = Q^T H Q known, then `width` rows that come next."""
+
+    def __init__(
+        self, operator: SymmetricOperator, generator: torch.Generator, settings: EigenSettings, start: Tensor | None
+    ) -> None:
+        self.operator, self.generator, self.settings = operator, generator, settings
+        self.capacity = min(settings.basis, operator.dim)
+        self.basis = torch.empty(self.capacity + settings.block, operator.dim, dtype=operator.dtype)
+        self.T = torch.zeros(self.capacity, self.capacity, dtype=torch.float64)
+        self.size, self.width, self.scale = 0, 0, 1.0
+        self.coupling = torch.zeros(0, 0, dtype=torch.float64)
+        self.random_start, self.first_cycle = start is None, 0
+        first = draw_probes(operator.dim, min(settings.block, self.capacity), generator, operator.dtype)
+        if start is not None:
+            first[:, 0] = _mixed(start, first[:, 0])
+        self._append(first.T.contiguous())
+        self.noise = matvec_noise(operator, self.basis[0][:, None])
+        self.matvecs = 2
+        self._restarted = False
+
+    @property
+    def full(self) -> bool:
+        return self.size + self.width > self.capacity
+
+    def expand(self) -> None:
+        """Apply H to the next rows, project, and find the rows after them."""
+        old, new = self.size, self.size + self.width
+        W = self.operator.apply(self.basis[old:new].T.contiguous()).T.clone(memory_format=torch.contiguous_format)
+        self.matvecs += self.width
+        if not torch.isfinite(W).all():
+            raise ValueError(
+                "expected finite products H v, got NaN or infinity; check the parameters with check_operator"
+            )
+        self.scale = max(self.scale if old else 0.0, *(norm(w) for w in W))
+        components = orthogonalise(W, self.basis[:new])
+        self.T[:new, old:new] = components
+        self.T[old:new, :new] = components.T
+        self.T[old:new, old:new] = (components[old:] + components[old:].T) / 2
+        self.size = new
+        self.coupling = self._append(W)
+        self.first_cycle += not self._restarted
+
+    def _append(self, W: Float[Tensor, "b n"]) -> Float64[Tensor, "next b"]:
+        """Orthonormal rows after the first `size` that span the rows of W; B with W^T = next^T B.
+
+        A row that is round-off alone (an invariant subspace is complete) is replaced by a random one, with B = 0.
+        """
+        B = torch.zeros(W.shape[0], W.shape[0], dtype=torch.float64)
+        self.width = 0
+        for j, w in enumerate(W):
+            found = self.basis[self.size : self.size + self.width]
+            if self.size + self.width == self.operator.dim:
+                break
+            before = norm(w)
+            B[: self.width, j] = orthogonalise(w[None], found)[:, 0]
+            length = norm(w)
+            if length < before / 10:  # cancellation brought the round-off of earlier passes forward
+                orthogonalise(w[None], self.basis[: self.size + self.width])
+                length = norm(w)
+            if is_dust(length, self.scale, w.dtype):
+                w.normal_(generator=self.generator)
+                orthogonalise(w[None], self.basis[: self.size + self.width])
+                torch.div(w, norm(w), out=self.basis[self.size + self.width])
+            else:
+                B[self.width, j] = length
+                torch.div(w, length, out=self.basis[self.size + self.width])
+            self.width += 1
+        return B[: self.width]
+
+    def ritz(self) -> _Ritz:
+        m, s = self.size, self.settings
+        values, coordinates = torch.linalg.eigh(self.T[:m, :m])
+        last = coordinates[m - self.coupling.shape[1] :]
+        residuals = torch.linalg.vector_norm(self.coupling @ last, dim=0)
+        return _Ritz(values, coordinates, residuals, list(range(m - 1, m - 1 - s.largest, -1)), list(range(s.smallest)))
+
+    def floor(self, ritz: _Ritz) -> float:
+        """The residual that the matvec's round-off leaves at least."""
+        return max(self.noise, torch.finfo(self.basis.dtype).eps * float(ritz.values.abs().max()))
+
+    def restart(self, ritz: _Ritz) -> None:
+        """Keep the share KEEP of the memory in Ritz vectors, and the rows that come next.
+
+        The vectors kept beyond the wanted ones come from both ends evenly, whichever end is still open: those of its
+        own end speed it up where the spectrum is dense there, those of the other end where that one reaches far.
+        """
+        s, m = self.settings, self.size
+        keep = max(s.wanted, min(int(self.capacity * KEEP), self.capacity - 2 * s.block))
+        top = s.largest + (keep - s.wanted) // 2
+        kept = list(range(keep - top)) + list(range(m - top, m))
+        combination = ritz.coordinates[:, kept].T.to(self.basis.dtype)
+        for first in range(0, self.basis.shape[1], CHUNK):
+            columns = slice(first, first + CHUNK)
+            self.basis[:keep, columns] = combination @ self.basis[:m, columns]
+        self.basis[keep : keep + self.width] = self.basis[m : m + self.width].clone()
+        self.T.zero_()
+        self.T[:keep, :keep] = torch.diag(ritz.values[kept])
+        self.size, self._restarted = keep, True
+
+    def measured(self, ritz: _Ritz, budget: StopReason) -> tuple[EigenEnds, bool]:
+        """The wanted pairs with residuals by the operator itself, and whether more steps would make them better."""
+        s = self.settings
+        vectors = self.basis[: self.size].T @ ritz.coordinates[:, ritz.wanted].to(self.basis.dtype)
+        values, residuals = rayleigh(self.operator, vectors)
+        self.matvecs += s.wanted
+        estimated = ritz.residuals[ritz.wanted]
+        # a residual far above the recurrence's estimate is the matvec's round-off: more steps cannot lower it
+        stuck = (estimated <= residuals / 4) | (estimated <= self.floor(ritz))
+        reached = residuals <= (s.rtol * values.abs()).clamp_min(s.atol)
+        errors = residuals / ritz.gaps()
+
+        def end(part: slice, descending: bool) -> Eigenpairs:
+            reason: StopReason = budget
+            if (reached | stuck)[part].all():
+                reason = "tolerance" if reached[part].all() else "noise floor"
+            order = torch.argsort(values[part], descending=descending)
+            pairs = [quantity[part][order] for quantity in (values, residuals, errors)]
+            return Eigenpairs(pairs[0], vectors[:, part][:, order], pairs[1], pairs[2], reason)
+
+        beyond = inf
+        if self.random_start:
+            beyond = _beyond(self.operator.dim, self.first_cycle, float(ritz.values[-1] - ritz.values[0]))
+        largest, smallest = end(slice(0, s.largest), True), end(slice(s.largest, s.wanted), False)
+        ends = EigenEnds(largest, smallest, "lanczos", self.matvecs, beyond, self.noise)
+        return ends, not bool((reached | stuck).all())
+
+
+def rayleigh(
+    operator: SymmetricOperator, vectors: Float[Tensor, "n k"]
+) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
+    """Rayleigh quotients and residuals of k vectors that are near to unit length, added up in float64."""
+    values, residuals = [], []
+    for v, w in zip(vectors.T, operator.apply(vectors.contiguous()).T, strict=True):
+        length = norm(v)
+        value = float(torch.dot(v.double(), w.double())) / length**2
+        values.append(value)
+        residuals.append(norm(w.double() - value * v.double()) / length)
+    return torch.tensor(values, dtype=torch.float64), torch.tensor(residuals, dtype=torch.float64)
+
+
+def _mixed(start: Tensor, random: Tensor) -> Tensor:
+    """The normalised sum of the start vectors' directions, with a little of the random vector."""
+    columns = start.reshape(random.numel(), -1).to(random.dtype)
+    lengths = torch.linalg.vector_norm(columns, dim=0)
+    if not ((lengths > 0) & torch.isfinite(lengths)).all():
+        raise ValueError(f"expected finite start vectors that are not zero, got lengths {lengths.tolist()}")
+    total = (columns / lengths).sum(dim=1)
+    return total / norm(total) + WARM_NOISE * random / norm(random)
+
+
+def _beyond(n: int, steps: int, spread: float) -> float:
+    """How far outside the Ritz values the spectrum may reach, with probability 0.99 over a random start.
+
+    Kuczynski and Wozniakowski (1992), Theorem 4.2: after m steps the end is missed by more than the share eps of the
+    spectrum's width with probability at most 1.648 sqrt(n) exp(-sqrt(eps) (2 m - 1)).
+    """
+    if steps >= n:
+        return 0.0
+    eps = (log(2 * 1.648 * sqrt(n) / 0.01) / (2 * steps - 1)) ** 2
+    return eps / (1 - 2 * eps) * spread if eps < 0.5 else inf
+
+
+@dataclass(frozen=True)
+class PowerSettings:
+    """Power iteration stops at a residual of max(rtol |lambda|, atol), or when the budget of one end is spent."""
+
+    rtol: float = 1e-3
+    atol: float = 0.0
+    max_matvecs: int = 100
+    max_seconds: float = inf
+
+    def __post_init__(self) -> None:
+        if self.rtol < 0 or self.atol < 0 or self.max_matvecs < 1:
+            raise ValueError(
+                f"expected rtol, atol >= 0 and max_matvecs >= 1, got {self.rtol}, {self.atol} and {self.max_matvecs}"
+            )
+
+
+def power_iteration(
+    operator: SymmetricOperator,
+    generator: torch.Generator,
+    settings: PowerSettings = PowerSettings(),
+    shift: float = 0.0,
+    progress: Progress | None = None,
+) -> tuple[Eigenpairs, int]:
+    """The eigenpair of H whose eigenvalue is farthest from shift, and the matvecs it took.
+
+    v <- (H - shift) v / |(H - shift) v|, from a Gaussian start.  With shift = 0 this is the eigenvalue of largest
+    magnitude, of either sign; with that eigenvalue as the shift it is the other end of the spectrum.
+    """
+    v = draw_probes(operator.dim, 1, generator, operator.dtype)[:, 0]
+    deadline, epsilon = monotonic() + settings.max_seconds, torch.finfo(operator.dtype).eps
+    step, reason = 0, None
+    while True:
+        v /= norm(v)
+        step += 1
+        w = operator.apply(v[:, None])[:, 0] - shift * v
+        moved = float(torch.dot(v.double(), w.double()))
+        value, residual = moved + shift, norm(w.double() - moved * v.double())
+        if not isfinite(residual):
+            raise ValueError(
+                "expected finite products H v, got NaN or infinity; check the parameters with check_operator"
+            )
+        if progress:
+            progress(step, settings.max_matvecs, f"eigenvalue {value:.4g} +- {residual:.1e}")
+        reason = _power_reason(settings, step, value, residual, epsilon * max(abs(moved), abs(shift)), deadline)
+        if reason:
+            vector_error = torch.tensor([inf], dtype=torch.float64)
+            numbers = torch.tensor([[value], [residual]], dtype=torch.float64)
+            return Eigenpairs(numbers[0], v[:, None], numbers[1], vector_error, reason), step
+        v = w
+
+
+def _power_reason(
+    settings: PowerSettings, step: int, value: float, residual: float, floor: float, deadline: float
+) -> StopReason | None:
+    if residual <= max(settings.rtol * abs(value), settings.atol):
+        return "tolerance"
+    if residual <= floor:
+        return "noise floor"
+    if step == settings.max_matvecs:
+        return "matvec budget"
+    return "time budget" if monotonic() > deadline else None
+
+
+def power_ends(
+    operator: SymmetricOperator,
+    generator: torch.Generator,
+    settings: PowerSettings = PowerSettings(),
+    progress: Progress | None = None,
+) -> EigenEnds:
+    """Both ends of the spectrum as StableGS takes them: power iteration, then power iteration on H - lambda I.
+
+    The first run finds the eigenvalue of largest magnitude, which is lambda_max or, where the negative end is longer,
+    lambda_min; the run shifted by it finds the other end.
+    """
+    first, steps = power_iteration(operator, generator, settings, progress=progress)
+    other, more = power_iteration(operator, generator, settings, shift=float(first.values), progress=progress)
+    smallest, largest = sorted((first, other), key=lambda pair: float(pair.values))
+    return EigenEnds(largest, smallest, "power iteration", steps + more, inf, nan)

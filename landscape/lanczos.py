@@ -1,0 +1,97 @@
+"""The Lanczos recurrence with full re-orthogonalisation (Lanczos 1950, Paige 1972).
+
+    H Q = Q T + r e_m^T      Q (n, m) orthonormal, T tridiagonal, r orthogonal to Q
+
+Vectors are in the operator's dtype, T in float64.  Every new vector is orthogonalised twice against all the earlier
+ones: the first pass leaves components of the size of its own round-off, the second removes them and corrects the
+entries of T ("twice is enough", Kahan and Parlett).  Rows of the workspaces are vectors, so that each is contiguous.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from landscape.operator import SymmetricOperator
+from landscape.results import Progress
+
+
+@dataclass(frozen=True, eq=False)
+class LanczosFactorization:
+    """H Q = Q T + r e_m^T with m <= the steps asked for (fewer where Q spans an invariant subspace: then r = 0)."""
+
+    Q: Float[Tensor, "n m"]
+    T: Float64[Tensor, "m m"]
+    r: Float[Tensor, " n"]
+
+
+def orthogonalise(
+    vectors: Float[Tensor, "b n"], basis: Float[Tensor, "m n"], passes: int = 2
+) -> Float64[Tensor, "m b"]:
+    """Remove from vectors, in place, their components along the orthonormal rows of basis; return these components."""
+    components = torch.zeros(basis.shape[0], vectors.shape[0], dtype=torch.float64)
+    for _ in range(passes):
+        part = basis @ vectors.T
+        vectors.addmm_(part.T, basis, alpha=-1)
+        components += part.double()
+    return components
+
+
+def norm(vector: Tensor) -> float:
+    """Euclidean length, added up in float64."""
+    return float(torch.linalg.vector_norm(vector, dtype=torch.float64))
+
+
+def is_dust(length: float, scale: float, dtype: torch.dtype) -> bool:
+    """Whether a remainder this long is the round-off of orthogonalising vectors of length `scale`."""
+    return length <= 10 * torch.finfo(dtype).eps * scale
+
+
+def lanczos(
+    operator: SymmetricOperator, starts: Float[Tensor, "n k"], steps: int, progress: Progress | None = None
+) -> list[LanczosFactorization]:
+    """One factorisation per column of starts, run in lock-step so that the operator sees blocks of k vectors.
+
+    Memory: k * steps vectors.
+
+    >>> from landscape.operator import DenseOperator
+    >>> A = DenseOperator(torch.diag(torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)))
+    >>> (f,) = lanczos(A, torch.ones(3, 1, dtype=torch.float64), steps=3)
+    >>> [round(x, 9) for x in torch.linalg.eigvalsh(f.T).tolist()]
+    [1.0, 2.0, 4.0]
+    """
+    n, k = starts.shape
+    if steps < 1:
+        raise ValueError(f"expected at least one Lanczos step, got {steps}")
+    lengths = [norm(start) for start in starts.T]
+    if not all(0 < length < torch.inf for length in lengths):
+        raise ValueError(f"expected finite start vectors that are not zero, got lengths {lengths}")
+    steps = min(steps, n)
+    basis = torch.empty(k, steps, n, dtype=operator.dtype)
+    T = torch.zeros(k, steps, steps, dtype=torch.float64)
+    remainders = torch.stack([start / length for start, length in zip(starts.T, lengths, strict=True)]).to(
+        operator.dtype
+    )
+    sizes, running = [0] * k, list(range(k))
+    for j in range(steps):
+        for i in running:
+            basis[i, j] = remainders[i]
+        products = operator.apply(basis[running, j].T.contiguous()).T
+        for i, product in zip(list(running), products, strict=True):
+            w = product.clone()[None]
+            scale = norm(w)
+            T[i, j, j] = orthogonalise(w, basis[i, : j + 1])[j, 0]
+            sizes[i], remainders[i] = j + 1, w[0]
+            beta = norm(w)
+            if is_dust(beta, max(scale, float(T[i].abs().max())), operator.dtype):
+                running.remove(i)
+                remainders[i] = 0
+            elif j + 1 < steps:
+                T[i, j, j + 1] = T[i, j + 1, j] = beta
+                remainders[i] = w[0] / beta
+        if progress:
+            progress((j + 1) * k, steps * k, f"Lanczos step {j + 1} of {steps}")
+        if not running:
+            break
+    return [LanczosFactorization(basis[i, :m].T, T[i, :m, :m], remainders[i]) for i, m in enumerate(sizes)]

@@ -1,0 +1,183 @@
+"""Symmetric operators: all that the rest of the package sees of an objective's curvature.
+
+An operator H has n rows (`dim`), named groups of rows (`blocks`: one per attribute, say), a `dtype`, and
+`apply(V) -> H V` for k vectors at once, V of shape (n, k).  Operators compose:
+
+    SumOperator         sum_i w_i H_i
+    RestrictedOperator  E^T H E     one block, E its rows of the identity
+    ScaledOperator      D H D       a change of metric: curvature in the units theta / d
+    ProjectedOperator   P H P       P an orthogonal projector, to leave a known null space out
+    CountingOperator    H           counts what is applied, and the seconds it took
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from time import perf_counter
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@runtime_checkable
+class SymmetricOperator(Protocol):
+    """H = H^T as a product with blocks of vectors."""
+
+    @property
+    def dim(self) -> int: ...
+
+    @property
+    def blocks(self) -> Mapping[str, slice]: ...
+
+    @property
+    def dtype(self) -> torch.dtype: ...
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """H V.  Raises ValueError where V has another shape than (dim, k)."""
+        ...
+
+
+def require_vectors(V: Tensor, n: int) -> None:
+    """Raise ValueError unless V is (n, k)."""
+    if V.ndim == 1 and V.shape[0] == n:
+        raise ValueError(f"expected V of shape (n, k) with n = {n}, got ({n},); use V[:, None]")
+    if V.ndim != 2 or V.shape[0] != n:
+        raise ValueError(f"expected V of shape (n, k) with n = {n}, got {tuple(V.shape)}")
+
+
+def require_blocks(blocks: Mapping[str, slice], n: int) -> dict[str, slice]:
+    """A copy of blocks; raise ValueError unless they are disjoint ranges of 0..n."""
+    end = 0
+    for name, block in sorted(blocks.items(), key=lambda item: (item[1].start or 0, item[1].stop or 0)):
+        if block.start is None or block.stop is None or block.step not in (None, 1):
+            raise ValueError(f"expected block {name!r} as slice(start, stop), got {block}")
+        if not end <= block.start <= block.stop <= n:
+            raise ValueError(
+                f"expected disjoint blocks within 0..{n}, got {name!r} = {block.start}..{block.stop} after {end}"
+            )
+        end = block.stop
+    return dict(blocks)
+
+
+class DenseOperator:
+    """A symmetric matrix as an operator.
+
+    >>> H = DenseOperator(torch.tensor([[2.0, 1.0], [1.0, 3.0]]))
+    >>> H.apply(torch.tensor([[1.0], [-1.0]]))
+    tensor([[ 1.],
+            [-2.]])
+    """
+
+    def __init__(self, matrix: Float[Tensor, "n n"], blocks: Mapping[str, slice] | None = None) -> None:
+        if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+            raise ValueError(f"expected a square matrix, got shape {tuple(matrix.shape)}")
+        if not torch.isfinite(matrix).all():
+            raise ValueError("expected a finite matrix, got NaN or infinite entries")
+        gap = float((matrix - matrix.T).abs().max()) if matrix.numel() else 0.0
+        largest = float(matrix.abs().max()) if matrix.numel() else 0.0
+        if gap > matrix.shape[0] * torch.finfo(matrix.dtype).eps * largest:
+            raise ValueError(f"expected a symmetric matrix, got |A - A^T| = {gap:.1e}; use (A + A.T) / 2")
+        self.matrix = matrix
+        self.dim = matrix.shape[0]
+        self.dtype = matrix.dtype
+        self.blocks = require_blocks({"all": slice(0, self.dim)} if blocks is None else blocks, self.dim)
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        require_vectors(V, self.dim)
+        return self.matrix @ V
+
+
+class SumOperator:
+    """sum_i weights_i H_i of operators with the same rows; weights 1 by default."""
+
+    def __init__(self, terms: Sequence[SymmetricOperator], weights: Sequence[float] | None = None) -> None:
+        if not terms:
+            raise ValueError("expected at least one operator to sum, got none")
+        weights = [1.0] * len(terms) if weights is None else weights
+        if len(weights) != len(terms):
+            raise ValueError(f"expected one weight per operator ({len(terms)}), got {len(weights)}")
+        first = terms[0]
+        for term in terms[1:]:
+            if (term.dim, term.dtype, dict(term.blocks)) != (first.dim, first.dtype, dict(first.blocks)):
+                raise ValueError(
+                    f"expected operators of {first.dim} rows, {first.dtype} and blocks {', '.join(first.blocks)}, "
+                    f"got {term.dim} rows, {term.dtype} and blocks {', '.join(term.blocks)}"
+                )
+        self.terms, self.weights = tuple(terms), tuple(weights)
+        self.dim, self.dtype, self.blocks = first.dim, first.dtype, first.blocks
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        require_vectors(V, self.dim)
+        total = self.weights[0] * self.terms[0].apply(V)
+        for weight, term in zip(self.weights[1:], self.terms[1:], strict=True):
+            total.add_(term.apply(V), alpha=weight)
+        return total
+
+
+class RestrictedOperator:
+    """E^T H E: the diagonal block of H on one named block of rows.
+
+    >>> H = DenseOperator(torch.tensor([[2.0, 1.0], [1.0, 3.0]]), {"a": slice(0, 1), "b": slice(1, 2)})
+    >>> RestrictedOperator(H, "b").apply(torch.ones(1, 1))
+    tensor([[3.]])
+    """
+
+    def __init__(self, inner: SymmetricOperator, block: str) -> None:
+        if block not in inner.blocks:
+            raise ValueError(f"expected a block out of {', '.join(inner.blocks)}, got {block!r}")
+        self.inner = inner
+        self.rows = inner.blocks[block]
+        self.dim = self.rows.stop - self.rows.start
+        self.dtype = inner.dtype
+        self.blocks = {block: slice(0, self.dim)}
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        require_vectors(V, self.dim)
+        padded = V.new_zeros(self.inner.dim, V.shape[1])
+        padded[self.rows] = V
+        return self.inner.apply(padded)[self.rows]
+
+
+class ScaledOperator:
+    """D H D with D = diag(scale): the Hessian with respect to theta / scale."""
+
+    def __init__(self, inner: SymmetricOperator, scale: Float[Tensor, " n"]) -> None:
+        if scale.shape != (inner.dim,) or not torch.isfinite(scale).all():
+            raise ValueError(f"expected {inner.dim} finite scales, got shape {tuple(scale.shape)}")
+        self.inner = inner
+        self.scale = scale.to(inner.dtype)[:, None]
+        self.dim, self.dtype, self.blocks = inner.dim, inner.dtype, inner.blocks
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        require_vectors(V, self.dim)
+        return self.scale * self.inner.apply(self.scale * V)
+
+
+class ProjectedOperator:
+    """P H P for an orthogonal projector `project(V) -> P V` (linear, symmetric, idempotent: the caller's promise)."""
+
+    def __init__(self, inner: SymmetricOperator, project: Callable[[Tensor], Tensor]) -> None:
+        self.inner, self.project = inner, project
+        self.dim, self.dtype, self.blocks = inner.dim, inner.dtype, inner.blocks
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        require_vectors(V, self.dim)
+        return self.project(self.inner.apply(self.project(V)))
+
+
+class CountingOperator:
+    """H itself; counts the vectors (`matvecs`) and blocks (`calls`) applied so far and the `seconds` they took."""
+
+    def __init__(self, inner: SymmetricOperator) -> None:
+        self.inner = inner
+        self.dim, self.dtype, self.blocks = inner.dim, inner.dtype, inner.blocks
+        self.matvecs, self.calls, self.seconds = 0, 0, 0.0
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        require_vectors(V, self.dim)
+        start = perf_counter()
+        result = self.inner.apply(V)
+        self.seconds += perf_counter() - start
+        self.matvecs += V.shape[1]
+        self.calls += 1
+        return result

@@ -1,0 +1,237 @@
+"""What the estimators return: frozen records, each number with its error and each run with the reason it stopped.
+
+    interval        [low, high], the truth inside with the probability `confidence`
+    standard error  of a mean over probe vectors: s / sqrt(probes)
+    residual        |H v - lambda v| for a unit v: an eigenvalue lies within it of lambda, whatever v is
+    reason          why the work ended: "tolerance" (the error asked for is reached), "noise floor" (more work would not
+                    help: the error left is the matvec's own), "matvec budget", "time budget", or "exact"
+
+`record()` gives the scalars of a result as plain Python values for JSON; what is infinite or undefined is None there.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf, isfinite, sqrt
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from scipy.stats import t as student
+from torch import Tensor
+
+StopReason = Literal["tolerance", "noise floor", "matvec budget", "time budget", "exact"]
+Sign = Literal["positive", "negative", "zero", "undetermined"]
+Number = float | None
+
+Progress = Callable[[int, int, str], None]
+"""Called with the units of work done, the most there can be, and a few words on the state."""
+
+
+def finite_or_none(value: float) -> Number:
+    """A float that JSON can hold."""
+    return float(value) if isfinite(value) else None
+
+
+def t_interval(samples: Float64[Tensor, " s"], confidence: float) -> tuple[float, float, float, float]:
+    """Mean, standard error and both ends of Student's interval; a single sample has an infinite error."""
+    count, mean = samples.numel(), float(samples.mean())
+    if count < 2:
+        return mean, inf, -inf, inf
+    error = float(samples.std()) / sqrt(count)
+    half = float(student.ppf((1 + confidence) / 2, count - 1)) * error
+    return mean, error, mean - half, mean + half
+
+
+@dataclass(frozen=True, eq=False)
+class TraceEstimate:
+    """The trace of one block of H."""
+
+    block: str
+    dim: int
+    value: float
+    standard_error: float
+    low: float
+    high: float
+    confidence: float
+    probes: int
+    matvecs: int
+    reason: StopReason
+    samples: Float64[Tensor, " probes"]
+
+    @property
+    def half_width(self) -> float:
+        """Half the interval's length."""
+        return (self.high - self.low) / 2
+
+    @property
+    def sign(self) -> Sign:
+        """The sign of the trace where the interval decides it."""
+        if self.low == self.high == 0:
+            return "zero"
+        if self.low > 0:
+            return "positive"
+        return "negative" if self.high < 0 else "undetermined"
+
+    def record(self) -> dict[str, Number | int | str]:
+        return {
+            "value": finite_or_none(self.value),
+            "standard_error": finite_or_none(self.standard_error),
+            "low": finite_or_none(self.low),
+            "high": finite_or_none(self.high),
+            "confidence": self.confidence,
+            "sign": self.sign,
+            "dim": self.dim,
+            "probes": self.probes,
+            "matvecs": self.matvecs,
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Eigenpairs:
+    """k eigenpairs of one end of the spectrum, the outermost first.
+
+    residuals: |H v - lambda v| by a last application of the operator itself, not the recurrence's estimate.
+    vector_errors: residual over the distance to the nearest other approximate eigenvalue, about the sine of the angle
+        between v and the true eigenvector; infinite where that distance is not known.
+    """
+
+    values: Float64[Tensor, " k"]
+    vectors: Float[Tensor, "n k"]
+    residuals: Float64[Tensor, " k"]
+    vector_errors: Float64[Tensor, " k"]
+    reason: StopReason
+
+    def __len__(self) -> int:
+        return self.values.numel()
+
+    def interval(self, index: int = 0) -> tuple[float, float]:
+        """An eigenvalue of H lies in it."""
+        value, residual = float(self.values[index]), float(self.residuals[index])
+        return value - residual, value + residual
+
+    def record(self, index: int = 0) -> dict[str, Number | str]:
+        return {
+            "value": finite_or_none(float(self.values[index])),
+            "residual": finite_or_none(float(self.residuals[index])),
+            "vector_error": finite_or_none(float(self.vector_errors[index])),
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class EigenEnds:
+    """Both ends of the spectrum.
+
+    beyond: with the probability 0.99 over the random start, no eigenvalue lies farther than this outside
+        [smallest[0], largest[0]] (a worst-case bound over all spectra, far from sharp; infinite where there is none).
+    noise: relative round-off of one matvec, |H(a q)/a - H q| / |H q|, measured on the start vector (nan: not measured).
+    """
+
+    largest: Eigenpairs
+    smallest: Eigenpairs
+    method: str
+    matvecs: int
+    beyond: float
+    noise: float
+
+    def record(self) -> dict[str, object]:
+        return {
+            "max": [self.largest.record(i) for i in range(len(self.largest))],
+            "min": [self.smallest.record(i) for i in range(len(self.smallest))],
+            "method": self.method,
+            "matvecs": self.matvecs,
+            "beyond": finite_or_none(self.beyond),
+            "noise": finite_or_none(self.noise),
+        }
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """A derived number, with ends that carry the errors of what it is derived from and a sentence for its limits.
+
+    value is None where the number is undefined or unresolved; low and high may be infinite.
+    """
+
+    value: Number
+    low: float
+    high: float
+    note: str = ""
+
+    def record(self) -> dict[str, Number | str]:
+        value = None if self.value is None else finite_or_none(self.value)
+        return {"value": value, "low": finite_or_none(self.low), "high": finite_or_none(self.high), "note": self.note}
+
+    def __str__(self) -> str:
+        if self.value is not None:
+            return f"{self.value:.4g} in [{self.low:.4g}, {self.high:.4g}]" + (f" ({self.note})" if self.note else "")
+        return f">= {self.low:.4g}: {self.note}" if isfinite(self.low) else f"undefined: {self.note}"
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralDensity:
+    """The spectrum as seen by stochastic Lanczos quadrature: for every start vector, nodes and weights of a Gauss rule.
+
+    The density of eigenvalues, normalised to 1, is about the mean over starts of sum_j weights_j delta(x - nodes_j);
+    it is exact in expectation for polynomials of degree below 2 steps.
+    """
+
+    nodes: Float64[Tensor, "starts steps"]
+    weights: Float64[Tensor, "starts steps"]
+    dim: int
+    matvecs: int
+
+    def integral(self, function: Callable[[Tensor], Tensor], confidence: float = 0.95) -> Bracket:
+        """sum_i f(lambda_i) with the interval of its spread over start vectors (the rule's own error is not in it)."""
+        samples = self.dim * (self.weights * function(self.nodes)).sum(dim=1)
+        value, _, low, high = t_interval(samples, confidence)
+        return Bracket(value, low, high, f"spread over {samples.numel()} start vectors")
+
+    def smoothed(self, at: Float64[Tensor, " m"], width: float) -> Float64[Tensor, "starts m"]:
+        """The density at `at`, one row a start vector, each node blurred by a Gaussian of standard deviation width."""
+        offset = (at[None, :, None] - self.nodes[:, None, :]) / width
+        kernel = torch.exp(-offset.square() / 2) / (width * sqrt(2 * torch.pi))
+        return (kernel * self.weights[:, None, :]).sum(dim=2)
+
+
+@dataclass(frozen=True)
+class Anisotropy:
+    """The index family: how unequal the curvatures are.  None: what it needs was not computed."""
+
+    literal: Bracket
+    saddle: Bracket
+    share: Bracket | None = None
+    effective_rank: Bracket | None = None
+
+    def record(self) -> dict[str, object]:
+        members = {
+            "literal": self.literal,
+            "saddle": self.saddle,
+            "share": self.share,
+            "effective_rank": self.effective_rank,
+        }
+        return {name: bracket.record() for name, bracket in members.items() if bracket is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class Slice:
+    """The objective on a grid center + sum_d x_d directions[:, d], d = 1 or 2, beside its quadratic model.
+
+    loss has one axis per direction (rows follow coordinates[0], columns coordinates[1]).  model, slope and curvature
+    are None where neither gradient nor operator was given.  crossed marks points whose signature (order of sorting,
+    visible set) differs from the centre's: between them the objective may jump.
+    """
+
+    coordinates: tuple[Float64[Tensor, " _"], ...]
+    loss: Float64[Tensor, "..."]
+    center_loss: float
+    model: Float64[Tensor, "..."] | None
+    slope: Float64[Tensor, " d"] | None
+    curvature: Float64[Tensor, "d d"] | None
+    crossed: Bool[Tensor, "..."] | None
+    evaluations: int
+
+    @property
+    def difference(self) -> Float64[Tensor, "..."] | None:
+        """Objective minus quadratic model."""
+        return None if self.model is None else self.loss - self.model
