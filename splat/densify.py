@@ -33,8 +33,8 @@ SPLIT_SHRINK = 0.8 * SPLIT_INTO
 class DensifySettings:
     """When and what to densify, in a run of T steps: after min(start, start_share T), before min(stop, stop_share T).
 
-    The interval is `every`, but at most every_share T.  3DGS trains for 30,000 steps, where the shares change nothing; with
-    them short runs densify too, and have half of their steps to settle.
+    The interval is `every`, but at most every_share T.  3DGS trains for 30,000 steps, where the shares change nothing;
+    with them short runs densify too, and have half of their steps to settle.
     """
 
     enabled: bool = True
