@@ -39,6 +39,7 @@ slice             null, or:
                       curvature along each, and `unit` = sqrt(2 loss_scale / |curvature|), in parameter units
     loss_scale*       a change of loss: along a direction the curvature alone makes it within one `unit`
     center_loss*      L at the centre, a render of the slice's own
+    points, crossed_points    of the grid: all, and those that `crossed` (below) marks
     evaluations       renders of all views that the slice took
     note
 counts*           gaussians*, visible_gaussians*, parameters*, active_parameters*, sh_degree_stored*, sh_degree_active*,

@@ -36,14 +36,6 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
 )
 POSITIVE, NEGATIVE, UNDETERMINED = BLUE, VERMILION, "0.45"
 
-ATTRIBUTES = {
-    "means": "position",
-    "log_scales": "log scale",
-    "quats": "rotation",
-    "opacity_logits": "opacity",
-    "sh": "colour (SH)",
-}
-
 _RC: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 7,
@@ -88,8 +80,9 @@ def save(figure: Figure, path: str | Path) -> Path:
     """Write the figure (PNG, PDF or SVG by its suffix) so that `path` is the old file or the whole new one."""
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
+    options: dict[str, Any] = {"pil_kwargs": {"optimize": True}} if path.suffix == ".png" else {}
     with style():
-        figure.savefig(temporary)
+        figure.savefig(temporary, **options)
     temporary.replace(path)
     return path
 
@@ -119,11 +112,6 @@ def unit_suffix(exponent: int) -> str:
 def literal(text: str) -> str:
     """Text from a record, with nothing in it read as mathematics."""
     return text.replace("$", r"\$")
-
-
-def attribute_name(attribute: str) -> str:
-    """The attribute in the paper's words; a name that is none of the five stays as it is."""
-    return ATTRIBUTES.get(attribute, literal(attribute))
 
 
 def script(draw: Callable[[Record], Figure], name: str) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -54,9 +55,7 @@ def draw(record: Record) -> Figure:
                 f"matplotlib drew the surface, because the off-screen renderer failed: {error}", RendererMissing, 2
             )
             image = _drawn_by_matplotlib(heights)
-            figure.text(
-                0.01, 0.01, "drawn without the off-screen renderer (not available)", fontsize=5.5, color=VERMILION
-            )
+            figure.supxlabel("drawn without the off-screen renderer (not available)", fontsize=6, color=VERMILION)
         axes = figure.subplots()
         axes.imshow(image, extent=(0, 1, 0, 1), interpolation="antialiased")
         axes.set(xlim=(0.0, 1.0), ylim=(0.11, 0.92), aspect="equal")
@@ -65,7 +64,7 @@ def draw(record: Record) -> Figure:
         colours = ScalarMappable(Normalize(low, low + span), FIELD_MAP)
         figure.colorbar(colours, ax=axes, label=field.label, shrink=0.75, pad=0.0, aspect=20)
         curvatures = ", ".join(f"{d.name} {quantity(d.curvature)}" for d in (field.x, field.y))
-        flat = "" if high > low else " (the loss is the same at every point)"
+        flat = "" if high > low else "\nthe loss is the same at every point"
         figure.suptitle(f"Curvature along {curvatures}{flat}", fontsize=7)
     return figure
 
@@ -102,8 +101,9 @@ def _drawn_by_matplotlib(heights: np.ndarray) -> np.ndarray:
     for i, j in sorted(cells, key=lambda cell: float(x[cell] * Box.EYE[0] + y[cell] * Box.EYE[1])):
         ring = corners[[i, i + 1, i + 1, i], [j, j, j + 1, j + 1]]
         axes.fill(ring[:, 0], ring[:, 1], color=colours[i, j], linewidth=0.1)
-    figure.canvas.draw()
-    return np.asarray(figure.canvas.buffer_rgba())  # pyright: ignore[reportAttributeAccessIssue]
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
 
 
 def _draw_box(axes: Axes, field: Plane, heights: np.ndarray, levels: np.ndarray) -> None:

@@ -15,7 +15,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from analysis.quantities import power_of_ten, quantity
 from analysis.records import Record
-from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, attribute_name, new_figure, script, style
+from analysis.verdict import attribute_name
+from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, script, style
 
 SIGNS: dict[str, dict[str, Any]] = {
     "positive": {"color": POSITIVE, "marker": "o", "markerfacecolor": POSITIVE},
@@ -74,7 +75,9 @@ def _draw_taus(axes: Axes, entries: dict[str, dict[str, Any]]) -> None:
 
 
 def _rows(axes: Axes, entries: dict[str, dict[str, Any]], numbers: list[str]) -> None:
-    axes.set_yticks(range(len(entries)), [f"{attribute_name(k)}\n{n}" for k, n in zip(entries, numbers, strict=True)])
+    axes.set_yticks(
+        range(len(entries)), [f"{literal(attribute_name(k))}\n{n}" for k, n in zip(entries, numbers, strict=True)]
+    )
     axes.set_ylim(len(entries) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
     axes.grid(True, axis="both")

@@ -104,6 +104,8 @@ def _plane(scale: float) -> dict[str, Any]:
         ],
         "loss_scale": 8e-4,
         "center_loss": 0.0832,
+        "points": 357,
+        "crossed_points": 326,
         "evaluations": 357,
     }
 

@@ -1,0 +1,173 @@
+"""What a record says, in sentences: who carries the curvature, saddle or basin, how anisotropic, what was skipped.
+
+Every sentence follows from numbers of the record and their errors alone; where an error does not decide, it says so.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from analysis.quantities import quantity
+
+ATTRIBUTES = {
+    "means": "position",
+    "log_scales": "log scale",
+    "quats": "rotation",
+    "opacity_logits": "opacity",
+    "sh": "colour (SH)",
+}
+
+
+@dataclass(frozen=True)
+class Line:
+    """One sentence; a failure is a check that did not hold or a number that is none."""
+
+    text: str
+    level: Literal["fact", "caution", "failure"] = "fact"
+
+
+def attribute_name(attribute: str) -> str:
+    """The attribute in the paper's words; a name that is none of the five stays as it is."""
+    return ATTRIBUTES.get(attribute, attribute)
+
+
+def verdict(data: Mapping[str, Any]) -> list[Line]:
+    """The sentences of a record's data, failures first."""
+    lines = [
+        *_of_checks(data["checks"]),
+        *_of_traces(data["traces"]),
+        *_of_ends(data["eigenvalues"]),
+        *_of_anisotropy(data["anisotropy"]),
+        *_of_counts(data["counts"]),
+        *_of_slice(data.get("slice")),
+        *(Line(note, "caution") for note in data.get("notes", ())),
+    ]
+    return sorted(lines, key=lambda line: line.level != "failure")
+
+
+def _of_checks(checks: Mapping[str, Any]) -> list[Line]:
+    lines = []
+    for name, check in checks.items():
+        label, note = name.replace("_", " "), _in_brackets(check)
+        if check["passed"] is None:
+            lines.append(Line(f"The check of {label} could not run{note}.", "caution"))
+        elif not check["passed"]:
+            measured, bound = quantity(check["value"]), quantity(check["bound"])
+            text = f"The check of {label} failed: {measured}, where at most {bound} is allowed{note}."
+            lines.append(Line(f"{text} Do not trust the numbers below.", "failure"))
+    if checks and all(check["passed"] for check in checks.values()):
+        lines.append(Line(f"All {len(checks)} checks passed."))
+    return lines
+
+
+def _of_traces(traces: Mapping[str, Any]) -> list[Line]:
+    finite = {name: entry for name, entry in traces.items() if _is_finite(entry["value"])}
+    lines = [
+        Line(
+            f"The trace of {attribute_name(name)} is {quantity(traces[name]['value'])}{_in_brackets(traces[name])}.",
+            "failure",
+        )
+        for name in traces
+        if name not in finite
+    ]
+    total = sum(abs(entry["value"]) for entry in finite.values())
+    if total > 0:
+        first, *others = sorted(finite, key=lambda name: -abs(finite[name]["value"]))
+        value, error = finite[first]["value"], finite[first]["standard_error"]
+        text = (
+            f"{attribute_name(first).capitalize()} carries most of the curvature: its trace, {quantity(value, error)}, "
+        )
+        text += f"is {abs(value) / total:.0%} of the sum of all absolute traces (each in its own stored units)."
+        if others and _overlap(finite[first], finite[others[0]]):
+            text += f" Its error does not separate it from {attribute_name(others[0])}."
+        lines.append(Line(text))
+    elif finite:
+        lines.append(Line("Every trace is exactly 0."))
+    signs = {"negative": "negative: on average the loss curves down there", "undetermined": "not decided by its error"}
+    for sign, words in signs.items():
+        if named := [attribute_name(name) for name, entry in finite.items() if entry["sign"] == sign]:
+            lines.append(Line(f"The sign of the trace of {' and '.join(named)} is {words}.", "caution"))
+    return lines
+
+
+def _of_ends(ends: Mapping[str, Any]) -> list[Line]:
+    top, bottom = ends["max"], ends["min"]
+    numbers = [top["value"], top["residual"], bottom["value"], bottom["residual"]]
+    if not all(_is_finite(number) for number in numbers):
+        return [Line("The ends of the spectrum were not determined.", "failure")]
+    high, low = quantity(top["value"], top["residual"]), quantity(bottom["value"], bottom["residual"])
+    ends_text = f"the curvature runs from {low} to {high}"
+    if bottom["value"] + bottom["residual"] < 0 < top["value"] - top["residual"]:
+        return [Line(f"The Hessian is indefinite, so the checkpoint is no basin in every direction: {ends_text}.")]
+    if bottom["value"] - bottom["residual"] > 0:
+        return [Line(f"No direction of negative curvature was found: {ends_text}.")]
+    if top["value"] + top["residual"] < 0:
+        return [Line(f"No direction of positive curvature was found: {ends_text}.")]
+    return [Line(f"Whether the Hessian is indefinite is not decided by the residuals: {ends_text}.", "caution")]
+
+
+def _of_anisotropy(family: Mapping[str, Any]) -> list[Line]:
+    lines = []
+    saddle, share = family.get("saddle"), family.get("share")
+    if saddle and _is_finite(saddle["value"]):
+        text = f"The steepest direction up is {quantity(saddle['value'])} times as curved as the steepest down"
+        lines.append(Line(f"{text}{_bracket(saddle)}."))
+    elif saddle and _is_finite(saddle["low"]):
+        text = f"The steepest direction up is at least {quantity(saddle['low'])} times as curved as the steepest down"
+        lines.append(Line(f"{text}{_in_brackets(saddle)}."))
+    elif saddle:
+        lines.append(
+            Line(f"The ratio of the two ends of the spectrum is not defined here{_in_brackets(saddle)}.", "caution")
+        )
+    if share and _is_finite(share["value"]):
+        lines.append(
+            Line(f"The steepest direction alone holds {share['value']:.2%} of all absolute curvature{_bracket(share)}.")
+        )
+    return lines
+
+
+def _of_counts(counts: Mapping[str, int]) -> list[Line]:
+    lines = []
+    unseen = counts["gaussians"] - counts["visible_gaussians"]
+    if unseen:
+        lines.append(
+            Line(f"{unseen:,} of {counts['gaussians']:,} Gaussians touch no pixel of any view and were left out.")
+        )
+    if counts["sh_degree_active"] < counts["sh_degree_stored"]:
+        degrees = f"degree {counts['sh_degree_active']} of {counts['sh_degree_stored']}"
+        lines.append(Line(f"Colour uses spherical harmonics of {degrees}; the bands above were left out."))
+    used = counts["active_parameters"], counts["parameters"]
+    lines.append(Line(f"The operator acts on {used[0]:,} of {used[1]:,} parameters, over {counts['views']} views."))
+    return lines
+
+
+def _of_slice(plane: Mapping[str, Any] | None) -> list[Line]:
+    if plane is None:
+        return [Line("No slice of the loss was recorded.", "caution")]
+    if not plane.get("crossed_points"):
+        return []
+    share = f"{plane['crossed_points']:,} of the slice's {plane['points']:,} points"
+    return [Line(f"At {share} the order of the splats or the set of visible ones is not the checkpoint's.")]
+
+
+def _is_finite(number: float | None) -> bool:
+    return number is not None and math.isfinite(number)
+
+
+def _overlap(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+    """Whether two standard errors of the difference of the sizes reach 0; an infinite error always does."""
+    errors = [entry["standard_error"] for entry in (first, second)]
+    if not all(_is_finite(error) for error in errors):
+        return True
+    return abs(abs(first["value"]) - abs(second["value"])) < 2 * math.hypot(*errors)
+
+
+def _bracket(entry: Mapping[str, Any]) -> str:
+    if entry["low"] is None and entry["high"] is None:
+        return ""
+    return f" (between {quantity(entry['low'])} and {quantity(entry['high'])})"
+
+
+def _in_brackets(entry: Mapping[str, Any]) -> str:
+    return f" ({entry['note']})" if entry.get("note") else ""

@@ -1,0 +1,160 @@
+import math
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from analysis.records import record_folder, write_record
+from analysis.report import write_report
+from analysis.verdict import verdict
+from tests.recorded import synthetic
+
+PIXEL = bytes.fromhex("89504e470d0a1a0a") + b"not looked into"
+
+
+class Page(HTMLParser):
+    """Every address that a browser would fetch, the visible text by element, and the number of scripts."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.addresses, self.texts, self.scripts, self.tags, self.open = [], [], 0, [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.open.append(tag)
+        self.scripts += tag == "script"
+        self.addresses += [
+            value for key, value in attrs if key in {"src", "href", "srcset", "data", "action", "poster"}
+        ]
+        if tag in {"meta", "link", "img", "br"}:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        while self.open and self.open.pop() != tag:
+            pass
+
+    def handle_data(self, data):
+        if not {"script", "style"} & set(self.open):
+            self.texts.append(data)
+
+    @property
+    def text(self):
+        return re.sub(r"\s+", " ", " ".join(self.texts))
+
+
+def page(folder, data, arrays, picture=None):
+    with record_folder(folder) as partial:
+        write_record(partial, data, arrays)
+        if picture:
+            (partial / f"{picture}.png").write_bytes(PIXEL)
+        path = write_report(partial)
+        assert [p.name for p in partial.glob("*.tmp")] == []
+    return (folder / path.name).read_text(encoding="utf-8")
+
+
+def sentences(data, level=None):
+    return " | ".join(line.text for line in verdict(data) if level in {None, line.level})
+
+
+def test_the_page_fetches_nothing_and_carries_its_pictures(tmp_path):
+    text = page(tmp_path / "probe", *synthetic(), picture="traces")
+    parsed = Page(text)
+    assert len(parsed.addresses) == 1 and parsed.addresses[0].startswith("data:image/png;base64,")
+    assert "default-src 'none'" in text and "link" not in parsed.tags
+    assert "connect-src" not in text and "@import" not in text.partition("</style>")[0]
+    assert len(text) < 6e6
+
+
+def test_plotly_is_carried_once_and_only_where_there_is_a_slice(tmp_path):
+    data, arrays = synthetic()
+    with_slice = page(tmp_path / "a", data, arrays)
+    assert with_slice.count("* plotly.js v") == 1 and 'id="surface"' in with_slice
+    data["slice"] = None
+    del arrays["slice"]
+    without = page(tmp_path / "b", data, arrays)
+    assert "* plotly.js v" not in without and Page(without).scripts == 0
+    assert "No slice of the loss was recorded" in Page(without).text
+
+
+def test_every_number_of_the_tables_is_on_the_page_with_its_error(tmp_path):
+    data, arrays = synthetic()
+    text = Page(page(tmp_path / "probe", data, arrays)).text
+    for expected in (
+        "(3.991 ± 0.093) × 10⁵",
+        "−308.2 ± 8.0",
+        "(3.1000 ± 0.0012) × 10⁴",
+        "−220.0 ± 3.0",
+        "10,091",
+        "rademacher",
+    ):
+        assert expected in text
+
+
+def test_text_of_the_record_cannot_become_markup(tmp_path):
+    evil = '</script><script>alert(1)</script><img src="http://example.org/x.png">'
+    data, arrays = synthetic()
+    data["provenance"] |= {"scene": evil, "settings": {evil: [evil]}}
+    data["notes"] = [evil]
+    data["slice"]["directions"][0]["name"] = evil
+    data["checks"]["symmetry"]["note"] = evil
+    data["traces"]["means"]["method"] = evil
+    clean, hostile = Page(page(tmp_path / "a", *synthetic())), Page(page(tmp_path / "b", data, arrays))
+    assert hostile.scripts == clean.scripts
+    assert "img" not in hostile.tags and hostile.addresses == []
+    assert "alert(1)" in hostile.text
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e9])
+def test_records_of_extreme_size_and_without_numbers_make_a_page(tmp_path, scale):
+    data, arrays = synthetic(scale)
+    data["traces"]["means"] |= {"value": None, "standard_error": None, "low": None, "high": None, "tau": math.nan}
+    data["eigenvalues"]["min"] |= {"value": math.nan}
+    arrays["slice"]["loss"][:3] = math.nan
+    text = Page(page(tmp_path / "probe", data, arrays)).text
+    assert "not a number" in text and "The ends of the spectrum were not determined" in text
+
+
+def test_the_verdict_names_the_attribute_that_carries_the_curvature():
+    data, _ = synthetic()
+    assert "Position carries most of the curvature" in sentences(data) and "98%" in sentences(data)
+    data["traces"]["quats"] |= {"value": -3.9e5, "standard_error": 4e4}
+    assert "Its error does not separate it from rotation" in sentences(data)
+    data["traces"]["quats"] |= {"value": -8e5, "standard_error": 4e3}
+    assert "Rotation carries most" in sentences(data) and "separate" not in sentences(data)
+
+
+@pytest.mark.parametrize(
+    ("low", "residual", "words"),
+    [
+        (-220.0, 3.0, "The Hessian is indefinite"),
+        (-2.0, 3.0, "not decided by the residuals"),
+        (5.0, 3.0, "No direction of negative curvature was found"),
+    ],
+)
+def test_the_verdict_calls_indefinite_what_the_residual_proves(low, residual, words):
+    data, _ = synthetic()
+    data["eigenvalues"]["min"] |= {"value": low, "residual": residual}
+    assert words in sentences(data)
+
+
+def test_a_failed_check_comes_first_and_in_red(tmp_path):
+    data, arrays = synthetic()
+    assert sentences(data, "failure") == ""
+    data["checks"]["symmetry"] |= {"value": 0.5, "passed": False}
+    first = verdict(data)[0]
+    assert first.level == "failure" and "symmetry failed: 0.500" in first.text
+    assert 'class="failure">The check of symmetry failed' in page(tmp_path / "probe", data, arrays)
+
+
+def test_the_verdict_says_what_was_skipped_and_what_could_not_run():
+    said = sentences(synthetic()[0])
+    assert "217 of 10,091 Gaussians touch no pixel" in said
+    assert "degree 0 of 3" in said and "326 of the slice's 357 points" in said
+    assert "finite difference could not run (every direction crosses a sort)" in said
+
+
+def test_an_unbounded_ratio_is_given_by_its_bound():
+    data, _ = synthetic()
+    data["anisotropy"]["saddle"] = {"value": None, "low": 40.0, "high": None, "note": "the small end is not resolved"}
+    assert "at least 40.0 times as curved as the steepest down (the small end is not resolved)" in sentences(data)

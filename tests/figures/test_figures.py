@@ -1,0 +1,198 @@
+import math
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+from PIL import Image
+
+from analysis.records import Record, read_record, record_folder, write_record
+from figures import make_all, slice2d, spectrum, surface, traces
+from figures.plane import plane
+from figures.render_surface import Box
+from figures.style import COLUMN, exponent_of
+from tests.recorded import synthetic
+
+POINT = 1 / 72  # inches
+
+
+def recorded(folder, data, arrays) -> Record:
+    with record_folder(folder) as partial:
+        write_record(partial, data, arrays)
+    return read_record(folder)
+
+
+def nothing_drawn(*_):
+    raise RuntimeError("no OpenGL here")
+
+
+def laid_out(figure):
+    """The figure drawn once, at a resolution that suffices for its layout, and the renderer that measures it."""
+    figure.set_dpi(100)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return canvas.get_renderer()
+
+
+def words(figure, renderer):
+    """(text, box in pixels) of every text that is drawn and is no bare number."""
+    texts = [text for text in figure.findobj(Text) if text.get_visible() and any(c.isalpha() for c in text.get_text())]
+    return [(text.get_text(), text.get_window_extent(renderer)) for text in texts]
+
+
+def difficult(case):
+    """The synthetic record and what can be wrong with one."""
+    if case in {"1e-12", "1e9"}:
+        return synthetic(float(case))
+    data, arrays = synthetic()
+    if case == "no numbers":
+        data["traces"]["means"] |= {"value": math.nan, "standard_error": math.nan, "low": None, "high": None}
+        data["traces"]["quats"] |= {"value": None, "standard_error": None, "tau": None, "low": None, "high": None}
+        arrays["slice"]["loss"][2:6, :4] = math.nan
+        arrays["traces"] = {}
+    if case == "flat":
+        for entry in data["traces"].values():
+            entry |= {"value": 0.0, "standard_error": 0.0, "low": 0.0, "high": 0.0, "tau": 0.0, "sign": "zero"}
+        arrays["slice"]["loss"][:] = data["slice"]["center_loss"]
+        arrays["spectrum"]["ritz_values"][:] = 0.0
+    if case == "extremes":
+        data["traces"]["means"] |= {"value": 1e9, "standard_error": 1e8, "low": 8e8, "high": 1.2e9}
+        data["traces"]["sh"] |= {"value": -1e-12, "standard_error": 1e-13, "low": -1.2e-12, "high": -8e-13}
+        data["traces"]["opacity_logits"] |= {"value": -50.0, "standard_error": 80.0, "low": -210.0, "high": 110.0}
+        data["traces"]["opacity_logits"]["sign"] = "undetermined"
+    if case == "least":
+        arrays = {"slice": {k: arrays["slice"][k] for k in ("x", "y", "loss")}, "spectrum": arrays["spectrum"]}
+        arrays["spectrum"] = {k: arrays["spectrum"][k][[0, -1]] for k in ("ritz_values", "residuals")}
+    return data, arrays
+
+
+CASES = ("plain", "1e-12", "1e9", "no numbers", "flat", "extremes", "least")
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("module", [traces, spectrum, slice2d, surface], ids=lambda module: module.__name__)
+def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, monkeypatch, module, case):
+    monkeypatch.setattr(surface, "_rendered", nothing_drawn)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", surface.RendererMissing)
+        figure = module.draw(recorded(tmp_path / "probe", *difficult(case)))
+    renderer = laid_out(figure)
+    drawn = figure.get_tightbbox(renderer)
+    assert figure.get_figwidth() == COLUMN
+    assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
+    assert drawn.x1 <= COLUMN + POINT and drawn.y1 <= figure.get_figheight() + POINT
+    boxes = words(figure, renderer)
+    pairs = [
+        (a, b) for i, (a, box) in enumerate(boxes) for b, other in boxes[:i] if box.shrunk(0.9, 0.9).overlaps(other)
+    ]
+    assert pairs == []
+
+
+def test_the_drawn_traces_are_the_recorded_ones(tmp_path):
+    record = recorded(tmp_path / "probe", *synthetic())
+    axes = traces.draw(record).axes[0]
+    markers = [line for line in axes.lines if line.get_marker() in {"o", "s"}]
+    drawn = [float(np.asarray(line.get_xdata())[0]) for line in markers]
+    assert drawn == [abs(entry["value"]) for entry in record.data["traces"].values()]
+    assert [line.get_marker() for line in markers] == ["o", "o", "o", "s", "o"]  # only opacity is negative
+
+
+def test_an_undetermined_sign_reaches_the_left_edge(tmp_path):
+    axes = traces.draw(recorded(tmp_path / "probe", *difficult("extremes"))).axes[0]
+    left = axes.get_xlim()[0]
+    bars = [line for line in axes.lines if line.get_marker() == "None" and len(np.asarray(line.get_xdata())) == 2]
+    assert [float(np.asarray(bar.get_xdata())[0]) == left for bar in bars] == [False, False, False, True, False]
+
+
+def test_cross_sections_are_the_rows_and_columns_through_the_centre(tmp_path):
+    record = recorded(tmp_path / "probe", *synthetic())
+    figure, arrays = slice2d.draw(record), record.arrays["slice"]
+    field = plane(record)
+    center = record.data["slice"]["center_loss"]
+    sections = {axes.get_xlabel(): axes.lines[0] for axes in figure.axes if "step along" in axes.get_xlabel()}
+    first = np.asarray(sections[field.x.short_label].get_ydata(), dtype=float) * 10.0**field.exponent
+    second = np.asarray(sections[field.y.short_label].get_ydata(), dtype=float) * 10.0**field.exponent
+    np.testing.assert_allclose(first, arrays["loss"][:, 8] - center, rtol=1e-12, atol=1e-17)
+    np.testing.assert_allclose(second, arrays["loss"][10, :] - center, rtol=1e-12, atol=1e-17)
+
+
+def test_the_first_direction_runs_to_the_right(tmp_path):
+    data, arrays = synthetic()
+    arrays["slice"]["loss"] = data["slice"]["center_loss"] + np.add.outer(np.arange(21.0), np.zeros(17))
+    arrays["slice"]["crossed"] = np.arange(21)[:, None] * np.ones(17) > 15
+    axes = slice2d.draw(recorded(tmp_path / "probe", data, arrays)).axes[0]
+    (dots,) = [line for line in axes.lines if len(np.asarray(line.get_xdata())) == 5 * 17]
+    assert np.min(np.asarray(dots.get_xdata())) > 0.4 * axes.get_xlim()[1]
+
+
+def test_a_missing_slice_is_said_and_the_other_figures_are_drawn(tmp_path):
+    data, arrays = synthetic()
+    del arrays["slice"]
+    record = recorded(tmp_path / "probe", data | {"slice": None}, arrays)
+    for module in (slice2d, surface):
+        with pytest.raises(ValueError, match="expected a recorded slice"):
+            module.draw(record)
+    assert [path.name for path in make_all.draw_probe(record.folder)] == ["traces.png", "spectrum.png"]
+
+
+def test_a_slice_without_a_finite_point_is_refused(tmp_path):
+    data, arrays = synthetic()
+    arrays["slice"]["loss"][:] = math.nan
+    with pytest.raises(ValueError, match="expected finite losses"):
+        slice2d.draw(recorded(tmp_path / "probe", data, arrays))
+
+
+def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypatch):
+    record = recorded(tmp_path / "probe", *synthetic())
+    monkeypatch.setattr(surface, "RENDERER", [sys.executable, "-c", "import sys; sys.exit('no OpenGL here')"])
+    with pytest.warns(surface.RendererMissing, match="no OpenGL here"):
+        figure = surface.draw(record)
+    assert "without the off-screen renderer" in figure.get_supxlabel()
+
+
+def test_pyvista_renders_the_field_where_the_labels_are_put(tmp_path):
+    heights = np.zeros((9, 9))
+    heights[-1, :] = 1.0  # high at the right end of x
+    try:
+        image = surface._rendered(heights, np.array([]))
+    except RuntimeError as error:
+        pytest.skip(f"no off-screen renderer on this machine: {error}")
+    size = image.shape[0]
+    assert image.shape[:2] == (Box.PIXELS, Box.PIXELS)
+
+    def pixel(point):
+        column, row = Box.project(np.array(point)) * size
+        return image[size - 1 - int(row), int(column), :3]
+
+    ink = np.argwhere(image[..., :3].min(axis=-1) < 0.95)
+    x, y = np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9), indexing="ij")
+    corners = Box.project(np.stack([x, y, heights * Box.TOP], axis=-1).reshape(-1, 3)) * size
+    assert ink[:, 1].min() == pytest.approx(corners[:, 0].min(), abs=2)
+    assert ink[:, 1].max() == pytest.approx(corners[:, 0].max(), abs=2)
+    assert size - 1 - ink[:, 0].min() == pytest.approx(corners[:, 1].max(), abs=2)
+    assert size - 1 - ink[:, 0].max() == pytest.approx(corners[:, 1].min(), abs=2)
+    assert pixel((0, 0, 0))[2] > pixel((0, 0, 0))[0]  # low is blue
+    high = pixel((0.999, 0.0, 0.98 * Box.TOP))
+    assert high[0] > high[2]  # high is yellow
+
+
+def test_a_figure_from_the_command_line_and_its_refusal(tmp_path):
+    folder = recorded(tmp_path / "probe", *synthetic()).folder
+    good, bad = (
+        subprocess.run(
+            [sys.executable, "-m", "figures.traces", str(place)], capture_output=True, text=True, check=False
+        )
+        for place in (folder, tmp_path)
+    )
+    assert good.returncode == 0 and good.stdout.strip() == str(folder / "traces.png")
+    with Image.open(folder / "traces.png") as picture:
+        assert picture.width == round(COLUMN * 300)
+    assert bad.returncode == 2 and bad.stderr.startswith("expected a folder") and "Traceback" not in bad.stderr
+
+
+def test_an_axis_takes_out_a_power_of_a_thousand():
+    assert [exponent_of(10.0**k) for k in (-12, -4, -1, 0, 3, 4, 9)] == [-12, -6, 0, 0, 0, 3, 9]
+    assert exponent_of(np.array([np.nan, 0.0])) == 0
