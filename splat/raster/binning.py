@@ -8,10 +8,10 @@ double precision and rounded outwards.  Splats are (n, 9) arrays: mean x, y; con
 from math import ceil, floor, inf, log, sqrt
 
 import numpy as np
-from numba import prange
 
-from splat.raster.compositing import CAPPED, TILE_ROWS, Lists, formula, kernel, worker
+from splat.raster.compositing import CAPPED, TILE_ROWS, Lists, formula, kernel
 from splat.raster.simd import lanes_of
+from splat.raster.threads import over_range
 from splat.settings import RenderSettings
 
 WIDEN = 1e-4  # relative widening of an ellipse's level, so that no active pixel is missed
@@ -26,7 +26,7 @@ def depth_order(depths: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     return index[np.argsort(depths[index], kind="stable")]
 
 
-@worker
+@kernel
 def radix_argsort(keys, index):
     """index, reordered so that the 32-bit keys ascend; stable. Overwrites both."""
     n = keys.size
@@ -87,35 +87,32 @@ def rows_in_strip(splat, level, det, ex, ey, left, right):
 
 
 @kernel
-def count_tiles(threads, splats, order, tile, width, height, alpha_min, contour, bound):
+def count_tiles(start, stop, splats, order, tile, width, height, alpha_min, contour, bound):
     """An upper bound of the number of tiles each splat touches: those of its ellipse's box."""
-    for t in prange(threads):
-        for i in range(order.size * t // threads, order.size * (t + 1) // threads):
-            splat = splats[order[i]]
-            ex, ey, level, _det = ellipse_of(splat, alpha_min, contour)
-            bound[i] = 0
-            if level > 0:
-                x0, x1 = pixels_within(splat[0] - 0.5, ex, width)
-                y0, y1 = pixels_within(splat[1] - 0.5, ey, height)
-                if x0 <= x1 and y0 <= y1:
-                    bound[i] = (x1 // tile - x0 // tile + 1) * (y1 // TILE_ROWS - y0 // TILE_ROWS + 1)
+    for i in range(start, stop):
+        splat = splats[order[i]]
+        ex, ey, level, _det = ellipse_of(splat, alpha_min, contour)
+        bound[i] = 0
+        if level > 0:
+            x0, x1 = pixels_within(splat[0] - 0.5, ex, width)
+            y0, y1 = pixels_within(splat[1] - 0.5, ey, height)
+            if x0 <= x1 and y0 <= y1:
+                bound[i] = (x1 // tile - x0 // tile + 1) * (y1 // TILE_ROWS - y0 // TILE_ROWS + 1)
 
 
 @kernel
-def list_tiles(threads, splats, order, tile, columns, width, height, alpha_min, contour, cap, place, count, tiles, rows, histogram):
+def list_tiles(start, stop, splats, order, tile, columns, width, height, alpha_min, contour, cap, place, count, tiles, rows):
     """The tiles that each splat touches and its rows in them, at place[i], place[i] + 1, ...; count[i] of them."""
-    for t in prange(threads):
-        for i in range(order.size * t // threads, order.size * (t + 1) // threads):
-            count[i] = 0
-            if place[i + 1] > place[i]:
-                count[i] = list_splat(
-                    splats[order[i]], tile, columns, width, height, alpha_min, contour, cap,
-                    tiles[place[i] :], rows[place[i] :], histogram[t],
-                )  # fmt: skip
+    for i in range(start, stop):
+        count[i] = 0
+        if place[i + 1] > place[i]:
+            count[i] = list_splat(
+                splats[order[i]], tile, columns, width, height, alpha_min, contour, cap, tiles[place[i] :], rows[place[i] :]
+            )
 
 
-@worker
-def list_splat(splat, tile, columns, width, height, alpha_min, contour, cap, tiles, rows, histogram):
+@kernel
+def list_splat(splat, tile, columns, width, height, alpha_min, contour, cap, tiles, rows):
     ex, ey, level, det = ellipse_of(splat, alpha_min, contour)
     mx, my = splat[0] - 0.5, splat[1] - 0.5
     x0, x1 = pixels_within(mx, ex, width)
@@ -130,25 +127,30 @@ def list_splat(splat, tile, columns, width, height, alpha_min, contour, cap, til
                 top, bottom = max(y0 - row * TILE_ROWS, 0), min(y1 - row * TILE_ROWS, TILE_ROWS - 1)
                 tiles[k] = row * columns + column
                 rows[k] = top | bottom << 8 | flags
-                histogram[tiles[k]] += 1
                 k += 1
     return k
 
 
 @kernel
-def fill_lists(threads, order, place, count, tiles, rows, first, splat_of, entry_rows):
-    """Scatter into the tiles' lists. first: (threads, tiles), where each thread's entries of a tile begin; advanced."""
-    for t in prange(threads):
-        for i in range(order.size * t // threads, order.size * (t + 1) // threads):
-            for k in range(place[i], place[i] + count[i]):
-                e = first[t, tiles[k]]
-                first[t, tiles[k]] = e + 1
-                splat_of[e] = order[i]
-                entry_rows[e] = rows[k]
+def fill_lists(order, place, count, tiles, rows, start, splat_of, entry_rows):
+    """Sort the entries by tile, in order of depth within each; start: (tiles + 1,) becomes where each tile's begin."""
+    start[:] = 0
+    for i in range(order.size):
+        for k in range(place[i], place[i] + count[i]):
+            start[tiles[k] + 1] += 1
+    for t in range(start.size - 1):
+        start[t + 1] += start[t]
+    following = start[:-1].copy()
+    for i in range(order.size):
+        for k in range(place[i], place[i] + count[i]):
+            e = following[tiles[k]]
+            following[tiles[k]] = e + 1
+            splat_of[e] = order[i]
+            entry_rows[e] = rows[k]
 
 
 def bin_splats(
-    threads: int, splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, settings: RenderSettings
+    splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, settings: RenderSettings
 ) -> Lists:
     """The tile lists of a view; the tiles are ordered heaviest first.  Their slots are assigned by `assign_slots`."""
     tile = lanes_of(splats.dtype)
@@ -158,24 +160,20 @@ def bin_splats(
     contour = inf if settings.contour_sigma is None else settings.contour_sigma
     where = (tile, width, height, settings.alpha_min, contour)
     bound = np.empty(order.size, np.int64)
-    count_tiles(threads, splats, order, *where, bound)
+    over_range(order.size, count_tiles, splats, order, *where, bound)
     place = np.zeros(order.size + 1, np.int64)
     np.cumsum(bound, out=place[1:])
     count = np.empty(order.size, np.int32)
     tiles, rows = np.empty(place[-1], np.int32), np.empty(place[-1], np.int32)
-    histogram = np.zeros((threads, tile_count), np.int32)
     cap = np.inf if settings.gradient_through_cap else settings.alpha_max
-    list_tiles(threads, splats, order, tile, columns, *where[1:], cap, place, count, tiles, rows, histogram)
-    start = np.zeros(tile_count + 1, np.int64)
-    per_tile = histogram.sum(axis=0)
-    np.cumsum(per_tile, out=start[1:])
-    first = start[:-1] + np.cumsum(histogram, axis=0) - histogram
-    splat_of, entry_rows = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
-    fill_lists(threads, order, place, count, tiles, rows, first, splat_of, entry_rows)
-    return Lists(start, splat_of, entry_rows, np.empty(0, np.int32), heaviest_first(per_tile))
+    over_range(order.size, list_tiles, splats, order, tile, columns, *where[1:], cap, place, count, tiles, rows)
+    entries, start = int(count.sum()), np.empty(tile_count + 1, np.int64)
+    splat_of, entry_rows = np.empty(entries, np.int32), np.empty(entries, np.int32)
+    fill_lists(order, place, count, tiles, rows, start, splat_of, entry_rows)
+    return Lists(start, splat_of, entry_rows, np.empty(0, np.int32), heaviest_first(np.diff(start)))
 
 
-@worker
+@kernel
 def assign_slots(start, splat_of, reached, slot_start, slots):
     """Number the entries that some pixel reaches, splat-major: splat i's are slot_start[i], ..., slot_start[i + 1] - 1.
 

@@ -25,13 +25,13 @@ A dash marks a tangent.  K tangents share the primal quantities of a splat's row
 K = 1 the two loops are one.  Every entry (a splat in a tile) writes its nine sums to its own slot, splat-major, so that no
 sum depends on the order in which threads finish.
 
-Arrays are flat: `params` holds PARAMS floats a splat, `tangents` K x TANGENTS floats a splat, a plane stride x height floats.
+Every kernel takes tiles from a counter until none is left (`threads.over_tiles`).  Arrays are flat: `params` holds PARAMS floats a splat, `tangents` K x TANGENTS floats a splat, a plane stride x height floats.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from splat.raster.simd import (
     any_lane,
@@ -99,8 +99,7 @@ class Pixels(NamedTuple):
     stop: np.ndarray
 
 
-kernel = njit(cache=True, parallel=True, nogil=True, error_model="numpy", boundscheck=False)
-worker = njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+kernel = njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 formula = njit(cache=True, forceinline=True, error_model="numpy", boundscheck=False)
 
 
@@ -251,15 +250,8 @@ def store_moments(sums, slot, moments, dx):
 
 
 @kernel
-def forward(threads, params, lists, frame, pixels):
+def forward(counter, params, lists, frame, pixels):
     """Render: fill `pixels`."""
-    counter = np.zeros(1, np.int64)
-    for _ in prange(threads):
-        forward_tiles(counter, params, lists, frame, pixels)
-
-
-@worker
-def forward_tiles(counter, params, lists, frame, pixels):
     L = lanes(params)
     state = scratch(params, 5 * L * TILE_ROWS)  # a row: T (negative once stopped), image (3), stop
     tile = next_tile(counter, lists)
@@ -331,15 +323,8 @@ def all_stopped(state, L):
 
 
 @kernel
-def backward(threads, params, lists, frame, pixels, cotangent, sums):
+def backward(counter, params, lists, frame, pixels, cotangent, sums):
     """Moments of every entry, (entries, SUMS), from the cotangent of the planes."""
-    counter = np.zeros(1, np.int64)
-    for _ in prange(threads):
-        backward_tiles(counter, params, lists, frame, pixels, cotangent, sums)
-
-
-@worker
-def backward_tiles(counter, params, lists, frame, pixels, cotangent, sums):
     L = lanes(params)
     state = scratch(params, 6 * L * TILE_ROWS)  # a row: T, R, g (3), stop
     tile = next_tile(counter, lists)
@@ -399,15 +384,8 @@ def backward_entry(params, lists, e, k, x0, y0, frame, state, sums):
 
 
 @kernel
-def tangent(threads, params, tangents, lists, frame, pixels, planes, transmittances):
+def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittances):
     """J u for K tangents: their planes (K, 4 planes) and the tangents of the final transmittance (K planes)."""
-    counter = np.zeros(1, np.int64)
-    for _ in prange(threads):
-        tangent_tiles(counter, params, tangents, lists, frame, pixels, planes, transmittances)
-
-
-@worker
-def tangent_tiles(counter, params, tangents, lists, frame, pixels, planes, transmittances):
     L = lanes(params)
     K = transmittances.size // frame.size
     width = (2 + 4 * K) * L
@@ -514,18 +492,11 @@ def tangent_entry_block(params, tangents, K, lists, e, k, x0, y0, frame, state, 
 
 
 @kernel
-def curvature(threads, params, tangents, lists, frame, pixels, cotangent, transmittances, cotangents, sums):
+def curvature(counter, params, tangents, lists, frame, pixels, cotangent, transmittances, cotangents, sums):
     """Moments of the tangent of `backward` for K tangents, (entries, K, SUMS).
 
     cotangent: g, 4 planes; cotangents: g' of every tangent, (K, 4 planes); transmittances: as `tangent` left them.
     """
-    counter = np.zeros(1, np.int64)
-    for _ in prange(threads):
-        curvature_tiles(counter, params, tangents, lists, frame, pixels, cotangent, transmittances, cotangents, sums)
-
-
-@worker
-def curvature_tiles(counter, params, tangents, lists, frame, pixels, cotangent, transmittances, cotangents, sums):
     L = lanes(params)
     K = transmittances.size // frame.size
     width = (6 + 5 * K) * L

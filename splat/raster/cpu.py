@@ -7,7 +7,6 @@ pixels; a splat is nine numbers (`packing.py`).  `rasterize` wraps it for autogr
 
 from math import log2
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from splat.raster import binning, compositing, packing
 from splat.raster.simd import lanes_of
+from splat.raster.threads import over_range, over_tiles
 from splat.settings import RenderSettings
 
 LEAST_TRANSMITTANCE = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}  # beneath it T would underflow
@@ -48,8 +48,8 @@ class Raster:
     ):
         self.splats, self.width, self.height = splats, width, height
         dtype, n = splats.dtype, len(splats)
-        self.threads, lanes = numba.get_num_threads(), lanes_of(dtype)
-        self.lists = binning.bin_splats(self.threads, splats, depths, drawn, width, height, settings)
+        lanes = lanes_of(dtype)
+        self.lists = binning.bin_splats(splats, depths, drawn, width, height, settings)
         columns, tile_rows = -(-width // lanes), -(-height // compositing.TILE_ROWS)
         self.plane = (tile_rows * compositing.TILE_ROWS, columns * lanes)
         size = self.plane[0] * self.plane[1]
@@ -66,9 +66,9 @@ class Raster:
         self.params = aligned((n * compositing.PARAMS,), dtype)
         least = log2(settings.alpha_min) if settings.alpha_min else -np.inf
         contour = np.inf if settings.contour_sigma is None else settings.contour_sigma
-        packing.pack_splats(splats, max(least, LEAST_LOG2_ALPHA[dtype]), contour, self.params)
+        over_range(n, packing.pack_splats, splats, max(least, LEAST_LOG2_ALPHA[dtype]), contour, self.params)
         self.pixels = compositing.Pixels(aligned((4 * size,), dtype), aligned((size,), dtype), aligned((size,), dtype))
-        compositing.forward(self.threads, self.params, self.lists, self.frame, self.pixels)
+        over_tiles(compositing.forward, self.params, self.lists, self.frame, self.pixels)
         self._moments: np.ndarray | None = None
         self._cotangent: np.ndarray | None = None
         self._slot_start: np.ndarray | None = None
@@ -109,9 +109,9 @@ class Raster:
         slot_start = self.slot_start
         sums = aligned((slot_start[-1] * compositing.SUMS,), self.splats.dtype)
         self._cotangent = np.ascontiguousarray(cotangent, self.splats.dtype).reshape(-1)
-        compositing.backward(self.threads, self.params, self.lists, self.frame, self.pixels, self._cotangent, sums)
+        over_tiles(compositing.backward, self.params, self.lists, self.frame, self.pixels, self._cotangent, sums)
         self._moments, gradient = np.empty((len(self.splats), 3), self.splats.dtype), np.empty_like(self.splats)
-        packing.reduce_gradient(self.splats, slot_start, sums, self._moments, gradient)
+        over_range(len(self.splats), packing.reduce_gradient, self.splats, slot_start, sums, self._moments, gradient)
         return gradient
 
     def jvp(self, directions: np.ndarray) -> "Tangent":
@@ -126,11 +126,10 @@ class Tangent:
         self.raster, self.directions = raster, np.ascontiguousarray(directions, raster.splats.dtype)
         K, dtype, size = directions.shape[1], raster.splats.dtype, raster.frame.size
         self._packed = aligned((len(directions) * K * compositing.TANGENTS,), dtype)
-        packing.pack_tangents(raster.splats, self.directions, self._packed)
+        over_range(len(directions), packing.pack_tangents, raster.splats, self.directions, self._packed)
         _ = raster.slot_start  # reorders the tiles by the entries that are reached
         planes, self._transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
-        compositing.tangent(
-            raster.threads, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, planes, self._transmittances
+        over_tiles(compositing.tangent, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, planes, self._transmittances
         )
         self.planes = planes.reshape(K, 4, *raster.plane)
 
@@ -144,10 +143,9 @@ class Tangent:
             raise RuntimeError("expected backward(cotangent) before curvature(...): it needs the first-order adjoint")
         K, slot_start = self.directions.shape[1], raster.slot_start
         sums = aligned((slot_start[-1] * K * compositing.SUMS,), raster.splats.dtype)
-        compositing.curvature(
-            raster.threads, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, raster._cotangent,
+        over_tiles(compositing.curvature, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, raster._cotangent,
             self._transmittances, np.ascontiguousarray(cotangents, raster.splats.dtype).reshape(-1), sums,
         )  # fmt: skip
         product = np.empty_like(self.directions)
-        packing.reduce_curvature(raster.splats, self.directions, slot_start, sums, raster._moments, product)
+        over_range(len(raster.splats), packing.reduce_curvature, raster.splats, self.directions, slot_start, sums, raster._moments, product)
         return product

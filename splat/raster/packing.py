@@ -1,4 +1,4 @@
-"""From splats to what the compositing kernels read, and from their sums back to splats.
+"""From splats to what the compositing kernels read, and from their sums back to splats, for the splats start..stop.
 
 A splat is nine numbers: mean x, y; conic a, b, c; opacity; colour.  Tangents carry K vectors side by side: (n, K, 9).
 With S, Sx, ... the moments of a splat's entries (`compositing.py`) and Q = [[a, b], [b, c]]:
@@ -12,7 +12,6 @@ With S, Sx, ... the moments of a splat's entries (`compositing.py`) and Q = [[a,
 from math import log, log2
 
 import numpy as np
-from numba import prange
 
 from splat.raster.compositing import (
     BLUE,
@@ -44,9 +43,9 @@ LOG2_E = 1 / log(2)
 
 
 @kernel
-def pack_splats(splats, log2_alpha_min, contour, params):
+def pack_splats(start, stop, splats, log2_alpha_min, contour, params):
     """params (n * PARAMS) of splats (n, 9)."""
-    for i in prange(splats.shape[0]):
+    for i in range(start, stop):
         p, opacity = PARAMS * i, splats[i, 5]
         params[p + MX], params[p + MY] = splats[i, 0] - 0.5, splats[i, 1] - 0.5
         params[p + LXX] = -LOG2_E / 2 * splats[i, 2]
@@ -59,10 +58,10 @@ def pack_splats(splats, log2_alpha_min, contour, params):
 
 
 @kernel
-def pack_tangents(splats, directions, tangents):
+def pack_tangents(start, stop, splats, directions, tangents):
     """tangents (n * K * TANGENTS) of directions (n, K, 9)."""
     K = directions.shape[1]
-    for i in prange(splats.shape[0]):
+    for i in range(start, stop):
         a, b, c, opacity = splats[i, 2], splats[i, 3], splats[i, 4], splats[i, 5]
         for k in range(K):
             t, u = (i * K + k) * TANGENTS, directions[i, k]
@@ -73,9 +72,9 @@ def pack_tangents(splats, directions, tangents):
 
 
 @kernel
-def reduce_gradient(splats, slot_start, sums, moments, gradient):
+def reduce_gradient(start, stop, splats, slot_start, sums, moments, gradient):
     """gradient (n, 9) and the moments S, Sx, Sy (n, 3) from the sums of the entries (slots, SUMS)."""
-    for i in prange(splats.shape[0]):
+    for i in range(start, stop):
         total = np.zeros(SUMS, sums.dtype)
         for slot in range(slot_start[i], slot_start[i + 1]):
             for j in range(SUMS):
@@ -90,10 +89,10 @@ def reduce_gradient(splats, slot_start, sums, moments, gradient):
 
 
 @kernel
-def reduce_curvature(splats, directions, slot_start, sums, moments, product):
+def reduce_curvature(start, stop, splats, directions, slot_start, sums, moments, product):
     """product (n, K, 9) from the sums of the entries (slots, K, SUMS) and the moments of the gradient."""
     K = directions.shape[1]
-    for i in prange(splats.shape[0]):
+    for i in range(start, stop):
         a, b, c, opacity = splats[i, 2], splats[i, 3], splats[i, 4], splats[i, 5]
         S, Sx, Sy = moments[i, 0], moments[i, 1], moments[i, 2]
         for k in range(K):

@@ -9,6 +9,7 @@ any width and type: the array that a vector is loaded from decides its dtype, an
     iota(a)                         0, 1, 2, ...; here and above, a names the dtype
     x + y, x - y, x * y, x / y, -x  may be contracted to fused multiply-adds by the compiler
     fma(x, y, z)                    x y + z with one rounding, always: for values that decide a comparison
+    minimum(x, y), maximum(x, y), sqrt(x)
     x < y ..., m & n                masks;  select(m, x, y);  any_lane(m)
     exp2(x)                         for -126 <= x <= 126 (float32), -1022 <= x <= 1022 (float64); relative error: EXP2_ERROR
     store_sums(a, i, (v0, ...))     the sum over the lanes of each vector to a[i], a[i+1], ...
@@ -334,6 +335,14 @@ def select(typing, mask, x, y):
     if vector is None:
         return None
     return vector(mask, vector, vector), lambda context, builder, sig, args: builder.select(*args)
+
+
+@intrinsic
+def sqrt(typing, x):
+    def generate(context, builder, sig, args):
+        return _call(builder, f"llvm.sqrt.{_suffix(x)}", x.llvm, list(args))
+
+    return x(x), generate
 
 
 @intrinsic

@@ -1,0 +1,43 @@
+"""Run a compiled kernel on every core.
+
+Kernels release the interpreter's lock and are called from a pool of Python threads: a start costs some 30 microseconds, and
+no second thread runtime spins beside torch's.  The number of threads is torch's (`torch.set_num_threads`).  No result
+depends on it: kernels write to places of their own and sum in a fixed order.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+import torch
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads - 1, thread_name_prefix="splat")
+
+
+def thread_count() -> int:
+    return torch.get_num_threads()
+
+
+def _run(calls: list[tuple]) -> None:
+    """Run (function, arguments...) of every call at once, the first in this thread."""
+    waiting = [_pool(len(calls)).submit(*call) for call in calls[1:]]
+    calls[0][0](*calls[0][1:])
+    for future in waiting:
+        future.result()
+
+
+def over_range(size: int, kernel: Callable, *arguments) -> None:
+    """kernel(start, stop, *arguments) over contiguous parts of range(size)."""
+    parts = min(thread_count(), max(size, 1))
+    edges = [size * t // parts for t in range(parts + 1)]
+    _run([(kernel, edges[t], edges[t + 1], *arguments) for t in range(parts)])
+
+
+def over_tiles(kernel: Callable, *arguments) -> None:
+    """kernel(counter, *arguments) on every thread: each takes the next tile from the counter until none is left."""
+    counter = np.zeros(1, np.int64)
+    _run([(kernel, counter, *arguments)] * thread_count())
