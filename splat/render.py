@@ -1,6 +1,6 @@
 """Render a view of a set of Gaussians: the one interface to the renderer's implementations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.projection import Splats, project
+from splat.raster.functions import project_by_kernel, rasterize_by_kernel
 from splat.raster.reference import rasterize_reference
 from splat.settings import RenderSettings
 
@@ -20,7 +21,8 @@ Backend = Literal["cpu", "reference"]
 class Rendering:
     """image: linear RGB as trained on, background included; alpha: accumulated opacity; splats: the 2-D footprints.
 
-    `splats.means` is on the autograd graph: call `.retain_grad()` on it to get the screen-space gradient of densification.
+    depth: the sum of weight times z, world units (divide by alpha for a mean); None where it was not asked for.
+    `splats.means` is on the autograd graph: its gradient is the screen-space gradient of densification.
     """
 
     image: Float[Tensor, "3 h w"]
@@ -38,12 +40,29 @@ def render(
     depth: bool = False,
     backend: Backend = "cpu",
 ) -> Rendering:
-    """Colour, accumulated alpha and, if asked for, expected depth (sum of weight times z, world units) of one view.
+    """Colour, accumulated alpha and, if asked for, expected depth of one view; twice differentiable.
 
-    Differentiable twice in the Gaussians' stored parameters.  background: black where None.
+    background: black where None.  backend: "cpu" the kernels, "reference" plain torch (slow, any number of derivatives).
+    Raises ValueError where a parameter is not finite.
     """
+    gaussians.require_finite()
     if background is None:
-        background = torch.zeros(3, dtype=gaussians.flat.dtype)
-    splats = project(gaussians, camera, settings)
-    image, alpha, expected = rasterize_reference(splats, background, camera.width, camera.height, settings)
-    return Rendering(image, alpha, expected if depth else None, splats)
+        background = torch.zeros(3)
+    background = background.to(gaussians.flat)
+    if backend == "reference":
+        splats = project(gaussians, camera, settings)
+        image, alpha, expected = rasterize_reference(splats, background, camera.width, camera.height, settings)
+        return Rendering(image, alpha, expected if depth else None, splats)
+    splats = project_by_kernel(gaussians, camera, settings)
+    image, alpha = rasterize_by_kernel(splats, background, camera.width, camera.height, settings)
+    expected = _expected_depth(splats, gaussians, camera, settings) if depth else None
+    return Rendering(image, alpha, expected, splats)
+
+
+def _expected_depth(splats: Splats, gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> Float[Tensor, "h w"]:
+    """Depth is composited like a colour: one more pass over the same splats with z for red, on black."""
+    axis, centre = camera.forward.to(gaussians.flat), camera.centre.to(gaussians.flat)
+    z = (gaussians.means - centre) @ axis
+    layers = replace(splats, colours=torch.stack([z, torch.zeros_like(z), torch.zeros_like(z)], dim=1))
+    black = torch.zeros(3, dtype=z.dtype)
+    return rasterize_by_kernel(layers, black, camera.width, camera.height, settings)[0][0]

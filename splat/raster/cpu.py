@@ -1,17 +1,13 @@
-"""The compositing of splats on the CPU: a view held still, and the same as a torch function.
+"""The compositing of splats on the CPU: a view held still.
 
 `Raster` has done all that depends on the splats alone (order, tile lists, final transmittances, stops); its methods are
 passes over the pixels.  Images are padded planes: (planes, padded height, padded width), whole tiles of `lanes` x TILE_ROWS
-pixels; a splat is nine numbers (`packing.py`).  `rasterize` wraps it for autograd, with a double backward.
+pixels; a splat is nine numbers (`packing.py`).
 """
 
 from math import log2
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from splat.raster import binning, compositing, packing
 from splat.raster.simd import lanes_of
 from splat.raster.threads import over_range, over_tiles
@@ -69,8 +65,6 @@ class Raster:
         over_range(n, packing.pack_splats, splats, max(least, LEAST_LOG2_ALPHA[dtype]), contour, self.params)
         self.pixels = compositing.Pixels(aligned((4 * size,), dtype), aligned((size,), dtype), aligned((size,), dtype))
         over_tiles(compositing.forward, self.params, self.lists, self.frame, self.pixels)
-        self._moments: np.ndarray | None = None
-        self._cotangent: np.ndarray | None = None
         self._slot_start: np.ndarray | None = None
 
     @property
@@ -104,19 +98,27 @@ class Raster:
             self._slot_start = slot_start
         return self._slot_start
 
-    def backward(self, cotangent: np.ndarray) -> np.ndarray:
-        """The gradient in the splats, (n, 9), from padded cotangent planes (4, ...), which are kept for `curvature`."""
-        slot_start = self.slot_start
-        sums = aligned((slot_start[-1] * compositing.SUMS,), self.splats.dtype)
-        self._cotangent = np.ascontiguousarray(cotangent, self.splats.dtype).reshape(-1)
-        over_tiles(compositing.backward, self.params, self.lists, self.frame, self.pixels, self._cotangent, sums)
-        self._moments, gradient = np.empty((len(self.splats), 3), self.splats.dtype), np.empty_like(self.splats)
-        over_range(len(self.splats), packing.reduce_gradient, self.splats, slot_start, sums, self._moments, gradient)
-        return gradient
+    def backward(self, cotangent: np.ndarray) -> "Adjoint":
+        """The gradient in the splats from padded cotangent planes (4, ...)."""
+        return Adjoint(self, cotangent)
 
     def jvp(self, directions: np.ndarray) -> "Tangent":
         """J u for directions (n, K, 9) of the splats."""
         return Tangent(self, directions)
+
+
+class Adjoint:
+    """The first-order adjoint of the splats: `gradient` (n, 9), its moments, and the cotangent it came from."""
+
+    def __init__(self, raster: Raster, cotangent: np.ndarray):
+        dtype, n, slot_start = raster.splats.dtype, len(raster.splats), raster.slot_start
+        self.cotangent = np.ascontiguousarray(cotangent, dtype).reshape(-1)
+        sums = aligned((slot_start[-1] * compositing.SUMS,), dtype)
+        over_tiles(
+            compositing.backward, raster.params, raster.lists, raster.frame, raster.pixels, self.cotangent, sums
+        )
+        self.moments, self.gradient = np.empty((n, 3), dtype), np.empty_like(raster.splats)
+        over_range(n, packing.reduce_gradient, raster.splats, slot_start, sums, self.moments, self.gradient)
 
 
 class Tangent:
@@ -129,23 +131,26 @@ class Tangent:
         over_range(len(directions), packing.pack_tangents, raster.splats, self.directions, self._packed)
         _ = raster.slot_start  # reorders the tiles by the entries that are reached
         planes, self._transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
-        over_tiles(compositing.tangent, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, planes, self._transmittances
-        )
+        over_tiles(
+            compositing.tangent, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, planes,
+            self._transmittances,
+        )  # fmt: skip
         self.planes = planes.reshape(K, 4, *raster.plane)
 
-    def curvature(self, cotangents: np.ndarray) -> np.ndarray:
-        """The tangent of `Raster.backward`, (n, K, 9): its cotangent held at the last one passed, with tangents cotangents.
+    def curvature(self, adjoint: Adjoint, cotangents: np.ndarray) -> np.ndarray:
+        """The tangent of `Raster.backward` along the directions, (n, K, 9).
 
-        cotangents: padded planes (K, 4, ...), the tangent of the cotangent (0 for the second derivative of R alone).
+        cotangents: padded planes (K, 4, ...), the tangents of the adjoint's cotangent; 0 for the second derivative of R alone.
         """
-        raster = self.raster
-        if raster._cotangent is None or raster._moments is None:
-            raise RuntimeError("expected backward(cotangent) before curvature(...): it needs the first-order adjoint")
-        K, slot_start = self.directions.shape[1], raster.slot_start
+        raster, K = self.raster, self.directions.shape[1]
+        slot_start = raster.slot_start
         sums = aligned((slot_start[-1] * K * compositing.SUMS,), raster.splats.dtype)
-        over_tiles(compositing.curvature, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, raster._cotangent,
-            self._transmittances, np.ascontiguousarray(cotangents, raster.splats.dtype).reshape(-1), sums,
+        over_tiles(
+            compositing.curvature, raster.params, self._packed, raster.lists, raster.frame, raster.pixels,
+            adjoint.cotangent, self._transmittances, np.ascontiguousarray(cotangents, raster.splats.dtype).reshape(-1), sums,
         )  # fmt: skip
         product = np.empty_like(self.directions)
-        over_range(len(raster.splats), packing.reduce_curvature, raster.splats, self.directions, slot_start, sums, raster._moments, product)
+        over_range(
+            len(product), packing.reduce_curvature, raster.splats, self.directions, slot_start, sums, adjoint.moments, product
+        )
         return product
