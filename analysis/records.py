@@ -298,11 +298,8 @@ def _refuse_foreign(folder: Path) -> None:
 
 
 def _clean_up_after_kills(folder: Path, previous: Path) -> None:
-    if previous.is_dir():
-        if folder.exists():
-            shutil.rmtree(previous)
-        else:
-            previous.rename(folder)
+    if folder.exists():  # else `previous` is the only record there is
+        shutil.rmtree(previous, ignore_errors=True)
     for partial in folder.parent.glob(f".{folder.name}.partial-*"):
         if time.time() - partial.stat().st_mtime > _ABANDONED_AFTER:
             shutil.rmtree(partial, ignore_errors=True)

@@ -54,7 +54,7 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
         if field.model is not None:
             axes.contour(x, y, field.model.T, levels=levels, colors="white", linewidths=0.7, linestyles="dashed")
     else:
-        axes.text(0.5, 0.65, "the loss is the same at every point", transform=axes.transAxes, ha="center")
+        axes.text(0.5, 0.65, "the loss is the same\nat every point", transform=axes.transAxes, ha="center")
         axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     if field.crossed is not None:
         rows, columns = np.nonzero(field.crossed)

@@ -36,7 +36,7 @@ def draw(record: Record) -> Figure:
         _rows(above, entries, [_signed(entry) for entry in entries.values()])
         _draw_traces(above, entries, samples)
         above.set_xlabel("|trace| (loss per squared parameter unit)")
-        above.set_title("Curvature by attribute: trace and scale", loc="left")
+        above.set_title("Trace and curvature scale by attribute", loc="left")
         _rows(below, entries, [quantity(entry["tau"]) for entry in entries.values()])
         _draw_taus(below, entries)
         below.set_xlabel("curvature scale τ = √(max(trace, 0) / dim)")

@@ -2,10 +2,11 @@ import math
 import re
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
-from analysis.records import record_folder, write_record
-from analysis.report import write_report
+from analysis.records import read_record, record_folder, write_record
+from analysis.report import interactive_surface, write_report
 from analysis.verdict import verdict
 from tests.recorded import synthetic
 
@@ -89,6 +90,19 @@ def test_every_number_of_the_tables_is_on_the_page_with_its_error(tmp_path):
         "rademacher",
     ):
         assert expected in text
+
+
+def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
+    data, arrays = synthetic()
+    data["slice"]["directions"][0]["name"] = '<a href="http://example.org">e₁</a>'
+    with record_folder(tmp_path / "probe") as partial:
+        write_record(partial, data, arrays)
+    figure = interactive_surface(read_record(tmp_path / "probe"))
+    assert figure is not None
+    title = figure.to_dict()["layout"]["scene"]["xaxis"]["title"]["text"]
+    assert "<" not in title and "&lt;a href" in title
+    heights = np.asarray(next(figure.select_traces())["z"])  # plotly's rows run along y
+    np.testing.assert_array_equal(heights.T, arrays["slice"]["loss"] - data["slice"]["center_loss"])
 
 
 def test_text_of_the_record_cannot_become_markup(tmp_path):
