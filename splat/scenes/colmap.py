@@ -37,7 +37,7 @@ def read_colmap(root: Path, model: Path, images: str | None = None) -> tuple[lis
         raise ValueError(
             f"expected a COLMAP model, cannot read the one in {model}: {error}; export it again"
         ) from error
-    posed = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
+    posed = sorted((reconstruction.images[i] for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
     if not posed:
         raise ValueError(
             f"expected images with poses in the COLMAP model {model}, got none among {len(reconstruction.images)}; "

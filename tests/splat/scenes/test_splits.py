@@ -17,10 +17,11 @@ def test_llff_holds_out_every_eighth_and_spreads_n_over_the_rest() -> None:
     assert split.train == (FERN[1], FERN[10], FERN[19])  # places 0, 8, 16 of the other 17
 
 
-def test_llff_rounds_half_to_even_as_the_public_code_does() -> None:
+def test_llff_rounds_to_nearest_and_half_to_even_as_the_public_code_does() -> None:
     names = tuple(f"{i:02d}" for i in range(16))  # 14 to train on; linspace(0, 13, 3) = 0, 6.5, 13
     others = [name for i, name in enumerate(names) if i % 8]
     assert llff_split(names, 3).train == (others[0], others[6], others[13])
+    assert llff_split(names, 4).train == (others[0], others[4], others[9], others[13])  # 0, 4.33, 8.67, 13
 
 
 def test_without_a_number_all_but_the_test_views_train() -> None:

@@ -56,6 +56,14 @@ def test_gaussians_lie_flat_on_their_surfaces(small: SyntheticScene) -> None:
     torch.testing.assert_close(normals[wall & ~floor][:, 2], torch.ones(int((wall & ~floor).sum())))
 
 
+def test_the_gaussians_of_the_ball_face_outward(small: SyntheticScene) -> None:
+    outward = (small.truth.means - torch.tensor([-0.75, 0.35, 0.2])) / 0.65
+    ball = (outward.norm(dim=1) - 1).abs() < 1e-5
+    assert int(ball.sum()) > 10
+    normals = rotation_matrices(small.truth.quats)[ball, :, 2]
+    torch.testing.assert_close(normals, outward[ball], atol=1e-5, rtol=0)
+
+
 def test_every_point_is_tracked_by_two_views_that_have_it_in_the_image(small: SyntheticScene) -> None:
     points, frames = small.scene.points, small.scene.frames
     assert points is not None and points.observations is not None and len(points) > 20
@@ -96,6 +104,16 @@ def test_a_written_scene_is_found_again(small: SyntheticScene, tmp_path: Path) -
     assert scene.points.observations is not None and small.scene.points.observations is not None
     assert torch.equal(scene.points.observations, small.scene.points.observations)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["scene"]
+
+
+def test_tracks_follow_their_frames_into_the_order_of_the_file(small: SyntheticScene, tmp_path: Path) -> None:
+    points = small.scene.points
+    backwards = Scene("s", tmp_path, "synthetic", small.scene.frames[::-1], points, torch.zeros(3))
+    write_transforms_scene(backwards, tmp_path / "s")
+    scene = load_scene(tmp_path / "s")
+    assert scene.points is not None and points is not None
+    for name in scene.names:
+        assert torch.equal(scene.points.sightings(scene.select([name])), points.sightings(small.scene.select([name])))
 
 
 def test_frames_of_one_name_in_two_folders_and_a_background_survive_the_round_trip(
