@@ -33,6 +33,15 @@ def quantity(value: float | None, error: float | None = None) -> str:
     return f"({_fixed(value, exponent, places)} ± {_fixed(error, exponent, places)}) × {power_of_ten(exponent)}"
 
 
+def measured(value: float | None, error: float | None) -> str:
+    """`quantity` for a number that comes with an error: where that is not determined, it says so.
+
+    >>> measured(5.0, None), measured(5.0, 0.0), measured(None, None)
+    ('5.00 ± ?', '5.00', '–')
+    """
+    return quantity(value, math.inf if error is None else error)
+
+
 def power_of_ten(exponent: int) -> str:
     """
     >>> power_of_ten(-12)

@@ -14,7 +14,7 @@ import plotly.graph_objects as go
 import plotly.io
 from plotly.offline import get_plotlyjs
 
-from analysis.quantities import quantity
+from analysis.quantities import measured, quantity
 from analysis.records import Record, read_record
 from analysis.verdict import attribute_name, verdict
 
@@ -49,7 +49,7 @@ def render_report(record: Record) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"quantity": quantity, "attribute": attribute_name, "cell": _cell}
+    environment.filters |= {"quantity": quantity, "measured": measured, "attribute": attribute_name, "cell": _cell}
     surface = interactive_surface(record)
     return environment.get_template("report.html.jinja").render(
         data=record.data,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from analysis.quantities import quantity
+from analysis.quantities import measured, quantity
 
 ATTRIBUTES = {
     "means": "position",
@@ -76,7 +76,7 @@ def _of_traces(traces: Mapping[str, Any]) -> list[Line]:
         first, *others = sorted(finite, key=lambda name: -abs(finite[name]["value"]))
         value, error = finite[first]["value"], finite[first]["standard_error"]
         text = (
-            f"{attribute_name(first).capitalize()} carries most of the curvature: its trace, {quantity(value, error)}, "
+            f"{attribute_name(first).capitalize()} carries most of the curvature: its trace, {measured(value, error)}, "
         )
         text += f"is {abs(value) / total:.0%} of the sum of all absolute traces (each in its own stored units)."
         if others and _overlap(finite[first], finite[others[0]]):
@@ -96,7 +96,7 @@ def _of_ends(ends: Mapping[str, Any]) -> list[Line]:
     numbers = [top["value"], top["residual"], bottom["value"], bottom["residual"]]
     if not all(_is_finite(number) for number in numbers):
         return [Line("The ends of the spectrum were not determined.", "failure")]
-    high, low = quantity(top["value"], top["residual"]), quantity(bottom["value"], bottom["residual"])
+    high, low = measured(top["value"], top["residual"]), measured(bottom["value"], bottom["residual"])
     ends_text = f"the curvature runs from {low} to {high}"
     if bottom["value"] + bottom["residual"] < 0 < top["value"] - top["residual"]:
         return [Line(f"The Hessian is indefinite, so the checkpoint is no basin in every direction: {ends_text}.")]

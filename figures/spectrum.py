@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from analysis.quantities import power_of_ten, quantity
+from analysis.quantities import measured, power_of_ten
 from analysis.records import Record
 from figures.style import BLACK, NEGATIVE, POSITIVE, new_figure, script, style
 
@@ -61,7 +61,7 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
 
 def _label_ends(axes: Axes, record: Record) -> None:
     ends = record.data["eigenvalues"]
-    lines = [f"{name} {quantity(ends[name]['value'], ends[name]['residual'])}" for name in ("max", "min")]
+    lines = [f"{name} {measured(ends[name]['value'], ends[name]['residual'])}" for name in ("max", "min")]
     axes.text(0.03, 0.96, "\n".join(lines), transform=axes.transAxes, va="top", linespacing=1.4)
 
 

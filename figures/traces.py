@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from analysis.quantities import power_of_ten, quantity
+from analysis.quantities import measured, power_of_ten, quantity
 from analysis.records import Record
 from analysis.verdict import attribute_name
 from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, script, style
@@ -106,7 +106,7 @@ def _sign(entry: dict[str, Any]) -> str:
 
 
 def _signed(entry: dict[str, Any]) -> str:
-    return quantity(entry["value"], entry["standard_error"])
+    return measured(entry["value"], entry["standard_error"])
 
 
 def _interval(entry: dict[str, Any]) -> tuple[float, float]:

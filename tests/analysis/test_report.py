@@ -1,6 +1,7 @@
 import math
 import re
 from html.parser import HTMLParser
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,7 +102,8 @@ def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
     assert figure is not None
     title = figure.to_dict()["layout"]["scene"]["xaxis"]["title"]["text"]
     assert "<" not in title and "&lt;a href" in title
-    heights = np.asarray(next(figure.select_traces())["z"])  # plotly's rows run along y
+    surfaces: Any = list(figure.select_traces())
+    heights = np.asarray(surfaces[0].z)  # plotly's rows run along y
     np.testing.assert_array_equal(heights.T, arrays["slice"]["loss"] - data["slice"]["center_loss"])
 
 
@@ -150,6 +152,13 @@ def test_the_verdict_calls_indefinite_what_the_residual_proves(low, residual, wo
     data, _ = synthetic()
     data["eigenvalues"]["min"] |= {"value": low, "residual": residual}
     assert words in sentences(data)
+
+
+def test_a_number_without_its_error_is_never_shown_as_exact(tmp_path):
+    data, arrays = synthetic()
+    data["traces"]["means"] |= {"value": 4e5, "standard_error": None, "sign": "undetermined"}
+    assert "4.00 × 10⁵ ± ?" in sentences(data)
+    assert "4.00 × 10⁵ ± ?" in Page(page(tmp_path / "probe", data, arrays)).text
 
 
 def test_a_failed_check_comes_first_and_in_red(tmp_path):
