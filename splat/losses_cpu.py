@@ -301,6 +301,10 @@ class ViewLoss:
         eps, pixel, structural = scalar(self.settings.eps), scalar(self.pixel), scalar(self.structural)
         return KINDS[self.settings.pixel], eps, pixel, structural
 
+    def value(self, image: np.ndarray) -> float:
+        """The loss at padded planes."""
+        return self.linearize(image, second_order=False).value
+
     def linearize(self, image: np.ndarray, second_order: bool = True) -> "LinearLoss":
         """Value and gradient at padded planes (at least three), and what the Hessian's product needs if second_order."""
         x = np.ascontiguousarray(image[:3], self.dtype).reshape(-1)

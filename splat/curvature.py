@@ -1,0 +1,156 @@
+"""The loss of a scene over a set of views as an objective, and its Hessian as an operator of `landscape`.
+
+`SceneObjective` holds what stands still: views, loss, background, thresholds, and which Gaussians matter.  Removed from the
+operator, exactly, and counted: Gaussians that touch no pixel of any view, SH bands not in use, and the radial direction of
+each quaternion (a null direction of the image).  Quaternions are brought to unit length first: the image does not change,
+and the trace of their block, which scales with 1/|q|^2, gets a meaning.
+
+    L(theta) = 1/M sum_m l(I_m(theta)),   theta the stored parameters of the active Gaussians, laid out like Gaussians.flat
+"""
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from landscape.operator import require_vectors
+from splat.camera import Camera
+from splat.gaussians import Gaussians
+from splat.linearize import LinearizedView, rasterize_view, touches
+from splat.losses import LossSettings
+from splat.losses_cpu import ViewLoss
+from splat.scenes.view import View
+from splat.settings import RenderSettings
+
+
+@dataclass(frozen=True)
+class ActiveCounts:
+    """What of a set of Gaussians is left in the operator, and what was removed as exactly flat."""
+
+    gaussians: int
+    active_gaussians: int
+    parameters: int
+    active_parameters: int
+    sh_degree: int
+    active_sh_degree: int
+    radial_quaternions: int
+    views: int
+
+
+class SceneObjective:
+    """The mean loss over views as a function of the active Gaussians' stored parameters.
+
+    gaussians: those of the checkpoint; sh_degree: the bands in use (all by default).  `active` are the Gaussians that touch
+    a pixel of some view, with unit quaternions; `mask` says which of the given ones they are.  Raises ValueError where no
+    Gaussian is seen or a parameter is not finite.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        views: Sequence[View],
+        loss: LossSettings = LossSettings(),
+        background: Float[Tensor, "3"] | None = None,
+        settings: RenderSettings = RenderSettings(),
+        sh_degree: int | None = None,
+    ):
+        if not views:
+            raise ValueError("expected at least one view, got none")
+        gaussians.require_finite()
+        flat, degree = gaussians.flat, gaussians.sh_degree if sh_degree is None else sh_degree
+        dtype = np.dtype(np.float32 if flat.dtype == torch.float32 else np.float64)
+        self.settings, self.views = settings, tuple(views)
+        self.background = torch.zeros(3, dtype=flat.dtype) if background is None else background.to(flat)
+        self._losses = [ViewLoss(view.image.numpy(), loss, dtype) for view in views]
+        everyone = gaussians.select(torch.arange(len(gaussians)), degree)
+        self.mask: Bool[Tensor, " n"] = self._support(everyone)
+        if not self.mask.any():
+            raise ValueError(f"expected Gaussians in sight, got {len(gaussians)} of which no view sees any")
+        active = everyone.select(self.mask)
+        quats = active.quats
+        quats /= quats.norm(dim=1, keepdim=True)
+        self.active = active
+        self.counts = ActiveCounts(
+            gaussians=len(gaussians),
+            active_gaussians=len(active),
+            parameters=flat.numel(),
+            active_parameters=active.flat.numel() - len(active),
+            sh_degree=gaussians.sh_degree,
+            active_sh_degree=degree,
+            radial_quaternions=len(active),
+            views=len(views),
+        )
+        self._seen: tuple[Tensor, Hashable] | None = None
+
+    def _support(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
+        seen = np.zeros(len(gaussians), np.bool_)
+        for view in self.views:
+            seen |= touches(rasterize_view(gaussians, view.camera, self.background, self.settings))
+        return torch.from_numpy(seen)
+
+    @property
+    def blocks(self) -> Mapping[str, slice]:
+        return self.active.blocks
+
+    def loss(self, flat: Float[Tensor, " p"]) -> float:
+        """L at other parameters of the active Gaussians: a true render, sorted anew."""
+        total, pieces = 0.0, []
+        for view, loss in zip(self.views, self._losses, strict=True):
+            raster = rasterize_view(self.active.with_flat(flat), view.camera, self.background, self.settings)
+            total += loss.value(raster.planes)
+            pieces.append(hash(raster.lists.splat.tobytes()))
+        self._seen = flat, tuple(pieces)
+        return total / len(self.views)
+
+    def signature(self, flat: Float[Tensor, " p"]) -> Hashable:
+        """The piece of the objective that flat lies in: which splats each tile draws, in which order."""
+        if self._seen is None or self._seen[0] is not flat:
+            self.loss(flat)
+        assert self._seen is not None
+        return self._seen[1]
+
+    @cached_property
+    def linearized(self) -> list[LinearizedView]:
+        """Every view held still at the active Gaussians."""
+        return [self._linearize(view.camera, loss) for view, loss in zip(self.views, self._losses, strict=True)]
+
+    def _linearize(self, camera: Camera, loss: ViewLoss) -> LinearizedView:
+        return LinearizedView(self.active, camera, loss, self.background, self.settings)
+
+    @property
+    def gradient(self) -> Float[Tensor, " p"]:
+        """The gradient of L at the active Gaussians."""
+        return torch.stack([view.gradient for view in self.linearized]).mean(dim=0)
+
+
+class SceneHessian:
+    """H of L, or its Gauss-Newton part, on the complement of the quaternions' radial directions.
+
+    A `landscape` operator: `dim`, `blocks`, `dtype`, `apply(V)`.  radial: keep the radial directions instead.
+    """
+
+    def __init__(self, objective: SceneObjective, *, gauss_newton: bool = False, radial: bool = False):
+        self.objective, self.gauss_newton, self.radial = objective, gauss_newton, radial
+        self.dim = objective.active.flat.numel()
+        self.blocks = objective.blocks
+        self.dtype = objective.active.flat.dtype
+
+    def project(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+        """V without its components along the quaternions' lengths."""
+        if self.radial:
+            return V
+        V, rows, quats = V.clone(), self.blocks["quats"], self.objective.active.quats
+        tangents = V[rows].view(*quats.shape, -1)
+        tangents -= quats[:, :, None] * (quats[:, :, None] * tangents).sum(dim=1, keepdim=True)
+        return V
+
+    def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+        require_vectors(V, self.dim)
+        V, total = self.project(V), torch.zeros(V.shape, dtype=self.dtype)
+        for view in self.objective.linearized:
+            total += view.ggn(V) if self.gauss_newton else view.hvp(V)
+        return self.project(total / len(self.objective.linearized))

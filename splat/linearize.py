@@ -1,0 +1,112 @@
+"""One view held still: the loss, its gradient, and exact derivatives of first and second order as products with blocks.
+
+Everything that depends on the scene alone is done once: projection with its Jacobian and curvature per Gaussian, order,
+tile lists, final transmittances, first-order adjoints, the loss's own derivatives.  Each product is then two passes over
+the pixels for K vectors together.  With y the splats, P the projection, R the compositing, g = dl/dI, a = R'(y)^T g:
+
+    gradient  P'^T R'^T g
+    J u       R' P' u
+    G u       P'^T R'^T l'' R' P' u                                          (Gauss-Newton; l'' may be indefinite: SSIM)
+    H u       P'^T [ R'^T l'' R' P' u + (g . R'')(P' u) ] + (a . P'') u
+
+Vectors are columns of (p, K) blocks laid out like `Gaussians.flat`.  The order of the splats, the alpha_min cut, the stop and
+the clamps are held fixed; they are piecewise constant.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splat.camera import Camera
+from splat.gaussians import Gaussians
+from splat.losses_cpu import LinearLoss, ViewLoss
+from splat.projection_cpu import Projection, lens_of, project_arrays
+from splat.raster.cpu import Adjoint, Raster
+from splat.settings import RenderSettings
+
+
+def rasterize_view(
+    gaussians: Gaussians, camera: Camera, background: Float[Tensor, "3"], settings: RenderSettings
+) -> Raster:
+    """Project and composite a view by the kernels, without derivatives."""
+    gaussians.require_finite()
+    splats, depths, drawn = project_arrays(gaussians, lens_of(camera, settings))
+    return Raster(splats, depths, drawn, background.to(gaussians.flat).numpy(), camera.width, camera.height, settings)
+
+
+class LinearizedView:
+    """A view's loss at fixed Gaussians: `.value`, `.image`, `.gradient`, `.jvp(U)`, `.vjp(G)`, `.hvp(U)`, `.ggn(U)`."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        loss: ViewLoss,
+        background: Float[Tensor, "3"],
+        settings: RenderSettings = RenderSettings(),
+    ):
+        self.gaussians = gaussians
+        self._raster = rasterize_view(gaussians, camera, background, settings)
+        self._loss: LinearLoss = loss.linearize(self._raster.planes)
+        self._adjoint: Adjoint = self._raster.backward(self._loss.gradient)
+        self._index = np.flatnonzero(np.diff(self._raster.slot_start))
+        self._projection = Projection(
+            gaussians, lens_of(camera, settings), self._raster.splats, self._adjoint.gradient, self._index
+        )
+        self.value = self._loss.value
+        block = np.zeros((gaussians.flat.numel(), 1), self._raster.splats.dtype)
+        self._projection.pull(self._adjoint.gradient[:, None], None, block)
+        self.gradient: Float[Tensor, " p"] = torch.from_numpy(block[:, 0])
+
+    @property
+    def image(self) -> Float[Tensor, "3 h w"]:
+        return torch.from_numpy(self._raster.crop(self._raster.planes[:3]).copy())
+
+    @property
+    def entries(self) -> int:
+        """How many (splat, tile) pairs a product passes over."""
+        return int(self._raster.slot_start[-1])
+
+    @property
+    def touched(self) -> int:
+        """How many Gaussians reach a tile of this view before its pixels stop."""
+        return len(self._index)
+
+    def jvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "k 4 h w"]:
+        """J U: tangents of colour and accumulated alpha."""
+        planes = self._raster.jvp(self._projection.jvp(_block(U))).planes
+        return torch.from_numpy(self._raster.crop(planes).copy())
+
+    def vjp(self, G: Float[Tensor, "k 4 h w"]) -> Float[Tensor, "p k"]:
+        """J^T G for cotangents of colour and accumulated alpha."""
+        bars = [self._raster.backward(self._raster.pad(g.numpy())).gradient for g in G]
+        return self._pulled(np.stack(bars, axis=1), None)
+
+    def hvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+        """H U of the view's loss."""
+        block = _block(U)
+        tangent = self._raster.jvp(self._projection.jvp(block))
+        return self._pulled(tangent.curvature(self._adjoint, self._loss.hvp(tangent.planes)), block)
+
+    def ggn(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+        """G U, the Gauss-Newton part of H U."""
+        tangent = self._raster.jvp(self._projection.jvp(_block(U)))
+        cotangents = self._loss.hvp(tangent.planes)
+        bars = [self._raster.backward(cotangent).gradient for cotangent in cotangents]
+        return self._pulled(np.stack(bars, axis=1), None)
+
+    def _pulled(self, cotangents: np.ndarray, block: np.ndarray | None) -> Tensor:
+        out = np.zeros((self.gaussians.flat.numel(), cotangents.shape[1]), cotangents.dtype)
+        self._projection.pull(cotangents, block, out)
+        return torch.from_numpy(out)
+
+
+def touches(raster: Raster) -> Bool[np.ndarray, " n"]:
+    """Which splats have any weight in any pixel of the image: the exact support of the view's derivatives."""
+    ones = raster.pad(np.ones((4, raster.height, raster.width), raster.splats.dtype))
+    return raster.backward(ones).gradient[:, 6] != 0
+
+
+def _block(U: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(U.detach().numpy())
