@@ -62,10 +62,9 @@ class SceneObjective:
             raise ValueError("expected at least one view, got none")
         gaussians.require_finite()
         flat, degree = gaussians.flat, gaussians.sh_degree if sh_degree is None else sh_degree
-        dtype = np.dtype(np.float32 if flat.dtype == torch.float32 else np.float64)
         self.settings, self.views = settings, tuple(views)
         self.background = torch.zeros(3, dtype=flat.dtype) if background is None else background.to(flat)
-        self._losses = [ViewLoss(view.image.numpy(), loss, dtype) for view in views]
+        self._losses = [ViewLoss.of(view.image, loss, flat.dtype) for view in views]
         everyone = gaussians.select(torch.arange(len(gaussians)), degree)
         self.mask: Bool[Tensor, " n"] = self._support(everyone)
         if not self.mask.any():

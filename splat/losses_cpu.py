@@ -264,6 +264,11 @@ class ViewLoss:
         """Uninitialised plane sets, (sets, 3, padded height, padded width)."""
         return aligned((sets, 3, self.shape[2], self.shape[3]), self.dtype)
 
+    @classmethod
+    def of(cls, target: Float[Tensor, "3 h w"], settings: LossSettings, dtype: torch.dtype) -> "ViewLoss":
+        """The loss against a tensor, for images of dtype."""
+        return cls(target.numpy(), settings, np.float32 if dtype == torch.float32 else np.float64)
+
     def padded(self, image: Tensor) -> np.ndarray:
         """Padded planes of an image, 0 outside it."""
         planes = self.planes(1)[0]

@@ -22,7 +22,8 @@ from torch import Tensor
 from splat.adam import Adam
 from splat.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.gaussians import Gaussians
-from splat.losses import LossSettings, photometric_loss
+from splat.losses import LossSettings
+from splat.losses_cpu import ViewLoss, view_loss
 from splat.render import render
 from splat.scenes.view import View
 from splat.settings import RenderSettings
@@ -181,19 +182,22 @@ def train(training: Training, views: Sequence[View]) -> Iterator[Progress]:
     config, schedule = training.config, training.config.densify
     if not views:
         raise ValueError("expected at least one view to train on, got none")
+    losses = [ViewLoss.of(view.image, config.loss, training.gaussians.flat.dtype) for view in views]
     while training.step < config.iterations:
         step = training.step + 1
         training.raise_sh_degree(min(config.sh_degree, (step - 1) // config.sh_degree_every))
-        view = views[training.next_view(len(views))]
+        chosen = training.next_view(len(views))
+        view, loss_of_view = views[chosen], losses[chosen]
         gaussians = training.gaussians
-        background, target = torch.tensor(config.background, dtype=gaussians.flat.dtype), view.image
+        background = torch.tensor(config.background, dtype=gaussians.flat.dtype)
         if config.random_background:
             drawn = torch.rand(3, generator=training.generator, dtype=background.dtype)
-            background, target = drawn, with_background(view, background, drawn)
+            target = with_background(view, background, drawn)
+            background, loss_of_view = drawn, ViewLoss.of(target, config.loss, background.dtype)
 
         flat = gaussians.flat.detach().requires_grad_()
         rendering = render(gaussians.with_flat(flat), view.camera, background, config.render)
-        loss = photometric_loss(rendering.image, target, config.loss)
+        loss = view_loss(rendering.image, loss_of_view)
         if not torch.isfinite(loss):
             gaussians.require_finite()
             raise ValueError(
