@@ -114,7 +114,10 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
     pinhole = _pinhole(lens, photo)
     width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
     fx, fy, cx, cy = pinhole.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    full = Camera(photo.rotation, photo.centre, fx, fy, cx, cy, pinhole.width, pinhole.height)
+    try:
+        full = Camera(photo.rotation, photo.centre, fx, fy, cx, cy, pinhole.width, pinhole.height)
+    except ValueError as error:
+        raise ValueError(f"the camera of image {photo.name!r} cannot be: {error}") from error
     camera = full.resized(width, height)
     read = partial(_read, photo.path, lens, pinhole, (width, height), background)
     return Frame(photo.name, camera, read, photo.subset, photo.depth_range)

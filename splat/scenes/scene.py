@@ -118,11 +118,15 @@ def load_scene(
         background = own_background
     if background is None:
         background = (1.0,) * 3 if image_header(photos[0].path)[1] else (0.0,) * 3
-    colour = torch.tensor(background, dtype=torch.float32)
-    if colour.shape != (3,) or not bool(((colour >= 0) & (colour <= 1)).all()):
-        raise ValueError(f"expected a background of three numbers in [0, 1], got {background}")
+    colour = _colour(background)
     frames = tuple(frame(photo, downscale, colour) for photo in photos)
     return Scene(root.resolve().name, root.resolve(), kind, frames, points, colour)
+
+
+def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
+    if len(values) != 3 or not all(isinstance(v, (int, float)) and 0 <= v <= 1 for v in values):
+        raise ValueError(f"expected a background of three numbers in [0, 1], got {values!r}")
+    return torch.tensor(values, dtype=torch.float32)
 
 
 def _read(root: Path, images: str | None) -> tuple[Kind, list[Photo], Points | None, list[float] | None]:

@@ -32,6 +32,7 @@ from splat.scenes.view import Points, Subset
 BLENDER_FILES: tuple[tuple[Subset, str], ...] = (("train", "transforms_train.json"), ("test", "transforms_test.json"))
 SINGLE_FILE = "transforms.json"
 REFUSED_TERMS = ("k4", "k5", "k6")
+NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "k1", "k2", "k3", "p1", "p2", *REFUSED_TERMS)
 
 
 def read_blender(root: Path) -> list[Photo]:
@@ -108,6 +109,9 @@ def _pose(matrix: Any, name: str, path: Path) -> tuple[Tensor, Tensor]:
 
 def _lens(values: Mapping[str, Any], size: tuple[int, int], name: str, path: Path) -> pycolmap.Camera:
     """The pycolmap camera of one frame's intrinsics."""
+    wrong = [key for key in NUMBERS if key in values and not isinstance(values[key], (int, float))]
+    if wrong:
+        raise ValueError(f"expected a number, got {wrong[0]} = {values[wrong[0]]!r} for {name!r} in {path}")
     model = str(values.get("camera_model", "OPENCV"))
     if values.get("is_fisheye") or model not in PINHOLE_MODELS + UNDISTORTED_HERE:
         kind = "a fisheye lens" if values.get("is_fisheye") else f"camera_model {model}"

@@ -99,15 +99,37 @@ def test_a_fisheye_colmap_model_is_refused_with_the_command_that_mends_it(tmp_pa
         load_scene(tmp_path)
 
 
-def test_the_points_of_fern_fall_on_their_observations(fern: Path) -> None:
+def test_the_points_of_fern_fall_where_colmap_projects_and_observes_them(fern: Path) -> None:
     model = pycolmap.Reconstruction(fern / "sparse/0")
     errors = []
     for frame in load_scene(fern).frames:
         image = model.find_image_with_name(frame.name)
         assert image is not None
-        slots = [point for point in image.points2D if point.has_point3D()]
-        xyz = torch.tensor(np.array([model.points3D[slot.point3D_id].xyz for slot in slots]))
-        pixels, depth = pixel_coordinates(frame.camera, xyz)
+        slots = [slot for slot in image.points2D if slot.has_point3D()]
+        xyz = np.array([model.points3D[slot.point3D_id].xyz for slot in slots])
+        pixels, depth = pixel_coordinates(frame.camera, torch.from_numpy(xyz))
         assert bool((depth > 0).all())
+        colmap = np.array([image.project_point(point) for point in xyz[:50]])
+        np.testing.assert_allclose(pixels[:50].numpy(), colmap, atol=1e-9)
         errors.append(np.linalg.norm(pixels.numpy() - [slot.xy for slot in slots], axis=1))
     assert np.concatenate(errors).mean() < 1.5
+
+
+def test_the_points_of_fern_have_the_colour_of_the_photographs_there_and_not_half_a_pixel_away(fern: Path) -> None:
+    scene = load_scene(fern)
+    points = scene.points
+    assert points is not None and points.observations is not None
+
+    def difference(shift: tuple[float, float]) -> float:
+        total = []
+        for i, view in enumerate(views):
+            seen = points.observations[points.observations[:, 1] == i, 0]  # type: ignore[index]
+            pixels = pixel_coordinates(view.camera, points.xyz[seen])[0] + torch.tensor(shift)
+            grid = pixels / torch.tensor([view.camera.width, view.camera.height]) * 2 - 1
+            colours = torch.nn.functional.grid_sample(view.image[None], grid[None, None].float(), align_corners=False)
+            total.append((colours[0, :, 0].T - points.rgb[seen]).abs())
+        return float(torch.cat(total).mean())
+
+    views = scene.load()
+    here = difference((0, 0))
+    assert all(difference(shift) > 1.02 * here for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)))

@@ -68,6 +68,10 @@ def test_lenses_that_a_pinhole_cannot_stand_for_are_refused(
         ),
         (lambda c: c["frames"][1].update(file_path="images/a.png"), "'images/a.png' more than once"),
         (lambda c: c.update(ply_file_path="none.ply"), "cannot read .*none.ply"),
+        (lambda c: c.update(fl_x=None), "expected a number, got fl_x = None for 'images/a.png'"),
+        (lambda c: c.update(fl_x=-3.0), "camera of image 'images/a.png' cannot be: expected positive focal lengths"),
+        (lambda c: c.update(background="white"), "three numbers in"),
+        (lambda c: c["frames"][2]["transform_matrix"][0].__setitem__(0, 2.0), "'images/c.png' cannot be: .*rotation"),
     ],
 )
 def test_bad_transforms_are_refused_in_one_sentence(
