@@ -6,7 +6,8 @@
     effective_rank  (sum |lambda_i|)^2 / sum lambda_i^2            over how many directions it is spread, 1 to n
 
 Brackets follow from the eigenvalues' residuals, the round-off and the sums' intervals (each at a level that gives the
-quotient 95%).  The literal index is negative for an indefinite operator; where lambda_n may be zero it has no upper bound.
+quotient 95%).  The literal index is negative for an indefinite operator; where lambda_n may be zero it has no upper
+bound.
 """
 
 from math import inf

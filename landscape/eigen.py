@@ -242,6 +242,7 @@ class _Krylov:
         """The wanted pairs with residuals by the operator itself, and whether more steps would make them better."""
         s = self.settings
         vectors = self.basis[: self.size].T @ ritz.coordinates[:, ritz.wanted].to(self.basis.dtype)
+        vectors /= torch.linalg.vector_norm(vectors, dim=0)  # restarts leave a little of their round-off
         values, residuals = rayleigh(self.operator, vectors)
         self.matvecs += s.wanted
         estimated = ritz.residuals[ritz.wanted]

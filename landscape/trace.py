@@ -8,8 +8,11 @@
 
 `PAPER` is StableGS's estimator, Eq. (6): Gaussian z, one block at a time, ten probes.
 
-An adaptive run stops when the t interval's half width is below max(rtol |trace|, atol).  It looks only when the number
-of probes has grown by half since the last look, because every look is a chance to stop on a variance that is too small.
+An adaptive run stops when the t interval's half width is below max(rtol |trace|, atol).  Every look is a chance to stop
+on a variance that is too small by luck, so it looks only when the number of probes has grown by half since the last
+look, and stops when the tolerance still holds four probes later: a few further samples make up for stopping on one's
+own variance (Simons 1968; from 93.5 to 94.5% cover here).  Samples of a trace that one eigenvalue dominates are skewed,
+and Student's interval covers less (91% with ten probes on the spectrum 1/i).
 """
 
 from collections.abc import Sequence
@@ -25,7 +28,8 @@ from landscape.probes import Distribution, draw_probes, split
 from landscape.results import Progress, StopReason, TraceEstimate, t_interval
 
 Reading = Literal["block", "full"]
-GROWTH = 1.5
+GROWTH = 1.5  # between two looks
+CONFIRMATION = 4  # probes between reaching the tolerance and believing it
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,8 @@ def estimate_traces(
 ) -> dict[str, TraceEstimate]:
     """The trace of each named block (all of the operator's by default) with its standard error and interval.
 
-    Progress counts probe vectors.  With the reading "full" all estimates share their probes, hence are correlated.
+    Progress counts probe vectors.  With the reading "full" all estimates share probes and matvecs, hence are
+    correlated.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
@@ -116,7 +121,7 @@ class _Run:
         self.samples = torch.empty(len(rows), 0, dtype=torch.float64)
 
     def estimate(self, done_before: int, most: int, progress: Progress | None) -> dict[str, TraceEstimate]:
-        settings, probes, look = self.settings, 0, self.settings.min_probes
+        settings, probes, look, confirming = self.settings, 0, self.settings.min_probes, False
         if self.operator.dim == 0:
             self.samples = torch.zeros(len(self.rows), 2, dtype=torch.float64)
             return self._estimates("exact", probes=0)
@@ -129,9 +134,11 @@ class _Run:
             if probes < look and not late:
                 continue
             estimates = self._estimates("time budget" if late else "matvec budget", probes)
-            if late or probes == settings.max_probes or all(e.reason == "tolerance" for e in estimates.values()):
+            reached = all(estimate.reason == "tolerance" for estimate in estimates.values())
+            if late or probes == settings.max_probes or (reached and confirming):
                 return estimates
-            look = min(ceil(GROWTH * look), settings.max_probes)
+            look = min(probes + CONFIRMATION if reached else ceil(GROWTH * probes), settings.max_probes)
+            confirming = reached
 
     def _draw(self, count: int) -> None:
         Z = draw_probes(self.operator.dim, count, self.generator, self.operator.dtype, self.settings.distribution)

@@ -2,6 +2,8 @@
 
 opencv_distortion     the radial and tangential lens model, from its textbook formula
 distorted_picture     what such a lens makes of a pattern, by inverting the model in every pixel
+symmetric_matrix      a dense matrix with a prescribed spectrum
+absolute_matrix       |A| by its eigendecomposition
 """
 
 from collections.abc import Callable, Mapping
@@ -37,3 +39,17 @@ def distorted_picture(
     there_x, there_y = opencv_distortion(x, y, terms)
     assert np.abs(there_x - seen_x).max() < 1e-12 and np.abs(there_y - seen_y).max() < 1e-12
     return pattern(x, y)
+
+
+def symmetric_matrix(eigenvalues: np.ndarray, seed: int) -> np.ndarray:
+    """A dense symmetric matrix with these eigenvalues and a random orthonormal set of eigenvectors."""
+    n = len(eigenvalues)
+    vectors, _ = np.linalg.qr(np.random.default_rng(seed).standard_normal((n, n)))
+    matrix = (vectors * eigenvalues) @ vectors.T
+    return (matrix + matrix.T) / 2
+
+
+def absolute_matrix(matrix: np.ndarray) -> np.ndarray:
+    """|A| = sum_i |lambda_i| v_i v_i^T."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.abs(values)) @ vectors.T

@@ -1,0 +1,34 @@
+"""Dense symmetric matrices with the spectra that curvature has: the cases of the tests of eigenvalues and densities."""
+
+import numpy as np
+import torch
+
+from landscape.operator import DenseOperator
+from tests.oracles import symmetric_matrix
+
+N = 120
+_index = np.arange(N)
+SPECTRA = {
+    "power law": 1 / (1 + _index) ** 1.5,
+    "indefinite": np.linspace(-1, 1.5, N) ** 3,
+    "both tails": np.where(_index % 3 > 0, 1.0, -0.1) / (1 + _index),
+    "clustered": np.where(_index < 5, 1 - 1e-5 * _index, np.where(_index >= N - 4, -0.3, 0.3 * _index / N)),
+    "rank-deficient": np.where(_index < 10, 1.0 + _index, 0.0),
+    "negative": -np.linspace(1, 2, N),
+    "multiple": np.where(_index < 40, 2.0, -1.0),
+    "zero": np.zeros(N),
+}
+
+
+def operator(name, dtype=torch.float64):
+    matrix = torch.from_numpy(symmetric_matrix(SPECTRA[name], seed=sum(map(ord, name))))
+    return DenseOperator(matrix.to(dtype))
+
+
+def eigenvalues(dense):
+    """Ascending; those of the matrix as it is stored, in float64."""
+    return torch.linalg.eigvalsh(dense.matrix.double())
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)

@@ -1,0 +1,256 @@
+from functools import cache
+
+import pytest
+import torch
+
+from landscape.eigen import EigenSettings, PowerSettings, extreme_eigenpairs, power_ends, power_iteration
+from landscape.operator import CountingOperator, DenseOperator
+from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
+
+SETTINGS = {
+    "one pair": EigenSettings(rtol=1e-3),
+    "with restarts": EigenSettings(2, 2, rtol=1e-6, basis=16),
+    "blocks": EigenSettings(3, 1, rtol=1e-5, basis=24, block=3),
+    "whole basis": EigenSettings(2, 3, rtol=1e-8, basis=1000),
+}
+
+
+@cache
+def solved(name, case, dtype):
+    H = operator(name, dtype)
+    return H, extreme_eigenpairs(H, generator(), SETTINGS[case])
+
+
+def both(ends):
+    return (ends.largest, ends.smallest)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("case", SETTINGS)
+@pytest.mark.parametrize("name", SPECTRA)
+def test_a_true_eigenvalue_lies_within_each_residual_and_the_ends_are_the_ends(name, case, dtype):
+    H, ends = solved(name, case, dtype)
+    true = eigenvalues(H)
+    # the residual itself is measured with a rounded product
+    rounding = 4 * torch.finfo(dtype).eps * float(true.abs().max())
+    for pairs in both(ends):
+        nearest = (pairs.values[:, None] - true).abs().min(dim=1).values
+        assert (nearest <= pairs.residuals + rounding).all()
+    # in a cluster closer than the tolerance the outermost eigenvalue may lie outside the residual, not the tolerance
+    for pairs, outside in ((ends.largest, true[-1]), (ends.smallest, true[0])):
+        asked = max(float(pairs.residuals[0]), SETTINGS[case].rtol * abs(float(pairs.values[0])))
+        assert abs(pairs.values[0] - outside) <= asked + rounding
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("case", SETTINGS)
+@pytest.mark.parametrize("name", SPECTRA)
+def test_residuals_are_those_of_the_vectors_returned_and_vectors_are_orthonormal(name, case, dtype):
+    H, ends = solved(name, case, dtype)
+    unit = torch.finfo(dtype).eps
+    for pairs in both(ends):
+        V = pairs.vectors.double()
+        residuals = (H.matrix.double() @ V - pairs.values * V).norm(dim=0)
+        rounding = 10 * unit * float(H.matrix.norm())
+        assert ((residuals - pairs.residuals).abs() <= rounding).all()
+        assert (V.T @ V - torch.eye(len(pairs))).abs().max() < N * unit
+        if pairs.reason == "tolerance":
+            assert (pairs.residuals <= SETTINGS[case].rtol * pairs.values.abs()).all()
+
+
+@pytest.mark.parametrize("name", ["power law", "indefinite", "both tails", "clustered", "negative", "multiple"])
+def test_to_a_tight_tolerance_the_pairs_are_the_outermost_ones_in_order(name):
+    H = operator(name)
+    true = eigenvalues(H)
+    ends = extreme_eigenpairs(H, generator(), EigenSettings(3, 3, rtol=1e-10, basis=40, max_matvecs=5000))
+    assert torch.allclose(ends.largest.values, true.flip(0)[:3], rtol=0, atol=1e-9)
+    assert torch.allclose(ends.smallest.values, true[:3], rtol=0, atol=1e-9)
+
+
+def test_restarts_are_exercised_and_the_memory_is_kept():
+    seen = []
+
+    class Watched(DenseOperator):
+        def apply(self, V):
+            seen.append(V.shape[1])
+            return super().apply(V)
+
+    H = Watched(operator("indefinite").matrix)
+    ends = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-8, basis=12))
+    assert ends.largest.reason == ends.smallest.reason == "tolerance"
+    assert ends.matvecs == sum(seen) > 5 * 12
+
+
+def test_one_end_alone_may_be_asked_for():
+    true = eigenvalues(operator("both tails"))
+    ends = extreme_eigenpairs(operator("both tails"), generator(), EigenSettings(0, 2, rtol=1e-8))
+    assert len(ends.largest) == 0
+    assert torch.allclose(ends.smallest.values, true[:2], rtol=0, atol=1e-8)
+
+
+def test_eigenvectors_errors_are_bounded_by_residual_over_gap():
+    H = operator("both tails")
+    _, vectors = torch.linalg.eigh(H.matrix)
+    pairs = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-3)).largest
+    sine = (pairs.vectors[:, 0] - vectors[:, -1] * (vectors[:, -1] @ pairs.vectors[:, 0])).norm()
+    # the gap is to an approximate neighbour, which is a little off: its own error counts
+    assert 0 < float(sine) <= 1.1 * float(pairs.vector_errors[0])
+
+
+def test_float32_stops_at_its_noise_floor_and_says_so():
+    H = operator("indefinite", torch.float32)
+    ends = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-12, max_matvecs=2000))
+    for pairs in both(ends):
+        assert pairs.reason == "noise floor"
+        assert float(pairs.residuals[0]) < 20 * torch.finfo(torch.float32).eps * abs(float(pairs.values[0]))
+    assert ends.matvecs < 2 * N
+
+
+def test_the_noise_of_a_product_ends_the_run_where_more_work_would_not_help():
+    source = generator(1)
+
+    class Noisy(DenseOperator):
+        def apply(self, V):
+            exact = super().apply(V)
+            return exact + 1e-6 / N**0.5 * torch.randn(V.shape, generator=source, dtype=V.dtype) * V.norm(dim=0)
+
+    ends = extreme_eigenpairs(Noisy(operator("indefinite").matrix), generator(), EigenSettings(rtol=1e-9))
+    for pairs in both(ends):
+        assert pairs.reason == "noise floor"
+        assert 0.2e-6 < float(pairs.residuals[0]) < 5e-6
+    # the difference of two products, one of them scaled by a third: noise of 1e-6 and 1e-6
+    assert ends.noise == pytest.approx(2**0.5 * 1e-6, rel=4 / (2 * N) ** 0.5)
+
+
+def test_a_budget_is_kept_and_said():
+    H = CountingOperator(operator("indefinite"))
+    ends = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-10, max_matvecs=20))
+    assert H.matvecs == ends.matvecs <= 20
+    assert ends.largest.reason == "matvec budget"
+    late = extreme_eigenpairs(operator("indefinite"), generator(), EigenSettings(rtol=1e-10, max_seconds=0.0))
+    assert late.smallest.reason == "time budget"
+
+
+def test_one_end_may_be_converged_where_the_other_is_not():
+    ends = extreme_eigenpairs(operator("power law"), generator(), EigenSettings(rtol=1e-6, max_matvecs=25))
+    assert (ends.largest.reason, ends.smallest.reason) == ("tolerance", "matvec budget")
+
+
+def test_a_warm_start_needs_fewer_products():
+    H = operator("indefinite")
+    cold = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-6))
+    nearby = DenseOperator(H.matrix + 1e-4 * operator("both tails").matrix)
+    start = torch.cat([cold.largest.vectors, cold.smallest.vectors], dim=1)
+    warm = extreme_eigenpairs(nearby, generator(), EigenSettings(rtol=1e-6), start=start)
+    again = extreme_eigenpairs(nearby, generator(), EigenSettings(rtol=1e-6))
+    assert warm.matvecs < again.matvecs
+    assert warm.beyond == float("inf") > again.beyond
+    assert torch.allclose(warm.largest.values, again.largest.values, rtol=1e-6, atol=0)
+
+
+def test_a_warm_start_at_inner_eigenvectors_still_finds_the_ends():
+    H = operator("indefinite")
+    true, vectors = torch.linalg.eigh(H.matrix)
+    ends = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-6), start=vectors[:, [50, 60]])
+    assert float(ends.largest.values) == pytest.approx(float(true[-1]), rel=1e-6)
+    assert float(ends.smallest.values) == pytest.approx(float(true[0]), rel=1e-6)
+
+
+def test_no_eigenvalue_lies_beyond_the_stated_bound():
+    H = operator("both tails")
+    true = eigenvalues(H)
+    for seed in range(20):
+        ends = extreme_eigenpairs(H, generator(seed), EigenSettings(rtol=1e-12, max_matvecs=40))
+        assert 0 < ends.beyond < 1
+        assert true[-1] <= ends.largest.values[0] + ends.beyond
+        assert true[0] >= ends.smallest.values[0] - ends.beyond
+
+
+def test_the_same_seed_gives_the_same_pairs_bit_for_bit():
+    runs = [extreme_eigenpairs(operator("clustered"), generator(3), SETTINGS["blocks"]) for _ in range(2)]
+    assert torch.equal(runs[0].largest.vectors, runs[1].largest.vectors)
+    assert torch.equal(runs[0].smallest.values, runs[1].smallest.values)
+
+
+def test_operators_of_one_and_two_rows_are_solved_exactly():
+    one = extreme_eigenpairs(DenseOperator(torch.tensor([[-3.0]])), generator(), EigenSettings(1, 0))
+    assert one.largest.values.tolist() == [-3.0] and one.largest.residuals.tolist() == [0.0]
+    two = extreme_eigenpairs(DenseOperator(torch.tensor([[0.0, 2.0], [2.0, 0.0]]).double()), generator())
+    assert two.largest.values.tolist() == pytest.approx([2.0]) and two.smallest.values.tolist() == pytest.approx([-2.0])
+
+
+def test_progress_counts_matvecs_up_to_the_budget():
+    seen = []
+    ends = extreme_eigenpairs(operator("indefinite"), generator(), progress=lambda *state: seen.append(state))
+    assert [done for done, _, _ in seen] == sorted({done for done, _, _ in seen})
+    assert seen[-1][0] <= ends.matvecs and seen[0][1] == 1000 and "largest" in seen[-1][2]
+
+
+def test_products_that_are_not_finite_are_an_error():
+    class Broken(DenseOperator):
+        def apply(self, V):
+            return V / 0
+
+    with pytest.raises(ValueError, match="finite products"):
+        extreme_eigenpairs(Broken(torch.eye(5)), generator())
+    with pytest.raises(ValueError, match="finite products"):
+        power_iteration(Broken(torch.eye(5)), generator())
+
+
+def test_bad_requests_are_refused():
+    with pytest.raises(ValueError, match="not both 0"):
+        EigenSettings(0, 0)
+    with pytest.raises(ValueError, match="a basis of at least 5 vectors"):
+        EigenSettings(basis=4)
+    with pytest.raises(ValueError, match="max_matvecs >= 7"):
+        EigenSettings(max_matvecs=6)
+    with pytest.raises(ValueError, match="at most 2 eigenpairs"):
+        extreme_eigenpairs(DenseOperator(torch.eye(2)), generator(), EigenSettings(2, 1))
+    with pytest.raises(ValueError, match="start vectors that are not zero"):
+        extreme_eigenpairs(operator("zero"), generator(), start=torch.zeros(N))
+
+
+@pytest.mark.parametrize("name", ["power law", "both tails", "clustered", "negative", "multiple"])
+def test_power_iteration_finds_the_eigenvalue_of_largest_magnitude(name):
+    H = operator(name)
+    true = eigenvalues(H)
+    dominant = float(true[true.abs().argmax()])
+    pair, steps = power_iteration(H, generator(), PowerSettings(rtol=1e-4, max_matvecs=3000))
+    assert pair.reason == "tolerance" and steps <= 3000
+    assert abs(float(pair.values) - dominant) <= float(pair.residuals) <= 1e-4 * abs(dominant)
+    assert float((H.matrix @ pair.vectors - pair.values * pair.vectors).norm()) == pytest.approx(float(pair.residuals))
+
+
+def test_shifted_power_iteration_finds_the_end_opposite_to_the_shift():
+    H = operator("both tails")
+    true = eigenvalues(H)
+    pair, _ = power_iteration(H, generator(), PowerSettings(rtol=1e-3, max_matvecs=3000), shift=float(true[-1]))
+    assert float(pair.values) == pytest.approx(float(true[0]), rel=1e-4)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_power_ends_puts_the_ends_in_order_whichever_is_longer(sign):
+    H = DenseOperator(sign * operator("both tails").matrix)
+    true = eigenvalues(H)
+    ends = power_ends(H, generator(), PowerSettings(rtol=1e-3, max_matvecs=3000))
+    assert float(ends.largest.values) == pytest.approx(float(true[-1]), rel=1e-3)
+    assert float(ends.smallest.values) == pytest.approx(float(true[0]), rel=1e-3)
+    assert ends.method == "power iteration"
+
+
+def test_power_iteration_says_when_its_budget_ends_it():
+    H = CountingOperator(operator("indefinite"))
+    ends = power_ends(H, generator(), PowerSettings(rtol=1e-12, max_matvecs=15))
+    assert ends.largest.reason == "matvec budget" and H.matvecs == ends.matvecs == 30
+    late, steps = power_iteration(operator("indefinite"), generator(), PowerSettings(rtol=1e-12, max_seconds=0.0))
+    assert (late.reason, steps) == ("time budget", 1)
+
+
+def test_power_iteration_of_zero_is_zero():
+    pair, _ = power_iteration(operator("zero"), generator())
+    assert float(pair.values) == float(pair.residuals) == 0.0
+
+
+def test_bad_power_settings_are_refused():
+    with pytest.raises(ValueError, match="max_matvecs >= 1"):
+        PowerSettings(max_matvecs=0)

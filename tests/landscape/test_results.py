@@ -1,0 +1,47 @@
+import json
+from math import inf, nan
+
+import pytest
+import torch
+
+from landscape.anisotropy import anisotropy
+from landscape.checks import check_operator
+from landscape.density import spectral_density
+from landscape.eigen import extreme_eigenpairs, power_ends
+from landscape.results import Bracket, t_interval
+from landscape.trace import estimate_traces
+from tests.landscape.spectra import generator, operator
+
+
+def test_students_interval_of_four_numbers_is_the_textbooks():
+    mean, error, low, high = t_interval(torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64), 0.95)
+    assert mean == 2.5 and error == pytest.approx((5 / 3) ** 0.5 / 2)
+    assert high - mean == mean - low == pytest.approx(3.182446305 * error)  # t(0.975; 3)
+
+
+def test_one_sample_has_no_error_bar():
+    assert t_interval(torch.tensor([3.0], dtype=torch.float64), 0.95)[1:] == (inf, -inf, inf)
+
+
+@pytest.mark.parametrize("name", ["both tails", "zero", "rank-deficient"])
+def test_every_record_is_strict_json(name):
+    H = operator(name)
+    ends = extreme_eigenpairs(H, generator())
+    records = [
+        {block: estimate.record() for block, estimate in estimate_traces(H, generator()).items()},
+        ends.record(),
+        power_ends(H, generator()).record(),
+        anisotropy(ends, spectral_density(H, generator())).record(),
+        check_operator(H, generator()).record(),
+    ]
+    assert json.loads(json.dumps(records, allow_nan=False)) == records
+
+
+def test_a_record_has_no_number_where_there_is_none():
+    assert Bracket(nan, -inf, 2.0).record() == {"value": None, "low": None, "high": 2.0, "note": ""}
+
+
+def test_a_bracket_reads_as_a_sentence():
+    assert str(Bracket(2.0, 1.0, 3.0, "a note")) == "2 in [1, 3] (a note)"
+    assert str(Bracket(None, 5.0, inf, "why")) == ">= 5: why"
+    assert str(Bracket(None, inf, inf, "why")) == "undefined: why"
