@@ -20,7 +20,7 @@ from torch import Tensor
 from landscape.operator import require_vectors
 from splat.camera import Camera
 from splat.gaussians import Gaussians
-from splat.linearize import LinearizedView, rasterize_view, touches
+from splat.linearize import LinearizedView, OwnBlocks, rasterize_view, touches
 from splat.losses import LossSettings
 from splat.losses_cpu import ViewLoss
 from splat.scenes.view import View
@@ -124,6 +124,14 @@ class SceneObjective:
     def gradient(self) -> Float[Tensor, " p"]:
         """The gradient of L at the active Gaussians."""
         return torch.stack([view.gradient for view in self.linearized]).mean(dim=0)
+
+
+    def block_diagonal(self, *, gauss_newton: bool = False) -> OwnBlocks:
+        """Own blocks of the mean over views: of the Hessian or of its Gauss-Newton part (see `LinearizedView`)."""
+        total = self.linearized[0].block_diagonal(gauss_newton=gauss_newton)
+        for view in self.linearized[1:]:
+            total = total + view.block_diagonal(gauss_newton=gauss_newton)
+        return total * (1 / len(self.views))
 
 
 class SceneHessian:

@@ -184,6 +184,17 @@ def pixel_slope(residual, kind, eps):
     return length, residual / length
 
 
+@formula
+def pixel_curvature(residual, kind, eps, weight):
+    """The second derivative of the pixel loss, times weight; 0 for L1 (its kink at 0 has none)."""
+    if kind == L1:
+        return residual * 0.0
+    if kind == L2:
+        return 2.0 * weight
+    squared = residual * residual + eps * eps
+    return weight * (eps * eps) / (squared * sqrt(squared))
+
+
 @kernel
 def gradient_rows(start, stop, shape, taps, partials, x, y, kind, eps, pixel, structural, blurred_sp, gradient, sums):
     """The gradient of the loss, and the pixel loss to sums[row].  structural = 0: partials is not read.
@@ -227,12 +238,7 @@ def product_rows(start, stop, shape, taps, partials, v, x, y, kind, eps, pixel, 
         at = top + line * stride
         for i in range(0, stride, L):
             image, aim, tangent = load(x, at + i), load(y, at + i), load(v, at + i)
-            total = broadcast(x, 0.0)
-            if kind == L2:
-                total = 2.0 * pixel * tangent
-            elif kind == CHARBONNIER:
-                squared = (image - aim) * (image - aim) + eps * eps
-                total = pixel * eps * eps * tangent / (squared * sqrt(squared))
+            total = pixel_curvature(image - aim, kind, eps, broadcast(x, pixel)) * tangent
             if structural != 0:
                 bm = blur_column(partials, top + i, line, height, stride, taps)
                 bp = blur_column(partials, size + top + i, line, height, stride, taps)
@@ -241,6 +247,46 @@ def product_rows(start, stop, shape, taps, partials, v, x, y, kind, eps, pixel, 
             store(product, at + i, total)
         for i in range(width, stride):
             product[at + i] = 0
+
+
+@kernel
+def blur_five_along_rows(start, stop, shape, taps, fields, blurred):
+    """Rows of five plane sets, blurred along x only."""
+    height, width, plane_rows, stride = shape
+    L, size = lanes(fields), 3 * plane_rows * stride
+    buffer = row_buffer(fields, stride)
+    for row in range(start, stop):
+        at = ((row // height) * plane_rows + row % height) * stride
+        for f in range(5):
+            for i in range(0, stride, L):
+                store(buffer, BORDER + i, load(fields, f * size + at + i))
+            clear_ends(buffer, width)
+            for i in range(0, stride, L):
+                store(blurred, f * size + at + i, blur_row(buffer, i, taps))
+
+
+@kernel
+def diagonal_rows(start, stop, shape, taps, blurred, x, y, kind, eps, pixel, structural, blurred_sp, diagonal):
+    """The diagonal of the loss's Hessian; blurred: S_mm, S_mp, S_mq, S_pp, S_pq blurred along x with the squared window."""
+    height, width, plane_rows, stride = shape
+    L, size = lanes(x), 3 * plane_rows * stride
+    for row in range(start, stop):
+        top, line = (row // height) * plane_rows * stride, row % height
+        at = top + line * stride
+        for i in range(0, stride, L):
+            image, aim = load(x, at + i), load(y, at + i)
+            total = pixel_curvature(image - aim, kind, eps, broadcast(x, pixel))
+            if structural != 0:
+                mm = blur_column(blurred, top + i, line, height, stride, taps)
+                mp = blur_column(blurred, size + top + i, line, height, stride, taps)
+                mq = blur_column(blurred, 2 * size + top + i, line, height, stride, taps)
+                pp = blur_column(blurred, 3 * size + top + i, line, height, stride, taps)
+                pq = blur_column(blurred, 4 * size + top + i, line, height, stride, taps)
+                coupled = mm + 4.0 * image * (mp + image * pp + aim * pq) + 2.0 * aim * mq
+                total -= structural * (coupled + 2.0 * load(blurred_sp, at + i))
+            store(diagonal, at + i, total)
+        for i in range(width, stride):
+            diagonal[at + i] = 0
 
 
 class ViewLoss:
@@ -357,6 +403,22 @@ class LinearLoss:
                 product_rows, partials, v, self._image, y, *loss._pointwise(), self._blurred, product.reshape(-1)
             )
         return products
+
+
+    def diagonal(self) -> np.ndarray:
+        """The pixel-diagonal of l'', padded planes (3, ...): that of SSIM is one blur with the squared window."""
+        loss = self.loss
+        none, y = np.empty(0, loss.dtype), loss.target.reshape(-1)
+        diagonal, blurred = loss.planes(1)[0], none
+        diagonal[:, loss.shape[0] :] = 0
+        if loss.structural:
+            blurred = loss.planes(5).reshape(-1)
+            over_range(3 * loss.shape[0], blur_five_along_rows, loss.shape, loss.taps**2, self._second, blurred)
+        over_range(
+            3 * loss.shape[0], diagonal_rows, loss.shape, loss.taps**2, blurred, self._image, y, *loss._pointwise(),
+            self._blurred, diagonal.reshape(-1),
+        )  # fmt: skip
+        return diagonal
 
 
 # --- for autograd -----------------------------------------------------------------------------------------------------

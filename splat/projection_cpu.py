@@ -12,8 +12,6 @@ of a (p, K) block laid out like the flat vector.  Splats are (n, 9), tangents of
 from math import exp
 
 import numpy as np
-from numba import prange
-from torch import Tensor
 
 from splat.camera import Camera
 from splat.dual import DIRECTIONS, tangent_of, variable
@@ -28,8 +26,9 @@ from splat.projection_formulas import (
     offset_from,
     to_camera,
 )
-from splat.raster.compositing import formula, kernel, worker
+from splat.raster.compositing import formula, kernel
 from splat.raster.simd import store
+from splat.raster.threads import over_range
 from splat.settings import RenderSettings
 
 GEOMETRY = 10  # mean 3, log-scales 3, quaternion 4
@@ -83,14 +82,15 @@ def quaternion(array, i):
 
 
 @kernel
-def project_splats(lens, means, log_scales, quats, logits, sh, splats, depths, drawn):
+def project_splats(start, stop, lens, means, log_scales, quats, logits, sh, splats, depths, drawn):
     """Fill splats (n, 9), depths and drawn; a Gaussian behind the near plane gets an opacity of 0."""
     bands = sh.shape[1]
-    for i in prange(means.shape[0]):
+    for i in range(start, stop):
         mean = point(means, i)
         depths[i] = to_camera(lens, offset_from(lens, mean))[2]
         drawn[i] = depths[i] > lens.near
-        splats[i] = 0
+        for j in range(9):
+            splats[i, j] = 0
         if drawn[i]:
             values = geometry(lens, mean, point(log_scales, i), quaternion(quats, i))
             for j in range(5):
@@ -105,12 +105,14 @@ def project_splats(lens, means, log_scales, quats, logits, sh, splats, depths, d
 
 
 @kernel
-def project_adjoint(lens, means, log_scales, quats, sh, splats, drawn, bar, d_means, d_log_scales, d_quats, d_logits, d_sh):
-    """The adjoints of the stored parameters, given that of the splats, bar (n, 9)."""
+def project_adjoint(start, stop, lens, means, log_scales, quats, sh, splats, drawn, bar, d_means, d_log_scales, d_quats, d_logits, d_sh):
+    """The adjoints of the stored parameters, given that of the splats, bar (n, 9); outputs start at 0."""
     bands = sh.shape[1]
-    for i in prange(means.shape[0]):
-        d_means[i], d_log_scales[i], d_quats[i], d_logits[i], d_sh[i] = 0, 0, 0, 0, 0
-        if drawn[i] and np.any(bar[i] != 0):
+    for i in range(start, stop):
+        moves = False
+        for j in range(9):
+            moves |= bar[i, j] != 0
+        if drawn[i] and moves:
             mean = point(means, i)
             bars = (
                 np.float64(bar[i, 0]), np.float64(bar[i, 1]), np.float64(bar[i, 2]),
@@ -137,7 +139,7 @@ def project_adjoint(lens, means, log_scales, quats, sh, splats, drawn, bar, d_me
 # --- a view held still ------------------------------------------------------------------------------------------------
 
 
-@worker
+@kernel
 def linearize_gaussian(lens, mean, log_scales, quat, colour_weight, bands, bar, jacobian, curvature, harmonic, slope):
     """One Gaussian's Jacobian (5, 10), packed curvature (55,), harmonics (16,) and their derivative in the mean (16, 3).
 
@@ -159,7 +161,8 @@ def linearize_gaussian(lens, mean, log_scales, quat, colour_weight, bands, bar, 
     values = geometry(lens, x, s, q)
     for j in range(5):
         store(lanes, 0, tangent_of(values[j]))
-        jacobian[j] = lanes[:GEOMETRY]
+        for k in range(GEOMETRY):
+            jacobian[j, k] = lanes[k]
     m, t, r = geometry_adjoint(lens, x, s, q, bar)
     along = colour_adjoint(lens, x, colour_weight, bands)
     rows = (
@@ -182,11 +185,11 @@ def linearize_gaussian(lens, mean, log_scales, quat, colour_weight, bands, bar, 
 
 @kernel
 def linearize_all(
-    lens, index, means, log_scales, quats, sh, splats, bar, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope
+    start, stop, lens, index, means, log_scales, quats, sh, splats, bar, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope
 ):  # fmt: skip
     """Fill the arrays of `Projection` for the Gaussians at index; bar (n, 9) is the adjoint of the splats."""
     bands = sh.shape[1]
-    for e in prange(index.size):
+    for e in range(start, stop):
         i = index[e]
         weight = np.zeros(16)
         for c in range(3):
@@ -211,11 +214,10 @@ def linearize_all(
 
 
 @kernel
-def push_forward(index, splats, jacobian, harmonic, visible, colour_slope, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
-    """P' u: out (n, K, 9), 0 for Gaussians not at index."""
+def push_forward(start, stop, index, splats, jacobian, harmonic, visible, colour_slope, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
+    """P' u: out (n, K, 9), which starts at 0."""
     K, bands = out.shape[1], d_sh.shape[1]
-    out[:] = 0
-    for e in prange(index.size):
+    for e in range(start, stop):
         i = index[e]
         opacity = splats[i, 5]
         for k in range(K):
@@ -238,12 +240,12 @@ def push_forward(index, splats, jacobian, harmonic, visible, colour_slope, d_mea
 
 @kernel
 def pull_back(
-    index, splats, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope, opacity_bar, second_order,
+    start, stop, index, splats, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope, opacity_bar, second_order,
     cotangents, d_means, d_log_scales, d_quats, d_logits, d_sh, out_means, out_log_scales, out_quats, out_logits, out_sh,
 ):  # fmt: skip
     """P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order; added to the outputs."""
     K, bands = cotangents.shape[1], out_sh.shape[1]
-    for e in prange(index.size):
+    for e in range(start, stop):
         i = index[e]
         opacity = splats[i, 5]
         slope_of_opacity = opacity * (1 - opacity)
@@ -285,6 +287,52 @@ def pull_back(
             out_logits[i, k] += logit
 
 
+@kernel
+def chain_blocks(
+    start, stop, index, splats, own, jacobian, curvature, harmonic, visible, colour_slope, opacity_bar, curved, geometry_out, sh_out
+):  # fmt: skip
+    """Blocks of the splats at index, own (m, 9, 9) as lower triangles, in stored parameters: P'^T own P', plus (a . P'') where curved.
+
+    geometry_out: (n, 11, 11) over mean, log-scales, quaternion and opacity logit; sh_out: (n, k, 3), the diagonal of SH's.
+    Both are added to.
+    """
+    bands = sh_out.shape[1]
+    J, column, product = np.zeros((9, GEOMETRY + 1)), np.zeros(9), np.zeros(9)
+    for e in range(start, stop):
+        i = index[e]
+        opacity = np.float64(splats[i, 5])
+        slope = opacity * (1 - opacity)
+        J[5, GEOMETRY] = slope
+        for r in range(5):
+            for j in range(GEOMETRY):
+                J[r, j] = jacobian[e, r, j]
+        for c in range(3):
+            for j in range(3):
+                J[6 + c, j] = visible[e, c] * colour_slope[e, c, j]
+            for b in range(bands):
+                sh_out[i, b, c] += visible[e, c] * harmonic[e, b] * harmonic[e, b] * own[e, 6 + c, 6 + c]
+        for j in range(GEOMETRY + 1):
+            for r in range(9):
+                column[r] = J[r, j]
+                product[r] = 0
+            for r in range(9):
+                for s in range(r):
+                    product[r] += own[e, r, s] * column[s]
+                    product[s] += own[e, r, s] * column[r]
+                product[r] += own[e, r, r] * column[r]
+            for k in range(j + 1):
+                total = 0.0
+                for r in range(9):
+                    total += J[r, k] * product[r]
+                if curved and j < GEOMETRY:
+                    total += curvature[e, j * (j + 1) // 2 + k]
+                geometry_out[i, j, k] += total
+                if k < j:
+                    geometry_out[i, k, j] += total
+        if curved:
+            geometry_out[i, GEOMETRY, GEOMETRY] += slope * (1 - 2 * opacity) * opacity_bar[i]
+
+
 @formula
 def add_symmetric(packed, u, h):
     """h += C u, C symmetric with its lower triangle packed row by row."""
@@ -302,7 +350,7 @@ def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.nda
     arrays = attribute_arrays(gaussians)
     n, dtype = len(gaussians), arrays[0].dtype
     splats, depths, drawn = np.empty((n, 9), dtype), np.empty(n, dtype), np.empty(n, np.bool_)
-    project_splats(lens, *arrays, splats, depths, drawn)
+    over_range(n, project_splats, lens, *arrays, splats, depths, drawn)
     return splats, depths, drawn
 
 
@@ -320,16 +368,16 @@ class Projection:
         self.harmonic, self.slope = np.empty((m, 16), dtype), np.empty((m, 16, 3), dtype)
         self.colour_bar, self.visible = np.empty((m, 3), dtype), np.empty((m, 3), dtype)
         self.colour_slope, self.opacity_bar = np.empty((m, 3, 3), dtype), np.ascontiguousarray(bar[:, 5])
-        linearize_all(
-            lens, index, means, log_scales, quats, sh, splats, bar, self.jacobian, self.curvature, self.harmonic,
+        over_range(
+            m, linearize_all, lens, index, means, log_scales, quats, sh, splats, bar, self.jacobian, self.curvature, self.harmonic,
             self.slope, self.colour_bar, self.visible, self.colour_slope,
         )  # fmt: skip
 
     def jvp(self, block: np.ndarray) -> np.ndarray:
         """P' U: (n, K, 9) from a block (p, K) of tangents of the stored parameters."""
-        out = np.empty((self.n, block.shape[1], 9), self.splats.dtype)
-        push_forward(
-            self.index, self.splats, self.jacobian, self.harmonic, self.visible, self.colour_slope,
+        out = np.zeros((self.n, block.shape[1], 9), self.splats.dtype)
+        over_range(
+            self.index.size, push_forward, self.index, self.splats, self.jacobian, self.harmonic, self.visible, self.colour_slope,
             *split(block, self.n, self.sh_degree), out,
         )  # fmt: skip
         return out
@@ -337,13 +385,17 @@ class Projection:
     def pull(self, cotangents: np.ndarray, block: np.ndarray | None, out: np.ndarray) -> None:
         """Add P'^T cotangents, and (a . P'') block where a block (p, K) is given, to out (p, K)."""
         tangents = split(out if block is None else block, self.n, self.sh_degree)
-        pull_back(
-            self.index, self.splats, self.jacobian, self.curvature, self.harmonic, self.slope, self.colour_bar,
+        over_range(
+            self.index.size, pull_back, self.index, self.splats, self.jacobian, self.curvature, self.harmonic, self.slope, self.colour_bar,
             self.visible, self.colour_slope, self.opacity_bar, block is not None, cotangents, *tangents,
             *split(out, self.n, self.sh_degree),
         )  # fmt: skip
 
 
-def as_array(tensor: Tensor) -> np.ndarray:
-    """A contiguous NumPy view (or copy) of a tensor."""
-    return np.ascontiguousarray(tensor.detach().numpy())
+    def add_blocks(self, own: np.ndarray, curved: bool, geometry: np.ndarray, sh: np.ndarray) -> None:
+        """Add the blocks of splats, own (m, 9, 9), to blocks of stored parameters: `chain_blocks`."""
+        over_range(
+            self.index.size, chain_blocks, self.index, self.splats, own, self.jacobian, self.curvature, self.harmonic,
+            self.visible, self.colour_slope, self.opacity_bar, curved, geometry, sh,
+        )  # fmt: skip
+

@@ -8,7 +8,7 @@ pixels; a splat is nine numbers (`packing.py`).
 from math import log2
 
 import numpy as np
-from splat.raster import binning, compositing, packing
+from splat.raster import binning, blocks, compositing, packing
 from splat.raster.simd import lanes_of
 from splat.raster.threads import over_range, over_tiles
 from splat.settings import RenderSettings
@@ -101,6 +101,24 @@ class Raster:
     def backward(self, cotangent: np.ndarray) -> "Adjoint":
         """The gradient in the splats from padded cotangent planes (4, ...)."""
         return Adjoint(self, cotangent)
+
+    def own_blocks(self, adjoint: "Adjoint", curvature: np.ndarray, index: np.ndarray, gauss_newton: bool) -> np.ndarray:
+        """Own blocks (m, 9, 9), lower triangles, of the splats at index: of the Hessian or of its Gauss-Newton part.
+
+        adjoint: that of the loss's gradient; curvature: the pixel-diagonal of l'', padded planes (3, ...).
+        """
+        dtype, slot_start = self.splats.dtype, self.slot_start
+        sums = aligned((slot_start[-1] * blocks.BLOCK_SUMS,), dtype)
+        gradient = np.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent
+        over_tiles(
+            blocks.block_moments, self.params, self.lists, self.frame, self.pixels, gradient,
+            np.ascontiguousarray(curvature, dtype).reshape(-1), sums,
+        )  # fmt: skip
+        own = np.empty((index.size, 9, 9), dtype)
+        over_range(
+            index.size, blocks.reduce_blocks, index, self.splats, slot_start, sums, adjoint.moments, not gauss_newton, own
+        )
+        return own
 
     def jvp(self, directions: np.ndarray) -> "Tangent":
         """J u for directions (n, K, 9) of the splats."""
