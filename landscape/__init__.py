@@ -6,7 +6,7 @@ Everything here sees a `SymmetricOperator` and a `torch.Generator`, and returns 
 from landscape.anisotropy import anisotropy, effective_rank, literal, saddle, share
 from landscape.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
 from landscape.density import absolute_sum, spectral_density
-from landscape.eigen import EigenSettings, PowerSettings, extreme_eigenpairs, power_ends, power_iteration
+from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.lanczos import LanczosFactorization, lanczos
 from landscape.objective import ObjectiveHessian
 from landscape.operator import (
@@ -18,6 +18,7 @@ from landscape.operator import (
     SumOperator,
     SymmetricOperator,
 )
+from landscape.power import PowerSettings, power_ends, power_iteration
 from landscape.results import (
     Anisotropy,
     Bracket,

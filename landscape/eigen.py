@@ -1,4 +1,4 @@
-"""Eigenpairs at the two ends of the spectrum: Lanczos with thick restarts, and the paper's power iteration.
+"""Eigenpairs at the two ends of the spectrum, by Lanczos with thick restarts.
 
 `extreme_eigenpairs` runs one (block) Lanczos recurrence for both ends (Wu and Simon 2000).  The projected matrix
 T = Q^T H Q is kept whole, so that nothing is assumed of its shape after a restart.  When the memory budget of basis
@@ -10,7 +10,7 @@ of the matvec, or at its budget.  The residuals reported are measured afterwards
 """
 
 from dataclasses import dataclass
-from math import inf, isfinite, log, nan, sqrt
+from math import inf, log, sqrt
 from time import monotonic
 
 import torch
@@ -300,83 +300,3 @@ def _beyond(n: int, steps: int, spread: float) -> float:
         return 0.0
     eps = (log(2 * 1.648 * sqrt(n) / 0.01) / (2 * steps - 1)) ** 2
     return eps / (1 - 2 * eps) * spread if eps < 0.5 else inf
-
-
-@dataclass(frozen=True)
-class PowerSettings:
-    """Power iteration stops at a residual of max(rtol |lambda|, atol), or when the budget of one end is spent."""
-
-    rtol: float = 1e-3
-    atol: float = 0.0
-    max_matvecs: int = 100
-    max_seconds: float = inf
-
-    def __post_init__(self) -> None:
-        if self.rtol < 0 or self.atol < 0 or self.max_matvecs < 1:
-            raise ValueError(
-                f"expected rtol, atol >= 0 and max_matvecs >= 1, got {self.rtol}, {self.atol} and {self.max_matvecs}"
-            )
-
-
-def power_iteration(
-    operator: SymmetricOperator,
-    generator: torch.Generator,
-    settings: PowerSettings = PowerSettings(),
-    shift: float = 0.0,
-    progress: Progress | None = None,
-) -> tuple[Eigenpairs, int]:
-    """The eigenpair of H whose eigenvalue is farthest from shift, and the matvecs it took.
-
-    v <- (H - shift) v / |(H - shift) v|, from a Gaussian start.  With shift = 0 this is the eigenvalue of largest
-    magnitude, of either sign; with that eigenvalue as the shift it is the other end of the spectrum.
-    """
-    v = draw_probes(operator.dim, 1, generator, operator.dtype)[:, 0]
-    deadline, epsilon = monotonic() + settings.max_seconds, torch.finfo(operator.dtype).eps
-    step, reason = 0, None
-    while True:
-        v /= norm(v)
-        step += 1
-        w = operator.apply(v[:, None])[:, 0] - shift * v
-        moved = float(torch.dot(v.double(), w.double()))
-        value, residual = moved + shift, norm(w.double() - moved * v.double())
-        if not isfinite(residual):
-            raise ValueError(
-                "expected finite products H v, got NaN or infinity; check the parameters with check_operator"
-            )
-        if progress:
-            progress(step, settings.max_matvecs, f"eigenvalue {value:.4g} +- {residual:.1e}")
-        reason = _power_reason(settings, step, value, residual, epsilon * max(abs(moved), abs(shift)), deadline)
-        if reason:
-            vector_error = torch.tensor([inf], dtype=torch.float64)
-            numbers = torch.tensor([[value], [residual]], dtype=torch.float64)
-            return Eigenpairs(numbers[0], v[:, None], numbers[1], vector_error, reason), step
-        v = w
-
-
-def _power_reason(
-    settings: PowerSettings, step: int, value: float, residual: float, floor: float, deadline: float
-) -> StopReason | None:
-    if residual <= max(settings.rtol * abs(value), settings.atol):
-        return "tolerance"
-    if residual <= floor:
-        return "noise floor"
-    if step == settings.max_matvecs:
-        return "matvec budget"
-    return "time budget" if monotonic() > deadline else None
-
-
-def power_ends(
-    operator: SymmetricOperator,
-    generator: torch.Generator,
-    settings: PowerSettings = PowerSettings(),
-    progress: Progress | None = None,
-) -> EigenEnds:
-    """Both ends of the spectrum as StableGS takes them: power iteration, then power iteration on H - lambda I.
-
-    The first run finds the eigenvalue of largest magnitude, which is lambda_max or, where the negative end is longer,
-    lambda_min; the run shifted by it finds the other end.
-    """
-    first, steps = power_iteration(operator, generator, settings, progress=progress)
-    other, more = power_iteration(operator, generator, settings, shift=float(first.values), progress=progress)
-    smallest, largest = sorted((first, other), key=lambda pair: float(pair.values))
-    return EigenEnds(largest, smallest, "power iteration", steps + more, inf, nan)

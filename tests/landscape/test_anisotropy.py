@@ -5,8 +5,9 @@ import torch
 
 from landscape.anisotropy import anisotropy, effective_rank, literal, saddle, share
 from landscape.density import spectral_density
-from landscape.eigen import EigenSettings, PowerSettings, extreme_eigenpairs, power_ends
+from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.operator import DenseOperator
+from landscape.power import PowerSettings, power_ends
 from landscape.results import EigenEnds, Eigenpairs
 from tests.landscape.spectra import N, eigenvalues, generator, operator
 

@@ -3,7 +3,7 @@ from functools import cache
 import pytest
 import torch
 
-from landscape.eigen import EigenSettings, PowerSettings, extreme_eigenpairs, power_ends, power_iteration
+from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.operator import CountingOperator, DenseOperator
 from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
 
@@ -122,6 +122,22 @@ def test_the_noise_of_a_product_ends_the_run_where_more_work_would_not_help():
     assert ends.noise == pytest.approx(2**0.5 * 1e-6, rel=4 / (2 * N) ** 0.5)
 
 
+def test_noise_that_only_the_end_vectors_have_ends_the_run_too():
+    source = generator(1)
+
+    class Noisy(DenseOperator):
+        """Noise in proportion to the product: small on the random start, large where the run is going."""
+
+        def apply(self, V):
+            exact = super().apply(V)
+            return exact + 1e-4 * exact.norm(dim=0) / N**0.5 * torch.randn(V.shape, generator=source, dtype=V.dtype)
+
+    H = Noisy(operator("both tails").matrix)
+    ends = extreme_eigenpairs(H, generator(), EigenSettings(1, 0, rtol=1e-6))
+    assert ends.largest.reason == "noise floor" and ends.noise < 0.5 * float(ends.largest.residuals[0])
+    assert ends.matvecs < N // 2
+
+
 def test_a_budget_is_kept_and_said():
     H = CountingOperator(operator("indefinite"))
     ends = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-10, max_matvecs=20))
@@ -157,13 +173,12 @@ def test_a_warm_start_at_inner_eigenvectors_still_finds_the_ends():
 
 
 def test_no_eigenvalue_lies_beyond_the_stated_bound():
-    H = operator("both tails")
+    H = operator("negative")
     true = eigenvalues(H)
     for seed in range(20):
-        ends = extreme_eigenpairs(H, generator(seed), EigenSettings(rtol=1e-12, max_matvecs=40))
-        assert 0 < ends.beyond < 1
-        assert true[-1] <= ends.largest.values[0] + ends.beyond
-        assert true[0] >= ends.smallest.values[0] - ends.beyond
+        ends = extreme_eigenpairs(H, generator(seed), EigenSettings(rtol=1e-12, max_matvecs=25))
+        missed = max(float(true[-1] - ends.largest.values[0]), float(ends.smallest.values[0] - true[0]))
+        assert 0 < missed <= ends.beyond < 0.2  # the spectrum is 1 wide
 
 
 def test_the_same_seed_gives_the_same_pairs_bit_for_bit():
@@ -193,8 +208,6 @@ def test_products_that_are_not_finite_are_an_error():
 
     with pytest.raises(ValueError, match="finite products"):
         extreme_eigenpairs(Broken(torch.eye(5)), generator())
-    with pytest.raises(ValueError, match="finite products"):
-        power_iteration(Broken(torch.eye(5)), generator())
 
 
 def test_bad_requests_are_refused():
@@ -208,49 +221,3 @@ def test_bad_requests_are_refused():
         extreme_eigenpairs(DenseOperator(torch.eye(2)), generator(), EigenSettings(2, 1))
     with pytest.raises(ValueError, match="start vectors that are not zero"):
         extreme_eigenpairs(operator("zero"), generator(), start=torch.zeros(N))
-
-
-@pytest.mark.parametrize("name", ["power law", "both tails", "clustered", "negative", "multiple"])
-def test_power_iteration_finds_the_eigenvalue_of_largest_magnitude(name):
-    H = operator(name)
-    true = eigenvalues(H)
-    dominant = float(true[true.abs().argmax()])
-    pair, steps = power_iteration(H, generator(), PowerSettings(rtol=1e-4, max_matvecs=3000))
-    assert pair.reason == "tolerance" and steps <= 3000
-    assert abs(float(pair.values) - dominant) <= float(pair.residuals) <= 1e-4 * abs(dominant)
-    assert float((H.matrix @ pair.vectors - pair.values * pair.vectors).norm()) == pytest.approx(float(pair.residuals))
-
-
-def test_shifted_power_iteration_finds_the_end_opposite_to_the_shift():
-    H = operator("both tails")
-    true = eigenvalues(H)
-    pair, _ = power_iteration(H, generator(), PowerSettings(rtol=1e-3, max_matvecs=3000), shift=float(true[-1]))
-    assert float(pair.values) == pytest.approx(float(true[0]), rel=1e-4)
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_power_ends_puts_the_ends_in_order_whichever_is_longer(sign):
-    H = DenseOperator(sign * operator("both tails").matrix)
-    true = eigenvalues(H)
-    ends = power_ends(H, generator(), PowerSettings(rtol=1e-3, max_matvecs=3000))
-    assert float(ends.largest.values) == pytest.approx(float(true[-1]), rel=1e-3)
-    assert float(ends.smallest.values) == pytest.approx(float(true[0]), rel=1e-3)
-    assert ends.method == "power iteration"
-
-
-def test_power_iteration_says_when_its_budget_ends_it():
-    H = CountingOperator(operator("indefinite"))
-    ends = power_ends(H, generator(), PowerSettings(rtol=1e-12, max_matvecs=15))
-    assert ends.largest.reason == "matvec budget" and H.matvecs == ends.matvecs == 30
-    late, steps = power_iteration(operator("indefinite"), generator(), PowerSettings(rtol=1e-12, max_seconds=0.0))
-    assert (late.reason, steps) == ("time budget", 1)
-
-
-def test_power_iteration_of_zero_is_zero():
-    pair, _ = power_iteration(operator("zero"), generator())
-    assert float(pair.values) == float(pair.residuals) == 0.0
-
-
-def test_bad_power_settings_are_refused():
-    with pytest.raises(ValueError, match="max_matvecs >= 1"):
-        PowerSettings(max_matvecs=0)

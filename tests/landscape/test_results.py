@@ -7,7 +7,8 @@ import torch
 from landscape.anisotropy import anisotropy
 from landscape.checks import check_operator
 from landscape.density import spectral_density
-from landscape.eigen import extreme_eigenpairs, power_ends
+from landscape.eigen import extreme_eigenpairs
+from landscape.power import power_ends
 from landscape.results import Bracket, t_interval
 from landscape.trace import estimate_traces
 from tests.landscape.spectra import generator, operator

@@ -1,0 +1,61 @@
+import pytest
+import torch
+
+from landscape.operator import CountingOperator, DenseOperator
+from landscape.power import PowerSettings, power_ends, power_iteration
+from tests.landscape.spectra import eigenvalues, generator, operator
+
+
+@pytest.mark.parametrize("name", ["power law", "both tails", "clustered", "negative", "multiple"])
+def test_power_iteration_finds_the_eigenvalue_of_largest_magnitude(name):
+    H = operator(name)
+    true = eigenvalues(H)
+    dominant = float(true[true.abs().argmax()])
+    pair, steps = power_iteration(H, generator(), PowerSettings(rtol=1e-4, max_matvecs=3000))
+    assert pair.reason == "tolerance" and steps <= 3000
+    assert abs(float(pair.values) - dominant) <= float(pair.residuals) <= 1e-4 * abs(dominant)
+    assert float((H.matrix @ pair.vectors - pair.values * pair.vectors).norm()) == pytest.approx(float(pair.residuals))
+
+
+def test_shifted_power_iteration_finds_the_end_opposite_to_the_shift():
+    H = operator("both tails")
+    true = eigenvalues(H)
+    pair, _ = power_iteration(H, generator(), PowerSettings(rtol=1e-3, max_matvecs=3000), shift=float(true[-1]))
+    assert float(pair.values) == pytest.approx(float(true[0]), rel=1e-4)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_power_ends_puts_the_ends_in_order_whichever_is_longer(sign):
+    H = DenseOperator(sign * operator("both tails").matrix)
+    true = eigenvalues(H)
+    ends = power_ends(H, generator(), PowerSettings(rtol=1e-3, max_matvecs=3000))
+    assert float(ends.largest.values) == pytest.approx(float(true[-1]), rel=1e-3)
+    assert float(ends.smallest.values) == pytest.approx(float(true[0]), rel=1e-3)
+    assert ends.method == "power iteration"
+
+
+def test_power_iteration_says_when_its_budget_ends_it():
+    H = CountingOperator(operator("indefinite"))
+    ends = power_ends(H, generator(), PowerSettings(rtol=1e-12, max_matvecs=15))
+    assert ends.largest.reason == "matvec budget" and H.matvecs == ends.matvecs == 30
+    late, steps = power_iteration(operator("indefinite"), generator(), PowerSettings(rtol=1e-12, max_seconds=0.0))
+    assert (late.reason, steps) == ("time budget", 1)
+
+
+def test_power_iteration_of_zero_is_zero():
+    pair, _ = power_iteration(operator("zero"), generator())
+    assert float(pair.values) == float(pair.residuals) == 0.0
+
+
+def test_bad_power_settings_are_refused():
+    with pytest.raises(ValueError, match="max_matvecs >= 1"):
+        PowerSettings(max_matvecs=0)
+
+
+def test_products_that_are_not_finite_are_an_error():
+    class Broken(DenseOperator):
+        def apply(self, V):
+            return V / 0
+
+    with pytest.raises(ValueError, match="finite products"):
+        power_iteration(Broken(torch.eye(5)), generator())
