@@ -54,7 +54,9 @@ TILE_ROWS = 16
 NEVER = 1e30  # the stop index of a pixel that does not stop
 AHEAD = 6  # entries between a prefetch and its use
 
-PARAMS = 16  # one cache line in float32: mean x, y (pixel index units); log2 alpha = LO + LXX dx^2 + LXY dx dy + LYY dy^2
+PARAMS = (
+    16  # one cache line in float32: mean x, y (pixel index units); log2 alpha = LO + LXX dx^2 + LXY dx dy + LYY dy^2
+)
 MX, MY, LXX, LXY, LYY, LO, RED, GREEN, BLUE, CUT = range(10)
 CAPPED = 1 << 16  # in an entry's rows: its splat's alpha can reach the cap
 TANGENTS = 12  # q' = Q0 + QX dx + QY dy + QXX dx^2 + QXY dx dy + QYY dy^2, colour'
@@ -299,7 +301,7 @@ def forward_entry(params, lists, e, k, x0, y0, frame, state):
         T = load(state, b)
         alpha, _uncapped = alpha_row(dy0 + load(frame.row_offsets, L * y), terms, T > 0.0, frame.cap)
         w = alpha * T
-        after = T - w
+        after = fma(-alpha, T, T)  # T - w, to the last bit even where alpha is near 1
         ends = (after < frame.floor) & (T > 0.0)
         if any_lane(ends):
             w = select(ends, 0.0, w)
@@ -453,7 +455,7 @@ def tangent_entry_single(params, tangents, lists, e, k, x0, y0, frame, state):
         alpha, uncapped = alpha_row(dy, terms, index < load(state, b + L), frame.cap)
         T = load(state, b)
         w = alpha * T
-        store(state, b, T - w)
+        store(state, b, fma(-alpha, T, T))
         dq = quadratic(dy, dterms)
         if capped:
             dq = select(uncapped <= frame.cap, dq, 0.0)
@@ -476,7 +478,7 @@ def tangent_entry_block(params, tangents, K, lists, e, k, x0, y0, frame, state, 
         alpha, uncapped = alpha_row(dy0 + load(frame.row_offsets, L * y), terms, index < load(state, b + L), frame.cap)
         T = load(state, b)
         w = alpha * T
-        store(state, b, T - w)
+        store(state, b, fma(-alpha, T, T))
         free = select(uncapped <= frame.cap, w, 0.0) if lists.rows[e] & CAPPED else w
         store3(shared, 3 * L * y, L, (alpha, w, free))
     for i in range(K):
@@ -603,7 +605,9 @@ def curvature_entry_block(params, tangents, K, lists, e, k, x0, y0, frame, state
     top, bottom = row_range(lists.rows[e])
     for y in range(top, bottom):
         b, x = width * y, 4 * L * y
-        alpha, uncapped = alpha_row(dy0 + load(frame.row_offsets, L * y), terms, index < load(state, b + 5 * L), frame.cap)
+        alpha, uncapped = alpha_row(
+            dy0 + load(frame.row_offsets, L * y), terms, index < load(state, b + 5 * L), frame.cap
+        )
         g = load3(state, b + 2 * L, L)
         store3(shared, x, L, backward_row(state, b, L, alpha, g, colour))
         if capped:
