@@ -27,7 +27,9 @@ class Camera:
     def __post_init__(self) -> None:
         error = (self.rotation @ self.rotation.T - torch.eye(3, dtype=self.rotation.dtype)).abs().max().item()
         if not error < 1e-4 or torch.linalg.det(self.rotation) < 0:
-            raise ValueError(f"expected a rotation matrix, got one with |R R^T - 1| = {error:.1e}: {self.rotation.tolist()}")
+            raise ValueError(
+                f"expected a rotation matrix, got one with |R R^T - 1| = {error:.1e}: {self.rotation.tolist()}"
+            )
         if not (self.fx > 0 and self.fy > 0 and self.width > 0 and self.height > 0):
             raise ValueError(
                 f"expected positive focal lengths and image size, got {self.fx}, {self.fy}, {self.width}, {self.height}"

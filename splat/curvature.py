@@ -64,6 +64,7 @@ class SceneObjective:
         flat, degree = gaussians.flat, gaussians.sh_degree if sh_degree is None else sh_degree
         self.settings, self.views = settings, tuple(views)
         self.background = torch.zeros(3, dtype=flat.dtype) if background is None else background.to(flat)
+        self.couples_pixels = loss.ssim_weight > 0
         self._losses = [ViewLoss.of(view.image, loss, flat.dtype) for view in views]
         everyone = gaussians.select(torch.arange(len(gaussians)), degree)
         self.mask: Bool[Tensor, " n"] = self._support(everyone)
@@ -124,7 +125,6 @@ class SceneObjective:
     def gradient(self) -> Float[Tensor, " p"]:
         """The gradient of L at the active Gaussians."""
         return torch.stack([view.gradient for view in self.linearized]).mean(dim=0)
-
 
     def block_diagonal(self, *, gauss_newton: bool = False) -> OwnBlocks:
         """Own blocks of the mean over views: of the Hessian or of its Gauss-Newton part (see `LinearizedView`)."""

@@ -1,7 +1,9 @@
 """Dual numbers for Numba: a formula written once is evaluated with its derivative along.
 
 A `Dual` is value + tangent eps with eps^2 = 0.  The value is a float; the tangent is a float (one direction) or a
-`Vector` (as many directions as it has lanes), of the same precision or a lower one.  A function of floats that uses +, -, *, /, `sqrt` and `exp` gives, applied to
+`Vector` (as many directions as it has lanes), of the same precision or a lower one.
+
+A function of floats that uses +, -, *, /, `sqrt` and `exp` gives, applied to
 duals, its Jacobian; applied to the adjoint of a function, its Hessian.  Branches look at the value alone.
 
     dual(x, dx)         value_of(x)         tangent_of(x)        value_of takes floats too
@@ -9,14 +11,17 @@ duals, its Jacobian; applied to the adjoint of a function, its Hessian.  Branche
     sqrt(x), exp(x)     of floats and duals
 """
 
+# pyright: reportOptionalCall=false
+# (numba declares its decorators as None until they are set up)
+
 import operator
 
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
 
-from splat.raster.simd import VectorType
+from splat.raster.simd import VectorType, intrinsic
 
 CONTRACT = ("contract",)
 

@@ -17,13 +17,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.losses_cpu import LinearLoss, ViewLoss
-from splat.projection_cpu import Projection, lens_of, project_arrays
+from splat.projection_cpu import lens_of, project_arrays
+from splat.projection_linear import Projection
 from splat.raster.cpu import Adjoint, Raster
 from splat.settings import RenderSettings
 
@@ -140,6 +141,15 @@ class LinearizedView:
         geometry, sh = np.zeros((n, 11, 11), own.dtype), np.zeros((n, bands, 3), own.dtype)
         self._projection.add_blocks(own, not gauss_newton, geometry, sh)
         return OwnBlocks(torch.from_numpy(geometry), torch.from_numpy(sh))
+
+    def loss_curvatures(self, U: Float[Tensor, "p k"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
+        """(J u)^T l'' (J u) of every column, and the same with l'' replaced by its pixel-diagonal: no backward pass."""
+        planes = self._raster.jvp(self._projection.jvp(_block(U))).planes
+        products, images = self._loss.hvp(planes)[:, :3], self._raster.crop(planes[:, :3])
+        weighted = self._raster.crop(self._loss.diagonal()) * images
+        full = np.einsum("kchw,kchw->k", images, self._raster.crop(products), dtype=np.float64)
+        pixelwise = np.einsum("kchw,kchw->k", images, weighted, dtype=np.float64)
+        return torch.from_numpy(full), torch.from_numpy(pixelwise)
 
     def _pulled(self, cotangents: np.ndarray, block: np.ndarray | None) -> Tensor:
         out = np.zeros((self.gaussians.flat.numel(), cotangents.shape[1]), cotangents.dtype)

@@ -9,8 +9,8 @@ and x y, SSIM is
 The window's blur is its own adjoint, so with S_m, S_p, S_q the partial derivatives
 
     gradient of sum S      blur(S_m) + 2 x blur(S_p) + y blur(S_q)
-    its tangent for v      the same of S_m', S_p', S_q', plus 2 v blur(S_p), where m' = blur(v), p' = 2 blur(x v), q' = blur(y v)
-                           and a dash is the second derivative of S applied to (m', p', q')
+    its tangent for v      the same of S_m', S_p', S_q', plus 2 v blur(S_p), a dash the second derivative of S applied to
+                           m' = blur(v), p' = 2 blur(x v), q' = blur(y v)
 
 Six separable blurs a channel each.  Planes are padded as in `raster/cpu.py`; only the first three are read, and the padding
 of an output is 0.  A `row` counts the rows of the three channels, one after the other.
@@ -381,7 +381,13 @@ class LinearLoss:
     """A loss held still at an image: value, gradient (4, padded planes; that of alpha is 0) and Hessian-vector products."""
 
     def __init__(
-        self, loss: ViewLoss, value: float, gradient: np.ndarray, image: np.ndarray, second: np.ndarray, blurred: np.ndarray
+        self,
+        loss: ViewLoss,
+        value: float,
+        gradient: np.ndarray,
+        image: np.ndarray,
+        second: np.ndarray,
+        blurred: np.ndarray,
     ):
         self.loss, self.value, self.gradient = loss, value, gradient
         self._image, self._second, self._blurred = image, second, blurred
@@ -403,7 +409,6 @@ class LinearLoss:
                 product_rows, partials, v, self._image, y, *loss._pointwise(), self._blurred, product.reshape(-1)
             )
         return products
-
 
     def diagonal(self) -> np.ndarray:
         """The pixel-diagonal of l'', padded planes (3, ...): that of SSIM is one blur with the squared window."""

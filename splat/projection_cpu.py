@@ -1,12 +1,7 @@
-"""Projection and SH as kernels: stored parameters of Gaussians -> splats of a view, with derivatives.
+"""Projection and SH as kernels: stored parameters of Gaussians -> splats of a view, and the adjoint: training's passes.
 
-`project_splats` and `project_adjoint` are the forward and backward of training.  `Projection` is a view held still: per
-Gaussian that is drawn the Jacobian and the curvature `(a . P'')` of the map from its stored parameters to its splat, a the
-first-order adjoint of its splat, applied to blocks of K vectors.  Values are computed in double precision, so that needles
-(condition number to 1e6) keep their conics in float32.
-
-Tangents and adjoints of the stored parameters are (parameters of a Gaussian..., K) per attribute: `split` makes such views
-of a (p, K) block laid out like the flat vector.  Splats are (n, 9), tangents of splats (n, K, 9): `raster/packing.py`.
+Values are computed in double precision, so that needles (condition number to 1e6) keep their conics in float32.  Splats are
+(n, 9): `raster/packing.py`.  The second order is in `projection_linear.py`.
 """
 
 from math import exp
@@ -14,8 +9,7 @@ from math import exp
 import numpy as np
 
 from splat.camera import Camera
-from splat.dual import DIRECTIONS, tangent_of, variable
-from splat.gaussians import Gaussians, attribute_shapes
+from splat.gaussians import Gaussians
 from splat.projection_formulas import (
     Lens,
     basis,
@@ -27,12 +21,8 @@ from splat.projection_formulas import (
     to_camera,
 )
 from splat.raster.compositing import formula, kernel
-from splat.raster.simd import store
 from splat.raster.threads import over_range
 from splat.settings import RenderSettings
-
-GEOMETRY = 10  # mean 3, log-scales 3, quaternion 4
-SYMMETRIC = GEOMETRY * (GEOMETRY + 1) // 2
 
 
 def lens_of(camera: Camera, settings: RenderSettings) -> Lens:
@@ -54,16 +44,6 @@ def lens_of(camera: Camera, settings: RenderSettings) -> Lens:
 def attribute_arrays(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     """The five attributes as NumPy views."""
     return tuple(value.detach().numpy() for value in gaussians.attributes.values())
-
-
-def split(block: np.ndarray, n: int, sh_degree: int) -> tuple[np.ndarray, ...]:
-    """Views of a (p, K) block laid out like the flat vector: (n, 3, K), (n, 3, K), (n, 4, K), (n, K), (n, k, 3, K)."""
-    views, start = [], 0
-    for shape in attribute_shapes(n, sh_degree).values():
-        size = int(np.prod(shape))
-        views.append(block[start : start + size].reshape(*shape, block.shape[1]))
-        start += size
-    return tuple(views)
 
 
 @formula
@@ -105,7 +85,9 @@ def project_splats(start, stop, lens, means, log_scales, quats, logits, sh, spla
 
 
 @kernel
-def project_adjoint(start, stop, lens, means, log_scales, quats, sh, splats, drawn, bar, d_means, d_log_scales, d_quats, d_logits, d_sh):
+def project_adjoint(
+    start, stop, lens, means, log_scales, quats, sh, splats, drawn, bar, d_means, d_log_scales, d_quats, d_logits, d_sh
+):
     """The adjoints of the stored parameters, given that of the splats, bar (n, 9); outputs start at 0."""
     bands = sh.shape[1]
     for i in range(start, stop):
@@ -136,215 +118,6 @@ def project_adjoint(start, stop, lens, means, log_scales, quats, sh, splats, dra
             d_logits[i] = opacity * (1.0 - opacity) * bar[i, 5]
 
 
-# --- a view held still ------------------------------------------------------------------------------------------------
-
-
-@kernel
-def linearize_gaussian(lens, mean, log_scales, quat, colour_weight, bands, bar, jacobian, curvature, harmonic, slope):
-    """One Gaussian's Jacobian (5, 10), packed curvature (55,), harmonics (16,) and their derivative in the mean (16, 3).
-
-    colour_weight: (16,) the adjoint of the direction's harmonics, sum_c sh[k, c] colour_bar[c]; bar: five geometric adjoints.
-    """
-    x = (variable(jacobian, mean[0], 0), variable(jacobian, mean[1], 1), variable(jacobian, mean[2], 2))
-    s = (
-        variable(jacobian, log_scales[0], 3),
-        variable(jacobian, log_scales[1], 4),
-        variable(jacobian, log_scales[2], 5),
-    )
-    q = (
-        variable(jacobian, quat[0], 6),
-        variable(jacobian, quat[1], 7),
-        variable(jacobian, quat[2], 8),
-        variable(jacobian, quat[3], 9),
-    )
-    lanes = np.empty(DIRECTIONS, jacobian.dtype)
-    values = geometry(lens, x, s, q)
-    for j in range(5):
-        store(lanes, 0, tangent_of(values[j]))
-        for k in range(GEOMETRY):
-            jacobian[j, k] = lanes[k]
-    m, t, r = geometry_adjoint(lens, x, s, q, bar)
-    along = colour_adjoint(lens, x, colour_weight, bands)
-    rows = (
-        m[0] + along[0], m[1] + along[1], m[2] + along[2], t[0], t[1], t[2], r[0], r[1], r[2], r[3],
-    )  # fmt: skip
-    place = 0
-    for j in range(GEOMETRY):
-        store(lanes, 0, tangent_of(rows[j]))
-        for k in range(j + 1):
-            curvature[place + k] = lanes[k]
-        place += j + 1
-    harmonics = basis(direction_of(lens, x)[0])
-    plain = basis(direction_of(lens, mean)[0])
-    for k in range(16):
-        harmonic[k] = plain[k]
-        store(lanes, 0, tangent_of(harmonics[k]))
-        for j in range(3):
-            slope[k, j] = lanes[j]
-
-
-@kernel
-def linearize_all(
-    start, stop, lens, index, means, log_scales, quats, sh, splats, bar, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope
-):  # fmt: skip
-    """Fill the arrays of `Projection` for the Gaussians at index; bar (n, 9) is the adjoint of the splats."""
-    bands = sh.shape[1]
-    for e in range(start, stop):
-        i = index[e]
-        weight = np.zeros(16)
-        for c in range(3):
-            visible[e, c] = 1.0 if splats[i, 6 + c] > 0 else 0.0
-            colour_bar[e, c] = visible[e, c] * bar[i, 6 + c]
-            for k in range(bands):
-                weight[k] += sh[i, k, c] * colour_bar[e, c]
-        bars = (
-            np.float64(bar[i, 0]), np.float64(bar[i, 1]), np.float64(bar[i, 2]),
-            np.float64(bar[i, 3]), np.float64(bar[i, 4]),
-        )  # fmt: skip
-        linearize_gaussian(
-            lens, point(means, i), point(log_scales, i), quaternion(quats, i), weight, bands, bars,
-            jacobian[e], curvature[e], harmonic[e], slope[e],
-        )  # fmt: skip
-        for c in range(3):
-            for j in range(3):
-                total = 0.0
-                for k in range(bands):
-                    total += sh[i, k, c] * slope[e, k, j]
-                colour_slope[e, c, j] = total
-
-
-@kernel
-def push_forward(start, stop, index, splats, jacobian, harmonic, visible, colour_slope, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
-    """P' u: out (n, K, 9), which starts at 0."""
-    K, bands = out.shape[1], d_sh.shape[1]
-    for e in range(start, stop):
-        i = index[e]
-        opacity = splats[i, 5]
-        for k in range(K):
-            for r in range(5):
-                J = jacobian[e, r]
-                total = J[6] * d_quats[i, 0, k] + J[9] * d_quats[i, 3, k]
-                total += J[7] * d_quats[i, 1, k] + J[8] * d_quats[i, 2, k]
-                for j in range(3):
-                    total += J[j] * d_means[i, j, k] + J[3 + j] * d_log_scales[i, j, k]
-                out[i, k, r] = total
-            out[i, k, 5] = opacity * (1 - opacity) * d_logits[i, k]
-            for c in range(3):
-                total = out.dtype.type(0)
-                for j in range(3):
-                    total += colour_slope[e, c, j] * d_means[i, j, k]
-                for b in range(bands):
-                    total += harmonic[e, b] * d_sh[i, b, c, k]
-                out[i, k, 6 + c] = visible[e, c] * total
-
-
-@kernel
-def pull_back(
-    start, stop, index, splats, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope, opacity_bar, second_order,
-    cotangents, d_means, d_log_scales, d_quats, d_logits, d_sh, out_means, out_log_scales, out_quats, out_logits, out_sh,
-):  # fmt: skip
-    """P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order; added to the outputs."""
-    K, bands = cotangents.shape[1], out_sh.shape[1]
-    for e in range(start, stop):
-        i = index[e]
-        opacity = splats[i, 5]
-        slope_of_opacity = opacity * (1 - opacity)
-        u, h = np.empty(GEOMETRY, out_means.dtype), np.empty(GEOMETRY, out_means.dtype)
-        for k in range(K):
-            y = cotangents[i, k]
-            for j in range(GEOMETRY):
-                h[j] = 0
-                for r in range(5):
-                    h[j] += jacobian[e, r, j] * y[r]
-            logit = slope_of_opacity * y[5]
-            for c in range(3):
-                bar = visible[e, c] * y[6 + c]
-                for j in range(3):
-                    h[j] += colour_slope[e, c, j] * bar
-                for b in range(bands):
-                    out_sh[i, b, c, k] += harmonic[e, b] * bar
-            if second_order:
-                for j in range(3):
-                    u[j], u[3 + j] = d_means[i, j, k], d_log_scales[i, j, k]
-                for j in range(4):
-                    u[6 + j] = d_quats[i, j, k]
-                add_symmetric(curvature[e], u, h)
-                logit += slope_of_opacity * (1 - 2 * opacity) * opacity_bar[i] * d_logits[i, k]
-                for b in range(bands):
-                    weight, along = out_means.dtype.type(0), out_means.dtype.type(0)
-                    for c in range(3):
-                        weight += colour_bar[e, c] * d_sh[i, b, c, k]
-                    for j in range(3):
-                        h[j] += slope[e, b, j] * weight
-                        along += slope[e, b, j] * u[j]
-                    for c in range(3):
-                        out_sh[i, b, c, k] += colour_bar[e, c] * along
-            for j in range(3):
-                out_means[i, j, k] += h[j]
-                out_log_scales[i, j, k] += h[3 + j]
-            for j in range(4):
-                out_quats[i, j, k] += h[6 + j]
-            out_logits[i, k] += logit
-
-
-@kernel
-def chain_blocks(
-    start, stop, index, splats, own, jacobian, curvature, harmonic, visible, colour_slope, opacity_bar, curved, geometry_out, sh_out
-):  # fmt: skip
-    """Blocks of the splats at index, own (m, 9, 9) as lower triangles, in stored parameters: P'^T own P', plus (a . P'') where curved.
-
-    geometry_out: (n, 11, 11) over mean, log-scales, quaternion and opacity logit; sh_out: (n, k, 3), the diagonal of SH's.
-    Both are added to.
-    """
-    bands = sh_out.shape[1]
-    J, column, product = np.zeros((9, GEOMETRY + 1)), np.zeros(9), np.zeros(9)
-    for e in range(start, stop):
-        i = index[e]
-        opacity = np.float64(splats[i, 5])
-        slope = opacity * (1 - opacity)
-        J[5, GEOMETRY] = slope
-        for r in range(5):
-            for j in range(GEOMETRY):
-                J[r, j] = jacobian[e, r, j]
-        for c in range(3):
-            for j in range(3):
-                J[6 + c, j] = visible[e, c] * colour_slope[e, c, j]
-            for b in range(bands):
-                sh_out[i, b, c] += visible[e, c] * harmonic[e, b] * harmonic[e, b] * own[e, 6 + c, 6 + c]
-        for j in range(GEOMETRY + 1):
-            for r in range(9):
-                column[r] = J[r, j]
-                product[r] = 0
-            for r in range(9):
-                for s in range(r):
-                    product[r] += own[e, r, s] * column[s]
-                    product[s] += own[e, r, s] * column[r]
-                product[r] += own[e, r, r] * column[r]
-            for k in range(j + 1):
-                total = 0.0
-                for r in range(9):
-                    total += J[r, k] * product[r]
-                if curved and j < GEOMETRY:
-                    total += curvature[e, j * (j + 1) // 2 + k]
-                geometry_out[i, j, k] += total
-                if k < j:
-                    geometry_out[i, k, j] += total
-        if curved:
-            geometry_out[i, GEOMETRY, GEOMETRY] += slope * (1 - 2 * opacity) * opacity_bar[i]
-
-
-@formula
-def add_symmetric(packed, u, h):
-    """h += C u, C symmetric with its lower triangle packed row by row."""
-    place = 0
-    for j in range(GEOMETRY):
-        for k in range(j):
-            h[j] += packed[place + k] * u[k]
-            h[k] += packed[place + k] * u[j]
-        h[j] += packed[place + j] * u[j]
-        place += j + 1
-
-
 def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Splats (n, 9), depths (n,) and which are drawn (n,)."""
     arrays = attribute_arrays(gaussians)
@@ -352,50 +125,3 @@ def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.nda
     splats, depths, drawn = np.empty((n, 9), dtype), np.empty(n, dtype), np.empty(n, np.bool_)
     over_range(n, project_splats, lens, *arrays, splats, depths, drawn)
     return splats, depths, drawn
-
-
-class Projection:
-    """The map from stored parameters to the splats of one view, held still at the Gaussians and at an adjoint of the splats.
-
-    index: the Gaussians that matter (those that touch a pixel); bar: (n, 9), the adjoint of the splats.
-    """
-
-    def __init__(self, gaussians: Gaussians, lens: Lens, splats: np.ndarray, bar: np.ndarray, index: np.ndarray):
-        means, log_scales, quats, _logits, sh = attribute_arrays(gaussians)
-        self.n, self.sh_degree, self.splats, self.index = len(gaussians), gaussians.sh_degree, splats, index
-        m, dtype = index.size, splats.dtype
-        self.jacobian, self.curvature = np.empty((m, 5, GEOMETRY), dtype), np.empty((m, SYMMETRIC), dtype)
-        self.harmonic, self.slope = np.empty((m, 16), dtype), np.empty((m, 16, 3), dtype)
-        self.colour_bar, self.visible = np.empty((m, 3), dtype), np.empty((m, 3), dtype)
-        self.colour_slope, self.opacity_bar = np.empty((m, 3, 3), dtype), np.ascontiguousarray(bar[:, 5])
-        over_range(
-            m, linearize_all, lens, index, means, log_scales, quats, sh, splats, bar, self.jacobian, self.curvature, self.harmonic,
-            self.slope, self.colour_bar, self.visible, self.colour_slope,
-        )  # fmt: skip
-
-    def jvp(self, block: np.ndarray) -> np.ndarray:
-        """P' U: (n, K, 9) from a block (p, K) of tangents of the stored parameters."""
-        out = np.zeros((self.n, block.shape[1], 9), self.splats.dtype)
-        over_range(
-            self.index.size, push_forward, self.index, self.splats, self.jacobian, self.harmonic, self.visible, self.colour_slope,
-            *split(block, self.n, self.sh_degree), out,
-        )  # fmt: skip
-        return out
-
-    def pull(self, cotangents: np.ndarray, block: np.ndarray | None, out: np.ndarray) -> None:
-        """Add P'^T cotangents, and (a . P'') block where a block (p, K) is given, to out (p, K)."""
-        tangents = split(out if block is None else block, self.n, self.sh_degree)
-        over_range(
-            self.index.size, pull_back, self.index, self.splats, self.jacobian, self.curvature, self.harmonic, self.slope, self.colour_bar,
-            self.visible, self.colour_slope, self.opacity_bar, block is not None, cotangents, *tangents,
-            *split(out, self.n, self.sh_degree),
-        )  # fmt: skip
-
-
-    def add_blocks(self, own: np.ndarray, curved: bool, geometry: np.ndarray, sh: np.ndarray) -> None:
-        """Add the blocks of splats, own (m, 9, 9), to blocks of stored parameters: `chain_blocks`."""
-        over_range(
-            self.index.size, chain_blocks, self.index, self.splats, own, self.jacobian, self.curvature, self.harmonic,
-            self.visible, self.colour_slope, self.opacity_bar, curved, geometry, sh,
-        )  # fmt: skip
-

@@ -59,7 +59,9 @@ def render(
     return Rendering(image, alpha, expected, splats)
 
 
-def _expected_depth(splats: Splats, gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> Float[Tensor, "h w"]:
+def _expected_depth(
+    splats: Splats, gaussians: Gaussians, camera: Camera, settings: RenderSettings
+) -> Float[Tensor, "h w"]:
     """Depth is composited like a colour: one more pass over the same splats with z for red, on black."""
     axis, centre = camera.forward.to(gaussians.flat), camera.centre.to(gaussians.flat)
     z = (gaussians.means - centre) @ axis

@@ -101,13 +101,24 @@ def count_tiles(start, stop, splats, order, tile, width, height, alpha_min, cont
 
 
 @kernel
-def list_tiles(start, stop, splats, order, tile, columns, width, height, alpha_min, contour, cap, place, count, tiles, rows):
+def list_tiles(
+    start, stop, splats, order, tile, columns, width, height, alpha_min, contour, cap, place, count, tiles, rows
+):
     """The tiles that each splat touches and its rows in them, at place[i], place[i] + 1, ...; count[i] of them."""
     for i in range(start, stop):
         count[i] = 0
         if place[i + 1] > place[i]:
             count[i] = list_splat(
-                splats[order[i]], tile, columns, width, height, alpha_min, contour, cap, tiles[place[i] :], rows[place[i] :]
+                splats[order[i]],
+                tile,
+                columns,
+                width,
+                height,
+                alpha_min,
+                contour,
+                cap,
+                tiles[place[i] :],
+                rows[place[i] :],
             )
 
 

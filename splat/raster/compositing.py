@@ -25,7 +25,8 @@ A dash marks a tangent.  K tangents share the primal quantities of a splat's row
 K = 1 the two loops are one.  Every entry (a splat in a tile) writes its nine sums to its own slot, splat-major, so that no
 sum depends on the order in which threads finish.
 
-Every kernel takes tiles from a counter until none is left (`threads.over_tiles`).  Arrays are flat: `params` holds PARAMS floats a splat, `tangents` K x TANGENTS floats a splat, a plane stride x height floats.
+Every kernel takes tiles from a counter until none is left (`threads.over_tiles`).  Arrays are flat: `params` holds PARAMS
+floats a splat, `tangents` K x TANGENTS floats a splat, a plane stride x height floats.
 """
 
 from typing import NamedTuple
@@ -68,7 +69,7 @@ class Lists(NamedTuple):
     """Which splats touch which tiles. An entry is a splat in a tile; the entries of a tile are in order of depth.
 
     start: (tiles + 1,) first entry of each tile; splat: (entries,); rows: (entries,) first row | last row << 8 within the
-    tile, and CAPPED; slots: (entries,) where an entry's sums go, splat-major; order: the tiles in the order in which they are handed out.
+    tile, and CAPPED; slots: (entries,) where an entry's sums go, splat-major; order: the tiles as they are handed out.
     """
 
     start: np.ndarray

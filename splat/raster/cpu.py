@@ -8,6 +8,7 @@ pixels; a splat is nine numbers (`packing.py`).
 from math import log2
 
 import numpy as np
+
 from splat.raster import binning, blocks, compositing, packing
 from splat.raster.simd import lanes_of
 from splat.raster.threads import over_range, over_tiles
@@ -102,7 +103,9 @@ class Raster:
         """The gradient in the splats from padded cotangent planes (4, ...)."""
         return Adjoint(self, cotangent)
 
-    def own_blocks(self, adjoint: "Adjoint", curvature: np.ndarray, index: np.ndarray, gauss_newton: bool) -> np.ndarray:
+    def own_blocks(
+        self, adjoint: "Adjoint", curvature: np.ndarray, index: np.ndarray, gauss_newton: bool
+    ) -> np.ndarray:
         """Own blocks (m, 9, 9), lower triangles, of the splats at index: of the Hessian or of its Gauss-Newton part.
 
         adjoint: that of the loss's gradient; curvature: the pixel-diagonal of l'', padded planes (3, ...).
@@ -116,7 +119,15 @@ class Raster:
         )  # fmt: skip
         own = np.empty((index.size, 9, 9), dtype)
         over_range(
-            index.size, blocks.reduce_blocks, index, self.splats, slot_start, sums, adjoint.moments, not gauss_newton, own
+            index.size,
+            blocks.reduce_blocks,
+            index,
+            self.splats,
+            slot_start,
+            sums,
+            adjoint.moments,
+            not gauss_newton,
+            own,
         )
         return own
 
@@ -132,9 +143,7 @@ class Adjoint:
         dtype, n, slot_start = raster.splats.dtype, len(raster.splats), raster.slot_start
         self.cotangent = np.ascontiguousarray(cotangent, dtype).reshape(-1)
         sums = aligned((slot_start[-1] * compositing.SUMS,), dtype)
-        over_tiles(
-            compositing.backward, raster.params, raster.lists, raster.frame, raster.pixels, self.cotangent, sums
-        )
+        over_tiles(compositing.backward, raster.params, raster.lists, raster.frame, raster.pixels, self.cotangent, sums)
         self.moments, self.gradient = np.empty((n, 3), dtype), np.empty_like(raster.splats)
         over_range(n, packing.reduce_gradient, raster.splats, slot_start, sums, self.moments, self.gradient)
 
@@ -169,6 +178,13 @@ class Tangent:
         )  # fmt: skip
         product = np.empty_like(self.directions)
         over_range(
-            len(product), packing.reduce_curvature, raster.splats, self.directions, slot_start, sums, adjoint.moments, product
+            len(product),
+            packing.reduce_curvature,
+            raster.splats,
+            self.directions,
+            slot_start,
+            sums,
+            adjoint.moments,
+            product,
         )
         return product

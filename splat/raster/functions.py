@@ -12,7 +12,8 @@ from torch import Tensor
 from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.projection import Splats
-from splat.projection_cpu import Projection, attribute_arrays, lens_of, project_adjoint, project_arrays
+from splat.projection_cpu import attribute_arrays, lens_of, project_adjoint, project_arrays
+from splat.projection_linear import Projection
 from splat.raster.cpu import Raster
 from splat.raster.threads import over_range
 from splat.settings import RenderSettings

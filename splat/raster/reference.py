@@ -52,7 +52,11 @@ def rasterize_reference(
 def _reach(splats: Splats, settings: RenderSettings) -> Float[Tensor, "n 2"]:
     """Half-extent in x and y of each splat's alpha_min contour (infinite without one), a little more than exact."""
     a, b, c = splats.conics.detach().unbind(-1)
-    level = 2 * torch.log(splats.opacities.detach() / settings.alpha_min) if settings.alpha_min else torch.full_like(a, torch.inf)
+    level = (
+        2 * torch.log(splats.opacities.detach() / settings.alpha_min)
+        if settings.alpha_min
+        else torch.full_like(a, torch.inf)
+    )
     level = level * 1.001 + 1e-3
     return torch.stack([c, a], dim=-1).mul(level[:, None]).div((a * c - b * b)[:, None]).clamp_min(0).sqrt() + 1e-3
 
@@ -73,11 +77,15 @@ def _alphas(splats: Splats, index: Tensor, xs: Tensor, ys: Tensor, settings: Ren
     return torch.where(active, capped, torch.zeros_like(capped))
 
 
-def _composite(splats: Splats, index: Tensor, background: Tensor, xs: Tensor, ys: Tensor, settings: RenderSettings) -> Tensor:
+def _composite(
+    splats: Splats, index: Tensor, background: Tensor, xs: Tensor, ys: Tensor, settings: RenderSettings
+) -> Tensor:
     """One tile, (5, h, w): colour, alpha, depth."""
     alpha = _alphas(splats, index, xs, ys, settings)
     before, after = _transmittances(alpha)
-    running = (after >= settings.transmittance_min).cumprod(0).bool()  # the first splat that would pass the floor ends it
+    running = (
+        (after >= settings.transmittance_min).cumprod(0).bool()
+    )  # the first splat that would pass the floor ends it
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     before, after = _transmittances(alpha)
     weight = alpha * before
@@ -92,4 +100,3 @@ def _transmittances(alpha: Float[Tensor, "m h w"]) -> tuple[Tensor, Tensor]:
     log_after = torch.log1p(-alpha).cumsum(0)
     after = log_after.exp()
     return torch.cat([torch.ones_like(after[:1]), after])[: len(alpha)], after
-

@@ -18,15 +18,26 @@ any width and type: the array that a vector is loaded from decides its dtype, an
 Requires C-contiguous arrays; indices are not checked.
 """
 
+# pyright: reportOptionalCall=false
+# (numba declares its decorators as None until they are set up)
+
 import operator
 import os
+from collections.abc import Callable
+from typing import Any
 
 import llvmlite.binding
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
+from numba.extending import intrinsic as numba_intrinsic
+from numba.extending import lower_builtin, lower_cast, models, register_model
+
+
+def intrinsic(definition: Callable) -> Callable[..., Any]:
+    """Numba's `intrinsic`, typed as what kernels see of it: a function without the leading typing context."""
+    return numba_intrinsic(definition)  # pyright: ignore[reportReturnType]
 
 
 def _register_bits() -> int:
@@ -263,8 +274,10 @@ def _sums_of_four(builder, vector, values):
     if n == 2:
         pairs = [builder.fadd(shuffle(v, w, [0, 2]), shuffle(v, w, [1, 3])) for v, w in (values[:2], values[2:])]
         return shuffle(pairs[0], pairs[1], [0, 1, 2, 3])
-    pairs = [builder.fadd(shuffle(v, w, [0, 4, 1, 5]), shuffle(v, w, [2, 6, 3, 7])) for v, w in (values[:2], values[2:])]
-    return builder.fadd(shuffle(*pairs, [0, 1, 4, 5]), shuffle(*pairs, [2, 3, 6, 7]))
+    pairs = [
+        builder.fadd(shuffle(v, w, [0, 4, 1, 5]), shuffle(v, w, [2, 6, 3, 7])) for v, w in (values[:2], values[2:])
+    ]
+    return builder.fadd(shuffle(pairs[0], pairs[1], [0, 1, 4, 5]), shuffle(pairs[0], pairs[1], [2, 3, 6, 7]))
 
 
 # --- functions of vectors ---------------------------------------------------------------------------------------------

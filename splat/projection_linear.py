@@ -1,0 +1,297 @@
+"""The projection of one view held still: first and second derivatives as products with blocks of vectors.
+
+Per Gaussian that matters, the Jacobian of the map from its stored parameters to its splat and the curvature `(a . P'')`, a the
+first-order adjoint of its splat.  SH enters the colour linearly: its derivatives are the harmonics at the view direction and
+their slope in the mean, so a Gaussian needs 179 numbers, not a dense 9 x 59 and 59 x 59.
+
+Tangents and adjoints of the stored parameters are (parameters of a Gaussian..., K) per attribute: `split` makes such views
+of a (p, K) block laid out like the flat vector.  Splats are (n, 9), tangents of splats (n, K, 9): `raster/packing.py`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from splat.dual import DIRECTIONS, tangent_of, variable
+from splat.gaussians import Gaussians, attribute_shapes
+from splat.projection_cpu import attribute_arrays, point, quaternion
+from splat.projection_formulas import Lens, basis, colour_adjoint, direction_of, geometry, geometry_adjoint
+from splat.raster.compositing import formula, kernel
+from splat.raster.simd import store
+from splat.raster.threads import over_range
+
+GEOMETRY = 10  # mean 3, log-scales 3, quaternion 4
+SYMMETRIC = GEOMETRY * (GEOMETRY + 1) // 2
+
+
+class Held(NamedTuple):
+    """What stands still.  index: (m,) the Gaussians that matter; splats (n, 9); opacity_bar (n,); the rest one row each.
+
+    jacobian (5, 10): mean x, y and conic in mean, log-scales, quaternion; curvature (55,): lower triangle of the geometry's
+    (10, 10); harmonic (16,) and slope (16, 3) in the mean; colour_bar (3,): adjoint of the colour before its clamp at 0;
+    visible (3,): 1 where that clamp does not hold; colour_slope (3, 3): dcolour/dmean.
+    """
+
+    index: np.ndarray
+    splats: np.ndarray
+    opacity_bar: np.ndarray
+    jacobian: np.ndarray
+    curvature: np.ndarray
+    harmonic: np.ndarray
+    slope: np.ndarray
+    colour_bar: np.ndarray
+    visible: np.ndarray
+    colour_slope: np.ndarray
+
+
+def split(block: np.ndarray, n: int, sh_degree: int) -> tuple[np.ndarray, ...]:
+    """Views of a (p, K) block laid out like the flat vector: (n, 3, K), (n, 3, K), (n, 4, K), (n, K), (n, k, 3, K)."""
+    views, start = [], 0
+    for shape in attribute_shapes(n, sh_degree).values():
+        size = int(np.prod(shape))
+        views.append(block[start : start + size].reshape(*shape, block.shape[1]))
+        start += size
+    return tuple(views)
+
+
+@kernel
+def linearize_gaussian(lens, mean, log_scales, quat, colour_weight, bands, bar, jacobian, curvature, harmonic, slope):
+    """One Gaussian's Jacobian (5, 10), packed curvature (55,), harmonics (16,) and their derivative in the mean (16, 3).
+
+    colour_weight: (16,) the adjoint of the direction's harmonics, sum_c sh[k, c] colour_bar[c]; bar: five geometric adjoints.
+    """
+    x = (variable(jacobian, mean[0], 0), variable(jacobian, mean[1], 1), variable(jacobian, mean[2], 2))
+    s = (
+        variable(jacobian, log_scales[0], 3),
+        variable(jacobian, log_scales[1], 4),
+        variable(jacobian, log_scales[2], 5),
+    )
+    q = (
+        variable(jacobian, quat[0], 6),
+        variable(jacobian, quat[1], 7),
+        variable(jacobian, quat[2], 8),
+        variable(jacobian, quat[3], 9),
+    )
+    lanes = np.empty(DIRECTIONS, jacobian.dtype)
+    values = geometry(lens, x, s, q)
+    for j in range(5):
+        store(lanes, 0, tangent_of(values[j]))
+        for k in range(GEOMETRY):
+            jacobian[j, k] = lanes[k]
+    m, t, r = geometry_adjoint(lens, x, s, q, bar)
+    along = colour_adjoint(lens, x, colour_weight, bands)
+    rows = (
+        m[0] + along[0], m[1] + along[1], m[2] + along[2], t[0], t[1], t[2], r[0], r[1], r[2], r[3],
+    )  # fmt: skip
+    place = 0
+    for j in range(GEOMETRY):
+        store(lanes, 0, tangent_of(rows[j]))
+        for k in range(j + 1):
+            curvature[place + k] = lanes[k]
+        place += j + 1
+    harmonics = basis(direction_of(lens, x)[0])
+    plain = basis(direction_of(lens, mean)[0])
+    for k in range(16):
+        harmonic[k] = plain[k]
+        store(lanes, 0, tangent_of(harmonics[k]))
+        for j in range(3):
+            slope[k, j] = lanes[j]
+
+
+@kernel
+def linearize_all(start, stop, held, lens, means, log_scales, quats, sh, bar):
+    """Fill the arrays of `Projection` for the Gaussians at index; bar (n, 9) is the adjoint of the splats."""
+    bands = sh.shape[1]
+    for e in range(start, stop):
+        i = held.index[e]
+        weight = np.zeros(16)
+        for c in range(3):
+            held.visible[e, c] = 1.0 if held.splats[i, 6 + c] > 0 else 0.0
+            held.colour_bar[e, c] = held.visible[e, c] * bar[i, 6 + c]
+            for k in range(bands):
+                weight[k] += sh[i, k, c] * held.colour_bar[e, c]
+        bars = (
+            np.float64(bar[i, 0]), np.float64(bar[i, 1]), np.float64(bar[i, 2]),
+            np.float64(bar[i, 3]), np.float64(bar[i, 4]),
+        )  # fmt: skip
+        linearize_gaussian(
+            lens, point(means, i), point(log_scales, i), quaternion(quats, i), weight, bands, bars,
+            held.jacobian[e], held.curvature[e], held.harmonic[e], held.slope[e],
+        )  # fmt: skip
+        for c in range(3):
+            for j in range(3):
+                total = 0.0
+                for k in range(bands):
+                    total += sh[i, k, c] * held.slope[e, k, j]
+                held.colour_slope[e, c, j] = total
+
+
+@kernel
+def push_forward(start, stop, held, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
+    """P' u: out (n, K, 9), which starts at 0."""
+    K, bands = out.shape[1], d_sh.shape[1]
+    for e in range(start, stop):
+        i = held.index[e]
+        opacity = held.splats[i, 5]
+        for k in range(K):
+            for r in range(5):
+                J = held.jacobian[e, r]
+                total = J[6] * d_quats[i, 0, k] + J[9] * d_quats[i, 3, k]
+                total += J[7] * d_quats[i, 1, k] + J[8] * d_quats[i, 2, k]
+                for j in range(3):
+                    total += J[j] * d_means[i, j, k] + J[3 + j] * d_log_scales[i, j, k]
+                out[i, k, r] = total
+            out[i, k, 5] = opacity * (1 - opacity) * d_logits[i, k]
+            for c in range(3):
+                total = out.dtype.type(0)
+                for j in range(3):
+                    total += held.colour_slope[e, c, j] * d_means[i, j, k]
+                for b in range(bands):
+                    total += held.harmonic[e, b] * d_sh[i, b, c, k]
+                out[i, k, 6 + c] = held.visible[e, c] * total
+
+
+@kernel
+def pull_back(
+    start, stop, held, second_order, cotangents, d_means, d_log_scales, d_quats, d_logits, d_sh,
+    out_means, out_log_scales, out_quats, out_logits, out_sh,
+):  # fmt: skip
+    """P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order; added to the outputs."""
+    K, bands = cotangents.shape[1], out_sh.shape[1]
+    for e in range(start, stop):
+        i = held.index[e]
+        opacity = held.splats[i, 5]
+        slope_of_opacity = opacity * (1 - opacity)
+        u, h = np.empty(GEOMETRY, out_means.dtype), np.empty(GEOMETRY, out_means.dtype)
+        for k in range(K):
+            y = cotangents[i, k]
+            for j in range(GEOMETRY):
+                h[j] = 0
+                for r in range(5):
+                    h[j] += held.jacobian[e, r, j] * y[r]
+            logit = slope_of_opacity * y[5]
+            for c in range(3):
+                bar = held.visible[e, c] * y[6 + c]
+                for j in range(3):
+                    h[j] += held.colour_slope[e, c, j] * bar
+                for b in range(bands):
+                    out_sh[i, b, c, k] += held.harmonic[e, b] * bar
+            if second_order:
+                for j in range(3):
+                    u[j], u[3 + j] = d_means[i, j, k], d_log_scales[i, j, k]
+                for j in range(4):
+                    u[6 + j] = d_quats[i, j, k]
+                add_symmetric(held.curvature[e], u, h)
+                logit += slope_of_opacity * (1 - 2 * opacity) * held.opacity_bar[i] * d_logits[i, k]
+                for b in range(bands):
+                    weight, along = out_means.dtype.type(0), out_means.dtype.type(0)
+                    for c in range(3):
+                        weight += held.colour_bar[e, c] * d_sh[i, b, c, k]
+                    for j in range(3):
+                        h[j] += held.slope[e, b, j] * weight
+                        along += held.slope[e, b, j] * u[j]
+                    for c in range(3):
+                        out_sh[i, b, c, k] += held.colour_bar[e, c] * along
+            for j in range(3):
+                out_means[i, j, k] += h[j]
+                out_log_scales[i, j, k] += h[3 + j]
+            for j in range(4):
+                out_quats[i, j, k] += h[6 + j]
+            out_logits[i, k] += logit
+
+
+@kernel
+def chain_blocks(start, stop, held, own, curved, geometry_out, sh_out):
+    """Own blocks of splats, (m, 9, 9) as lower triangles, in stored parameters: P'^T own P', plus (a . P'') where curved.
+
+    geometry_out: (n, 11, 11) over mean, log-scales, quaternion and opacity logit; sh_out: (n, k, 3), the diagonal of SH's.
+    Both are added to.
+    """
+    bands = sh_out.shape[1]
+    J, column, product = np.zeros((9, GEOMETRY + 1)), np.zeros(9), np.zeros(9)
+    for e in range(start, stop):
+        i = held.index[e]
+        opacity = np.float64(held.splats[i, 5])
+        slope = opacity * (1 - opacity)
+        J[5, GEOMETRY] = slope
+        for r in range(5):
+            for j in range(GEOMETRY):
+                J[r, j] = held.jacobian[e, r, j]
+        for c in range(3):
+            for j in range(3):
+                J[6 + c, j] = held.visible[e, c] * held.colour_slope[e, c, j]
+            for b in range(bands):
+                sh_out[i, b, c] += held.visible[e, c] * held.harmonic[e, b] * held.harmonic[e, b] * own[e, 6 + c, 6 + c]
+        for j in range(GEOMETRY + 1):
+            for r in range(9):
+                column[r] = J[r, j]
+                product[r] = 0
+            for r in range(9):
+                for s in range(r):
+                    product[r] += own[e, r, s] * column[s]
+                    product[s] += own[e, r, s] * column[r]
+                product[r] += own[e, r, r] * column[r]
+            for k in range(j + 1):
+                total = 0.0
+                for r in range(9):
+                    total += J[r, k] * product[r]
+                if curved and j < GEOMETRY:
+                    total += held.curvature[e, j * (j + 1) // 2 + k]
+                geometry_out[i, j, k] += total
+                if k < j:
+                    geometry_out[i, k, j] += total
+        if curved:
+            geometry_out[i, GEOMETRY, GEOMETRY] += slope * (1 - 2 * opacity) * held.opacity_bar[i]
+
+
+@formula
+def add_symmetric(packed, u, h):
+    """h += C u, C symmetric with its lower triangle packed row by row."""
+    place = 0
+    for j in range(GEOMETRY):
+        for k in range(j):
+            h[j] += packed[place + k] * u[k]
+            h[k] += packed[place + k] * u[j]
+        h[j] += packed[place + j] * u[j]
+        place += j + 1
+
+
+class Projection:
+    """The map from stored parameters to the splats of one view, held still at the Gaussians and at an adjoint of the splats.
+
+    index: the Gaussians that matter (those that touch a pixel); bar: (n, 9), the adjoint of the splats.
+    """
+
+    def __init__(self, gaussians: Gaussians, lens: Lens, splats: np.ndarray, bar: np.ndarray, index: np.ndarray):
+        means, log_scales, quats, _logits, sh = attribute_arrays(gaussians)
+        self.n, self.sh_degree, m = len(gaussians), gaussians.sh_degree, index.size
+
+        def empty(*shape: int) -> np.ndarray:
+            return np.empty((m, *shape), splats.dtype)
+
+        self.held = Held(
+            index, splats, np.ascontiguousarray(bar[:, 5]), empty(5, GEOMETRY), empty(SYMMETRIC), empty(16), empty(16, 3),
+            empty(3), empty(3), empty(3, 3),
+        )  # fmt: skip
+        over_range(m, linearize_all, self.held, lens, means, log_scales, quats, sh, bar)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of what is held per Gaussian in sight."""
+        return sum(array.nbytes for array in self.held[3:])
+
+    def jvp(self, block: np.ndarray) -> np.ndarray:
+        """P' U: (n, K, 9) from a block (p, K) of tangents of the stored parameters."""
+        out = np.zeros((self.n, block.shape[1], 9), self.held.splats.dtype)
+        over_range(self.held.index.size, push_forward, self.held, *split(block, self.n, self.sh_degree), out)
+        return out
+
+    def pull(self, cotangents: np.ndarray, block: np.ndarray | None, out: np.ndarray) -> None:
+        """Add P'^T cotangents, and (a . P'') block where a block (p, K) is given, to out (p, K)."""
+        tangents = split(out if block is None else block, self.n, self.sh_degree)
+        outputs = split(out, self.n, self.sh_degree)
+        over_range(self.held.index.size, pull_back, self.held, block is not None, cotangents, *tangents, *outputs)
+
+    def add_blocks(self, own: np.ndarray, curved: bool, geometry: np.ndarray, sh: np.ndarray) -> None:
+        """Add the blocks of splats, own (m, 9, 9), to blocks of stored parameters: `chain_blocks`."""
+        over_range(self.held.index.size, chain_blocks, self.held, own, curved, geometry, sh)
