@@ -123,7 +123,7 @@ def record_folder(folder: str | Path) -> Iterator[Path]:
     two renames) absent with the old record complete in `.NAME.previous` beside it, from where the next use restores it.
     """
     folder = Path(folder).absolute()
-    _refuse_foreign(folder)
+    require_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     previous = folder.with_name(f".{folder.name}.previous")
     _clean_up_after_kills(folder, previous)
@@ -287,8 +287,8 @@ def _why_not_found(folder: Path) -> str:
     return f"{expected}{state}; run `landscape probe CHECKPOINT` first"
 
 
-def _refuse_foreign(folder: Path) -> None:
-    """Replacing deletes: only an empty folder or an older record may be replaced."""
+def require_replaceable(folder: Path) -> None:
+    """Replacing deletes: raise ValueError unless folder is absent, empty or an older record."""
     if folder.is_dir() and any(folder.iterdir()) and not (folder / FILE).is_file():
         raise ValueError(
             f"expected an empty folder or an older record to replace, got {folder} without {FILE}; move it away"

@@ -263,7 +263,8 @@ class _Krylov:
         if self.random_start:
             beyond = _beyond(self.operator.dim, self.first_cycle, float(ritz.values[-1] - ritz.values[0]))
         largest, smallest = end(slice(0, s.largest), True), end(slice(s.largest, s.wanted), False)
-        ends = EigenEnds(largest, smallest, "lanczos", self.matvecs, beyond, self.noise)
+        spectrum = torch.stack([ritz.values, ritz.residuals])
+        ends = EigenEnds(largest, smallest, "lanczos", self.matvecs, beyond, self.noise, spectrum)
         return ends, not bool((reached | stuck).all())
 
 

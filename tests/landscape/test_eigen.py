@@ -58,6 +58,17 @@ def test_residuals_are_those_of_the_vectors_returned_and_vectors_are_orthonormal
             assert (pairs.residuals <= SETTINGS[case].rtol * pairs.values.abs()).all()
 
 
+@pytest.mark.parametrize("case", SETTINGS)
+def test_every_ritz_value_is_within_its_estimated_residual_of_an_eigenvalue_and_the_ends_are_among_them(case):
+    H, ends = solved(next(iter(SPECTRA)), case, torch.float64)
+    true = eigenvalues(H)
+    assert ends.ritz is not None
+    values, residuals = ends.ritz
+    rounding = 100 * torch.finfo(torch.float64).eps * float(true.abs().max())
+    assert ((values[:, None] - true).abs().min(dim=1).values <= residuals + rounding).all()
+    assert abs(values[-1] - ends.largest.values[0]) <= rounding and abs(values[0] - ends.smallest.values[0]) <= rounding
+
+
 @pytest.mark.parametrize("name", ["power law", "indefinite", "both tails", "clustered", "negative", "multiple"])
 def test_to_a_tight_tolerance_the_pairs_are_the_outermost_ones_in_order(name):
     H = operator(name)
