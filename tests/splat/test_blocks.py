@@ -1,0 +1,128 @@
+"""Every Gaussian's own block of the Hessian, and the traces that build on it, against the dense Hessian in float64."""
+
+from math import sqrt
+
+import pytest
+import torch
+from torch import Tensor
+
+from landscape.trace import TraceSettings
+from splat.camera import Camera
+from splat.curvature import SceneHessian, SceneObjective
+from splat.gaussians import Gaussians
+from splat.losses import LossSettings
+from splat.losses_cpu import ViewLoss
+from splat.render import render
+from splat.scenes.view import View
+from splat.traces import controlled, exact_traces
+from tests.splat.random_scenes import random_camera, random_gaussians
+
+GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")
+PIXEL_SUMS = [LossSettings(kind, ssim_weight=0) for kind in ("l1", "charbonnier", "l2")]
+
+
+def awkward_gaussians() -> Gaussians:
+    """Clamped by the cap, stopped behind opaque ones, a needle, one across the image's edge, two at the same place."""
+    gaussians = random_gaussians(24, sh_degree=1, seed=3, logit=1.0, spread=0.8)
+    gaussians.opacity_logits[:8] = 7.0  # the cap holds near their centres, and pixels stop behind several of them
+    gaussians.log_scales[:8] = -0.5
+    gaussians.log_scales[8] = torch.tensor([1.0, -6.0, -6.0])
+    gaussians.means[9] = torch.tensor([1.9, 0.0, 4.0])
+    gaussians.means[10] = gaussians.means[11]
+    return gaussians
+
+
+def objective_of(gaussians: Gaussians, loss: LossSettings, noise: float) -> SceneObjective:
+    """Two views whose targets are the renders themselves plus noise: small noise is a good fit."""
+    generator, views = torch.Generator().manual_seed(5), []
+    for seed in (0, 1):
+        camera: Camera = random_camera(32, 28, seed=seed, focal=34.0)
+        image = render(gaussians, camera, BACKGROUND).image
+        target = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype)
+        views.append(View(str(seed), camera, target.float()))
+    return SceneObjective(gaussians, views, loss, BACKGROUND)
+
+
+BACKGROUND = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+
+
+def dense(operator: SceneHessian) -> Tensor:
+    return operator.apply(torch.eye(operator.dim, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("loss", PIXEL_SUMS, ids=lambda loss: loss.pixel)
+@pytest.mark.parametrize("gauss_newton", [False, True])
+def test_own_blocks_are_those_of_the_dense_hessian(loss: LossSettings, gauss_newton: bool) -> None:
+    objective = objective_of(awkward_gaussians(), loss, noise=0.3)
+    view = objective.linearized[0]
+    assert view.touched < len(objective.active) or view.entries > 0
+    own, n = objective.block_diagonal(gauss_newton=gauss_newton), len(objective.active)
+    H = dense(SceneHessian(objective, gauss_newton=gauss_newton, radial=True))
+    rows = torch.cat([torch.arange(H.shape[0])[objective.blocks[name]].view(n, -1) for name in GEOMETRY], dim=1)
+    expected = torch.stack([H[index][:, index] for index in rows])
+    scale = 1e-10 * float(H.diagonal().abs().max())
+    assert float((own.geometry - expected).abs().max()) <= scale
+    assert float((own.sh.reshape(-1) - H.diagonal()[objective.blocks["sh"]]).abs().max()) <= scale
+    traces = own.traces()
+    for name, block in objective.blocks.items():
+        assert abs(traces[name] - float(H.diagonal()[block].sum())) <= 1e-10 * float(H.diagonal()[block].abs().sum())
+
+
+def test_under_l1_alone_the_appearance_has_no_curvature() -> None:
+    own = objective_of(awkward_gaussians(), PIXEL_SUMS[0], noise=0.3).block_diagonal()
+    assert own.traces()["sh"] == 0
+
+
+def test_traces_leave_the_radial_directions_of_the_quaternions_out() -> None:
+    objective = objective_of(awkward_gaussians(), PIXEL_SUMS[2], noise=0.3)
+    H = dense(SceneHessian(objective))  # projected
+    expected = float(H.diagonal()[objective.blocks["quats"]].sum())
+    assert objective.block_diagonal().traces(objective.active.quats)["quats"] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["l1", "charbonnier", "l2"])
+def test_the_pixel_diagonal_of_the_loss_is_that_of_its_dense_hessian(kind) -> None:
+    target, generator = torch.rand(3, 9, 13, dtype=torch.float64), torch.Generator().manual_seed(0)
+    image = target + 0.1 * torch.randn(3, 9, 13, generator=generator, dtype=torch.float64)
+    loss = ViewLoss.of(target, LossSettings(kind), torch.float64)
+    linear = loss.linearize(loss.padded(image))
+    units = torch.eye(image.numel(), dtype=torch.float64).view(-1, 3, 9, 13)
+    columns = [loss.cropped(linear.hvp(loss.padded(unit)[None])[0]).reshape(-1) for unit in units]
+    expected = torch.stack(columns).diagonal()
+    got = loss.cropped(linear.diagonal()).reshape(-1)
+    assert float((got - expected).norm() / expected.norm()) < 1e-12
+
+
+@pytest.mark.parametrize("loss", PIXEL_SUMS[1:], ids=lambda loss: loss.pixel)
+def test_traces_of_sums_over_pixels_are_exact(loss: LossSettings) -> None:
+    objective = objective_of(awkward_gaussians(), loss, noise=0.1)
+    H = dense(SceneHessian(objective))
+    for name, estimate in exact_traces(objective, torch.Generator().manual_seed(0)).items():
+        diagonal = H.diagonal()[objective.blocks[name]]
+        assert estimate.reason == "exact" and estimate.standard_error == 0
+        assert abs(estimate.value - float(diagonal.sum())) <= 1e-9 * float(diagonal.abs().sum())
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.5], ids=["near a fit", "far from a fit"])
+def test_traces_with_ssim_are_within_their_errors_over_many_seeds(noise: float) -> None:
+    objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise)
+    H, seeds, settings = dense(SceneHessian(objective)), 60, TraceSettings.fixed(12)
+    scores = {name: [] for name in objective.blocks}
+    for seed in range(seeds):
+        for name, estimate in exact_traces(objective, torch.Generator().manual_seed(seed), settings).items():
+            truth = float(H.diagonal()[objective.blocks[name]].sum())
+            scores[name].append((estimate.value - truth) / estimate.standard_error)
+    for name, values in scores.items():
+        z = torch.tensor(values)
+        # Student's t with 11 degrees of freedom has variance 11 / 9; the mean of 60 is then known to sqrt(11 / 9 / 60)
+        assert abs(float(z.mean())) < 4 * sqrt(11 / 9 / seeds), name
+        assert float(z.square().mean()) < 3, name
+
+
+def test_the_control_variate_leaves_the_mean_unbiased_and_lowers_the_variance() -> None:
+    generator, runs, count = torch.Generator().manual_seed(1), 4000, 12
+    y = torch.randn(runs, count, generator=generator, dtype=torch.float64) + 3
+    x = 2 * y + 0.1 * torch.randn(runs, count, generator=generator, dtype=torch.float64)
+    means = torch.stack([controlled(a, b, 3.0).mean() for a, b in zip(x, y, strict=True)])
+    assert abs(float(means.mean()) - 6) < 4 * float(means.std()) / sqrt(runs)
+    assert float(means.std()) < 0.1 * float(x.mean(dim=1).std())
