@@ -53,6 +53,8 @@ def _register_bits() -> int:
 
 
 REGISTER_BITS = _register_bits()
+# Compiled kernels are kept on disk under the machine's name and features, which say nothing of a width chosen by hand.
+CACHE = "LANDSCAPE_VECTOR_BITS" not in os.environ
 I32, I64 = ir.IntType(32), ir.IntType(64)
 
 

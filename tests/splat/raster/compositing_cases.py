@@ -34,11 +34,13 @@ class Case:
     settings: RenderSettings = RenderSettings()
     layers: int | None = None
     spread: float = 1.0
+    focal: float = 40.0
 
 
 CASES = {
     "typical": Case(200),
     "opaque": Case(400, logit=4.0, spread=0.6),
+    "walled": Case(300, size=(37, 24), logit=6.0, spread=0.4, focal=150.0),
     "capped": Case(60, logit=6.0, settings=RenderSettings(transmittance_min=1e-7)),
     "smooth": Case(60, settings=SMOOTH),
     "three sigma": Case(100, logit=2.0, settings=RenderSettings(contour_sigma=3.0)),
@@ -87,7 +89,7 @@ def composite(splats: Tensor, depths: Tensor, drawn: Tensor, case: Case) -> Tens
 def truth(name: str) -> Truth:
     case = CASES[name]
     width, height = case.size
-    camera = random_camera(width, height, focal=40.0)
+    camera = random_camera(width, height, focal=case.focal)
     projected = project(random_gaussians(case.n, logit=case.logit, spread=case.spread), camera, case.settings)
     parts = (projected.means, projected.conics, projected.opacities[:, None], projected.colours)
     splats, depths = torch.cat(parts, dim=1).float().double(), projected.depths.float().double()
