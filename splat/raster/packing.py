@@ -36,6 +36,7 @@ from splat.raster.compositing import (
     RED,
     SUMS,
     TANGENTS,
+    formula,
     kernel,
 )
 
@@ -71,14 +72,30 @@ def pack_tangents(start, stop, splats, directions, tangents):
             tangents[t + DRED], tangents[t + DGREEN], tangents[t + DBLUE] = u[6], u[7], u[8]
 
 
+@formula
+def sum_of_slots(sums, first, last, stride, offset):
+    """The nine sums of the slots first..last - 1; slot i's lie at i * stride + offset.  In registers."""
+    zero = sums.dtype.type(0)
+    s0, s1, s2, s3, s4, s5, s6, s7, s8 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for slot in range(first, last):
+        p = slot * stride + offset
+        s0 += sums[p]
+        s1 += sums[p + 1]
+        s2 += sums[p + 2]
+        s3 += sums[p + 3]
+        s4 += sums[p + 4]
+        s5 += sums[p + 5]
+        s6 += sums[p + 6]
+        s7 += sums[p + 7]
+        s8 += sums[p + 8]
+    return s0, s1, s2, s3, s4, s5, s6, s7, s8
+
+
 @kernel
 def reduce_gradient(start, stop, splats, slot_start, sums, moments, gradient):
     """gradient (n, 9) and the moments S, Sx, Sy (n, 3) from the sums of the entries (slots, SUMS)."""
     for i in range(start, stop):
-        total = np.zeros(SUMS, sums.dtype)
-        for slot in range(slot_start[i], slot_start[i + 1]):
-            for j in range(SUMS):
-                total[j] += sums[slot * SUMS + j]
+        total = sum_of_slots(sums, slot_start[i], slot_start[i + 1], SUMS, 0)
         a, b, c, opacity = splats[i, 2], splats[i, 3], splats[i, 4], splats[i, 5]
         S, Sx, Sy = total[0], total[1], total[2]
         moments[i, 0], moments[i, 1], moments[i, 2] = S, Sx, Sy
@@ -96,10 +113,7 @@ def reduce_curvature(start, stop, splats, directions, slot_start, sums, moments,
         a, b, c, opacity = splats[i, 2], splats[i, 3], splats[i, 4], splats[i, 5]
         S, Sx, Sy = moments[i, 0], moments[i, 1], moments[i, 2]
         for k in range(K):
-            total = np.zeros(SUMS, sums.dtype)
-            for slot in range(slot_start[i], slot_start[i + 1]):
-                for j in range(SUMS):
-                    total[j] += sums[(slot * K + k) * SUMS + j]
+            total = sum_of_slots(sums, slot_start[i], slot_start[i + 1], K * SUMS, k * SUMS)
             u, out = directions[i, k], product[i, k]
             mx, my = u[0], u[1]
             tx, ty = total[1] - mx * S, total[2] - my * S
