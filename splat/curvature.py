@@ -8,23 +8,26 @@ and the trace of their block, which scales with 1/|q|^2, gets a meaning.
     L(theta) = 1/M sum_m l(I_m(theta)),   theta the stored parameters of the active Gaussians, laid out like Gaussians.flat
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import add
 
 import numpy as np
+import psutil
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from landscape.operator import require_vectors
-from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.linearize import LinearizedView, OwnBlocks, rasterize_view, touches
 from splat.losses import LossSettings
 from splat.losses_cpu import ViewLoss
 from splat.scenes.view import View
 from splat.settings import RenderSettings
+
+MOST_VECTORS = 8  # beyond it a block of vectors gains no more: it has left the second-level cache
 
 
 @dataclass(frozen=True)
@@ -41,12 +44,27 @@ class ActiveCounts:
     views: int
 
 
+@dataclass(frozen=True)
+class MemoryPlan:
+    """What a memory budget decides.  bytes; kept of views stay linearised, the others are rebuilt for every product.
+
+    vectors: how many vectors a product takes at a time.
+    """
+
+    budget: int
+    bytes_per_view: int
+    kept: int
+    views: int
+    vectors: int
+
+
 class SceneObjective:
     """The mean loss over views as a function of the active Gaussians' stored parameters.
 
     gaussians: those of the checkpoint; sh_degree: the bands in use (all by default).  `active` are the Gaussians that touch
-    a pixel of some view, with unit quaternions; `mask` says which of the given ones they are.  Raises ValueError where no
-    Gaussian is seen or a parameter is not finite.
+    a pixel of some view, with unit quaternions; `mask` says which of the given ones they are.  memory: bytes that
+    linearised views and the workspace of their products may take (half of what is free by default); see `memory_plan`.
+    Raises ValueError where no Gaussian is seen or a parameter is not finite.
     """
 
     def __init__(
@@ -57,6 +75,7 @@ class SceneObjective:
         background: Float[Tensor, "3"] | None = None,
         settings: RenderSettings = RenderSettings(),
         sh_degree: int | None = None,
+        memory: int | None = None,
     ):
         if not views:
             raise ValueError("expected at least one view, got none")
@@ -85,6 +104,8 @@ class SceneObjective:
             views=len(views),
         )
         self._seen: tuple[Tensor, Hashable] | None = None
+        self._memory = psutil.virtual_memory().available // 2 if memory is None else memory
+        self._kept: dict[int, LinearizedView] = {}
 
     def _support(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
         seen = np.zeros(len(gaussians), np.bool_)
@@ -114,24 +135,38 @@ class SceneObjective:
         return self._seen[1]
 
     @cached_property
-    def linearized(self) -> list[LinearizedView]:
-        """Every view held still at the active Gaussians."""
-        return [self._linearize(view.camera, loss) for view, loss in zip(self.views, self._losses, strict=True)]
-
-    def _linearize(self, camera: Camera, loss: ViewLoss) -> LinearizedView:
-        return LinearizedView(self.active, camera, loss, self.background, self.settings)
+    def memory_plan(self) -> "MemoryPlan":
+        """Which views are kept linearised and how many vectors a product takes at a time; linearises the first view."""
+        first = self._linearize(0)
+        self._kept[0] = first
+        spare = self._memory - first.bytes - first.workspace(1)
+        per_vector = max(first.workspace(2) - first.workspace(1), 1)
+        more = min(max(spare // first.bytes, 0), len(self.views) - 1)
+        vectors = 1 + max(spare - more * first.bytes, 0) // per_vector
+        return MemoryPlan(self._memory, first.bytes, 1 + int(more), len(self.views), int(min(vectors, MOST_VECTORS)))
 
     @property
+    def linearized(self) -> Iterator[LinearizedView]:
+        """Every view held still at the active Gaussians: kept after the first time, or rebuilt, as `memory_plan` says."""
+        kept = self.memory_plan.kept
+        for index in range(len(self.views)):
+            if index < kept and index not in self._kept:
+                self._kept[index] = self._linearize(index)
+            yield self._kept[index] if index < kept else self._linearize(index)
+
+    def _linearize(self, index: int) -> LinearizedView:
+        camera = self.views[index].camera
+        return LinearizedView(self.active, camera, self._losses[index], self.background, self.settings)
+
+    @cached_property
     def gradient(self) -> Float[Tensor, " p"]:
         """The gradient of L at the active Gaussians."""
         return torch.stack([view.gradient for view in self.linearized]).mean(dim=0)
 
     def block_diagonal(self, *, gauss_newton: bool = False) -> OwnBlocks:
         """Own blocks of the mean over views: of the Hessian or of its Gauss-Newton part (see `LinearizedView`)."""
-        total = self.linearized[0].block_diagonal(gauss_newton=gauss_newton)
-        for view in self.linearized[1:]:
-            total = total + view.block_diagonal(gauss_newton=gauss_newton)
-        return total * (1 / len(self.views))
+        parts = (view.block_diagonal(gauss_newton=gauss_newton) for view in self.linearized)
+        return reduce(add, parts) * (1 / len(self.views))
 
 
 class SceneHessian:
@@ -158,6 +193,9 @@ class SceneHessian:
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         require_vectors(V, self.dim)
         V, total = self.project(V), torch.zeros(V.shape, dtype=self.dtype)
+        at_once = self.objective.memory_plan.vectors
         for view in self.objective.linearized:
-            total += view.ggn(V) if self.gauss_newton else view.hvp(V)
-        return self.project(total / len(self.objective.linearized))
+            for start in range(0, V.shape[1], at_once):
+                some = V[:, start : start + at_once]
+                total[:, start : start + at_once] += view.ggn(some) if self.gauss_newton else view.hvp(some)
+        return self.project(total / len(self.objective.views))

@@ -25,6 +25,7 @@ from splat.gaussians import Gaussians
 from splat.losses_cpu import LinearLoss, ViewLoss
 from splat.projection_cpu import lens_of, project_arrays
 from splat.projection_linear import Projection
+from splat.raster.compositing import SUMS, TANGENTS
 from splat.raster.cpu import Adjoint, Raster
 from splat.settings import RenderSettings
 
@@ -108,6 +109,18 @@ class LinearizedView:
         """How many Gaussians reach a tile of this view before its pixels stop."""
         return len(self._index)
 
+    @property
+    def bytes(self) -> int:
+        """Memory of what is held for the products."""
+        adjoint = self._adjoint.gradient.nbytes + self._adjoint.moments.nbytes  # its cotangent is the loss's gradient
+        return self._raster.bytes + self._projection.bytes + self._loss.bytes + adjoint
+
+    def workspace(self, vectors: int) -> int:
+        """Bytes that `hvp` of so many vectors takes beside its argument and result."""
+        item, planes, n = self.gradient.itemsize, self._raster.frame.size, len(self.gaussians)
+        each = 5 * planes + SUMS * self.entries + (TANGENTS + 2 * 9) * n
+        return item * (vectors * each + 18 * planes)
+
     def jvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "k 4 h w"]:
         """J U: tangents of colour and accumulated alpha."""
         planes = self._raster.jvp(self._projection.jvp(_block(U))).planes
@@ -122,7 +135,8 @@ class LinearizedView:
         """H U of the view's loss."""
         block = _block(U)
         tangent = self._raster.jvp(self._projection.jvp(block))
-        return self._pulled(tangent.curvature(self._adjoint, self._loss.hvp(tangent.planes)), block)
+        cotangents = self._loss.hvp(tangent.planes, out=tangent.planes)
+        return self._pulled(tangent.curvature(self._adjoint, cotangents), block)
 
     def ggn(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """G U, the Gauss-Newton part of H U."""

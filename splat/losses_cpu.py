@@ -392,23 +392,31 @@ class LinearLoss:
         self.loss, self.value, self.gradient = loss, value, gradient
         self._image, self._second, self._blurred = image, second, blurred
 
-    def hvp(self, tangents: np.ndarray) -> np.ndarray:
-        """l'' v for K padded tangents (K, >= 3 planes, ...): (K, 4, ...)."""
+    def hvp(self, tangents: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """l'' v for K padded tangents (K, 4, ...), to out (which may be the tangents themselves)."""
         loss = self.loss
         none, y = np.empty(0, loss.dtype), loss.target.reshape(-1)
-        products = aligned((len(tangents), 4, *loss.shape[2:]), loss.dtype)
-        products[:, :, loss.shape[0] :] = 0
-        products[:, 3] = 0
+        products = aligned((len(tangents), 4, *loss.shape[2:]), loss.dtype) if out is None else out
+        partials, blurred = none, none
+        if loss.structural:
+            blurred, partials = loss.planes(3).reshape(-1), loss.planes(3).reshape(-1)
         for tangent, product in zip(tangents, products, strict=True):
-            v, partials = np.ascontiguousarray(tangent[:3], loss.dtype).reshape(-1), none
+            v = np.ascontiguousarray(tangent[:3], loss.dtype).reshape(-1)
             if loss.structural:
-                blurred, partials = loss.planes(3).reshape(-1), loss.planes(3).reshape(-1)
                 loss._over_rows(blur_products_along_rows, v, self._image, y, blurred)
                 loss._over_rows(ssim_tangent_rows, blurred, self._second, partials)
             loss._over_rows(
                 product_rows, partials, v, self._image, y, *loss._pointwise(), self._blurred, product.reshape(-1)
             )
+            product[:, loss.shape[0] :] = 0
+            product[3] = 0
         return products
+
+    @property
+    def bytes(self) -> int:
+        """Memory of what is held, the target's included."""
+        target = self.loss.target.nbytes + (self.loss._target_moments.nbytes if self.loss.structural else 0)
+        return target + self.gradient.nbytes + self._image.nbytes + self._second.nbytes + self._blurred.nbytes
 
     def diagonal(self) -> np.ndarray:
         """The pixel-diagonal of l'', padded planes (3, ...): that of SSIM is one blur with the squared window."""

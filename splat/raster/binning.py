@@ -163,7 +163,7 @@ def fill_lists(order, place, count, tiles, rows, start, splat_of, entry_rows):
 def bin_splats(
     splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, settings: RenderSettings
 ) -> Lists:
-    """The tile lists of a view; the tiles are ordered heaviest first.  Their slots are assigned by `assign_slots`."""
+    """The tile lists of a view; the tiles are ordered heaviest first.  Slots come with `reached_lists`."""
     tile = lanes_of(splats.dtype)
     columns = -(-width // tile)
     tile_count = columns * -(-height // TILE_ROWS)
@@ -185,25 +185,36 @@ def bin_splats(
 
 
 @kernel
-def assign_slots(start, splat_of, reached, slot_start, slots):
-    """Number the entries that some pixel reaches, splat-major: splat i's are slot_start[i], ..., slot_start[i + 1] - 1.
+def keep_reached(lists, kept_start, splat_of, rows, slots, slot_start):
+    """Copy the entries that some pixel reaches, and number them splat-major.
 
-    reached: (tiles,) how many entries of each tile count.  Returns the number of slots.
+    kept_start: (tiles + 1,) where each tile's kept entries begin; splat i's slots are slot_start[i] .. slot_start[i + 1] - 1.
     """
-    n = slot_start.size - 1
     slot_start[:] = 0
-    for t in range(reached.size):
-        for e in range(start[t], start[t] + reached[t]):
+    for t in range(kept_start.size - 1):
+        first = lists.start[t]
+        for e in range(kept_start[t], kept_start[t + 1]):
+            splat_of[e], rows[e] = lists.splat[first + e - kept_start[t]], lists.rows[first + e - kept_start[t]]
             slot_start[splat_of[e] + 1] += 1
-    for i in range(n):
+    for i in range(slot_start.size - 1):
         slot_start[i + 1] += slot_start[i]
     next_slot = slot_start[:-1].copy()
-    for t in range(reached.size):
-        for e in range(start[t], start[t] + reached[t]):
-            i = splat_of[e]
-            slots[e] = next_slot[i]
-            next_slot[i] += 1
-    return slot_start[n]
+    for e in range(splat_of.size):
+        slots[e] = next_slot[splat_of[e]]
+        next_slot[splat_of[e]] += 1
+
+
+def reached_lists(lists: Lists, reached: np.ndarray, n: int) -> tuple[Lists, np.ndarray]:
+    """The lists without the entries behind each tile's last stop, with slots; and slot_start (n + 1,).
+
+    reached: (tiles,) how many entries of each tile some pixel reaches.
+    """
+    start = np.zeros(reached.size + 1, np.int64)
+    np.cumsum(reached, out=start[1:])
+    splat_of, rows, slots = (np.empty(start[-1], np.int32) for _ in range(3))
+    slot_start = np.empty(n + 1, np.int64)
+    keep_reached(lists, start, splat_of, rows, slots, slot_start)
+    return Lists(start, splat_of, rows, slots, heaviest_first(reached)), slot_start
 
 
 def heaviest_first(work: np.ndarray) -> np.ndarray:

@@ -87,17 +87,20 @@ class Raster:
 
     @property
     def slot_start(self) -> np.ndarray:
-        """(n + 1,) where each splat's entries begin among the slots of the sums."""
+        """(n + 1,) where each splat's entries begin among the slots of the sums; drops the entries that no pixel reaches."""
         if self._slot_start is None:
             per_tile = np.diff(self.lists.start)
             tile_rows, lanes = compositing.TILE_ROWS, self.plane[1] // self.frame.columns
             stops = self.pixels.stop.reshape(-1, tile_rows, self.frame.columns, lanes).max(axis=(1, 3)).reshape(-1)
             reached = np.minimum(per_tile, stops).astype(np.int64)
-            slot_start, slots = np.empty(len(self.splats) + 1, np.int64), np.empty(self.lists.splat.size, np.int32)
-            binning.assign_slots(self.lists.start, self.lists.splat, reached, slot_start, slots)
-            self.lists = self.lists._replace(slots=slots, order=binning.heaviest_first(reached))
-            self._slot_start = slot_start
+            self.lists, self._slot_start = binning.reached_lists(self.lists, reached, len(self.splats))
         return self._slot_start
+
+    @property
+    def bytes(self) -> int:
+        """Memory of what is held."""
+        held = (self.splats, self.params, *self.lists, *self.pixels, self.slot_start)
+        return sum(array.nbytes for array in held)
 
     def backward(self, cotangent: np.ndarray) -> "Adjoint":
         """The gradient in the splats from padded cotangent planes (4, ...)."""
@@ -156,7 +159,7 @@ class Tangent:
         K, dtype, size = directions.shape[1], raster.splats.dtype, raster.frame.size
         self._packed = aligned((len(directions) * K * compositing.TANGENTS,), dtype)
         over_range(len(directions), packing.pack_tangents, raster.splats, self.directions, self._packed)
-        _ = raster.slot_start  # reorders the tiles by the entries that are reached
+        _ = raster.slot_start  # drops the entries that no pixel reaches
         planes, self._transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
         over_tiles(
             compositing.tangent, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, planes,
