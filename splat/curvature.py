@@ -1,9 +1,9 @@
 """The loss of a scene over a set of views as an objective, and its Hessian as an operator of `landscape`.
 
 `SceneObjective` holds what stands still: views, loss, background, thresholds, and which Gaussians matter.  Removed from the
-operator, exactly, and counted: Gaussians that touch no pixel of any view, SH bands not in use, and the radial direction of
-each quaternion (a null direction of the image).  Quaternions are brought to unit length first: the image does not change,
-and the trace of their block, which scales with 1/|q|^2, gets a meaning.
+operator, exactly, and counted: Gaussians that touch no pixel of any view, SH bands not in use, the radial direction of each
+quaternion (a null direction of the image), and directions that no view sees (`null_space.py`).  Quaternions are brought to
+unit length first: the image does not change, and the trace of their block, which scales with 1/|q|^2, gets a meaning.
 
     L(theta) = 1/M sum_m l(I_m(theta)),   theta the stored parameters of the active Gaussians, laid out like Gaussians.flat
 """
@@ -24,6 +24,7 @@ from splat.gaussians import Gaussians
 from splat.linearize import LinearizedView, OwnBlocks, rasterize_view, touches
 from splat.losses import LossSettings
 from splat.losses_cpu import ViewLoss
+from splat.null_space import RowSpace, seen_harmonics, seen_parameters
 from splat.scenes.view import View
 from splat.settings import RenderSettings
 
@@ -170,24 +171,48 @@ class SceneObjective:
 
 
 class SceneHessian:
-    """H of L, or its Gauss-Newton part, on the complement of the quaternions' radial directions.
+    """H of L, or its Gauss-Newton part, on the complement of its exact null space (`null_space.py`): P H P.
 
-    A `landscape` operator: `dim`, `blocks`, `dtype`, `apply(V)`.  radial: keep the radial directions instead.
+    A `landscape` operator: `dim`, `blocks`, `dtype`, `apply(V)`.  P leaves out, for the Hessian, the lengths of the quaternions
+    (null where the gradient vanishes, and by choice elsewhere) and the SH directions that no view sees; for Gauss-Newton all
+    that no view sees.  keep_null: P = 1 instead.
     """
 
-    def __init__(self, objective: SceneObjective, *, gauss_newton: bool = False, radial: bool = False):
-        self.objective, self.gauss_newton, self.radial = objective, gauss_newton, radial
+    def __init__(self, objective: SceneObjective, *, gauss_newton: bool = False, keep_null: bool = False):
+        self.objective, self.gauss_newton, self.keep_null = objective, gauss_newton, keep_null
         self.dim = objective.active.flat.numel()
         self.blocks = objective.blocks
         self.dtype = objective.active.flat.dtype
 
+    @cached_property
+    def _row_space(self) -> RowSpace:
+        n, bands = len(self.objective.active), self.objective.active.sh.shape[1]
+        held = [view.held for view in self.objective.linearized]
+        return seen_parameters(held, n, bands) if self.gauss_newton else seen_harmonics(held, n, bands)
+
+    @property
+    def rank(self) -> int:
+        """The dimension of what P keeps."""
+        if self.keep_null:
+            return self.dim
+        seen = int(self._row_space.rank.sum())
+        n = len(self.objective.active)
+        return seen if self.gauss_newton else 10 * n + 3 * seen  # mean 3, log-scales 3, quaternion 3, logit 1
+
     def project(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-        """V without its components along the quaternions' lengths."""
-        if self.radial:
+        """P V."""
+        if self.keep_null:
             return V
-        V, rows, quats = V.clone(), self.blocks["quats"], self.objective.active.quats
-        tangents = V[rows].view(*quats.shape, -1)
-        tangents -= quats[:, :, None] * (quats[:, :, None] * tangents).sum(dim=1, keepdim=True)
+        n, K = len(self.objective.active), V.shape[1]
+        if self.gauss_newton:
+            parts = [V[rows].reshape(n, -1, K) for rows in self.blocks.values()]
+            sizes = [part.shape[1] for part in parts]
+            seen = self._row_space.project(torch.cat(parts, dim=1)).split(sizes, dim=1)
+            return torch.cat([part.reshape(-1, K) for part in seen])
+        V, quats = V.clone(), self.objective.active.quats
+        turns, harmonics = V[self.blocks["quats"]].view(n, 4, K), V[self.blocks["sh"]]
+        turns -= quats[:, :, None] * (quats[:, :, None] * turns).sum(dim=1, keepdim=True)
+        harmonics.copy_(self._row_space.project(harmonics.view(n, -1, 3 * K)).reshape(-1, K))
         return V
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
@@ -199,3 +224,23 @@ class SceneHessian:
                 some = V[:, start : start + at_once]
                 total[:, start : start + at_once] += view.ggn(some) if self.gauss_newton else view.hvp(some)
         return self.project(total / len(self.objective.views))
+
+
+def scene_units(objective: SceneObjective) -> Float[Tensor, " p"]:
+    """D for curvature D H D with positions in units of the scene's size (`ScaledOperator`); the other attributes have none.
+
+    The size: the median depth of the active Gaussians in the first view, for forward-facing views; the mean
+    distance of the cameras from their centroid otherwise.
+    """
+    cameras = [view.camera for view in objective.views]
+    directions = torch.stack([camera.forward for camera in cameras])
+    if float((directions @ directions.mean(dim=0)).min()) > 0.7 * float(directions.mean(dim=0).norm()):
+        offsets = objective.active.means.double() - cameras[0].centre
+        depth = offsets @ cameras[0].forward
+        size = float(depth[depth > 0].median())
+    else:
+        centres = torch.stack([camera.centre for camera in cameras])
+        size = float((centres - centres.mean(dim=0)).norm(dim=1).mean())
+    scale = torch.ones(objective.active.flat.numel(), dtype=objective.active.flat.dtype)
+    scale[objective.blocks["means"]] = size
+    return scale

@@ -24,7 +24,7 @@ from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.losses_cpu import LinearLoss, ViewLoss
 from splat.projection_cpu import lens_of, project_arrays
-from splat.projection_linear import Projection
+from splat.projection_linear import Held, Projection
 from splat.raster.compositing import SUMS, TANGENTS
 from splat.raster.cpu import Adjoint, Raster
 from splat.settings import RenderSettings
@@ -108,6 +108,11 @@ class LinearizedView:
     def touched(self) -> int:
         """How many Gaussians reach a tile of this view before its pixels stop."""
         return len(self._index)
+
+    @property
+    def held(self) -> Held:
+        """The projection's derivatives, Gaussian by Gaussian."""
+        return self._projection.held
 
     @property
     def bytes(self) -> int:

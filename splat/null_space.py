@@ -1,0 +1,94 @@
+"""The directions in which a scene's loss is exactly flat, Gaussian by Gaussian, and the projector that leaves them out.
+
+A Gaussian enters a view only through its splat of nine numbers, so over M views Gauss-Newton sees at most
+min(9 M, 10 + 3 min(M, k)) of its 11 + 3 k parameters (k SH coefficients a channel): with SH degree 3 and three views a third of
+the spectrum is zeros that say nothing.  The row space of all its projections' Jacobians, stacked, is what is left.  The
+Hessian sees more: everything but the SH directions that vanish in all view directions together with their slope in the mean,
+and (by choice, see `curvature.py`) the lengths of the quaternions.
+
+A basis is found per Gaussian from the eigenvectors of the small Gram matrix of its rows, each scaled to unit length; directions
+whose singular value is beneath TOLERANCE of the largest are null.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splat.projection_linear import GEOMETRY, Held
+
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-7}  # of the largest singular value; what rounding leaves of a zero
+CHUNK = 4096  # Gaussians at a time
+
+
+@dataclass(frozen=True, eq=False)
+class RowSpace:
+    """An orthonormal basis per Gaussian of what is seen, zero-padded; rank: how many of its rows are not padding."""
+
+    basis: Float[Tensor, "n r d"]
+    rank: Int[Tensor, " n"]
+
+    def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
+        """x without its null components."""
+        return self.basis.mT @ (self.basis @ x)
+
+
+def seen_harmonics(views: Sequence[Held], n: int, bands: int) -> RowSpace:
+    """The SH directions (k of one channel; the three are alike) in which the Hessian can be non-zero."""
+    rows = torch.zeros(n, 4 * len(views), bands, dtype=torch.float64)
+    for m, held in enumerate(views):
+        index = torch.from_numpy(held.index)
+        rows[index, 4 * m] = torch.from_numpy(held.harmonic[:, :bands]).double()
+        rows[index, 4 * m + 1 : 4 * m + 4] = torch.from_numpy(held.slope[:, :bands]).double().mT
+    return _row_space(rows, _dtype(views))
+
+
+def seen_parameters(views: Sequence[Held], n: int, bands: int) -> RowSpace:
+    """The directions of a Gaussian's parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
+    parts = [
+        _row_space(_jacobian_rows(views, start, min(start + CHUNK, n), bands), _dtype(views))
+        for start in range(0, n, CHUNK)
+    ]
+    width = max(part.basis.shape[1] for part in parts)
+    padded = [torch.nn.functional.pad(part.basis, (0, 0, 0, width - part.basis.shape[1])) for part in parts]
+    return RowSpace(torch.cat(padded), torch.cat([part.rank for part in parts]))
+
+
+def _dtype(views: Sequence[Held]) -> torch.dtype:
+    return torch.from_numpy(views[0].splats[:0]).dtype
+
+
+def _jacobian_rows(views: Sequence[Held], start: int, stop: int, bands: int) -> Float[Tensor, "n r d"]:
+    """The Jacobians of the splats of Gaussians start..stop in every view, stacked: nine rows a view, zero where unseen."""
+    rows = torch.zeros(stop - start, 9 * len(views), GEOMETRY + 1 + 3 * bands, dtype=torch.float64)
+    for m, held in enumerate(views):
+        index = torch.from_numpy(held.index)
+        here = (index >= start) & (index < stop)
+        i, at = index[here] - start, 9 * m
+        geometry = torch.from_numpy(held.jacobian)[here].double()
+        harmonic = torch.from_numpy(held.harmonic)[here, :bands].double()
+        slope, visible = (
+            torch.from_numpy(held.colour_slope)[here].double(),
+            torch.from_numpy(held.visible)[here].double(),
+        )
+        rows[i, at : at + 5, :GEOMETRY] = geometry
+        rows[i, at + 5, GEOMETRY] = 1.0
+        for c in range(3):
+            first = GEOMETRY + 1 + c
+            rows[i, at + 6 + c, :3] = visible[:, c, None] * slope[:, c]
+            rows[i, at + 6 + c, first : first + 3 * bands - c : 3] = visible[:, c, None] * harmonic
+    return rows
+
+
+def _row_space(rows: Float[Tensor, "n r d"], dtype: torch.dtype) -> RowSpace:
+    """An orthonormal basis of each Gaussian's rows, by the smaller of their two Gram matrices."""
+    rows = rows / rows.norm(dim=2, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny)
+    tall = rows.shape[1] > rows.shape[2]
+    values, vectors = torch.linalg.eigh(rows.mT @ rows if tall else rows @ rows.mT)
+    kept = values > TOLERANCE[dtype] ** 2 * values[:, -1:].clamp_min(1e-300)
+    basis = vectors.mT if tall else (vectors.mT @ rows) / values.clamp_min(1e-300).sqrt()[:, :, None]
+    basis = torch.where(kept[:, :, None], basis, torch.zeros_like(basis))
+    rank = kept.sum(dim=1)
+    return RowSpace(basis[:, basis.shape[1] - int(rank.max()) :].to(dtype), rank)  # eigenvalues ascend
