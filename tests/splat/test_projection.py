@@ -101,7 +101,8 @@ def test_the_specification_projects_as_the_textbook_does(degree):
     means, log_scales, quats, _, sh = (value.numpy() for value in gaussians.attributes.values())
     for i in torch.nonzero(splats.drawn)[:, 0].tolist():
         mean, covariance, colour, depth = splat_of_gaussian(
-            means[i], log_scales[i], quats[i], sh[i], camera.rotation.numpy(), camera.centre.numpy(), pinhole, clamp, SETTINGS.blur
+            means[i], log_scales[i], quats[i], sh[i], camera.rotation.numpy(), camera.centre.numpy(), pinhole, clamp,
+            SETTINGS.blur,
         )  # fmt: skip
         conic = np.linalg.inv(covariance)[[0, 0, 1], [0, 1, 1]]
         assert relative_error(splats.means[i], mean) < 1e-12
@@ -115,7 +116,7 @@ def test_harmonics_are_those_of_legendre_with_the_condon_shortley_phase():
     directions /= directions.norm(dim=1, keepdim=True)
     for degree in range(4):
         assert relative_error(harmonics(directions, degree), real_harmonics(directions.numpy(), degree)) < 1e-14
-    assert BAND_OF_COEFFICIENT == tuple(l for l in range(4) for _ in range(2 * l + 1))
+    assert tuple(l for l in range(4) for _ in range(2 * l + 1)) == BAND_OF_COEFFICIENT
 
 
 def test_rotations_do_not_depend_on_a_quaternions_length_or_sign():

@@ -1,0 +1,56 @@
+"""Small scenes of two views, and their loss and its derivatives by the specification in float64."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from splat.gaussians import Gaussians
+from splat.losses import LossSettings, photometric_loss
+from splat.render import render
+from splat.scenes.view import View
+from splat.settings import RenderSettings
+from tests.splat.random_scenes import random_camera
+
+BACKGROUND = torch.tensor([0.2, 0.5, 0.875], dtype=torch.float64)
+
+
+def two_views(width: int = 30, height: int = 22) -> list[View]:
+    """Cameras apart from each other, random pictures."""
+    generator = torch.Generator().manual_seed(0)
+    return [
+        View(
+            str(seed),
+            random_camera(width, height, seed=seed, focal=28.0),
+            torch.rand(3, height, width, generator=generator),
+        )
+        for seed in (1, 2)
+    ]
+
+
+def mean_loss(
+    gaussians: Gaussians, views: Sequence[View], loss: LossSettings, settings: RenderSettings = RenderSettings()
+) -> Tensor:
+    """The specification's loss of the views."""
+    losses = [
+        photometric_loss(
+            render(gaussians, view.camera, BACKGROUND, settings, backend="reference").image, view.image.double(), loss
+        )
+        for view in views
+    ]
+    return torch.stack(losses).mean()
+
+
+def gradient_and_products(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    loss: LossSettings,
+    U: Tensor,
+    settings: RenderSettings = RenderSettings(),
+) -> tuple[Tensor, Tensor]:
+    """The specification's gradient and H U."""
+    flat = gaussians.flat.clone().requires_grad_()
+    value = mean_loss(gaussians.with_flat(flat), views, loss, settings)
+    (gradient,) = torch.autograd.grad(value, flat, create_graph=True)
+    columns = [torch.autograd.grad((gradient * u).sum(), flat, retain_graph=True)[0] for u in U.T]
+    return gradient.detach(), torch.stack(columns, dim=1)

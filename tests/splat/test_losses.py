@@ -1,0 +1,172 @@
+"""Losses: the specification against windows and kornia, the kernels against the specification."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import kornia.metrics
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from splat.losses import LossSettings, photometric_loss, psnr, ssim, ssim_map
+from splat.losses_cpu import ViewLoss, view_loss
+from tests.oracles import similarity_by_windows
+from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, random_like, relative_error
+
+SIZES = [(53, 75), (7, 9), (1, 40), (40, 1)]
+SETTINGS = [
+    LossSettings(),
+    LossSettings("charbonnier"),
+    LossSettings("l2", literal=True),
+    LossSettings("l2", ssim_weight=0),
+    LossSettings("charbonnier", ssim_weight=0, eps=0.1),
+    LossSettings("l1", ssim_weight=1.0),
+]
+each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
+each_size = pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+each_loss = pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: f"{s.pixel} {s.ssim_weight} {s.literal}")
+
+
+def image_and_target(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Rounded to float32; a part of the image equals its target, so that residuals of 0 occur."""
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(3, *size, generator=generator)
+    image = (target + 0.1 * random_like((3, *size), 1).float()).clamp(0, 1)
+    image[:, : size[0] // 4] = target[:, : size[0] // 4]
+    return image.double(), target.double()
+
+
+@dataclass(frozen=True)
+class Truth:
+    image: Tensor
+    target: Tensor
+    v: Tensor
+    value: Tensor
+    gradient: Tensor
+    product: Tensor
+
+
+@cache
+def truth(size: tuple[int, int], settings: LossSettings) -> Truth:
+    image, target = image_and_target(size)
+    v = random_like((2, *image.shape), 2).float().double()
+    x = image.clone().requires_grad_()
+    value = photometric_loss(x, target, settings)
+    (gradient,) = torch.autograd.grad(value, x, create_graph=True)
+    products = [
+        torch.autograd.grad((gradient * each).sum(), x, retain_graph=True)[0] if gradient.requires_grad else 0 * each
+        for each in v
+    ]
+    return Truth(image, target, v, value.detach(), gradient.detach(), torch.stack(products))
+
+
+def test_similarity_is_that_of_the_windows_written_out():
+    for size in SIZES:
+        image, target = image_and_target(size)
+        assert relative_error(ssim_map(image, target), similarity_by_windows(image.numpy(), target.numpy())) < 1e-12
+
+
+def test_similarity_is_kornias_away_from_the_border():
+    image, target = image_and_target((40, 31))
+    peer = kornia.metrics.ssim(image[None], target[None], 11, eps=0.0, padding="valid")[0]
+    assert relative_error(ssim_map(image, target)[:, 5:-5, 5:-5], peer) < 1e-12
+
+
+def test_psnr_is_kornias():
+    image, target = image_and_target((40, 31))
+    assert psnr(image, target) == pytest.approx(float(kornia.metrics.psnr(image, target, 1.0)), rel=1e-12)
+
+
+def test_metrics_clip_what_a_picture_file_could_not_hold():
+    image, target = image_and_target((20, 20))
+    bright = image.clone()
+    bright[0, 3, 3] = 7.0
+    clipped = bright.clamp(0, 1)
+    assert psnr(bright, target) == psnr(clipped, target) and ssim(bright, target) == ssim(clipped, target)
+
+
+def test_the_photometric_loss_weighs_its_parts_as_written():
+    image, target = image_and_target((20, 30))
+    r = (image - target).numpy()
+    structural = 1 - similarity_by_windows(image.numpy(), target.numpy()).mean()
+    pixel = {"l1": np.abs(r).mean(), "l2": (r**2).mean(), "charbonnier": np.sqrt(r**2 + 0.03**2).mean()}
+    for kind, value in pixel.items():
+        settings = LossSettings(kind, ssim_weight=0.3, eps=0.03)
+        assert float(photometric_loss(image, target, settings)) == pytest.approx(
+            0.7 * value + 0.3 * structural, rel=1e-12
+        )
+        literal = photometric_loss(image, target, replace(settings, literal=True))
+        assert float(literal) == pytest.approx(value + 0.3 * structural, rel=1e-12)
+
+
+@each_dtype
+@each_loss
+@each_size
+def test_kernels_give_the_specifications_value_gradient_and_products(size, settings, dtype):
+    expected = truth(size, settings)
+    loss = ViewLoss.of(expected.target.to(dtype), settings, dtype)
+    held = loss.linearize(loss.padded(expected.image.to(dtype)))
+    assert held.value == pytest.approx(float(expected.value), rel=IMAGE[dtype], abs=IMAGE[dtype])
+    assert loss.value(loss.padded(expected.image.to(dtype))) == held.value
+    assert relative_error(loss.cropped(held.gradient), expected.gradient) < DERIVATIVE[dtype]
+    tangents = np.stack([loss.padded(v.to(dtype)) for v in expected.v])
+    products = held.hvp(tangents)
+    for product, each in zip(products, expected.product, strict=True):
+        assert relative_error(loss.cropped(product), each) < DERIVATIVE[dtype]
+
+
+@each_dtype
+@each_loss
+def test_padding_and_alpha_have_no_derivative(settings, dtype):
+    size = (7, 9)
+    expected = truth(size, settings)
+    loss = ViewLoss.of(expected.target.to(dtype), settings, dtype)
+    held = loss.linearize(loss.padded(expected.image.to(dtype)))
+    for planes in (held.gradient, held.hvp(loss.padded(expected.v[0].to(dtype))[None])[0]):
+        assert planes.shape[0] == 4 and not planes[3].any()
+        assert not planes[:, size[0] :].any() and not planes[:, :, size[1] :].any()
+
+
+@each_loss
+@pytest.mark.parametrize("size", [(17, 21), (1, 40)], ids=["17x21", "1x40"])
+def test_the_diagonal_is_that_of_the_dense_hessian(size, settings):
+    expected = truth(size, settings)
+    loss = ViewLoss.of(expected.target, settings, torch.float64)
+    held = loss.linearize(loss.padded(expected.image))
+    count = expected.image.numel()
+    every = [loss.padded(row.view(3, *size)) for row in torch.eye(count, dtype=torch.float64)]
+    columns = [loss.cropped(product).reshape(-1) for product in held.hvp(np.stack(every))]
+    dense = torch.stack(columns, dim=1)
+    assert relative_error(dense, dense.T) < 1e-12
+    assert relative_error(loss.cropped(held.diagonal()).reshape(-1), dense.diagonal()) < 1e-12
+
+
+@each_loss
+def test_autograd_reaches_the_kernels_twice(settings):
+    image, target = image_and_target((9, 6))
+    image = (target + 0.1 + 0.2 * (image - target).abs()).requires_grad_()  # no kink within the step
+    loss = ViewLoss.of(target, settings, torch.float64)
+    assert torch.autograd.gradcheck(lambda x: 100 * view_loss(x, loss), (image,))
+    assert torch.autograd.gradgradcheck(lambda x: 100 * view_loss(x, loss), (image,))
+
+
+def test_l1_has_no_slope_at_its_kink():
+    image, target = image_and_target((8, 8))
+    loss = ViewLoss.of(target, LossSettings("l1", ssim_weight=0), torch.float64)
+    gradient = loss.cropped(loss.linearize(loss.padded(image)).gradient)
+    assert ((gradient == 0) == (image == target)).all() and (image == target).any()
+    assert torch.equal(gradient, torch.sign(image - target) / image.numel())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"pixel": "l3"}, "expected the pixel loss 'l1', 'charbonnier' or 'l2', got 'l3'"),
+        ({"ssim_weight": 1.5}, "expected 0 <= ssim_weight <= 1"),
+        ({"eps": 0.0}, "eps > 0"),
+    ],
+)
+def test_wrong_settings_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        LossSettings(**wrong)
