@@ -155,7 +155,7 @@ class LinearizedView:
 
         "Exactly" for losses that are sums over pixels; of SSIM's l'' the coupling between pixels is left out.
         """
-        own = self._raster.own_blocks(self._adjoint, self._loss.diagonal(), self._index, gauss_newton)
+        own = self._raster.own_blocks(self._adjoint, self._loss.diagonal, self._index, gauss_newton)
         n, bands = len(self.gaussians), self.gaussians.sh.shape[1]
         geometry, sh = np.zeros((n, 11, 11), own.dtype), np.zeros((n, bands, 3), own.dtype)
         self._projection.add_blocks(own, not gauss_newton, geometry, sh)
@@ -165,7 +165,7 @@ class LinearizedView:
         """(J u)^T l'' (J u) of every column, and the same with l'' replaced by its pixel-diagonal: no backward pass."""
         planes = self._raster.jvp(self._projection.jvp(_block(U))).planes
         products, images = self._loss.hvp(planes)[:, :3], self._raster.crop(planes[:, :3])
-        weighted = self._raster.crop(self._loss.diagonal()) * images
+        weighted = self._raster.crop(self._loss.diagonal) * images
         full = np.einsum("kchw,kchw->k", images, self._raster.crop(products), dtype=np.float64)
         pixelwise = np.einsum("kchw,kchw->k", images, weighted, dtype=np.float64)
         return torch.from_numpy(full), torch.from_numpy(pixelwise)

@@ -17,12 +17,14 @@ of an output is 0.  A `row` counts the rows of the three channels, one after the
 """
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.ndimage import correlate1d
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from splat.losses import C1, C2, WINDOW, LossSettings, window
 from splat.raster.compositing import TILE_ROWS, formula, kernel, scratch
@@ -418,6 +420,7 @@ class LinearLoss:
         target = self.loss.target.nbytes + (self.loss._target_moments.nbytes if self.loss.structural else 0)
         return target + self.gradient.nbytes + self._image.nbytes + self._second.nbytes + self._blurred.nbytes
 
+    @cached_property
     def diagonal(self) -> np.ndarray:
         """The pixel-diagonal of l'', padded planes (3, ...): that of SSIM is one blur with the squared window."""
         loss = self.loss
@@ -458,6 +461,7 @@ class _PhotometricGradient(torch.autograd.Function):
         return weight * gradient
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, *outputs: Tensor):
         image, weight = ctx.saved_tensors
         linear = ctx.loss.linearize(ctx.loss.padded(image))

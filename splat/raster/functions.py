@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from splat.camera import Camera
 from splat.gaussians import Gaussians
@@ -63,6 +64,7 @@ class _ProjectAdjoint(torch.autograd.Function):
         return gradient
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, *outputs: Tensor):
         (flat,) = ctx.saved_tensors
         sh_degree, lens, splats, drawn = ctx.held
@@ -95,6 +97,7 @@ class _RasterizeAdjoint(torch.autograd.Function):
         return _parts(ctx.adjoint.gradient)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, *outputs: Tensor):
         raster = ctx.raster
         tangent = raster.jvp(_joined(outputs)[:, None])
