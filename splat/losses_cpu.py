@@ -24,11 +24,11 @@ import torch
 from jaxtyping import Float
 from scipy.ndimage import correlate1d
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from splat.losses import C1, C2, WINDOW, LossSettings, window
 from splat.raster.compositing import TILE_ROWS, formula, kernel, scratch
 from splat.raster.cpu import aligned
+from splat.raster.functions import last_derivative
 from splat.raster.simd import broadcast, lanes, lanes_of, load, maximum, select, sqrt, store
 from splat.raster.threads import over_range
 
@@ -461,12 +461,12 @@ class _PhotometricGradient(torch.autograd.Function):
         return weight * gradient
 
     @staticmethod
-    @once_differentiable
     def backward(ctx, *outputs: Tensor):
         image, weight = ctx.saved_tensors
         linear = ctx.loss.linearize(ctx.loss.padded(image))
         product = ctx.loss.cropped(linear.hvp(ctx.loss.padded(outputs[0])[None])[0])
-        return weight * product, (outputs[0] * ctx.gradient).sum(), None, None
+        values = (weight.detach() * product, (outputs[0].detach() * ctx.gradient).sum())
+        return *last_derivative(values, image, weight, outputs[0]), None, None
 
 
 def view_loss(image: Float[Tensor, "3 h w"], loss: ViewLoss) -> Float[Tensor, ""]:

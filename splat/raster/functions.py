@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from splat.camera import Camera
 from splat.gaussians import Gaussians
@@ -30,6 +29,25 @@ def _parts(splats: np.ndarray) -> tuple[Tensor, ...]:
 
 def _joined(parts: tuple[Tensor, ...]) -> np.ndarray:
     return torch.cat([part.detach().reshape(len(part), -1) for part in parts], dim=1).numpy()
+
+
+class _Last(torch.autograd.Function):
+    """The first `count` tensors, on the graph of them all, with a derivative that is an error."""
+
+    @staticmethod
+    def forward(ctx, count: int, *tensors: Tensor):
+        return tensors[:count]
+
+    @staticmethod
+    def backward(ctx, *outputs: Tensor):
+        raise NotImplementedError(
+            "expected at most two derivatives of the kernels, got a third; render with backend='reference' for more"
+        )
+
+
+def last_derivative(values: tuple[Tensor, ...], *sources: Tensor) -> tuple[Tensor, ...]:
+    """Second derivatives by a kernel: on the graph of what they came from, so that a third is refused, not taken for 0."""
+    return _Last.apply(len(values), *values, *sources)  # pyright: ignore[reportReturnType]
 
 
 class _Project(torch.autograd.Function):
@@ -64,7 +82,6 @@ class _ProjectAdjoint(torch.autograd.Function):
         return gradient
 
     @staticmethod
-    @once_differentiable
     def backward(ctx, *outputs: Tensor):
         (flat,) = ctx.saved_tensors
         sh_degree, lens, splats, drawn = ctx.held
@@ -73,7 +90,8 @@ class _ProjectAdjoint(torch.autograd.Function):
         direction = outputs[0].detach().numpy()[:, None]
         tangents, product = projection.jvp(direction), torch.zeros_like(flat)
         projection.pull(np.zeros_like(tangents), direction, product.numpy()[:, None])
-        return product, None, *_parts(tangents[:, 0])
+        product, *parts = last_derivative((product, *_parts(tangents[:, 0])), flat, *outputs)
+        return product, None, *parts
 
 
 class _Rasterize(torch.autograd.Function):
@@ -97,12 +115,12 @@ class _RasterizeAdjoint(torch.autograd.Function):
         return _parts(ctx.adjoint.gradient)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx, *outputs: Tensor):
         raster = ctx.raster
         tangent = raster.jvp(_joined(outputs)[:, None])
         product = tangent.curvature(ctx.adjoint, np.zeros_like(tangent.planes))
-        return None, torch.from_numpy(raster.crop(tangent.planes[0]).copy()), *_parts(product[:, 0])
+        values = (torch.from_numpy(raster.crop(tangent.planes[0]).copy()), *_parts(product[:, 0]))
+        return None, *last_derivative(values, *ctx.saved_tensors, *outputs)
 
 
 def project_by_kernel(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> Splats:

@@ -139,7 +139,7 @@ def test_the_diagonal_is_that_of_the_dense_hessian(size, settings):
     columns = [loss.cropped(product).reshape(-1) for product in held.hvp(np.stack(every))]
     dense = torch.stack(columns, dim=1)
     assert relative_error(dense, dense.T) < 1e-12
-    assert relative_error(loss.cropped(held.diagonal()).reshape(-1), dense.diagonal()) < 1e-12
+    assert relative_error(loss.cropped(held.diagonal).reshape(-1), dense.diagonal()) < 1e-12
 
 
 @each_loss
@@ -149,6 +149,17 @@ def test_autograd_reaches_the_kernels_twice(settings):
     loss = ViewLoss.of(target, settings, torch.float64)
     assert torch.autograd.gradcheck(lambda x: 100 * view_loss(x, loss), (image,))
     assert torch.autograd.gradgradcheck(lambda x: 100 * view_loss(x, loss), (image,))
+
+
+def test_a_third_derivative_by_the_kernels_is_refused():
+    image, target = image_and_target((9, 6))
+    x, loss = image.clone().requires_grad_(), ViewLoss.of(target, LossSettings(), torch.float64)
+    value = view_loss(x, loss)
+    for _ in range(2):
+        (gradient,) = torch.autograd.grad(value, x, create_graph=True)
+        value = (gradient**2).sum()
+    with pytest.raises(NotImplementedError, match="expected at most two derivatives of the kernels, got a third"):
+        torch.autograd.grad(value, x)
 
 
 def test_l1_has_no_slope_at_its_kink():
