@@ -1,0 +1,237 @@
+"""`landscape bench`: speed and memory of the kernels (`bench_kernels`) and of a scene's first and second order (`bench_scene`).
+
+OUT/kernels.csv   a line a stage and size: milliseconds, and over the prototype's where one was measured
+OUT/bench.csv     a line a time: what was timed (`stage`), why (`study`: stages, or what was scaled), on what, milliseconds
+OUT/bounds.csv    the ratios that the project promises, measured, with their bounds
+OUT/bench.png     the scaling, drawn by `figures.bench` from bench.csv
+
+Times are minima and medians of repetitions in turns (`timing`); ratios are of minima.  Products are per vector.
+"""
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from analysis import bench_kernels
+from analysis.bench_reference import ReferenceCost, reference_cost
+from analysis.bench_scene import OPERATIONS, VECTORS, ViewBench, per_vector, scaling
+from analysis.options import BenchOptions
+from analysis.peak import fma_peak
+from analysis.prototype import prototype_in
+from analysis.provenance import machine
+from analysis.timing import Timing, interleaved
+from analysis.workloads import Size, Workload, synthetic_workload, workload_of
+from figures import bench as figure
+from figures.style import save
+from splat.checkpoint import write_atomically
+from splat.raster.simd import lanes_of
+from splat.raster.threads import thread_count
+
+SIZES = ("10k@504x378", "100k@504x378")
+LARGEST = "500k@1600x1060"
+HEADINGS = {
+    "minimum_ms": "own",
+    "median_ms": "median",
+    "prototype_minimum_ms": "prototype",
+    "prototype_median_ms": "its median",
+    "ratio_of_minima": "ratio",
+    "ratio_of_medians": "of medians",
+}
+SCALING_SHARE = 3  # scaling is timed with this fraction of the repetitions
+
+
+def run_bench(options: BenchOptions) -> int:
+    """Measure, print tables, write them; returns the exit code."""
+    if options.repetitions < 1:
+        raise ValueError(f"expected at least 1 repetition, got {options.repetitions}")
+    if options.prototype is not None and options.subject != "kernels":
+        raise ValueError(
+            "expected --prototype with the kernels it is compared with: landscape bench kernels --prototype ..."
+        )
+    options.out.mkdir(parents=True, exist_ok=True)
+    console = Console()
+    about = machine(lanes_of(np.float32))
+    console.print(f"{about['cpu']}, {thread_count()} threads, {about['lanes']} lanes of float32", highlight=False)
+    if options.subject == "kernels":
+        _bench_kernels(options, console)
+    else:
+        _bench_scenes(options, console)
+    return 0
+
+
+# --- kernels ----------------------------------------------------------------------------------------------------------
+
+
+def _bench_kernels(options: BenchOptions, console: Console) -> None:
+    sizes = [Size.parse(text) for text in options.sizes or (*SIZES, LARGEST)]
+    rows: list[bench_kernels.Row] = []
+    with ExitStack() as stack:
+        prototype = stack.enter_context(prototype_in(options.prototype)) if options.prototype else None
+        progress = stack.enter_context(Progress(console=Console(stderr=True), transient=True))
+        for size in sizes:
+            bar = progress.add_task(f"{size} (first compiling)", total=options.repetitions)
+            measured = bench_kernels.measure(size, prototype, options.repetitions, lambda: progress.advance(bar))  # noqa: B023
+            rows += bench_kernels.with_totals(measured)
+            progress.remove_task(bar)
+    table, ratios = bench_kernels.table(rows), bench_kernels.products_over_gradients(rows)
+    for size in sizes:
+        shown = bench_kernels.table([row for row in rows if row.size == size])
+        shown = shown.drop(columns=["gaussians", "width", "height", "threads"]).rename(columns=HEADINGS)
+        console.print(_rich(shown, f"{size}: ms, per tangent"))
+    console.print(_rich(ratios, "products over gradients"))
+    _write(table, options.out / "kernels.csv", console)
+    _write(ratios, options.out / "kernel_bounds.csv", console)
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def _bench_scenes(options: BenchOptions, console: Console) -> None:
+    workloads = []
+    if options.subject is not None:
+        workloads = [workload_of(Path(options.subject), options.images, options.downscale)]
+    sizes = options.sizes or (() if workloads else SIZES)
+    workloads += [synthetic_workload(Size.parse(text)) for text in sizes]
+    peak = fma_peak()
+    times, bounds = [], []
+    for workload in workloads:
+        bench = ViewBench(workload)
+        console.print(
+            f"[bold]{workload.name}[/]: {len(workload.gaussians)} Gaussians, {bench.view.camera.width} x "
+            f"{bench.view.camera.height} px, {bench.linearized.touched} visible, {bench.linearized.entries} tile entries",
+            highlight=False,
+        )
+        measured = interleaved({**bench.stages(), **bench.wholes()}, options.repetitions)
+        lines = pd.DataFrame(_lines("stages", workload, bench, measured))
+        console.print(
+            _rich(lines.filter(["stage", "minimum_ms", "median_ms"]), "times of one view; ms, products per vector")
+        )
+        console.print(_arithmetic(bench, measured, peak))
+        cost = reference_cost(workload) if options.reference else None
+        held = _bounds(workload, bench, measured, cost)
+        console.print(_rich(held.drop(columns="scene"), "asked for"))
+        times.append(lines)
+        bounds.append(held)
+    times.append(pd.DataFrame(_scaling(workloads[0], max(1, options.repetitions // SCALING_SHARE))))
+    table = pd.concat(times, ignore_index=True)
+    _write(table, options.out / "bench.csv", console)
+    _write(pd.concat(bounds, ignore_index=True), options.out / "bounds.csv", console)
+    console.print(save(figure.draw(table), options.out / "bench.png"), soft_wrap=True, highlight=False)
+
+
+def _lines(
+    study: str, workload: Workload, bench: ViewBench | None, times: dict[str, Timing], value: int = 0
+) -> list[dict]:
+    """Lines of bench.csv; value: how much of what the study scales."""
+    camera = workload.views[0].camera
+    about = {
+        "study": study,
+        "scene": workload.name,
+        "gaussians": len(workload.gaussians),
+        "pixels": camera.width * camera.height,
+        "views": 1,
+        "threads": thread_count(),
+    }
+    if study in about:
+        about[study] = value
+    return [
+        {**about, "stage": name, "minimum_ms": 1e3 * time.minimum, "median_ms": 1e3 * time.median}
+        for name, time in per_vector(times).items()
+    ]
+
+
+def _scaling(workload: Workload, repetitions: int) -> list[dict]:
+    lines = []
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        bar = progress.add_task("scaling", total=None)
+        for study, value, times in scaling(workload, repetitions):
+            lines += _lines(study, workload, None, times, value)
+            progress.advance(bar)
+    return lines
+
+
+def _arithmetic(bench: ViewBench, times: dict[str, Timing], peak: float) -> Table:
+    """How many pairs a second the passes evaluate, and which share of the machine's peak their arithmetic is."""
+    pairs = bench.pairs
+    table = pd.DataFrame(
+        {
+            "pass": name,
+            "pairs_per_second_1e9": pairs / times[name].minimum / 1e9,
+            "share_of_peak": pairs * OPERATIONS[name] / times[name].minimum / peak,
+        }
+        for name in OPERATIONS
+    )
+    return _rich(table, f"{pairs / 1e6:.1f} million (pixel, Gaussian) pairs; peak {peak / 1e9:.0f} GFMA/s")
+
+
+def _bounds(
+    workload: Workload, bench: ViewBench, times: dict[str, Timing], reference: ReferenceCost | None
+) -> pd.DataFrame:
+    """What is asked for as ratios: of times, and of bytes over what the view's size allows."""
+    each, view = per_vector(times), bench.linearized
+    lines = [
+        _ratio(f"{stage} / {unit}", each[stage], each[unit], bound)
+        for stage, unit, bound in (
+            ("gradient", "rasterizer", 2.5),
+            ("H v 1", "gradient", 1.6),
+            ("H v 4", "gradient", 1.0),
+            ("block diagonal", "gradient", 3.0),
+            ("linearize", "gradient", 4.0),
+        )
+    ]
+    kept, allowed = bench.kept(), 1000 * view.touched + 200 * workload.pixels + 24 * view.entries
+    lines.append(_line(f"kept linearisation ({kept / 1e6:.1f} MB) / allowance", kept / allowed, 1.0))
+    workspaces = {K: bench.workspace(K) for K in VECTORS}
+    for K, used in workspaces.items():
+        allowed = K * (40 * view.entries + 28 * workload.pixels + 500 * view.touched)
+        lines.append(_line(f"workspace of K = {K} ({used / 1e6:.1f} MB) / allowance", used / allowed, 1.0))
+    if reference:
+        seconds, memory = times["H v 1"].minimum, kept + workspaces[1]
+        note = f"{reference.product:.1f} s, {reference.peak / 1e9:.1f} GB"
+        lines.append(
+            _line(f"reference's double backward ({note}) / H v 1, time", reference.product / seconds, 300, least=True)
+        )
+        lines.append(_line("the same, memory", reference.peak / memory, 50, least=True))
+    return pd.DataFrame({"scene": workload.name, **line} for line in lines)
+
+
+def _ratio(name: str, numerator: Timing, denominator: Timing, bound: float) -> dict:
+    return _line(name, numerator.minimum / denominator.minimum, bound) | {
+        "of_medians": numerator.median / denominator.median
+    }
+
+
+def _line(name: str, measured: float, bound: float, least: bool = False) -> dict:
+    holds = measured >= bound if least else measured <= bound
+    return {"what": name, "measured": measured, "asked": f"{'≥' if least else '≤'} {bound:g}", "holds": holds}
+
+
+# --- output -----------------------------------------------------------------------------------------------------------
+
+
+def _rich(table: pd.DataFrame, title: str) -> Table:
+    result = Table(title=title, title_justify="left")
+    for column in table:
+        numeric = pd.api.types.is_numeric_dtype(table[column]) and not pd.api.types.is_bool_dtype(table[column])
+        result.add_column(str(column).replace("_", " "), justify="right" if numeric else "left", overflow="fold")
+    for row in table.itertuples(index=False):
+        result.add_row(*map(_cell, row))
+    return result
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "[bold]no[/]"
+    if isinstance(value, float):
+        return "" if pd.isna(value) else f"{value:.1e}" if 0 < abs(value) < 1e-3 else f"{value:.4g}"
+    return str(value)
+
+
+def _write(table: pd.DataFrame, path: Path, console: Console) -> None:
+    write_atomically(path, table.to_csv(index=False).encode())
+    console.print(path, soft_wrap=True, highlight=False)

@@ -1,0 +1,67 @@
+"""Double backward through the torch reference renderer, for comparison: in a process of its own, whose memory is its own."""
+
+import multiprocessing
+import resource
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from analysis.workloads import Workload
+from splat.camera import Camera
+from splat.gaussians import Gaussians
+from splat.losses import LossSettings, photometric_loss
+from splat.render import render
+from splat.settings import RenderSettings
+
+
+@dataclass(frozen=True)
+class ReferenceCost:
+    """Seconds of a gradient, and of an H v with the graph it needs; peak: bytes that the latter added to the process's."""
+
+    gradient: float
+    product: float
+    peak: int
+
+
+def reference_cost(workload: Workload) -> ReferenceCost:
+    """One gradient and one H v of the first view, with as many threads as here."""
+    view = workload.views[0]
+    arrays = (workload.gaussians.flat.numpy(), view.image.numpy(), workload.background.numpy())
+    settings = (workload.gaussians.sh_degree, view.camera, workload.loss, workload.settings, torch.get_num_threads())
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(_measure, *arrays, *settings).result()
+
+
+def _measure(
+    flat: Any,
+    image: Any,
+    background: Any,
+    sh_degree: int,
+    camera: Camera,
+    loss: LossSettings,
+    settings: RenderSettings,
+    threads: int,
+) -> ReferenceCost:
+    torch.set_num_threads(threads)
+    theta, target = torch.from_numpy(flat).requires_grad_(), torch.from_numpy(image)
+
+    def gradient(create_graph: bool) -> torch.Tensor:
+        gaussians = Gaussians(theta, sh_degree)
+        rendered = render(gaussians, camera, torch.from_numpy(background), settings, backend="reference").image
+        return torch.autograd.grad(photometric_loss(rendered, target, loss), theta, create_graph=create_graph)[0]
+
+    before, start = _peak_bytes(), time.perf_counter()
+    torch.autograd.grad(gradient(create_graph=True), theta, torch.ones_like(theta))
+    peak, middle = _peak_bytes() - before, time.perf_counter()
+    gradient(create_graph=False)
+    return ReferenceCost(time.perf_counter() - middle, middle - start, peak)
+
+
+def _peak_bytes() -> int:
+    """Most memory that this process has held (Linux counts in KiB, macOS in bytes)."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
