@@ -65,9 +65,21 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """Measure the speed of the kernels."""
+    """Measure speed and memory: of the compositing kernels, or of first and second order on a scene."""
 
-    study: Positional[Literal["kernels"]]
-    """What to measure."""
+    subject: Positional[Literal["kernels"] | Path | None] = None
+    """kernels; or a scene's folder or a checkpoint. Default: a synthetic scene."""
+    out: Path = Path("runs/bench")
+    """Folder of the tables (CSV) and figures; files of an earlier run are replaced."""
+    repetitions: int = 15
+    """How often each thing is timed, in turns with what it is compared with."""
+    sizes: tuple[str, ...] = ()
+    """Synthetic sizes, GAUSSIANS@WIDTHxHEIGHT. Default: 10k@504x378 100k@504x378, and for kernels 500k@1600x1060."""
     prototype: Path | None = None
-    """Folder of a prototype of the kernels to measure beside them."""
+    """kernels only: folder of a prototype of the kernels to measure beside them. Its code is run."""
+    images: str | None = None
+    """Folder of images within the scene.  Default: images, else the largest images_K."""
+    downscale: float = 1.0
+    """Reduce the scene's images further by this factor."""
+    reference: FlagCreatePairsOff[bool] = False
+    """Compare with double backward through the torch reference renderer: minutes and gigabytes at full size."""
