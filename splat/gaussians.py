@@ -119,12 +119,19 @@ class Gaussians:
         return Gaussians.pack(chosen)
 
     def require_finite(self) -> None:
-        """Raise ValueError that names the attribute and the first Gaussian whose parameters are not finite."""
+        """Raise ValueError that names the attribute and the first Gaussian whose parameters are not finite.
+
+        A quaternion of length 0 has no direction and is refused too.
+        """
         for name, value in self.attributes.items():
-            bad = ~torch.isfinite(value.reshape(len(self), -1)).all(dim=1)
-            if bad.any():
-                first = int(bad.nonzero()[0])
-                raise ValueError(
-                    f"expected finite {name}, got {value[first].tolist()} at Gaussian {first} "
-                    f"({int(bad.sum())} of {len(self)} are not finite); remove them from the checkpoint"
-                )
+            self._require(torch.isfinite(value.reshape(len(self), -1)).all(dim=1), name, "finite")
+        self._require((self.quats != 0).any(dim=1), "quats", "non-zero")
+
+    def _require(self, good: Tensor, name: str, quality: str) -> None:
+        if good.all():
+            return
+        first = int((~good).nonzero()[0])
+        raise ValueError(
+            f"expected {quality} {name}, got {self.attributes[name][first].tolist()} at Gaussian {first} "
+            f"({int((~good).sum())} of {len(self)} are not {quality}); remove them from the checkpoint"
+        )

@@ -35,7 +35,7 @@ class LossSettings:
     def __post_init__(self) -> None:
         if self.pixel not in ("l1", "charbonnier", "l2"):
             raise ValueError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
-        if not 0 <= self.ssim_weight <= 1 or self.eps <= 0:
+        if not (0 <= self.ssim_weight <= 1 and self.eps > 0):
             raise ValueError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
 
     @property

@@ -42,9 +42,9 @@ class RenderSettings:
             raise ValueError(f"expected 0 <= alpha_min < alpha_max = {self.alpha_max}, got {self.alpha_min}")
         if not 0 <= self.transmittance_min < 1:
             raise ValueError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
-        if self.blur < 0 or self.near <= 0 or self.fov_clamp <= 0:
+        if not (self.blur >= 0 and self.near > 0 and self.fov_clamp > 0):  # so that nan is refused too
             raise ValueError(f"expected blur >= 0, near > 0, fov_clamp > 0, got {self}")
-        if self.contour_sigma is not None and self.contour_sigma <= 0:
+        if self.contour_sigma is not None and not self.contour_sigma > 0:
             raise ValueError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
 
 

@@ -176,6 +176,7 @@ def test_l1_has_no_slope_at_its_kink():
         ({"pixel": "l3"}, "expected the pixel loss 'l1', 'charbonnier' or 'l2', got 'l3'"),
         ({"ssim_weight": 1.5}, "expected 0 <= ssim_weight <= 1"),
         ({"eps": 0.0}, "eps > 0"),
+        ({"eps": float("nan")}, "eps > 0"),
     ],
 )
 def test_wrong_settings_are_refused(wrong, message):
