@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splat.losses import LossSettings, photometric_loss, psnr, ssim, ssim_map
+from splat.losses import LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map
 from splat.losses_cpu import ViewLoss, view_loss
 from tests.oracles import similarity_by_windows
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, random_like, relative_error
@@ -90,7 +90,11 @@ def test_the_photometric_loss_weighs_its_parts_as_written():
     image, target = image_and_target((20, 30))
     r = (image - target).numpy()
     structural = 1 - similarity_by_windows(image.numpy(), target.numpy()).mean()
-    pixel = {"l1": np.abs(r).mean(), "l2": (r**2).mean(), "charbonnier": np.sqrt(r**2 + 0.03**2).mean()}
+    pixel: dict[PixelLoss, float] = {
+        "l1": np.abs(r).mean(),
+        "l2": (r**2).mean(),
+        "charbonnier": np.sqrt(r**2 + 0.03**2).mean(),
+    }
     for kind, value in pixel.items():
         settings = LossSettings(kind, ssim_weight=0.3, eps=0.03)
         assert float(photometric_loss(image, target, settings)) == pytest.approx(
