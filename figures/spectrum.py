@@ -62,7 +62,7 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
 def _label_ends(axes: Axes, record: Record) -> None:
     ends = record.data["eigenvalues"]
     lines = [f"{name} {measured(ends[name]['value'], ends[name]['residual'])}" for name in ("max", "min")]
-    axes.set_title("\n".join([axes.get_title(loc="left"), ", ".join(lines)]), loc="left", linespacing=1.4)
+    axes.set_title("\n".join([axes.get_title(loc="left"), *lines]), loc="left", linespacing=1.4)
 
 
 def _draw_distribution(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> None:
