@@ -1,6 +1,7 @@
 """The `landscape` command: subcommands, and how errors become exit codes.
 
     0    done
+    1    a self-check failed under --strict
     2    bad input: one sentence on stderr that says what was expected, what came and what to do
     130  interrupted with Ctrl-C
 
@@ -53,7 +54,7 @@ def run(options: Options, arguments: Sequence[str]) -> int:
         case ProbeOptions():
             from analysis.probe import run_probe
 
-            return run_probe(options)
+            return run_probe(options, ["landscape", *arguments])
         case DemoOptions():
             from analysis.demo import run_demo
 

@@ -53,14 +53,24 @@ class ProbeOptions:
     """Folder of the results.  Default: probe, beside the checkpoint."""
     seed: int = 0
     """Of the probe vectors."""
+    strict: FlagCreatePairsOff[bool] = False
+    """Exit with 1 if a self-check fails; the record is written all the same."""
+    quick: FlagCreatePairsOff[bool] = False
+    """Rough numbers in about a third of the time."""
+    seconds: float = 75.0
+    """Time for the estimators together; what a stage did not reach in its share is said. inf: no limit."""
+    slice_points: int | None = None
+    """Points along each side of the slice, odd.  Default: 21, with --quick 11."""
+    slice_rise: float = 0.001
+    """Rise of the loss, as a share of it, that the slice's curvature units stand for; it reaches 3 units each way."""
 
 
 @dataclass(frozen=True)
 class DemoOptions:
     """Train and probe an embedded synthetic scene, and say which pictures to open."""
 
-    out: Path = Path("demo")
-    """Folder of the demo's run."""
+    out: Path = Path("runs/demo")
+    """Folder of the demo's scene and run.  Where it exists, the next free of OUT-2, OUT-3, ... is used."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,130 @@
+"""`landscape probe`: one checkpoint in, one record folder out (`analysis.records`), a table, and where to look.
+
+The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.
+"""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from analysis.drawing import draw
+from analysis.measurement import Findings, ProbeSettings, measure
+from analysis.options import ProbeOptions
+from analysis.probe_record import probe_arrays, probe_data
+from analysis.provenance import provenance
+from analysis.records import FILE, record_folder, require_replaceable, write_record
+from analysis.report import FILE as REPORT
+from analysis.report import write_report
+from analysis.stages import Stages
+from analysis.tables import probe_table
+from analysis.verdict import verdict
+from splat.checkpoint import Checkpoint, load_checkpoint
+from splat.curvature import SceneObjective
+from splat.raster.simd import lanes_of
+from splat.scenes.scene import Scene
+
+CHECK_FAILED = 1
+
+
+def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
+    """Probe the checkpoint; returns the exit code.  command: as typed, for the record."""
+    out = options.out or options.checkpoint.parent / "probe"
+    settings = _settings(options)
+    require_replaceable(out)
+    console, start = Console(stderr=True), perf_counter()
+    stages = Stages(console)
+    with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
+        checkpoint = load_checkpoint(options.checkpoint)
+        scene = checkpoint.load_scene(options.checkpoint, options.scene)
+        objective = scene_objective(checkpoint, scene)
+    console.print(_introduction(scene, checkpoint, objective), highlight=False)
+    with stages:
+        loss = checkpoint.training.config.loss
+        generator = torch.Generator().manual_seed(options.seed)
+        findings = measure(objective, loss, settings, generator, stages.stage)
+        data = probe_data(findings, objective, loss)
+        data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
+        with record_folder(out) as folder:
+            _write(folder, data, findings, stages, start)
+    _conclude(data, out)
+    failed = any(check["passed"] is False for check in data["checks"].values())
+    return CHECK_FAILED if options.strict and failed else 0
+
+
+def scene_objective(checkpoint: Checkpoint, scene: Scene) -> SceneObjective:
+    """The training's loss over its views, at the checkpoint."""
+    training = checkpoint.training
+    config = training.config
+    background = torch.tensor(config.background, dtype=training.gaussians.flat.dtype)
+    views = scene.load(checkpoint.scene.train)
+    return SceneObjective(training.gaussians, views, config.loss, background, config.render)
+
+
+def _settings(options: ProbeOptions) -> ProbeSettings:
+    settings = ProbeSettings.quick() if options.quick else ProbeSettings()
+    points = settings.slice_points if options.slice_points is None else options.slice_points
+    return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=options.seconds)
+
+
+def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjective) -> str:
+    counts, training = objective.counts, checkpoint.training
+    camera = objective.views[0].camera
+    return (
+        f"{scene.name} after {training.step} steps: {counts.views} views of {camera.width} x {camera.height} px, "
+        f"{counts.active_gaussians:,} of {counts.gaussians:,} Gaussians in sight, "
+        f"{counts.active_parameters:,} active parameters"
+    )
+
+
+def _provenance(
+    options: ProbeOptions, command: Sequence[str], settings: ProbeSettings, checkpoint: Checkpoint, scene: Scene
+) -> dict[str, Any]:
+    dtype = checkpoint.training.gaussians.flat.dtype
+    return provenance(
+        options.seed,
+        lanes=lanes_of(np.float32),
+        checkpoint=str(options.checkpoint),
+        scene=scene.name,
+        scene_folder=str(scene.root),
+        views=list(checkpoint.scene.train),
+        iteration=checkpoint.training.step,
+        dtype=str(dtype).removeprefix("torch."),
+        threads=torch.get_num_threads(),
+        command=shlex.join(command),
+        settings=asdict(settings),
+    )
+
+
+def _write(folder: Path, data: dict[str, Any], findings: Findings, stages: Stages, start: float) -> None:
+    """The record, its pictures and its page."""
+    data["timing"] = {"total": perf_counter() - start}
+    arrays = probe_arrays(findings)
+    write_record(folder, data, arrays)
+    with stages.stage("pictures"):
+        try:
+            data["notes"] += draw("make_all", folder)
+        except RuntimeError as error:  # the numbers stand without pictures
+            data["notes"].append(" ".join(str(error).split()))
+    # the pictures are drawn from the record; only now is it known how long they took
+    data["timing"] = {**stages.timing, "total": perf_counter() - start}
+    write_record(folder, data, arrays)
+    write_report(folder)
+
+
+def _conclude(data: dict[str, Any], out: Path) -> None:
+    """The table, what was not reached or failed, and the files to open."""
+    console = Console()
+    console.print(probe_table(data))
+    for line in verdict(data):
+        if line.level != "fact":
+            console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False)
+    pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
+    console.print(f"{data['timing']['total']:.1f} s; open {out / REPORT}", soft_wrap=True, highlight=False)
+    console.print(f"pictures: {pictures}; numbers: {FILE}, in {out}", soft_wrap=True, highlight=False)

@@ -1,0 +1,177 @@
+"""What a probe found as the `data` and `arrays` of a record (the keys are those of `analysis.records`)."""
+
+from collections.abc import Mapping
+from math import isnan, sqrt
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from analysis.measurement import Findings, PlaneSlice
+from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, literal
+from landscape.checks import ROUND_OFFS
+from splat.curvature import ActiveCounts, SceneObjective
+from splat.losses import LossSettings
+
+NAMES = ("e₁", "e₂")  # of the slice's directions
+
+
+def probe_data(findings: Findings, objective: SceneObjective, loss: LossSettings) -> dict[str, Any]:
+    """All scalars save timing and provenance."""
+    return {
+        "objective": {
+            "loss": loss_name(loss),
+            "operator": "hessian",
+            "value": findings.value,
+            "gradient_norm": findings.gradient_norm,
+        },
+        "traces": {name: _trace(trace) for name, trace in findings.traces.items()},
+        "eigenvalues": _eigenvalues(findings, objective.blocks),
+        "anisotropy": _anisotropy(findings),
+        "slice": None if findings.plane is None else _slice(findings.plane, findings.ends.largest),
+        "counts": {**_counts(objective.counts), **_work(findings, objective)},
+        "checks": _checks(findings),
+        "notes": list(findings.notes),
+    }
+
+
+def probe_arrays(findings: Findings) -> dict[str, dict[str, np.ndarray]]:
+    """The arrays, by file."""
+    arrays = {"traces": {name: trace.samples.numpy() for name, trace in findings.traces.items()}}
+    assert findings.ends.ritz is not None
+    values, residuals = findings.ends.ritz.numpy()
+    arrays["spectrum"] = {"ritz_values": values, "residuals": residuals}
+    if findings.density is not None:
+        arrays["spectrum"] |= {"nodes": findings.density.nodes.numpy(), "weights": findings.density.weights.numpy()}
+    if findings.plane is not None:
+        plane = findings.plane.slice
+        x, y = plane.coordinates
+        arrays["slice"] = {"x": x.numpy(), "y": y.numpy(), "loss": plane.loss.numpy()}
+        optional = {"model": plane.model, "crossed": plane.crossed}
+        arrays["slice"] |= {name: array.numpy() for name, array in optional.items() if array is not None}
+    return arrays
+
+
+def loss_name(loss: LossSettings) -> str:
+    """
+    >>> loss_name(LossSettings()), loss_name(LossSettings("charbonnier", 0.0, eps=0.001))
+    ('0.8 L1 + 0.2 (1 − SSIM)', 'Charbonnier (eps 0.001)')
+    """
+    pixel = {"l1": "L1", "l2": "L2", "charbonnier": f"Charbonnier (eps {loss.eps:g})"}[loss.pixel]
+    if loss.ssim_weight == 0:
+        return pixel
+    weighted = pixel if loss.pixel_weight == 1 else f"{loss.pixel_weight:g} {pixel}"
+    return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM)"
+
+
+def _trace(trace: TraceEstimate) -> dict[str, Any]:
+    sampled = trace.probes > 0
+    method = "exact, the coupling of pixels sampled with random signs" if sampled else "exact"
+    return {**trace.record(), "tau": sqrt(max(trace.value, 0.0) / trace.dim) if trace.dim else 0.0, "method": method}
+
+
+def _eigenvalues(findings: Findings, blocks: Mapping[str, slice]) -> dict[str, dict[str, Any]]:
+    ends, power = findings.ends, findings.power
+    return {
+        "max": _pair(ends, ends.largest, 0, blocks),
+        "second": _pair(ends, ends.largest, 1, blocks),
+        "min": _pair(ends, ends.smallest, 0, blocks),
+        "power_max": _pair(power, power.largest, 0, blocks),
+        "power_min": _pair(power, power.smallest, 0, blocks),
+    }
+
+
+def _pair(ends: EigenEnds, pairs: Eigenpairs, index: int, blocks: Mapping[str, slice]) -> dict[str, Any]:
+    shares = mass_shares(pairs.vectors[:, index], blocks)
+    return {**pairs.record(index), "matvecs": ends.matvecs, "method": ends.method, "shares": shares}
+
+
+def mass_shares(vector: Tensor, blocks: Mapping[str, slice]) -> dict[str, float]:
+    """The share of a vector's squared length that lies in each block.
+
+    >>> mass_shares(torch.tensor([3.0, 0.0, 4.0]), {"a": slice(0, 2), "b": slice(2, 3)})
+    {'a': 0.36, 'b': 0.64}
+    """
+    squares = vector.double().square()
+    return {name: float(squares[rows].sum() / squares.sum()) for name, rows in blocks.items()}
+
+
+def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
+    """The family from the Lanczos ends; the literal index is the paper's, from its power iteration."""
+    family: dict[str, Any] = anisotropy(findings.ends, findings.density).record()
+    certain, paper = literal(findings.ends), literal(findings.power)
+    note = "by power iteration, as the paper takes it; the bracket is that of Lanczos"
+    if paper.value is None or not certain.low <= paper.value <= certain.high:
+        note = "by power iteration, which did not arrive; the bracket is that of Lanczos"
+    if certain.note not in ("definite", "indefinite"):
+        note += f" ({certain.note})"
+    family["literal"] = {**certain.record(), "value": paper.record()["value"], "note": note}
+    left_out = {"value": None, "low": None, "high": None, "note": "needs the spectral density, which was left out"}
+    return {**family, **{name: left_out for name in ("share", "effective_rank") if name not in family}}
+
+
+def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> dict[str, Any]:
+    found = plane.slice
+    crossed = 0 if found.crossed is None else int(found.crossed.sum())
+    x, y = (float(axis.abs().max()) for axis in found.coordinates)
+    units = [reach / unit for reach, unit in zip((x, y), plane.units, strict=True)]
+    return {
+        "directions": [
+            {"name": name, "curvature": float(value), "residual": float(residual), "unit": unit}
+            for name, value, residual, unit in zip(NAMES, pairs.values, pairs.residuals, plane.units, strict=False)
+        ],
+        "loss_scale": plane.loss_scale,
+        "center_loss": found.center_loss,
+        "points": found.loss.numel(),
+        "crossed_points": crossed,
+        "evaluations": found.evaluations,
+        "note": f"±{units[0]:.3g} curvature units each way: ±{x:.3g} along e₁ and ±{y:.3g} along e₂, parameter units",
+    }
+
+
+def _counts(counts: ActiveCounts) -> dict[str, int]:
+    return {
+        "gaussians": counts.gaussians,
+        "visible_gaussians": counts.active_gaussians,
+        "skipped_gaussians": counts.gaussians - counts.active_gaussians,
+        "parameters": counts.parameters,
+        "active_parameters": counts.active_parameters,
+        "skipped_quaternion_lengths": counts.radial_quaternions,
+        "sh_degree_stored": counts.sh_degree,
+        "sh_degree_active": counts.active_sh_degree,
+        "views": counts.views,
+    }
+
+
+def _work(findings: Findings, objective: SceneObjective) -> dict[str, int]:
+    return {
+        "rank": findings.rank,
+        "views_kept_linearised": objective.memory_plan.kept,
+        "products": findings.matvecs,
+        "renders": 0 if findings.plane is None else findings.plane.slice.evaluations * objective.counts.views,
+    }
+
+
+def _checks(findings: Findings) -> dict[str, dict[str, Any]]:
+    operator, derivative = findings.operator_check, findings.gradient_check
+    bound = operator.tolerance
+    close = max(bound, ROUND_OFFS * torch.finfo(torch.float32).eps)  # differences are not much better in float64
+    steps = len(derivative.steps) + derivative.skipped
+    skipped = f"the order of the splats changed on {derivative.skipped} of {steps} steps"
+    ran = not isnan(derivative.error)
+    return {
+        "symmetry": _check(operator.symmetry, bound),
+        "round_off": _check(operator.noise, bound),
+        "finiteness": _check(0.0 if operator.finite else 1.0, 0.0),
+        "finite_difference": {
+            "value": derivative.error if ran else None,
+            "bound": close,
+            "passed": derivative.error <= close if ran else None,
+            "note": f"gradients {derivative.step:.0e} apart, {skipped}" if ran else skipped,
+        },
+    }
+
+
+def _check(value: float, bound: float) -> dict[str, Any]:
+    return {"value": value, "bound": bound, "passed": value <= bound}

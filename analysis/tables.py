@@ -1,0 +1,76 @@
+"""A record of a probe as one table for the terminal."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from analysis.quantities import measured, quantity
+from analysis.verdict import attribute_name
+
+ENDS = {
+    "max": "largest eigenvalue",
+    "second": "second largest",
+    "min": "smallest eigenvalue",
+    "power_max": "power iteration, max",
+    "power_min": "power iteration, min",
+}
+COUNTS = {
+    "Gaussians in sight": ("visible_gaussians", "gaussians"),
+    "active parameters": ("active_parameters", "parameters"),
+    "SH degree in use": ("sh_degree_active", "sh_degree_stored"),
+}
+NARROW = 0.1  # of the value
+OUTCOMES = {True: "[green]passed[/]", False: "[red]FAILED[/]", None: "[yellow]could not run[/]"}
+
+
+def probe_table(data: Mapping[str, Any]) -> Table:
+    """Traces, eigenvalues, anisotropy, counts and checks of a record's data."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("", no_wrap=True)
+    table.add_column("value ± error", justify="right", no_wrap=True)
+    table.add_column("τ", justify="right", no_wrap=True)
+    table.add_column("")
+    for name, trace in data["traces"].items():
+        value = measured(trace["value"], trace["standard_error"])
+        about = f"{trace['sign']}, dim {trace['dim']:,}, {trace['matvecs']} products{_reason(trace)}"
+        table.add_row(f"trace of {attribute_name(name)}", value, quantity(trace["tau"]), about)
+    table.add_section()
+    for name, end in data["eigenvalues"].items():
+        main, share = max(end["shares"].items(), key=lambda item: item[1])
+        about = f"{share:.0%} {attribute_name(main)}, {end['matvecs']} products{_reason(end)}"
+        table.add_row(ENDS[name], measured(end["value"], end["residual"]), "", about)
+    table.add_section()
+    for name, index in data["anisotropy"].items():
+        table.add_row(name.replace("_", " "), *_index(index))
+    table.add_section()
+    for name, (used, stored) in COUNTS.items():
+        table.add_row(name, f"{data['counts'][used]:,}", "", f"of {data['counts'][stored]:,}")
+    table.add_section()
+    for name, check in data["checks"].items():
+        about = f"{OUTCOMES[check['passed']]}, at most {quantity(check['bound'])}"
+        about += f" ({check['note']})" if check.get("note") else ""
+        table.add_row(f"check: {name.replace('_', ' ')}", quantity(check["value"]), "", about)
+    return table
+
+
+def _index(index: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Value, nothing, bracket and note; a narrow bracket is written as an error."""
+    value, low, high, note = (index[key] for key in ("value", "low", "high", "note"))
+    if low is None and high is None:
+        return quantity(value), "", note
+    if low is None or high is None:
+        bracket = " to ".join("unbounded" if end is None else quantity(end) for end in (low, high))
+    elif high - low < NARROW * abs(high + low) / 2:
+        if value is not None and low <= value <= high:
+            return measured(value, max(high - value, value - low)), "", note
+        bracket = measured((low + high) / 2, (high - low) / 2)
+    else:
+        bracket = f"{quantity(low)} to {quantity(high)}"
+    return quantity(value), "", f"{bracket} ({note})" if note else bracket
+
+
+def _reason(entry: Mapping[str, Any]) -> str:
+    """Why it stopped, where that was not because the error asked for was reached."""
+    return "" if entry["reason"] in ("tolerance", "exact") else f", {entry['reason']}"

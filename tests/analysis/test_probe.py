@@ -1,0 +1,335 @@
+"""Probing a checkpoint: the numbers against a dense Hessian, the record's layout, budgets, refusals, interruptions."""
+
+import json
+import math
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from analysis.cli import main
+from analysis.measurement import ProbeSettings
+from analysis.probe import scene_objective
+from analysis.records import Record, read_record
+from splat.adam import Adam
+from splat.checkpoint import load_checkpoint, save_checkpoint
+from splat.densify import ScreenGradients
+from splat.losses import photometric_loss
+from splat.render import render
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+
+ROOT = Path(__file__).parents[2]
+SCENE = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
+ATTRIBUTES = ["means", "log_scales", "quats", "opacity_logits", "sh"]
+UNLIMITED = ["--seconds", "inf", "--slice-points", "5"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run folder with its scene beside it; the checkpoint is in double precision."""
+    folder = tmp_path_factory.mktemp("probe")
+    write_transforms_scene(synthetic_scene(SCENE).scene, folder / "still")
+    out = folder / "run"
+    train = [
+        "train",
+        str(folder / "still"),
+        "--out",
+        str(out),
+        "--iterations",
+        "30",
+        "--no-densify",
+        "--sh-degree",
+        "1",
+    ]
+    assert main(train) == 0
+    loaded = load_checkpoint(out / "checkpoint.pt")
+    gaussians = loaded.training.gaussians.to(torch.float64)
+    state = Adam.zero(gaussians), ScreenGradients.zero(len(gaussians), torch.float64)
+    training = replace(loaded.training, gaussians=gaussians, adam=state[0], screen_gradients=state[1])
+    save_checkpoint(out / "double.pt", training, loaded.scene)
+    return out
+
+
+@pytest.fixture(scope="module")
+def record(run) -> Record:
+    assert main(["probe", str(run / "double.pt"), "--out", str(run / "recorded"), *UNLIMITED]) == 0
+    return read_record(run / "recorded")
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """For tests of the numbers alone."""
+    monkeypatch.setattr("analysis.probe.draw", lambda module, target: [])
+
+
+@pytest.fixture(scope="module")
+def dense(run):
+    """(objective, P H P, L, gradient): double backward through the reference renderer, on the quaternions' tangent spaces."""
+    path = run / "double.pt"
+    loaded = load_checkpoint(path)
+    objective = scene_objective(loaded, loaded.load_scene(path))
+    active, settings = objective.active, loaded.training.config.loss
+
+    def loss(flat):
+        images = (render(active.with_flat(flat), v.camera, backend="reference").image for v in objective.views)
+        losses = [photometric_loss(i, v.image.double(), settings) for i, v in zip(images, objective.views, strict=True)]
+        return torch.stack(losses).mean()
+
+    point = active.flat.clone().requires_grad_()
+    value = loss(point)
+    (gradient,) = torch.autograd.grad(value, point, create_graph=True)
+    (H,) = torch.autograd.grad(
+        gradient, point, torch.eye(len(point), dtype=torch.float64), retain_graph=True, is_grads_batched=True
+    )
+    gradient = gradient.detach()
+    for i, q in enumerate(active.quats):
+        rows = slice(active.blocks["quats"].start + 4 * i, active.blocks["quats"].start + 4 * i + 4)
+        H[rows] -= torch.outer(q, q @ H[rows])
+        H[:, rows] -= torch.outer(H[:, rows] @ q, q)
+    return objective, H, float(value.detach()), gradient
+
+
+def rounding(H) -> float:
+    """What the kernels' round-off may do to an entry: they agree with the reference to 1e-10 of the largest."""
+    return 1e-10 * float(H.abs().max()) * len(H)
+
+
+def test_traces_are_within_four_standard_errors_of_the_dense_hessian(record, dense):
+    objective, H, _, _ = dense
+    assert list(record.data["traces"]) == ATTRIBUTES
+    for name, trace in record.data["traces"].items():
+        rows = objective.blocks[name]
+        exact = float(H[rows, rows].trace())
+        assert abs(trace["value"] - exact) <= 4 * trace["standard_error"] + rounding(H), name
+        size = float(H[rows, rows].diagonal().abs().sum())
+        assert trace["standard_error"] < 0.1 * size, name  # so that the line above says something
+        each = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 3 * objective.active.sh.shape[1]}
+        assert trace["dim"] == len(objective.active) * each[name]
+        assert trace["tau"] == math.sqrt(max(trace["value"], 0) / trace["dim"])
+        assert record.arrays["traces"][name].mean() == pytest.approx(trace["value"], rel=1e-12)
+
+
+def test_eigenvalues_are_those_of_the_dense_hessian_within_their_residuals(record, dense):
+    _, H, _, _ = dense
+    true = torch.linalg.eigvalsh((H + H.T) / 2)
+    for name, index in (("max", -1), ("second", -2), ("min", 0)):
+        end = record.data["eigenvalues"][name]
+        assert abs(end["value"] - float(true[index])) <= end["residual"] + rounding(H), name
+        assert end["residual"] <= 1e-3 * abs(end["value"]) and end["reason"] == "tolerance"
+        assert sum(end["shares"].values()) == pytest.approx(1) and list(end["shares"]) == ATTRIBUTES
+    saddle = record.data["anisotropy"]["saddle"]
+    assert saddle["low"] <= float(-true[-1] / true[0]) <= saddle["high"]
+    share = record.data["anisotropy"]["share"]
+    assert share["low"] <= float(true[-1] / true.abs().sum()) <= share["high"]
+
+
+def test_the_literal_index_is_the_papers_power_iteration_beside_the_certain_bracket(record, dense):
+    _, H, _, _ = dense
+    ends, literal = record.data["eigenvalues"], record.data["anisotropy"]["literal"]
+    assert literal["value"] == ends["power_max"]["value"] / ends["power_min"]["value"]
+    true = torch.linalg.eigvalsh((H + H.T) / 2)
+    assert literal["low"] <= float(true[-1] / true[0]) <= literal["high"]
+    assert ("did not arrive" in literal["note"]) == (not literal["low"] <= literal["value"] <= literal["high"])
+
+
+def test_the_slice_is_made_of_true_losses_along_the_two_steepest_directions(record, dense):
+    objective, H, value, _ = dense
+    about, arrays = record.data["slice"], record.arrays["slice"]
+    assert arrays["loss"].shape == arrays["model"].shape == arrays["crossed"].shape == (5, 5)
+    assert about["center_loss"] == pytest.approx(value, rel=1e-12)
+    assert arrays["loss"][2, 2] == about["center_loss"] == arrays["model"][2, 2] and not arrays["crossed"][2, 2]
+    values, vectors = torch.linalg.eigh((H + H.T) / 2)
+    for axis, (name, index) in enumerate((("x", -1), ("y", -2))):
+        unit = math.sqrt(2 * about["loss_scale"] / float(values[index]))
+        assert about["directions"][axis]["unit"] == pytest.approx(unit, rel=1e-4)
+        assert arrays[name] == pytest.approx(np.linspace(-3, 3, 5) * unit, rel=1e-4)
+    assert about["loss_scale"] == pytest.approx(1e-3 * value)
+    # a vector is known up to its sign and its error: the losses on the axis are those along the dense one
+    for sign in (1, -1):
+        along = [objective.loss(objective.active.flat + sign * x * vectors[:, -1]) for x in arrays["x"]]
+        if along == pytest.approx(arrays["loss"][:, 2].tolist(), rel=1e-4):
+            break
+    else:
+        pytest.fail(f"{along} are not {arrays['loss'][:, 2]}")
+
+
+def test_the_record_has_the_layout_and_says_what_was_skipped_and_from_where_it_comes(record, dense, run):
+    objective, H, value, gradient = dense
+    data = record.data
+    for key in ("traces", "eigenvalues", "anisotropy", "counts", "checks", "timing", "provenance"):
+        assert data[key], key
+    assert {"max", "min"} <= set(data["eigenvalues"]) and {"literal", "saddle"} <= set(data["anisotropy"])
+    counts, loaded = data["counts"], load_checkpoint(run / "double.pt")
+    assert counts["gaussians"] == len(loaded.training.gaussians) and counts["views"] == 3
+    assert counts["visible_gaussians"] == counts["gaussians"] - counts["skipped_gaussians"] == len(objective.active)
+    assert counts["active_parameters"] == len(H) - len(objective.active) and counts["rank"] <= len(H)
+    assert all(check["passed"] for check in data["checks"].values())
+    assert set(data["checks"]) == {"symmetry", "round_off", "finiteness", "finite_difference"}
+    assert data["objective"]["value"] == pytest.approx(value, rel=1e-12)
+    assert data["objective"]["gradient_norm"] == pytest.approx(float(gradient.norm()), rel=1e-9)
+    stages = ["load", "linearise", "checks", "traces", "eigenvalues", "power iteration", "density", "slice", "pictures"]
+    assert list(data["timing"]) == [*stages, "total"]
+    assert sum(data["timing"][stage] for stage in stages) <= data["timing"]["total"]
+    provenance = data["provenance"]
+    assert (provenance["seed"], provenance["iteration"], provenance["dtype"]) == (0, 30, "float64")
+    assert provenance["scene_folder"] == str(run.parent / "still") and provenance["command"].startswith(
+        "landscape probe"
+    )
+    assert record.arrays["spectrum"]["ritz_values"][-1] == pytest.approx(data["eigenvalues"]["max"]["value"], rel=1e-9)
+    files = ["slice2d.png", "spectrum.png", "surface.png", "traces.png", "report.html", "probe.json"]
+    assert all((record.folder / file).stat().st_size > 5000 for file in files)
+
+
+def numbers(record: Record) -> tuple[dict, dict]:
+    """All that may not differ between two runs."""
+    data = {key: value for key, value in record.data.items() if key not in ("timing", "provenance")}
+    return data, {group: {k: v.tolist() for k, v in arrays.items()} for group, arrays in record.arrays.items()}
+
+
+def test_the_same_seed_gives_the_same_numbers_and_another_seed_does_not(run, record, no_pictures):
+    for seed, same in ((0, True), (1, False)):
+        out = run / f"seed{seed}"
+        assert main(["probe", str(run / "double.pt"), "--out", str(out), "--seed", str(seed), *UNLIMITED]) == 0
+        assert (numbers(read_record(out)) == numbers(record)) == same
+
+
+def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_pictures, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "140")
+    assert main(["probe", str(run / "checkpoint.pt"), "--quick"]) == 0
+    said = capsys.readouterr()
+    data = read_record(run / "probe").data
+    assert data["provenance"]["dtype"] == "float32" and data["slice"]["points"] == 121
+    for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
+        assert f"trace of {label}" in said.out
+    for label in ("largest eigenvalue", "smallest eigenvalue", "literal", "saddle", "check: symmetry"):
+        assert label in said.out
+    assert str(run / "probe" / "report.html") in said.out and "probe.json" in said.out
+    for stage in ("traces", "eigenvalues", "slice"):
+        assert stage in said.err
+
+
+def test_a_budget_that_ends_is_said_and_what_was_reached_is_recorded(run, tmp_path, capsys, no_pictures):
+    out = tmp_path / "short"
+    assert main(["probe", str(run / "checkpoint.pt"), "--out", str(out), "--seconds", "1e-6"]) == 0
+    data = read_record(out).data
+    assert data["eigenvalues"]["max"]["reason"] == "time budget"
+    assert data["slice"]["points"] == 25 and "5 x 5 points instead of 21 x 21" in " ".join(data["notes"])
+    assert data["anisotropy"]["share"]["value"] is None
+    assert any("density was left out" in note for note in data["notes"])
+    assert "density was left out" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_path, no_pictures, monkeypatch, capsys):
+    monkeypatch.setattr("splat.curvature.SceneHessian.apply", skewed(run))
+    quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
+    assert main([*quick, str(tmp_path / "lenient")]) == 0
+    assert main([*quick, str(tmp_path / "strict"), "--strict"]) == 1
+    for name in ("lenient", "strict"):
+        checks = read_record(tmp_path / name).data["checks"]
+        assert checks["symmetry"]["passed"] is False and checks["finite_difference"]["passed"] is False
+    assert "The check of symmetry failed" in " ".join(capsys.readouterr().out.split())
+
+
+def skewed(run):
+    """SceneHessian.apply with a hundredth of the result moved to the next row."""
+    from splat.curvature import SceneHessian
+
+    original = SceneHessian.apply
+
+    def apply(self, V):
+        product = original(self, V)
+        return product + 0.01 * product.roll(1, dims=0)
+
+    return apply
+
+
+def refused(capsys, arguments: list[str], *expected: str) -> None:
+    assert main(["probe", *arguments]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("landscape: ") and "Traceback" not in said.err and said.out == ""
+    message = said.err.strip()
+    assert message.count("\n") == 0, message
+    for part in expected:
+        assert part in message, message
+
+
+def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(run.parent / "still", tmp_path / "scene")
+    copy.mkdir()
+    path = copy / "checkpoint.pt"
+    refused(capsys, [str(path)], "expected a checkpoint", "found no such file")
+    path.write_bytes(b"not a checkpoint")
+    refused(capsys, [str(path)], "not one or is damaged")
+    shutil.copy(run / "checkpoint.pt", path)
+    refused(capsys, [str(path), "--scene", str(tmp_path / "nowhere")], "does not exist")
+    refused(capsys, [str(path), "--slice-points", "4"], "odd number")
+    refused(capsys, [str(path), "--seconds", "0"], "seconds")
+    (copy / "probe").mkdir()
+    (copy / "probe" / "thesis.txt").write_text("years of work")
+    refused(capsys, [str(path), "--scene", str(tmp_path / "scene")], "older record to replace", "move it away")
+    assert sorted(p.name for p in copy.rglob("*")) == ["checkpoint.pt", "probe", "thesis.txt"]
+
+
+def test_a_scene_that_has_moved_is_named_with_the_option_and_found_there(run, tmp_path, capsys, no_pictures):
+    still, away = run.parent / "still", tmp_path / "away"
+    still.rename(away)
+    try:
+        refused(capsys, [str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe")], "--scene")
+        options = ["--scene", str(away), "--out", str(tmp_path / "probe"), "--quick"]
+        assert main(["probe", str(run / "checkpoint.pt"), *options]) == 0
+    finally:
+        away.rename(still)
+    assert read_record(tmp_path / "probe").data["provenance"]["scene_folder"] == str(away)
+
+
+def test_a_probe_that_is_killed_leaves_the_old_record_whole(run, record, tmp_path):
+    out = tmp_path / "kept"
+    shutil.copytree(record.folder, out)
+    before = (out / "probe.json").read_bytes()
+    command = ["probe", str(run / "checkpoint.pt"), "--out", str(out), "--quick"]
+    process = subprocess.Popen([sys.executable, "-m", "analysis.cli", *command], cwd=ROOT, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 100
+    while not list(tmp_path.glob(".kept.partial-*/probe.json")):  # it is writing the new one
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.002)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert (out / "probe.json").read_bytes() == before and read_record(out).data["provenance"]["dtype"] == "float64"
+
+
+def test_an_interrupted_probe_writes_nothing(run, tmp_path, monkeypatch):
+    def interrupt(module, target):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("analysis.probe.draw", interrupt)
+    assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
+    def fail(module, target):
+        raise RuntimeError("drawing failed: no fonts")
+
+    monkeypatch.setattr("analysis.probe.draw", fail)
+    assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 0
+    assert "drawing failed: no fonts" in read_record(tmp_path / "probe").data["notes"]
+    assert "drawing failed: no fonts" in (tmp_path / "probe" / "report.html").read_text()
+
+
+def test_settings_out_of_range_are_refused():
+    for wrong in ({"slice_points": 3}, {"slice_points": 6}, {"slice_rise": 0.0}, {"seconds": 0.0}, {"memory": -1.0}):
+        with pytest.raises(ValueError, match="expected"):
+            replace(ProbeSettings(), **wrong)
+
+
+def test_the_record_is_strict_json(record):
+    json.loads((record.folder / "probe.json").read_text(), parse_constant=lambda name: pytest.fail(name))
