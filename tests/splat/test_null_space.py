@@ -42,7 +42,9 @@ def test_the_rank_is_that_of_the_stacked_jacobians_and_within_its_bound(views: i
         stacked = torch.cat(
             [torch.from_numpy(view._projection.jvp(unit.numpy())[i].T) for view in objective.linearized]
         )
-        total += int(torch.linalg.matrix_rank(stacked / stacked.norm(dim=1, keepdim=True).clamp_min(1e-300), rtol=1e-11))
+        total += int(
+            torch.linalg.matrix_rank(stacked / stacked.norm(dim=1, keepdim=True).clamp_min(1e-300), rtol=1e-11)
+        )
     assert operator.rank == total
     assert operator.rank <= n * min(9 * views, 10 + 3 * min(views, k))
 
