@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from rich import box
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -20,14 +21,13 @@ from rich.table import Table
 from analysis import bench_kernels
 from analysis.bench_reference import ReferenceCost, reference_cost
 from analysis.bench_scene import OPERATIONS, VECTORS, ViewBench, per_vector, scaling
+from analysis.drawing import draw
 from analysis.options import BenchOptions
 from analysis.peak import fma_peak
 from analysis.prototype import prototype_in
 from analysis.provenance import machine
 from analysis.timing import Timing, interleaved
 from analysis.workloads import Size, Workload, synthetic_workload, workload_of
-from figures import bench as figure
-from figures.style import save
 from splat.checkpoint import write_atomically
 from splat.raster.simd import lanes_of
 from splat.raster.threads import thread_count
@@ -38,7 +38,7 @@ HEADINGS = {
     "minimum_ms": "own",
     "median_ms": "median",
     "prototype_minimum_ms": "prototype",
-    "prototype_median_ms": "its median",
+    "prototype_median_ms": "median ",
     "ratio_of_minima": "ratio",
     "ratio_of_medians": "of medians",
 }
@@ -121,7 +121,8 @@ def _bench_scenes(options: BenchOptions, console: Console) -> None:
     table = pd.concat(times, ignore_index=True)
     _write(table, options.out / "bench.csv", console)
     _write(pd.concat(bounds, ignore_index=True), options.out / "bounds.csv", console)
-    console.print(save(figure.draw(table), options.out / "bench.png"), soft_wrap=True, highlight=False)
+    draw("bench", options.out / "bench.csv")
+    console.print(str(options.out / "bench.png"), soft_wrap=True, highlight=False)
 
 
 def _lines(
@@ -215,10 +216,12 @@ def _line(name: str, measured: float, bound: float, least: bool = False) -> dict
 
 
 def _rich(table: pd.DataFrame, title: str) -> Table:
-    result = Table(title=title, title_justify="left")
-    for column in table:
+    """The table for a terminal 80 characters wide: the first column keeps its line, the others' headings wrap."""
+    result = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for place, column in enumerate(table):
         numeric = pd.api.types.is_numeric_dtype(table[column]) and not pd.api.types.is_bool_dtype(table[column])
-        result.add_column(str(column).replace("_", " "), justify="right" if numeric else "left", overflow="fold")
+        heading = str(column).replace("_", " ")
+        result.add_column(heading, justify="right" if numeric else "left", no_wrap=place == 0)
     for row in table.itertuples(index=False):
         result.add_row(*map(_cell, row))
     return result
@@ -228,7 +231,7 @@ def _cell(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "[bold]no[/]"
     if isinstance(value, float):
-        return "" if pd.isna(value) else f"{value:.1e}" if 0 < abs(value) < 1e-3 else f"{value:.4g}"
+        return "" if pd.isna(value) else f"{value:.0e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}"
     return str(value)
 
 

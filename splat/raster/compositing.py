@@ -19,7 +19,7 @@ d = p - mean, conic (a, b, c), opacity o, colour c:
 
 `curvature`   (the tangent of `backward`) given q', c' and g' = dg.  With tau = T' / T, r, w, beta, R as above:
               tau <- tau + beta q';  nu = q' + tau;  h = nu g + g';  z = w (h . c + g . c')
-              s' = z - beta R' - beta r R q', 0 where the cap holds;  R' <- R' + z;  moments of s' and G' = sum w h.
+              s' = z - beta (R' + r R q'), 0 where the cap holds;  R' <- R' + z;  moments of s' and G' = sum w h.
 
 A dash marks a tangent.  K tangents share the primal quantities of a splat's rows, which stay in L1 between them; for
 K = 1 the two loops are one.  Every entry (a splat in a tile) writes its nine sums to its own slot, splat-major, so that no
@@ -505,7 +505,7 @@ def curvature(counter, params, tangents, lists, frame, pixels, cotangent, transm
     K = transmittances.size // frame.size
     width = (6 + 5 * K) * L
     state = scratch(params, width * TILE_ROWS)  # a row: T, R, g (3), stop, for each tangent tau, R', g' (3)
-    shared = scratch(params, 4 * L * TILE_ROWS)  # a row: w, beta, beta r R, 1 where the cap does not hold
+    shared = scratch(params, 4 * L * TILE_ROWS)  # a row: w, beta, r R, 1 where the cap does not hold
     tile = next_tile(counter, lists)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
@@ -542,7 +542,7 @@ def begin_curvature_row(state, b, L, frame, pixels, cotangent, transmittances, c
 
 
 @formula
-def curvature_row(state, b, L, w, beta, betarR, dq, g, colour, dcolour):
+def curvature_row(state, b, L, w, beta, rR, dq, g, colour, dcolour):
     """s' and h of a row, and the update of tau and R'."""
     dR = load(state, b + L)
     tau = load(state, b) + beta * dq
@@ -550,18 +550,18 @@ def curvature_row(state, b, L, w, beta, betarR, dq, g, colour, dcolour):
     z = w * dot_plus(h, colour, dot(g, dcolour))
     store(state, b, tau)
     store(state, b + L, dR + z)
-    return (z - beta * dR) - betarR * dq, h
+    return z - beta * (rR * dq + dR), h
 
 
 @formula
 def backward_row(state, b, L, alpha, g, colour):
-    """Restore T and advance R; w, beta and beta r R of a row."""
+    """Restore T and advance R; w, beta and r R of a row."""
     r = 1.0 / (1.0 - alpha)
     T, R = load(state, b) * r, load(state, b + L)
     w, beta = alpha * T, alpha * r
     store(state, b, T)
     store(state, b + L, R + w * dot(g, colour))
-    return w, beta, beta * r * R
+    return w, beta, r * R
 
 
 @formula
@@ -582,11 +582,11 @@ def curvature_entry_single(params, tangents, lists, e, k, x0, y0, frame, state, 
         dy = dy0 + load(frame.row_offsets, L * y)
         alpha, uncapped = alpha_row(dy, terms, index < load(state, b + 5 * L), frame.cap)
         g = load3(state, b + 2 * L, L)
-        w, beta, betarR = backward_row(state, b, L, alpha, g, colour)
+        w, beta, rR = backward_row(state, b, L, alpha, g, colour)
         dq = quadratic(dy, dterms)
         if capped:
             dq = select(uncapped <= frame.cap, dq, 0.0)
-        ds, h = curvature_row(state, b + 6 * L, L, w, beta, betarR, dq, g, colour, dcolour)
+        ds, h = curvature_row(state, b + 6 * L, L, w, beta, rR, dq, g, colour, dcolour)
         if capped:
             ds = select(uncapped <= frame.cap, ds, 0.0)
         moments = add_row(moments, dy, ds, w, h)
@@ -621,12 +621,12 @@ def curvature_entry_block(params, tangents, K, lists, e, k, x0, y0, frame, state
         for y in range(top, bottom):
             b, x = width * y, 4 * L * y
             dy = dy0 + load(frame.row_offsets, L * y)
-            w, beta, betarR = load3(shared, x, L)
+            w, beta, rR = load3(shared, x, L)
             g = load3(state, b + 2 * L, L)
             dq = quadratic(dy, dterms)
             if capped:
                 dq *= load(shared, x + 3 * L)
-            ds, h = curvature_row(state, b + (6 + 5 * i) * L, L, w, beta, betarR, dq, g, colour, dcolour)
+            ds, h = curvature_row(state, b + (6 + 5 * i) * L, L, w, beta, rR, dq, g, colour, dcolour)
             if capped:
                 ds *= load(shared, x + 3 * L)
             moments = add_row(moments, dy, ds, w, h)
