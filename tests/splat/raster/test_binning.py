@@ -76,20 +76,17 @@ def test_tiles_are_handed_out_once_each():
     assert sorted(raster.lists.order) == list(range(raster.lists.start.size - 1))
 
 
-def test_slots_number_the_reached_entries_splat_by_splat():
+def test_entries_that_no_pixel_reaches_are_dropped_and_the_others_numbered_splat_by_splat():
     raster = truth("walled").raster(DTYPES[0])
-    start, lists = raster.slot_start, raster.lists
-    stops = (
-        raster.pixels.stop.reshape(-1, TILE_ROWS, raster.frame.columns, lanes_of(np.float32))
-        .max(axis=(1, 3))
-        .reshape(-1)
-    )
-    slots, of_splat = [], []
+    before, columns = raster.lists, raster.frame.columns
+    stops = raster.pixels.stop.reshape(-1, TILE_ROWS, columns, lanes_of(np.float32)).max(axis=(1, 3)).reshape(-1)
+    start, after = raster.slot_start, raster.lists
+    assert after.splat.size < before.splat.size
     for tile, stop in enumerate(stops):
-        first, last = lists.start[tile], lists.start[tile + 1]
-        entries = slice(first, min(last, first + int(min(stop, last - first))))
-        slots += lists.slots[entries].tolist()
-        of_splat += lists.splat[entries].tolist()
-    assert len(slots) < lists.splat.size  # some are never reached
-    assert sorted(slots) == list(range(start[-1]))
-    assert all(start[i] <= slot < start[i + 1] for i, slot in zip(of_splat, slots, strict=True))
+        all_of_it = slice(before.start[tile], before.start[tile + 1])
+        kept = slice(after.start[tile], after.start[tile + 1])
+        reached = int(min(stop, all_of_it.stop - all_of_it.start))
+        assert after.splat[kept].tolist() == before.splat[all_of_it][:reached].tolist()
+        assert after.rows[kept].tolist() == before.rows[all_of_it][:reached].tolist()
+    assert sorted(after.slots) == list(range(after.splat.size)) and start[-1] == after.splat.size
+    assert ((start[after.splat] <= after.slots) & (after.slots < start[after.splat + 1])).all()

@@ -155,14 +155,14 @@ def test_the_counter_hands_out_every_number_once():
 
 
 OTHERS = [bits for bits in BITS if bits != str(simd.REGISTER_BITS)]
-KERNEL = "test_compositing.py::test_the_gradient_is_that_of_the_specification[opaque-float64]"
+KERNEL = "test_compositing.py::test_colour_and_alpha_are_those_of_the_specification[opaque-float64]"
 
 
 @pytest.mark.skipif("LANDSCAPE_VECTOR_BITS" in os.environ, reason="this is such a process")
 @pytest.mark.parametrize("bits", OTHERS)
 def test_the_same_holds_at_another_width(bits):
     files = [__file__]
-    if bits == OTHERS[0]:  # the kernels compile for twenty seconds
+    if bits == OTHERS[0]:  # the kernels take a while to compile
         files.append(str(Path(__file__).parent / KERNEL))
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *files]
     done = subprocess.run(command, env={**os.environ, "LANDSCAPE_VECTOR_BITS": bits}, capture_output=True, text=True)
