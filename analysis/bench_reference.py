@@ -6,6 +6,7 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -55,13 +56,19 @@ def _measure(
         rendered = render(gaussians, camera, torch.from_numpy(background), settings, backend="reference").image
         return torch.autograd.grad(photometric_loss(rendered, target, loss), theta, create_graph=create_graph)[0]
 
-    before, start = _peak_bytes(), time.perf_counter()
+    before, start = _memory()[0], time.perf_counter()
     torch.autograd.grad(gradient(create_graph=True), theta, torch.ones_like(theta))
-    peak, middle = _peak_bytes() - before, time.perf_counter()
+    peak, middle = _memory()[1] - before, time.perf_counter()
     gradient(create_graph=False)
     return ReferenceCost(time.perf_counter() - middle, middle - start, peak)
 
 
-def _peak_bytes() -> int:
-    """Most memory that this process has held (Linux counts in KiB, macOS in bytes)."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+def _memory() -> tuple[int, int]:
+    """Bytes of memory that this process holds, and the most it has held; where only the latter is known, twice that."""
+    status = Path("/proc/self/status")
+    if status.is_file():  # Linux, where getrusage counts what the parent held before the start too
+        fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
+        now, most = (1024 * int(fields[name].split()[0]) for name in ("VmRSS", "VmHWM"))
+        return now, most
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return most, most

@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from analysis.bench import run_bench
 from analysis.bench_kernels import own_stages
+from analysis.bench_reference import reference_cost
 from analysis.bench_scene import SCALED, ViewBench
 from analysis.cli import main
 from analysis.options import BenchOptions
@@ -125,6 +126,12 @@ def test_memory_is_that_of_the_arrays(bench):
     for K in (1, 8):  # the sums of the entries, the planes of the tangents
         least = 4 * K * (SUMS * view.entries + 5 * view._raster.frame.size)
         assert least <= bench.workspace(K) < 4 * least
+
+
+def test_the_reference_is_measured_in_a_process_of_its_own():
+    cost = reference_cost(synthetic_workload(TINY))
+    # the tiles' alphas alone: each of 60 Gaussians touches a tile of 16 x 16 pixels at least
+    assert cost.gradient > 0 and cost.product > 0 and cost.peak > 4 * 60 * 16 * 16
 
 
 def test_thinning_and_resizing_give_workloads_of_that_size():
