@@ -35,7 +35,6 @@ import numpy as np
 from numba import njit
 
 from splat.raster.simd import (
-    CACHE,
     any_lane,
     broadcast,
     exp2,
@@ -103,8 +102,8 @@ class Pixels(NamedTuple):
     stop: np.ndarray
 
 
-kernel = njit(cache=CACHE, nogil=True, error_model="numpy", boundscheck=False)
-formula = njit(cache=CACHE, forceinline=True, error_model="numpy", boundscheck=False)
+kernel = njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+formula = njit(cache=True, forceinline=True, error_model="numpy", boundscheck=False)
 
 
 # --- formulas that the kernels share ----------------------------------------------------------------------------------

@@ -34,6 +34,8 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import lower_builtin, lower_cast, models, register_model
 
+from splat.raster.kernel_cache import keep_kernels
+
 
 def intrinsic(definition: Callable) -> Callable[..., Any]:
     """Numba's `intrinsic`, typed as what kernels see of it: a function without the leading typing context."""
@@ -53,8 +55,7 @@ def _register_bits() -> int:
 
 
 REGISTER_BITS = _register_bits()
-# Compiled kernels are kept on disk under the machine's name and features, which say nothing of a width chosen by hand.
-CACHE = "LANDSCAPE_VECTOR_BITS" not in os.environ
+keep_kernels(REGISTER_BITS)
 I32, I64 = ir.IntType(32), ir.IntType(64)
 
 

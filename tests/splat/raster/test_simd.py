@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from splat.raster import simd
+from splat.raster import kernel_cache, simd
 from splat.raster.simd import (
     any_lane,
     broadcast,
@@ -173,3 +173,17 @@ def test_a_width_that_does_not_exist_is_refused():
     command = [sys.executable, "-c", "import splat.raster.simd"]
     done = subprocess.run(command, env={**os.environ, "LANDSCAPE_VECTOR_BITS": "100"}, capture_output=True, text=True)
     assert done.returncode != 0 and "expected LANDSCAPE_VECTOR_BITS to be 128, 256 or 512, got '100'" in done.stderr
+
+
+def test_a_changed_source_or_width_gets_kernels_of_its_own(tmp_path, monkeypatch) -> None:
+    for name in ("kernels.py", "formulas.py"):
+        (tmp_path / name).write_text("x = 1\n")
+    monkeypatch.setattr(kernel_cache, "PACKAGE", tmp_path)
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    before = kernel_cache.kernel_folder(256)
+    assert kernel_cache.kernel_folder(256) == before != kernel_cache.kernel_folder(512)
+    (tmp_path / "formulas.py").write_text("x = 2\n")
+    assert kernel_cache.kernel_folder(256) != before
+    assert before.is_relative_to(tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "elsewhere"))
+    assert kernel_cache.kernel_folder(256).parent == tmp_path / "elsewhere"
