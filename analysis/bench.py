@@ -37,10 +37,11 @@ LARGEST = "500k@1600x1060"
 HEADINGS = {
     "minimum_ms": "own",
     "median_ms": "median",
-    "prototype_minimum_ms": "prototype",
+    "prototype_minimum_ms": "proto",
     "prototype_median_ms": "median ",
     "ratio_of_minima": "ratio",
     "ratio_of_medians": "of medians",
+    "difference": "apart",
 }
 SCALING_SHARE = 3  # scaling is timed with this fraction of the repetitions
 
@@ -230,7 +231,13 @@ def _cell(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "[bold]no[/]"
     if isinstance(value, float):
-        return "" if pd.isna(value) else f"{value:.0e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}"
+        return (
+            ""
+            if pd.isna(value)
+            else f"{value:.0e}"
+            if 0 < abs(value) < 1e-3
+            else f"{value:.{3 if abs(value) < 1000 else 4}g}"
+        )
     return str(value)
 
 
