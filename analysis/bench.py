@@ -230,14 +230,10 @@ def _rich(table: pd.DataFrame, title: str) -> Table:
 def _cell(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "[bold]no[/]"
+    if isinstance(value, float) and 0 < abs(value) < 1e-3:
+        return f"{value:.0e}"
     if isinstance(value, float):
-        return (
-            ""
-            if pd.isna(value)
-            else f"{value:.0e}"
-            if 0 < abs(value) < 1e-3
-            else f"{value:.{3 if abs(value) < 1000 else 4}g}"
-        )
+        return "" if pd.isna(value) else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
     return str(value)
 
 
