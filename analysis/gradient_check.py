@@ -2,12 +2,16 @@
 
     |H v - P (g(theta + h v) - g(theta - h v)) / (2 h)| / |H v|,   v random, at the best of three steps h
 
-g is autograd's, through the renderer's first-order kernels in float64; P leaves the quaternions' lengths out, as the
-operator does.  The steps are tiny, because the loss has a kink at each zero residual and a jump wherever a splat's
-alpha falls under its threshold or a pixel stops: few lie within 1e-10 of a parameter, where float64 still leaves the
-differences five digits.  A step on which the order of the splats changes proves nothing and is skipped; Gaussians at
-exactly the same place, as cloning leaves them, would change places on any step and have their means held still.
+g is autograd's, in float64, through the torch specification of the projection and the first-order kernels of
+compositing and loss; P leaves the quaternions' lengths out, as the operator does.  The steps are tiny, because the loss
+has a kink at each zero residual and a jump wherever a splat's alpha falls under its threshold or a pixel stops: few lie
+within 1e-10 of a parameter, where float64 still leaves the differences five digits.  A step on which the order of the
+depths changes proves nothing and is skipped; Gaussians at exactly the same place, as cloning leaves them, would change
+places on any step and have their means held still.
 """
+
+from collections.abc import Hashable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -16,9 +20,11 @@ from torch import Tensor
 from landscape import DerivativeCheck, check_gradient
 from landscape.results import Progress
 from splat.curvature import SceneHessian, SceneObjective
+from splat.gaussians import Gaussians
 from splat.losses import LossSettings
 from splat.losses_cpu import ViewLoss, view_loss
-from splat.render import render
+from splat.projection import project
+from splat.raster.functions import rasterize_by_kernel
 
 STEPS = (3e-10, 1e-10, 3e-11)  # per parameter; means in units of their spread
 
@@ -27,32 +33,39 @@ def check_against_gradient(
     objective: SceneObjective, loss: LossSettings, generator: torch.Generator, progress: Progress | None = None
 ) -> DerivativeCheck:
     """The relative error of H v for one random v.  loss: the objective's."""
-    double = SceneObjective(
-        objective.active.to(torch.float64), objective.views, loss, objective.background, objective.settings
-    )
-    operator = SceneHessian(objective)
+    operator, double = SceneHessian(objective), objective.active.to(torch.float64)
+    background, settings = objective.background.double(), objective.settings
     direction = operator.project(_direction(objective, generator)[:, None])[:, 0]
-    losses = [ViewLoss.of(view.image, loss, torch.float64) for view in double.views]
+    losses = [ViewLoss.of(view.image, loss, torch.float64) for view in objective.views]
     done = 0
 
     def gradient(theta: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
         nonlocal done
         flat, total = theta.detach().requires_grad_(), torch.zeros_like(theta)
-        for view, of_view in zip(double.views, losses, strict=True):
-            image = render(double.active.with_flat(flat), view.camera, double.background, double.settings).image
+        for view, of_view in zip(objective.views, losses, strict=True):
+            size = view.camera.width, view.camera.height
+            splats = project(double.with_flat(flat), view.camera, settings)
+            splats = replace(splats, depths=splats.depths.detach())  # for the order alone
+            image, _ = rasterize_by_kernel(splats, background, *size, settings)
             total += torch.autograd.grad(view_loss(image, of_view), flat)[0]
         done += 1
         if progress:
             progress(done, 2 * len(STEPS), "gradients in double precision")
-        return _without_lengths(total / len(losses), double)
+        return _without_lengths(total / len(objective.views), double)
 
-    return check_gradient(operator, gradient, double.active.flat, direction, STEPS, double.signature)
+    def order(theta: Float[Tensor, " p"]) -> Hashable:
+        means = double.with_flat(theta).means
+        cameras = (view.camera for view in objective.views)
+        depths = torch.stack([(means - camera.centre) @ camera.forward for camera in cameras])
+        return hash(depths.argsort(dim=1, stable=True).numpy().tobytes())
+
+    return check_gradient(operator, gradient, double.flat, direction, STEPS, order)
 
 
-def _without_lengths(gradient: Float[Tensor, " p"], objective: SceneObjective) -> Float[Tensor, " p"]:
+def _without_lengths(gradient: Float[Tensor, " p"], gaussians: Gaussians) -> Float[Tensor, " p"]:
     """The gradient, which has no other null directions, without its components along the (unit) quaternions."""
-    quats, turns = objective.active.quats, objective.active.with_flat(gradient).quats
-    turns -= quats * (quats * turns).sum(dim=1, keepdim=True)
+    turns = gaussians.with_flat(gradient).quats
+    turns -= gaussians.quats * (gaussians.quats * turns).sum(dim=1, keepdim=True)
     return gradient
 
 

@@ -15,7 +15,7 @@ says which.  Time that a stage leaves goes to the later ones.  The numbers depen
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
-from math import inf, isinf, isqrt
+from math import isqrt
 from time import monotonic
 
 import torch
@@ -148,14 +148,15 @@ def measure(
         traces = exact_traces(objective, streams["traces"], allowed, report)
     with stage("eigenvalues") as report:
         eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
-        basis = _basis(operator, eigen, settings.memory, notes)
+        basis, before = _basis(operator, eigen, settings.memory, notes), (operator.seconds, operator.matvecs)
         ends = extreme_eigenpairs(operator, streams["eigenvalues"], replace(eigen, basis=basis), progress=report)
     with stage("power iteration") as report:
         each = replace(settings.power, max_seconds=budget.share("power iteration") / 2)
         power = power_ends(operator, streams["power iteration"], each, report)
     with stage("density") as report:
-        seconds = budget.share("density")
-        density = _density(operator, streams["density"], settings, seconds, report, notes)
+        each = (operator.seconds - before[0]) / (operator.matvecs - before[1])  # kernels are compiled by then
+        products = budget.share("density") / each
+        density = _density(operator, streams["density"], settings, products, report, notes)
     with stage("slice") as report:
         plane = _plane(objective, operator, gradient, ends, settings, budget.share("slice"), report, notes)
     return Findings(
@@ -210,15 +211,13 @@ def _density(
     operator: CountingOperator,
     generator: torch.Generator,
     settings: ProbeSettings,
-    seconds: float,
+    products: float,
     report: Progress,
     notes: list[str],
 ) -> SpectralDensity | None:
-    """As many steps as time and memory allow; None where that is too few to say anything."""
+    """As many steps as so many products and the memory allow; None where that is too few to say anything."""
     starts, steps = settings.density_starts, settings.density_steps
-    each = operator.seconds / operator.matvecs
-    affordable = inf if isinf(seconds) else seconds / (each * starts)
-    steps = int(min(steps, affordable, _vectors(operator, settings.memory)))
+    steps = int(min(steps, products / starts, _vectors(operator, settings.memory)))
     if steps < min(FEWEST_STEPS, operator.dim):
         notes.append(
             f"the spectral density was left out: time and memory allowed {steps} steps for each of {starts} start vectors"
