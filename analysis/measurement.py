@@ -51,7 +51,7 @@ from splat.traces import exact_traces
 GIB = 2**30
 FEWEST_STEPS, FEWEST_POINTS = 8, 5  # of a density and along a side of a slice that are worth their time
 # shares of the time; measured on 8,000 Gaussians in 3 views of 504 x 378 pixels
-SHARES = {"traces": 2.0, "eigenvalues": 4.0, "power iteration": 2.5, "density": 2.5, "slice": 5.0}
+SHARES = {"traces": 2.0, "eigenvalues": 4.0, "power iteration": 2.0, "density": 3.0, "slice": 5.0}
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class ProbeSettings:
     slice_points: int = 21
     slice_radius: float = 3.0
     slice_rise: float = 0.001
-    seconds: float = 75.0
+    seconds: float = 70.0
     memory: float = 2.0
 
     def __post_init__(self) -> None:
@@ -148,15 +148,14 @@ def measure(
         traces = exact_traces(objective, streams["traces"], allowed, report)
     with stage("eigenvalues") as report:
         eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
-        basis, before = _basis(operator, eigen, settings.memory, notes), (operator.seconds, operator.matvecs)
+        basis = _basis(operator, eigen, settings.memory, notes)
         ends = extreme_eigenpairs(operator, streams["eigenvalues"], replace(eigen, basis=basis), progress=report)
     with stage("power iteration") as report:
         each = replace(settings.power, max_seconds=budget.share("power iteration") / 2)
         power = power_ends(operator, streams["power iteration"], each, report)
     with stage("density") as report:
-        each = (operator.seconds - before[0]) / (operator.matvecs - before[1])  # kernels are compiled by then
-        products = budget.share("density") / each
-        density = _density(operator, streams["density"], settings, products, report, notes)
+        seconds = budget.share("density")
+        density = _density(operator, streams["density"], settings, seconds, report, notes)
     with stage("slice") as report:
         plane = _plane(objective, operator, gradient, ends, settings, budget.share("slice"), report, notes)
     return Findings(
@@ -211,13 +210,16 @@ def _density(
     operator: CountingOperator,
     generator: torch.Generator,
     settings: ProbeSettings,
-    products: float,
+    seconds: float,
     report: Progress,
     notes: list[str],
 ) -> SpectralDensity | None:
-    """As many steps as so many products and the memory allow; None where that is too few to say anything."""
+    """As many steps as time and memory allow; None where that is too few to say anything."""
     starts, steps = settings.density_starts, settings.density_steps
-    steps = int(min(steps, products / starts, _vectors(operator, settings.memory)))
+    room = _vectors(operator, settings.memory)
+    start = monotonic()
+    operator.apply(torch.ones(operator.dim, starts, dtype=operator.dtype))
+    steps = int(min(steps, seconds / (monotonic() - start), room))
     if steps < min(FEWEST_STEPS, operator.dim):
         notes.append(
             f"the spectral density was left out: time and memory allowed {steps} steps for each of {starts} start vectors"
@@ -225,7 +227,7 @@ def _density(
         return None
     if steps < settings.density_steps:
         notes.append(f"the spectral density took {steps} steps instead of {settings.density_steps}, to stay in budget")
-    batch = max(1, min(starts, _vectors(operator, settings.memory) // steps))
+    batch = max(1, min(starts, room // steps))
     return spectral_density(operator, generator, starts, steps, batch, report)
 
 

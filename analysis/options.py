@@ -57,7 +57,7 @@ class ProbeOptions:
     """Exit with 1 if a self-check fails; the record is written all the same."""
     quick: FlagCreatePairsOff[bool] = False
     """Rough numbers in about a third of the time."""
-    seconds: float = 75.0
+    seconds: float = 70.0
     """Time for the estimators together; what a stage did not reach in its share is said. inf: no limit."""
     slice_points: int | None = None
     """Points along each side of the slice, odd.  Default: 21, with --quick 11."""
