@@ -9,7 +9,7 @@ import os
 from hashlib import sha256
 from pathlib import Path
 
-import numba
+from numba.core import config
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -30,4 +30,4 @@ def kernel_folder(register_bits: int) -> Path:
 
 def keep_kernels(register_bits: int) -> None:
     """Tell Numba; to be called before the first kernel is defined."""
-    numba.config.CACHE_DIR = str(kernel_folder(register_bits))  # pyright: ignore[reportAttributeAccessIssue]
+    config.CACHE_DIR = str(kernel_folder(register_bits))
