@@ -30,4 +30,4 @@ def kernel_folder(register_bits: int) -> Path:
 
 def keep_kernels(register_bits: int) -> None:
     """Tell Numba; to be called before the first kernel is defined."""
-    config.CACHE_DIR = str(kernel_folder(register_bits))
+    config.CACHE_DIR = str(kernel_folder(register_bits))  # pyright: ignore[reportAttributeAccessIssue]
