@@ -126,7 +126,15 @@ class SceneObjective:
             total += loss.value(raster.planes)
             pieces.append(hash(raster.lists.splat.tobytes()))
         self._seen = flat, tuple(pieces)
+        return float(self.mean(torch.tensor(total, dtype=torch.float64)))
+
+    def mean(self, total: Tensor) -> Tensor:
+        """The mean over all views, given the sum over those that this process holds: here all of them."""
         return total / len(self.views)
+
+    def stacked(self, rows: Float[Tensor, "n m d"]) -> Float[Tensor, "n _ d"]:
+        """The rows of all views, given those of the views that this process holds: here all of them."""
+        return rows
 
     def signature(self, flat: Float[Tensor, " p"]) -> Hashable:
         """The piece of the objective that flat lies in: which splats each tile draws, in which order."""
@@ -162,12 +170,13 @@ class SceneObjective:
     @cached_property
     def gradient(self) -> Float[Tensor, " p"]:
         """The gradient of L at the active Gaussians."""
-        return torch.stack([view.gradient for view in self.linearized]).mean(dim=0)
+        return self.mean(torch.stack([view.gradient for view in self.linearized]).sum(dim=0))
 
     def block_diagonal(self, *, gauss_newton: bool = False) -> OwnBlocks:
         """Own blocks of the mean over views: of the Hessian or of its Gauss-Newton part (see `LinearizedView`)."""
         parts = (view.block_diagonal(gauss_newton=gauss_newton) for view in self.linearized)
-        return reduce(add, parts) * (1 / len(self.views))
+        total = reduce(add, parts)
+        return OwnBlocks(self.mean(total.geometry), self.mean(total.sh))
 
 
 class SceneHessian:
@@ -188,7 +197,8 @@ class SceneHessian:
     def _row_space(self) -> RowSpace:
         n, bands = len(self.objective.active), self.objective.active.sh.shape[1]
         held = [view.held for view in self.objective.linearized]
-        return seen_parameters(held, n, bands) if self.gauss_newton else seen_harmonics(held, n, bands)
+        seen = seen_parameters if self.gauss_newton else seen_harmonics
+        return seen(held, n, bands, self.objective.stacked)
 
     @property
     def rank(self) -> int:
@@ -223,7 +233,7 @@ class SceneHessian:
             for start in range(0, V.shape[1], at_once):
                 some = V[:, start : start + at_once]
                 total[:, start : start + at_once] += view.ggn(some) if self.gauss_newton else view.hvp(some)
-        return self.project(total / len(self.objective.views))
+        return self.project(self.objective.mean(total))
 
 
 def scene_units(objective: SceneObjective) -> Float[Tensor, " p"]:

@@ -10,7 +10,7 @@ A basis is found per Gaussian by a small singular value decomposition of its row
 whose singular value is beneath TOLERANCE of the largest are null.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -36,20 +36,30 @@ class RowSpace:
         return self.basis.mT @ (self.basis @ x)
 
 
-def seen_harmonics(views: Sequence[Held], n: int, bands: int) -> RowSpace:
-    """The SH directions (k of one channel; the three are alike) in which the Hessian can be non-zero."""
+Stacked = Callable[[Tensor], Tensor]
+
+
+def _alone(rows: Tensor) -> Tensor:
+    return rows
+
+
+def seen_harmonics(views: Sequence[Held], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
+    """The SH directions (k of one channel; the three are alike) in which the Hessian can be non-zero.
+
+    stacked: completes the rows of these views to those of all views, where other processes hold some.
+    """
     rows = torch.zeros(n, 4 * len(views), bands, dtype=torch.float64)
     for m, held in enumerate(views):
         index = torch.from_numpy(held.index)
         rows[index, 4 * m] = torch.from_numpy(held.harmonic[:, :bands]).double()
         rows[index, 4 * m + 1 : 4 * m + 4] = torch.from_numpy(held.slope[:, :bands]).double().mT
-    return _row_space(rows, _dtype(views))
+    return _row_space(stacked(rows), _dtype(views))
 
 
-def seen_parameters(views: Sequence[Held], n: int, bands: int) -> RowSpace:
+def seen_parameters(views: Sequence[Held], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
     """The directions of a Gaussian's parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
     parts = [
-        _row_space(_jacobian_rows(views, start, min(start + CHUNK, n), bands), _dtype(views))
+        _row_space(stacked(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), _dtype(views))
         for start in range(0, n, CHUNK)
     ]
     width = max(part.basis.shape[1] for part in parts)

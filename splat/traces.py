@@ -89,7 +89,8 @@ def _sample(objective: SceneObjective, generator: torch.Generator) -> tuple[Tens
     for i, rows in enumerate(blocks.values()):
         U[rows, i] = z[rows, 0]
     pairs = [view.loss_curvatures(U) for view in objective.linearized]
-    return sum(x for x, _ in pairs) / len(pairs), sum(y for _, y in pairs) / len(pairs)  # pyright: ignore
+    full, diagonal = (torch.stack(column).sum(dim=0) for column in zip(*pairs, strict=True))
+    return objective.mean(full), objective.mean(diagonal)
 
 
 def _estimate(name: str, dim: int, samples: Tensor, settings: TraceSettings, reason: StopReason) -> TraceEstimate:
