@@ -6,6 +6,7 @@ Everything here sees a `SymmetricOperator` and a `torch.Generator`, and returns 
 from landscape.anisotropy import anisotropy, effective_rank, literal, saddle, share
 from landscape.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
 from landscape.density import absolute_sum, spectral_density
+from landscape.distributed import DistributedOperator, Ranks
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.lanczos import LanczosFactorization, lanczos
 from landscape.objective import ObjectiveHessian
@@ -40,6 +41,7 @@ __all__ = [
     "CountingOperator",
     "DenseOperator",
     "DerivativeCheck",
+    "DistributedOperator",
     "EigenEnds",
     "EigenSettings",
     "Eigenpairs",
@@ -49,6 +51,7 @@ __all__ = [
     "PowerSettings",
     "Progress",
     "ProjectedOperator",
+    "Ranks",
     "RestrictedOperator",
     "ScaledOperator",
     "Slice",

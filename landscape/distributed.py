@@ -1,0 +1,119 @@
+"""Operators whose terms are spread over processes: H V = sum_r H_r V, H_r the terms of rank r, added by an all-reduce.
+
+    torchrun --nproc-per-node 2 study.py                     # in it, on every rank alike:
+    torch.distributed.init_process_group("gloo")             # "nccl" for ranks with a GPU each
+    ranks = Ranks.joined()
+    H = DistributedOperator(SumOperator([term_of(view) for view in ranks.share(views)]), ranks)
+    estimate_traces(H, torch.Generator().manual_seed(0))     # the same numbers on every rank
+
+Every rank runs the same estimator with the same seed.  An all-reduce hands the same bits to all, so all take the same steps;
+the numbers are those of one process but for the order of the sum.  What clocks decide may differ between ranks, so time
+budgets have to stay infinite.  Before a product the ranks compare their vectors, bit for bit: where they parted, all raise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from typing import TypeVar
+
+import torch
+import torch.distributed as dist
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
+
+from landscape.operator import SymmetricOperator, require_vectors
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """The processes of a group, seen from the one of number `rank` out of `size`.  Every method but share is collective."""
+
+    rank: int
+    size: int
+    group: dist.ProcessGroup | None = None
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
+    @classmethod
+    def joined(cls, group: dist.ProcessGroup | None = None) -> "Ranks":
+        """The group that this process has joined (all processes by default)."""
+        if not (dist.is_available() and dist.is_initialized()):
+            raise ValueError(
+                "expected an initialised process group, got none; start with torchrun and call "
+                'torch.distributed.init_process_group("gloo") first ("nccl" on GPUs)'
+            )
+        on_gpu = dist.get_backend(group) == "nccl"  # which moves nothing but what lies on a GPU
+        device = torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
+        return cls(dist.get_rank(group), dist.get_world_size(group), group, device)
+
+    def share(self, items: Sequence[Item]) -> Sequence[Item]:
+        """This rank's items: a contiguous part, so that all parts one after the other are the items in order.
+
+        >>> Ranks(0, 2).share("abcde"), Ranks(1, 2).share("abcde")
+        ('ab', 'cde')
+        """
+        if len(items) < self.size:
+            raise ValueError(
+                f"expected at least one item for each of {self.size} ranks, got {len(items)}; start fewer processes"
+            )
+        return items[self.rank * len(items) // self.size : (self.rank + 1) * len(items) // self.size]
+
+    def sum(self, x: Shaped[Tensor, "..."]) -> Shaped[Tensor, "..."]:
+        """The sum of x over ranks."""
+        return self._reduced(x, dist.ReduceOp.SUM)
+
+    def any(self, mask: Bool[Tensor, "..."]) -> Bool[Tensor, "..."]:
+        """Where the mask of some rank is set."""
+        return self._reduced(mask.to(torch.uint8), dist.ReduceOp.MAX).bool()
+
+    def gather(self, x: Shaped[Tensor, "..."]) -> list[Shaped[Tensor, "..."]]:
+        """x of every rank, in their order; all of one shape."""
+        parts = [torch.empty_like(x, device=self.device) for _ in range(self.size)]
+        dist.all_gather(parts, x.to(self.device).contiguous(), group=self.group)
+        return [part.to(x.device) for part in parts]
+
+    def require_same(self, name: str, value: object) -> None:
+        """Raise ValueError on all ranks unless the value's text is the same on each."""
+        digest = int.from_bytes(blake2b(str(value).encode(), digest_size=8).digest(), "little", signed=True)
+        if not self._agree(digest):
+            raise ValueError(f"expected the same {name} on every rank, got {value} on rank {self.rank} of {self.size}")
+
+    def require_same_vectors(self, V: Float[Tensor, "n k"]) -> None:
+        """Raise ValueError on all ranks unless they have the same number of vectors, the same bit for bit."""
+        bits = {2: torch.int16, 4: torch.int32, 8: torch.int64}[V.element_size()]
+        fingerprint = int(V.contiguous().view(bits).sum(dtype=torch.int64))  # exact, in whatever order it is added up
+        if not self._agree(V.shape[1], fingerprint):
+            raise ValueError(
+                f"expected the same vectors on every rank, got others on some (here {V.shape[1]}); seed the generators "
+                "alike, leave time budgets infinite, and run on machines of one kind"
+            )
+
+    def _agree(self, *numbers: int) -> bool:
+        """Whether these integers are the same on all ranks: the least of them and of their complements then match."""
+        mine = torch.tensor([*numbers, *(~number for number in numbers)])
+        least = self._reduced(mine, dist.ReduceOp.MIN)
+        return torch.equal(least[: len(numbers)], ~least[len(numbers) :])
+
+    def _reduced(self, x: Tensor, operation: dist.ReduceOp.RedOpType) -> Tensor:
+        total = x.to(self.device, copy=True).contiguous()
+        dist.all_reduce(total, operation, group=self.group)
+        return total.to(x.device)
+
+
+class DistributedOperator:
+    """sum_r H_r over ranks; `local` is this rank's H_r.  Collective: every rank applies it to the same vectors.
+
+    Raises ValueError on all ranks where they disagree on rows, dtype or blocks.
+    """
+
+    def __init__(self, local: SymmetricOperator, ranks: Ranks) -> None:
+        blocks = ", ".join(f"{name} {rows.start}..{rows.stop}" for name, rows in local.blocks.items())
+        ranks.require_same("operator", f"{local.dim} rows of {local.dtype} in {blocks}")
+        self.local, self.ranks = local, ranks
+        self.dim, self.dtype, self.blocks = local.dim, local.dtype, local.blocks
+
+    def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        require_vectors(V, self.dim)
+        self.ranks.require_same_vectors(V)
+        return self.ranks.sum(self.local.apply(V))

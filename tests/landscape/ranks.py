@@ -1,0 +1,26 @@
+"""Runs a function on gloo ranks, each a process of its own, that meet at a file."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch.multiprocessing.spawn import spawn
+
+from landscape.distributed import Ranks
+
+Findings = dict[str, Any]
+
+
+def on_ranks(size: int, folder: Path, work: Callable[[Ranks], Findings]) -> list[Findings]:
+    """What work(ranks) returned on every rank."""
+    spawn(_process, (size, str(folder), work), nprocs=size)
+    return [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(size)]
+
+
+def _process(rank: int, size: int, folder: str, work: Callable[[Ranks], Findings]) -> None:
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=size)
+    torch.save(work(Ranks.joined()), f"{folder}/{rank}.pt")
+    dist.destroy_process_group()
