@@ -104,7 +104,6 @@ class SceneObjective:
             radial_quaternions=len(active),
             views=len(views),
         )
-        self._seen: tuple[Tensor, Hashable] | None = None
         self._memory = psutil.virtual_memory().available // 2 if memory is None else memory
         self._kept: dict[int, LinearizedView] = {}
 
@@ -118,15 +117,25 @@ class SceneObjective:
     def blocks(self) -> Mapping[str, slice]:
         return self.active.blocks
 
-    def loss(self, flat: Float[Tensor, " p"]) -> float:
-        """L at other parameters of the active Gaussians: a true render, sorted anew."""
+    def evaluate(self, flat: Float[Tensor, " p"]) -> tuple[float, Hashable]:
+        """L at other parameters of the active Gaussians, a true render sorted anew, and the piece of L that they lie in.
+
+        The piece: which splats each tile draws, in which order.  Changes nothing, and may run in several threads at once.
+        """
         total, pieces = 0.0, []
         for view, loss in zip(self.views, self._losses, strict=True):
             raster = rasterize_view(self.active.with_flat(flat), view.camera, self.background, self.settings)
             total += loss.value(raster.planes)
             pieces.append(hash(raster.lists.splat.tobytes()))
-        self._seen = flat, tuple(pieces)
-        return float(self.mean(torch.tensor(total, dtype=torch.float64)))
+        return float(self.mean(torch.tensor(total, dtype=torch.float64))), self.joined(hash(tuple(pieces)))
+
+    def loss(self, flat: Float[Tensor, " p"]) -> float:
+        """L alone."""
+        return self.evaluate(flat)[0]
+
+    def signature(self, flat: Float[Tensor, " p"]) -> Hashable:
+        """The piece alone."""
+        return self.evaluate(flat)[1]
 
     def mean(self, total: Tensor) -> Tensor:
         """The mean over all views, given the sum over those that this process holds: here all of them."""
@@ -136,12 +145,9 @@ class SceneObjective:
         """The rows of all views, given those of the views that this process holds: here all of them."""
         return rows
 
-    def signature(self, flat: Float[Tensor, " p"]) -> Hashable:
-        """The piece of the objective that flat lies in: which splats each tile draws, in which order."""
-        if self._seen is None or self._seen[0] is not flat:
-            self.loss(flat)
-        assert self._seen is not None
-        return self._seen[1]
+    def joined(self, piece: int) -> Hashable:
+        """The piece of L, given that of the views that this process holds: here all of them."""
+        return piece
 
     @cached_property
     def memory_plan(self) -> "MemoryPlan":

@@ -91,9 +91,11 @@ class LinearizedView:
             gaussians, lens_of(camera, settings), self._raster.splats, self._adjoint.gradient, self._index
         )
         self.value = self._loss.value
-        block = np.zeros((gaussians.flat.numel(), 1), self._raster.splats.dtype)
-        self._projection.pull(self._adjoint.gradient[:, None], None, block)
-        self.gradient: Float[Tensor, " p"] = torch.from_numpy(block[:, 0])
+
+    @property
+    def gradient(self) -> Float[Tensor, " p"]:
+        """Of the loss; worked out from its adjoint every time, so that a view that is kept does not hold p numbers more."""
+        return self._pulled(self._adjoint.gradient[:, None], None)[:, 0]
 
     @property
     def image(self) -> Float[Tensor, "3 h w"]:
@@ -121,10 +123,10 @@ class LinearizedView:
         return self._raster.bytes + self._projection.bytes + self._loss.bytes + adjoint
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that `hvp` of so many vectors takes beside its argument and result."""
-        item, planes, n = self.gradient.itemsize, self._raster.frame.size, len(self.gaussians)
+        """Bytes that `hvp` of so many vectors takes beside its argument, its result and the loss's few rows a thread."""
+        item, planes, n = self._raster.splats.itemsize, self._raster.frame.size, len(self.gaussians)
         each = 5 * planes + SUMS * self.entries + (TANGENTS + 2 * 9) * n
-        return item * (vectors * each + 18 * planes)
+        return item * (vectors * each + 3 * planes)
 
     def jvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "k 4 h w"]:
         """J U: tangents of colour and accumulated alpha."""

@@ -133,6 +133,33 @@ def test_padding_and_alpha_have_no_derivative(settings, dtype):
 
 
 @each_loss
+def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_vectors(settings):
+    expected = truth((37, 53), settings)
+    loss = ViewLoss.of(expected.target, settings, torch.float64)
+    tangents = np.stack([loss.padded(v) for v in expected.v])
+
+    def everything() -> list[np.ndarray]:
+        held = loss.linearize(loss.padded(expected.image))
+        over = np.concatenate([tangents, tangents[:, :1]], axis=1)  # four planes, as the products have
+        held.hvp(over, out=over)
+        return [np.array(held.value), held.gradient, held.hvp(tangents), over, held.diagonal]
+
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            results.append(everything())
+    finally:
+        torch.set_num_threads(before)
+    assert (results[0][2] == results[0][3]).all() and results[0][2].any() == (
+        settings.pixel != "l1" or settings.ssim_weight > 0
+    )
+    for others in results[1:]:
+        assert all((one == other).all() for one, other in zip(results[0], others, strict=True))
+
+
+@each_loss
 @pytest.mark.parametrize("size", [(17, 21), (1, 40)], ids=["17x21", "1x40"])
 def test_the_diagonal_is_that_of_the_dense_hessian(size, settings):
     expected = truth(size, settings)

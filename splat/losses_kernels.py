@@ -1,0 +1,379 @@
+"""The kernels of the losses: SSIM's value, gradient, Hessian-vector product and diagonal in one sweep down the rows.
+
+Per pixel and channel, with x the image, y the target (its own blurs are constants) and m, p, q the window's means of x, x^2
+and x y, SSIM is
+
+    S(m, p, q) = A1 A2 / (B1 B2)      A1 = 2 m mu_y + C1     B1 = m^2 + mu_y^2 + C1
+                                      A2 = 2 (q - m mu_y) + C2     B2 = p - m^2 + var_y + C2
+
+The window's blur is its own adjoint, so with S_m, S_p, S_q the partial derivatives
+
+    gradient of sum S      blur(S_m) + 2 x blur(S_p) + y blur(S_q)
+    its tangent for v      the same of S_m', S_p', S_q', plus 2 v blur(S_p), a dash the second derivative of S applied to
+                           m' = blur(v), p' = 2 blur(x v), q' = blur(y v)
+
+A blur is separable: along each row at once, down the columns out of a `ring` of the last RING rows.  A sweep has up to three
+stages, each REACH rows behind the one before: products blurred along the row; partial derivatives at a row, blurred along
+it; the result at a row.  So nothing of the size of an image is written but the result.
+
+Kernels take a range of `rows`, those of the three channels one after the other; fields are flat plane sets (3, plane_rows,
+stride) of `shape` = (height, width, plane_rows, stride).  What a range needs beyond its ends it works out for itself.
+"""
+
+from splat.losses import C1, C2, WINDOW
+from splat.raster.compositing import formula, kernel, scratch
+from splat.raster.simd import broadcast, lanes, load, maximum, select, sqrt, store
+
+BORDER = 16  # floats before a row in scratch, so that the window may look past its ends
+REACH = WINDOW // 2
+RING = 16  # rows; a power of two, at least WINDOW
+L1, CHARBONNIER, L2 = range(3)
+
+
+# --- blurs ------------------------------------------------------------------------------------------------------------
+
+
+@formula
+def row_buffer(like, stride):
+    return scratch(like, stride + 2 * BORDER + 16)
+
+
+@formula
+def ring_buffer(like, fields, stride):
+    return scratch(like, fields * RING * stride)
+
+
+@formula
+def ring_row(field, y, stride):
+    """Where row y of a field lies in a ring."""
+    return (field * RING + (y & (RING - 1))) * stride
+
+
+@formula
+def clear(ring, field, y, stride):
+    """Rows outside the image are 0."""
+    at = ring_row(field, y, stride)
+    for i in range(stride):
+        ring[at + i] = 0
+
+
+@formula
+def blur_along(buffer, width, stride, taps, ring, at):
+    """The window along a bordered row of `width` numbers, to ring[at:]."""
+    for i in range(BORDER):
+        buffer[i] = 0
+    for i in range(BORDER + width, buffer.size):
+        buffer[i] = 0
+    for i in range(0, stride, lanes(buffer)):
+        total = load(buffer, BORDER + i) * taps[REACH]
+        for k in range(1, REACH + 1):
+            total += (load(buffer, BORDER + i - k) + load(buffer, BORDER + i + k)) * taps[REACH + k]
+        store(ring, at + i, total)
+
+
+@formula
+def blur_down(ring, field, y, i, stride, taps):
+    """The window over the rows round y of a ring, at the lanes at i."""
+    total = load(ring, ring_row(field, y, stride) + i) * taps[REACH]
+    for k in range(1, REACH + 1):
+        above, below = ring_row(field, y - k, stride) + i, ring_row(field, y + k, stride) + i
+        total += (load(ring, above) + load(ring, below)) * taps[REACH + k]
+    return total
+
+
+@formula
+def row_sum(values, width):
+    """In float64; four chains of additions, because one would wait for itself."""
+    a = b = c = d = 0.0
+    whole = width & ~3
+    for i in range(BORDER, BORDER + whole, 4):
+        a, b, c, d = a + values[i], b + values[i + 1], c + values[i + 2], d + values[i + 3]
+    for i in range(BORDER + whole, BORDER + width):
+        a += values[i]
+    return (a + b) + (c + d)
+
+
+@formula
+def blur_products(v, x, y, at, width, stride, taps, b0, b1, b2, ring, row):
+    """Stage one: row `row` of v, x v and y v, which begins at `at` in its field, blurred along itself."""
+    for i in range(0, stride, lanes(v)):
+        value = load(v, at + i)
+        store(b0, BORDER + i, value)
+        store(b1, BORDER + i, value * load(x, at + i))
+        store(b2, BORDER + i, value * load(y, at + i))
+    blur_three(b0, b1, b2, width, stride, taps, ring, row)
+
+
+@formula
+def blur_three(b0, b1, b2, width, stride, taps, ring, row):
+    blur_along(b0, width, stride, taps, ring, ring_row(0, row, stride))
+    blur_along(b1, width, stride, taps, ring, ring_row(1, row, stride))
+    blur_along(b2, width, stride, taps, ring, ring_row(2, row, stride))
+
+
+@formula
+def clear_three(ring, row, stride):
+    clear(ring, 0, row, stride)
+    clear(ring, 1, row, stride)
+    clear(ring, 2, row, stride)
+
+
+# --- the losses of a pixel --------------------------------------------------------------------------------------------
+
+
+@formula
+def similarity(m, p, q, mu, var):
+    """S and its partial derivatives in (m, p, q), with what the second derivatives need."""
+    A1, B1 = 2.0 * m * mu + C1, m * m + mu * mu + C1
+    A2, B2 = 2.0 * (q - m * mu) + C2, p - m * m + var + C2
+    r1, r2 = 1.0 / B1, 1.0 / B2
+    l, s = A1 * r1, A2 * r2  # S = l s; l depends on m alone
+    dl = (2.0 * mu - 2.0 * m * l) * r1
+    ds = (2.0 * m * s - 2.0 * mu) * r2  # ds/dm; ds/dp = -s r2, ds/dq = 2 r2
+    return l, s, dl, ds, r1, r2
+
+
+@formula
+def store_second(second, at, size, m, l, s, dl, ds, r1, r2):
+    """S_mm, S_mp, S_mq, S_pp, S_pq at a row (S_qq is 0)."""
+    sp, sq = -(s * r2), 2.0 * r2
+    ddl = (-2.0 * l - 4.0 * m * dl) * r1
+    dds = (2.0 * s + 4.0 * m * ds) * r2
+    smp, smq = (2.0 * m * sp - ds) * r2, 2.0 * m * sq * r2
+    store(second, at, ddl * s + 2.0 * dl * ds + l * dds)
+    store(second, size + at, dl * sp + l * smp)
+    store(second, 2 * size + at, dl * sq + l * smq)
+    store(second, 3 * size + at, -2.0 * l * sp * r2)
+    store(second, 4 * size + at, -(l * sq * r2))
+
+
+@formula
+def pixel_slope(residual, kind, eps):
+    """The pixel loss of a residual and its derivative."""
+    if kind == L1:
+        return maximum(residual, -residual), select(residual > 0.0, 1.0, select(residual < 0.0, -1.0, residual * 0.0))
+    if kind == L2:
+        return residual * residual, 2.0 * residual
+    length = sqrt(residual * residual + eps * eps)
+    return length, residual / length
+
+
+@formula
+def pixel_curvature(residual, kind, eps, weight):
+    """The second derivative of the pixel loss, times weight; 0 for L1 (its kink at 0 has none)."""
+    if kind == L1:
+        return residual * 0.0
+    if kind == L2:
+        return 2.0 * weight
+    squared = residual * residual + eps * eps
+    return weight * (eps * eps) / (squared * sqrt(squared))
+
+
+# --- sweeps -----------------------------------------------------------------------------------------------------------
+
+
+@formula
+def channel_part(start, stop, channel, height):
+    """The rows of a channel that a range of rows covers; none where the first is not beneath the second."""
+    return max(start - channel * height, 0), min(stop - channel * height, height)
+
+
+@kernel
+def value_rows(start, stop, shape, taps, x, y, target, kind, eps, structural, pixels, similarities):
+    """Sums over each row of the pixel loss and, unless structural = 0, of S.  target: mu_y and var_y (2 plane sets)."""
+    height, width, plane_rows, stride = shape
+    L, size = lanes(x), 3 * plane_rows * stride
+    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
+    ring, values = ring_buffer(x, 3, stride), row_buffer(x, stride)
+    for channel in range(3):
+        first, last = channel_part(start, stop, channel, height)
+        top = channel * plane_rows * stride
+        for row in range(first, last):
+            at = top + row * stride
+            for i in range(0, stride, L):
+                store(values, BORDER + i, pixel_slope(load(x, at + i) - load(y, at + i), kind, eps)[0])
+            pixels[channel * height + row] = row_sum(values, width)
+        if structural == 0 or first >= last:
+            continue
+        for ahead in range(first - REACH, last + REACH):
+            if 0 <= ahead < height:
+                blur_products(x, x, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
+            else:
+                clear_three(ring, ahead, stride)
+            row = ahead - REACH
+            if row < first:
+                continue
+            at = top + row * stride
+            for i in range(0, stride, L):
+                m, p = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
+                q = blur_down(ring, 2, row, i, stride, taps)
+                l, s, _dl, _ds, _r1, _r2 = similarity(m, p, q, load(target, at + i), load(target, size + at + i))
+                store(values, BORDER + i, l * s)
+            similarities[channel * height + row] = row_sum(values, width)
+
+
+@formula
+def differentiate_row(ring, row, at, size, shape, taps, target, second, inside, b0, b1, b2, values, slopes):
+    """Stage two of the gradient: S_m, S_p, S_q of a row, blurred along it; the sum of S.
+
+    The second derivatives go to `second` where that is not empty and the row is one of the range's own (inside).
+    """
+    _height, width, _plane_rows, stride = shape
+    for i in range(0, stride, lanes(ring)):
+        m, p = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
+        q = blur_down(ring, 2, row, i, stride, taps)
+        l, s, dl, ds, r1, r2 = similarity(m, p, q, load(target, at + i), load(target, size + at + i))
+        store(values, BORDER + i, l * s)
+        store(b0, BORDER + i, dl * s + l * ds)
+        store(b1, BORDER + i, -(l * s * r2))
+        store(b2, BORDER + i, 2.0 * l * r2)
+        if inside and second.size:
+            store_second(second, at + i, size, m, l, s, dl, ds, r1, r2)
+    blur_three(b0, b1, b2, width, stride, taps, slopes, row)
+    return row_sum(values, width)
+
+
+@kernel
+def gradient_rows(
+    start, stop, shape, taps, x, y, target, kind, eps, pixel, structural, second, blurred_sp, gradient, pixels, similarities
+):  # fmt: skip
+    """The gradient of the loss; sums over each row of the pixel loss and of S (unless structural = 0).
+
+    pixel, structural: weights of the two losses over the number of values.  target: mu_y and var_y (2 plane sets).
+    second: S_mm, S_mp, S_mq, S_pp, S_pq (5 plane sets), and blurred_sp: blur(S_p); or both empty.
+    """
+    height, width, plane_rows, stride = shape
+    L, size = lanes(x), 3 * plane_rows * stride
+    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
+    ring, slopes, values = ring_buffer(x, 3, stride), ring_buffer(x, 3, stride), row_buffer(x, stride)
+    for channel in range(3):
+        first, last = channel_part(start, stop, channel, height)
+        top = channel * plane_rows * stride
+        lead = 2 * REACH if structural != 0 else 0
+        for ahead in range(first - lead, last + lead if first < last else first - lead):
+            if structural != 0:
+                if 0 <= ahead < height:
+                    blur_products(x, x, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
+                else:
+                    clear_three(ring, ahead, stride)
+                row = ahead - REACH
+                if first - REACH <= row < last + REACH:
+                    if 0 <= row < height:
+                        at, inside = top + row * stride, first <= row < last
+                        total = differentiate_row(
+                            ring, row, at, size, shape, taps, target, second, inside, b0, b1, b2, values, slopes
+                        )
+                        if inside:
+                            similarities[channel * height + row] = total
+                    else:
+                        clear_three(slopes, row, stride)
+            row = ahead - lead
+            if row < first:
+                continue
+            at = top + row * stride
+            for i in range(0, stride, L):
+                image, aim = load(x, at + i), load(y, at + i)
+                value, slope = pixel_slope(image - aim, kind, eps)
+                slope = slope * pixel
+                store(values, BORDER + i, value)
+                if structural != 0:
+                    bm, bp = blur_down(slopes, 0, row, i, stride, taps), blur_down(slopes, 1, row, i, stride, taps)
+                    bq = blur_down(slopes, 2, row, i, stride, taps)
+                    slope -= structural * (bm + 2.0 * image * bp + aim * bq)
+                    if blurred_sp.size:
+                        store(blurred_sp, at + i, bp)
+                store(gradient, at + i, slope)
+            pixels[channel * height + row] = row_sum(values, width)
+            for i in range(width, stride):
+                gradient[at + i] = 0
+
+
+@formula
+def curve_row(ring, row, at, size, width, stride, taps, second, b0, b1, b2, slopes):
+    """Stage two of the product: S_m', S_p', S_q' of a row, blurred along it."""
+    for i in range(0, stride, lanes(ring)):
+        dm, dp = blur_down(ring, 0, row, i, stride, taps), 2.0 * blur_down(ring, 1, row, i, stride, taps)
+        dq = blur_down(ring, 2, row, i, stride, taps)
+        mm, mp, mq = load(second, at + i), load(second, size + at + i), load(second, 2 * size + at + i)
+        pp, pq = load(second, 3 * size + at + i), load(second, 4 * size + at + i)
+        store(b0, BORDER + i, mm * dm + mp * dp + mq * dq)
+        store(b1, BORDER + i, mp * dm + pp * dp + pq * dq)
+        store(b2, BORDER + i, mq * dm + pq * dp)
+    blur_three(b0, b1, b2, width, stride, taps, slopes, row)
+
+
+@kernel
+def product_rows(start, stop, shape, taps, v, x, y, kind, eps, pixel, structural, second, blurred_sp, product):
+    """The Hessian of the loss times v.  product must not be v: another range may still read it."""
+    height, width, plane_rows, stride = shape
+    L, size = lanes(x), 3 * plane_rows * stride
+    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
+    ring, slopes = ring_buffer(x, 3, stride), ring_buffer(x, 3, stride)
+    for channel in range(3):
+        first, last = channel_part(start, stop, channel, height)
+        top = channel * plane_rows * stride
+        lead = 2 * REACH if structural != 0 else 0
+        for ahead in range(first - lead, last + lead if first < last else first - lead):
+            if structural != 0:
+                if 0 <= ahead < height:
+                    blur_products(v, x, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
+                else:
+                    clear_three(ring, ahead, stride)
+                row = ahead - REACH
+                if first - REACH <= row < last + REACH:
+                    if 0 <= row < height:
+                        at = top + row * stride
+                        curve_row(ring, row, at, size, width, stride, taps, second, b0, b1, b2, slopes)
+                    else:
+                        clear_three(slopes, row, stride)
+            row = ahead - lead
+            if row < first:
+                continue
+            at = top + row * stride
+            for i in range(0, stride, L):
+                image, aim, tangent = load(x, at + i), load(y, at + i), load(v, at + i)
+                total = pixel_curvature(image - aim, kind, eps, broadcast(x, pixel)) * tangent
+                if structural != 0:
+                    bm, bp = blur_down(slopes, 0, row, i, stride, taps), blur_down(slopes, 1, row, i, stride, taps)
+                    bq = blur_down(slopes, 2, row, i, stride, taps)
+                    total -= structural * (bm + 2.0 * image * bp + aim * bq + 2.0 * tangent * load(blurred_sp, at + i))
+                store(product, at + i, total)
+            for i in range(width, stride):
+                product[at + i] = 0
+
+
+@kernel
+def diagonal_rows(start, stop, shape, taps, x, y, kind, eps, pixel, structural, second, blurred_sp, diagonal):
+    """The diagonal of the loss's Hessian.  taps: the window squared."""
+    height, width, plane_rows, stride = shape
+    L, size = lanes(x), 3 * plane_rows * stride
+    buffer, ring = row_buffer(x, stride), ring_buffer(x, 5, stride)
+    for channel in range(3):
+        first, last = channel_part(start, stop, channel, height)
+        top = channel * plane_rows * stride
+        lead = REACH if structural != 0 else 0
+        for ahead in range(first - lead, last + lead if first < last else first - lead):
+            if structural != 0:
+                for f in range(5):
+                    if 0 <= ahead < height:
+                        for i in range(0, stride, L):
+                            store(buffer, BORDER + i, load(second, f * size + top + ahead * stride + i))
+                        blur_along(buffer, width, stride, taps, ring, ring_row(f, ahead, stride))
+                    else:
+                        clear(ring, f, ahead, stride)
+            row = ahead - lead
+            if row < first:
+                continue
+            at = top + row * stride
+            for i in range(0, stride, L):
+                image, aim = load(x, at + i), load(y, at + i)
+                total = pixel_curvature(image - aim, kind, eps, broadcast(x, pixel))
+                if structural != 0:
+                    mm, mp = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
+                    mq, pp = blur_down(ring, 2, row, i, stride, taps), blur_down(ring, 3, row, i, stride, taps)
+                    pq = blur_down(ring, 4, row, i, stride, taps)
+                    coupled = mm + 4.0 * image * (mp + image * pp + aim * pq) + 2.0 * aim * mq
+                    total -= structural * (coupled + 2.0 * load(blurred_sp, at + i))
+                store(diagonal, at + i, total)
+            for i in range(width, stride):
+                diagonal[at + i] = 0
