@@ -119,19 +119,30 @@ class Gaussians:
         return Gaussians.pack(chosen)
 
     def require_finite(self) -> None:
-        """Raise ValueError that names the attribute and the first Gaussian whose parameters are not finite.
+        """Raise ValueError that names the attribute and the first Gaussian that has no finite image and derivatives.
 
-        A quaternion of length 0 has no direction and is refused too.
+        Refused are numbers that are not finite, quaternions of length 0, which have no direction, and quaternions and SH whose
+        fourth power (SSIM's curvature has that of a colour, a quaternion's 1 / |q|^2 twice) leaves the range of the dtype.
+        How large log_scales may be depends on the view: `projection_cpu.require_sizes`.
         """
-        for name, value in self.attributes.items():
-            self._require(torch.isfinite(value.reshape(len(self), -1)).all(dim=1), name, "finite")
-        self._require((self.quats != 0).any(dim=1), "quats", "non-zero")
+        sizes = {
+            name: value.detach().reshape(len(self), -1).abs().amax(dim=1) for name, value in self.attributes.items()
+        }
+        for name, size in sizes.items():
+            self._require(torch.isfinite(size), name, "finite")
+        largest = torch.finfo(self.flat.dtype).max ** 0.25
+        quats = sizes["quats"]
+        self._require(quats > 0, "quats", "non-zero")
+        self._require(
+            (quats >= 1 / largest) & (quats <= largest), "quats", "moderate", f" ({1 / largest:.1e} to {largest:.1e})"
+        )
+        self._require(sizes["sh"] <= largest, "sh", "moderate", f" (up to {largest:.1e})")
 
-    def _require(self, good: Tensor, name: str, quality: str) -> None:
+    def _require(self, good: Tensor, name: str, quality: str, meaning: str = "") -> None:
         if good.all():
             return
         first = int((~good).nonzero()[0])
         raise ValueError(
-            f"expected {quality} {name}, got {self.attributes[name][first].tolist()} at Gaussian {first} "
+            f"expected {quality} {name}{meaning}, got {self.attributes[name][first].tolist()} at Gaussian {first} "
             f"({int((~good).sum())} of {len(self)} are not {quality}); remove them from the checkpoint"
         )

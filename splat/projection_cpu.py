@@ -4,7 +4,7 @@ Values are computed in double precision, so that needles (condition number to 1e
 (n, 9): `raster/packing.py`.  The second order is in `projection_linear.py`.
 """
 
-from math import exp
+from math import exp, log
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from splat.projection_formulas import (
 from splat.raster.compositing import formula, kernel
 from splat.raster.threads import over_range
 from splat.settings import RenderSettings
+
+LARGEST_SPLAT = 2.0**60  # px, and world units: 1 / det of a needle is this squared over blur, which float32 still holds
 
 
 def lens_of(camera: Camera, settings: RenderSettings) -> Lens:
@@ -124,4 +126,25 @@ def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.nda
     n, dtype = len(gaussians), arrays[0].dtype
     splats, depths, drawn = np.empty((n, 9), dtype), np.empty(n, dtype), np.empty(n, np.bool_)
     over_range(n, project_splats, lens, *arrays, splats, depths, drawn)
+    require_sizes(lens, arrays[1], depths, drawn)
     return splats, depths, drawn
+
+
+def require_sizes(lens: Lens, log_scales: np.ndarray, depths: np.ndarray, drawn: np.ndarray) -> None:
+    """Raise ValueError that names the first Gaussian whose splat is larger than LARGEST_SPLAT, so that no derivative overflows.
+
+    log_scales: (n, 3); depths: (n,), those of the Gaussians drawn beyond near.  Size: the largest scale times focal length / z.
+    """
+    limit, focal = log(LARGEST_SPLAT), max(lens.fx, lens.fy)
+    if not log_scales.size or log_scales.max() + max(log(focal / lens.near), 0.0) <= limit:
+        return
+    gain = np.log(focal / np.where(drawn, depths, focal))
+    sizes = log_scales.max(axis=1) + np.maximum(gain, 0.0)
+    bad = drawn & (sizes > limit)
+    if bad.any():
+        first = int(np.argmax(bad))
+        raise ValueError(
+            f"expected log_scales of at most {limit - max(gain[first], 0.0):.1f} at depth {depths[first]:.3g} (a splat of "
+            f"{LARGEST_SPLAT:.0e} px), got {log_scales[first].tolist()} at Gaussian {first} ({int(bad.sum())} of {len(bad)} "
+            "are larger); remove them from the checkpoint"
+        )

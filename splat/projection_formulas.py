@@ -3,6 +3,14 @@
 The notation is that of `projection.py`; a bar marks an adjoint (the derivative of a scalar in the barred quantity).
 Applied to duals, `geometry` gives its Jacobian, `geometry_adjoint` the Hessian of `adjoint . geometry`; likewise for SH.
 3 x 3 matrices are tuples of three rows; rows and points are tuples.
+
+A splat may be larger than the image by many orders of magnitude, and a needle is so along one direction only.  For both:
+
+- r1, r2 are computed times `shrink` = 1 / max(1, size of the splat in px), so that their fourth powers, in det, stay in the
+  range of float32; blur becomes beta = blur shrink^2, and the conic is shrink^2 times that of the shrunken rows.
+- The adjoint needs Q r.  For r along a needle of length s that is 1/s, but summing a r1 + b r2 leaves s times round-off, and
+  another s comes with r.  With n = r1 x r2 and det = n.n + beta (r1.r1 + r2.r2) + beta^2, nothing cancels in
+  Q (r1; r2) = (beta r1 + r2 x n; beta r2 + n x r1) / det.
 """
 
 from typing import NamedTuple
@@ -108,52 +116,64 @@ def columns_of_rotation(unit):
 def projected_axes(lens, mean, log_scales, quat):
     """Everything that `geometry` and its adjoint share.
 
-    x y z, 1 / z, the clamped u = x / z and v = y / z, the unit quaternion and 1 / |quat|, the Gaussian's axes in the camera
-    frame (three columns, scaled), and r1, r2.
+    x y z, 1 / z, the clamped u = x / z and v = y / z, the unit quaternion and 1 / |quat|, the three scales, the Gaussian's axes
+    in the camera frame (three columns, scaled), shrink, and r1, r2 times shrink.
     """
     x, y, z = to_camera(lens, offset_from(lens, mean))
     depth = 1.0 / z
     u, v = clamped(x * depth, lens.limit_x), clamped(y * depth, lens.limit_y)
     unit, inverse_norm = unit_quaternion(quat)
     c0, c1, c2 = columns_of_rotation(unit)
-    m0 = scaled(to_camera(lens, c0), exp(log_scales[0]))
-    m1 = scaled(to_camera(lens, c1), exp(log_scales[1]))
-    m2 = scaled(to_camera(lens, c2), exp(log_scales[2]))
-    gain_x, gain_y = lens.fx * depth, lens.fy * depth
+    scales = (exp(log_scales[0]), exp(log_scales[1]), exp(log_scales[2]))
+    m0 = scaled(to_camera(lens, c0), scales[0])
+    m1 = scaled(to_camera(lens, c1), scales[1])
+    m2 = scaled(to_camera(lens, c2), scales[2])
+    longest = max(value_of(scales[0]), value_of(scales[1]), value_of(scales[2]))
+    shrink = 1.0 / max(1.0, longest * max(lens.fx, lens.fy) * value_of(depth))
+    gain_x, gain_y = (shrink * lens.fx) * depth, (shrink * lens.fy) * depth
     r1 = (gain_x * (m0[0] - u * m0[2]), gain_x * (m1[0] - u * m1[2]), gain_x * (m2[0] - u * m2[2]))
     r2 = (gain_y * (m0[1] - v * m0[2]), gain_y * (m1[1] - v * m1[2]), gain_y * (m2[1] - v * m2[2]))
-    return (x, y, z), depth, (u, v), unit, inverse_norm, (m0, m1, m2), r1, r2
+    return (x, y, z), depth, (u, v), unit, inverse_norm, scales, (m0, m1, m2), shrink, r1, r2
 
 
 @formula
-def conic_of(r1, r2, blur):
+def conic_of(r1, r2, blur, shrink):
+    """The conic a, b, c, and Q (r1; r2) for the shrunken rows and their Q."""
+    beta = blur * shrink * shrink
     xx, xy, yy = dot(r1, r1), dot(r1, r2), dot(r2, r2)
     normal = cross(r1, r2)
-    inverse = 1.0 / (dot(normal, normal) + blur * (xx + yy) + blur * blur)
-    return (yy + blur) * inverse, -(xy * inverse), (xx + blur) * inverse
+    inverse = 1.0 / (dot(normal, normal) + beta * (xx + yy) + beta * beta)
+    full = inverse * (shrink * shrink)
+    q1 = scaled(plus(scaled(r1, beta), cross(r2, normal)), inverse)
+    q2 = scaled(plus(scaled(r2, beta), cross(normal, r1)), inverse)
+    return ((yy + beta) * full, -(xy * full), (xx + beta) * full), q1, q2
 
 
 @formula
 def geometry(lens, mean, log_scales, quat):
     """Mean x, y (px) and conic a, b, c."""
-    (x, y, _z), depth, _uv, _unit, _inverse, _axes, r1, r2 = projected_axes(lens, mean, log_scales, quat)
-    a, b, c = conic_of(r1, r2, lens.blur)
+    (x, y, _z), depth, _uv, _unit, _inverse, _scales, _axes, shrink, r1, r2 = projected_axes(
+        lens, mean, log_scales, quat
+    )
+    (a, b, c), _q1, _q2 = conic_of(r1, r2, lens.blur, shrink)
     return lens.fx * x * depth + lens.cx, lens.fy * y * depth + lens.cy, a, b, c
 
 
 @formula
 def geometry_adjoint(lens, mean, log_scales, quat, bar):
     """The adjoints of mean, log_scales and quat (ten numbers), given those of mean x, y and conic a, b, c (five)."""
-    (x, y, _z), depth, (u, v), unit, inverse_norm, (m0, m1, m2), r1, r2 = projected_axes(lens, mean, log_scales, quat)
-    a, b, c = conic_of(r1, r2, lens.blur)
-    # d conic = -Q dSigma Q, so the covariance's adjoint is -Q G Q with G = [[a_bar, b_bar / 2], [b_bar / 2, c_bar]]
+    (x, y, _z), depth, (u, v), unit, inverse_norm, scales, (m0, m1, m2), shrink, r1, r2 = projected_axes(
+        lens, mean, log_scales, quat
+    )
+    (a, b, c), q1, q2 = conic_of(r1, r2, lens.blur, shrink)
+    # d conic = -Q dSigma Q, so the adjoint of (r1; r2) is -2 Q G Q (r1; r2) with G = [[a_bar, b_bar / 2], [b_bar / 2, c_bar]];
+    # that of the shrunken rows is the same with their q1, q2: what they lack cancels
     half = 0.5 * bar[3]
     p, q, s, t = a * bar[2] + b * half, a * half + b * bar[4], b * bar[2] + c * half, b * half + c * bar[4]
-    xx_bar, xy_bar, yy_bar = -(p * a + q * b), -(p * b + q * c), -(s * b + t * c)
-    r1_bar = plus(scaled(r1, 2.0 * xx_bar), scaled(r2, 2.0 * xy_bar))
-    r2_bar = plus(scaled(r1, 2.0 * xy_bar), scaled(r2, 2.0 * yy_bar))
+    r1_bar = plus(scaled(q1, -2.0 * p), scaled(q2, -2.0 * q))
+    r2_bar = plus(scaled(q1, -2.0 * s), scaled(q2, -2.0 * t))
     # r1 = fx / z (row_x - u row_z), r2 = fy / z (row_y - v row_z), the rows those of the axes m
-    along_x, along_y = scaled(r1_bar, lens.fx * depth), scaled(r2_bar, lens.fy * depth)
+    along_x, along_y = scaled(r1_bar, (shrink * lens.fx) * depth), scaled(r2_bar, (shrink * lens.fy) * depth)
     row_z = (m0[2], m1[2], m2[2])
     u_bar, v_bar = -dot(along_x, row_z), -dot(along_y, row_z)
     if abs(value_of(x * depth)) > lens.limit_x:
@@ -167,9 +187,9 @@ def geometry_adjoint(lens, mean, log_scales, quat, bar):
     n1 = (along_x[1], along_y[1], -(u * along_x[1] + v * along_y[1]))
     n2 = (along_x[2], along_y[2], -(u * along_x[2] + v * along_y[2]))
     log_scales_bar = (dot(n0, m0), dot(n1, m1), dot(n2, m2))
-    c0 = scaled(to_world(lens, n0), exp(log_scales[0]))
-    c1 = scaled(to_world(lens, n1), exp(log_scales[1]))
-    c2 = scaled(to_world(lens, n2), exp(log_scales[2]))
+    c0 = scaled(to_world(lens, n0), scales[0])
+    c1 = scaled(to_world(lens, n1), scales[1])
+    c2 = scaled(to_world(lens, n2), scales[2])
     return mean_bar, log_scales_bar, quaternion_adjoint(unit, inverse_norm, c0, c1, c2)
 
 

@@ -9,10 +9,14 @@ splat_of_gaussian     EWA projection by the textbook, with explicit covariances
 composited_picture    splatting, one pixel and one splat after the other
 similarity_by_windows SSIM from the statistics of every window
 central_difference    a derivative without a formula
+splat_in_many_digits  mean and conic of a Gaussian, with as many digits as wanted
+hessian_in_many_digits second differences with half of the digits
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
+import mpmath
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial.transform import Rotation
@@ -152,3 +156,45 @@ def central_difference(function: Callable[[float], np.ndarray], step: float) -> 
         return (function(h) - function(-h)) / (2 * h)
 
     return (4 * difference(step / 2) - difference(step)) / 3
+
+
+def splat_in_many_digits(
+    point: Sequence[Any], rotation: np.ndarray, centre: np.ndarray, pinhole: tuple[float, float, float, float],
+    blur: float,
+) -> list[Any]:  # fmt: skip
+    """Mean x, y and conic a, b, c of a Gaussian (mean, log-scales, quaternion w x y z), with mpmath's working precision."""
+    fx, fy, cx, cy = pinhole
+    W = mpmath.matrix(rotation.tolist())
+    x, y, z = W * mpmath.matrix([m - c for m, c in zip(point[:3], centre.tolist(), strict=True)])
+    length = mpmath.sqrt(sum(q * q for q in point[6:]))
+    r, i, j, k = (q / length for q in point[6:])
+    turn = mpmath.matrix(
+        [
+            [1 - 2 * (j * j + k * k), 2 * (i * j - r * k), 2 * (i * k + r * j)],
+            [2 * (i * j + r * k), 1 - 2 * (i * i + k * k), 2 * (j * k - r * i)],
+            [2 * (i * k - r * j), 2 * (j * k + r * i), 1 - 2 * (i * i + j * j)],
+        ]
+    )
+    jacobian = mpmath.matrix([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
+    axes = jacobian * W * turn * mpmath.diag([mpmath.exp(s) for s in point[3:6]])
+    conic = mpmath.inverse(axes * axes.T + blur * mpmath.eye(2))
+    return [fx * x / z + cx, fy * y / z + cy, conic[0, 0], conic[0, 1], conic[1, 1]]
+
+
+def hessian_in_many_digits(function: Callable[[list[Any]], Any], point: Sequence[float], digits: int) -> np.ndarray:
+    """Second central differences of a scalar function at a quarter of the digits for a step."""
+    with mpmath.workdps(digits):
+        step, at = mpmath.mpf(10) ** (-digits // 4), [mpmath.mpf(x) for x in point]
+
+        def moved(j: int, s: int, k: int, t: int) -> Any:
+            shifted = list(at)
+            shifted[j] += s * step
+            shifted[k] += t * step
+            return function(shifted)
+
+        result = np.empty((len(at), len(at)))
+        for j in range(len(at)):
+            for k in range(j + 1):
+                pairs = sum(s * t * moved(j, s, k, t) for s in (-1, 1) for t in (-1, 1))
+                result[j, k] = result[k, j] = float(pairs / (4 * step * step))
+        return result

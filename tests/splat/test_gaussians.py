@@ -83,3 +83,27 @@ def test_a_quaternion_without_a_direction_is_named():
     gaussians.quats[3] = 0.0
     with pytest.raises(ValueError, match=r"expected non-zero quats, got \[0.0, 0.0, 0.0, 0.0\] at Gaussian 3 \(1 of 6"):
         gaussians.require_finite()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["quats", "sh"])
+def test_magnitudes_whose_fourth_power_overflows_are_refused(name, dtype):
+    largest = torch.finfo(dtype).max ** 0.25
+    gaussians = random_gaussians(6, 1).to(dtype)
+    value = gaussians.attributes[name]
+    value[4].view(-1)[1] = 0.99 * largest
+    gaussians.require_finite()
+    value[4].view(-1)[1] = -1.01 * largest
+    with pytest.raises(ValueError, match=rf"expected moderate {name} \(.*\), got .* at Gaussian 4 \(1 of 6"):
+        gaussians.require_finite()
+
+
+def test_quaternions_too_short_for_their_curvature_are_refused():
+    gaussians = random_gaussians(6, 1).to(torch.float32)
+    gaussians.quats[1:3] = 1e-10
+    with pytest.raises(
+        ValueError, match=r"expected moderate quats \(2.3e-10 to 4.3e\+09\), got .* at Gaussian 1 \(2 of 6"
+    ):
+        gaussians.require_finite()
+    gaussians.quats[1:3] = 1e-9
+    gaussians.require_finite()

@@ -13,10 +13,16 @@ from splat.gaussians import Gaussians
 from splat.harmonics import BAND_OF_COEFFICIENT, harmonics
 from splat.projection import Splats, project, rotation_matrices
 from splat.projection_cpu import attribute_arrays, lens_of, project_adjoint, project_arrays
-from splat.projection_linear import Projection
+from splat.projection_linear import GEOMETRY, Projection
 from splat.raster.threads import over_range
 from splat.settings import RenderSettings
-from tests.oracles import central_difference, real_harmonics, splat_of_gaussian
+from tests.oracles import (
+    central_difference,
+    hessian_in_many_digits,
+    real_harmonics,
+    splat_in_many_digits,
+    splat_of_gaussian,
+)
 from tests.splat.random_scenes import (
     DERIVATIVE,
     DTYPES,
@@ -262,3 +268,45 @@ def test_the_near_plane_hides_what_is_nearer_and_nothing_else():
     splats, depths, drawn = project_arrays(gaussians, lens_of(camera, settings))
     assert drawn.tolist() == [False, True, False] == project(gaussians, camera, settings).drawn.tolist()
     assert not splats[[0, 2]].any() and splats[1].any() and depths[1] == 0.5001
+
+
+HUGE = {
+    "needle": (30.0, -1.5, -1.0), "pancake": (30.0, 29.0, -1.0), "ball": (30.0, 30.5, 30.0), "thin": (3.0, -10.8, -10.8),
+}  # fmt: skip
+
+
+@each_dtype
+@pytest.mark.parametrize("shape", HUGE)
+def test_the_curvature_of_splats_beyond_all_measure_keeps_its_digits(shape, dtype):
+    camera, bar = random_camera(focal=50.0), random_like((1, 9), 3).to(dtype).numpy()
+    gaussians = random_gaussians(1, spread=0.2)
+    gaussians.log_scales[:] = torch.tensor(HUGE[shape])
+    gaussians.quats[:] = torch.tensor([0.7, -0.4, 0.5, 0.3])
+    gaussians = gaussians.to(dtype)
+    lens = lens_of(camera, RenderSettings())
+    splats, _, _ = project_arrays(gaussians, lens)
+    packed = Projection(gaussians, lens, splats, bar, np.arange(1)).held.curvature[0].astype(np.float64)
+    curvature = np.zeros((GEOMETRY, GEOMETRY))
+    curvature[np.tril_indices(GEOMETRY)] = packed
+    pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
+
+    def along(point: list) -> object:
+        splat = splat_in_many_digits(point, camera.rotation.numpy(), camera.centre.numpy(), pinhole, 0.3)
+        return sum(float(b) * y for b, y in zip(bar[0, :5], splat, strict=True))
+
+    point = [*gaussians.means[0].tolist(), *gaussians.log_scales[0].tolist(), *gaussians.quats[0].tolist()]
+    expected = np.tril(hessian_in_many_digits(along, point, 160))
+    assert relative_error(curvature, expected) < DERIVATIVE[dtype]
+
+
+def test_a_splat_too_large_for_its_derivatives_is_named():
+    camera, gaussians = random_camera(focal=50.0), random_gaussians(5).to(torch.float32)
+    lens = lens_of(camera, RenderSettings())
+    gaussians.log_scales[3, 1] = 38.0
+    gaussians.means[3] = torch.tensor([0.0, 0.0, 4.0])
+    project_arrays(gaussians, lens)
+    gaussians.log_scales[3, 1] = 40.0
+    with pytest.raises(ValueError, match=r"expected log_scales of at most 3\d\.\d at depth .* at Gaussian 3 \(1 of 5"):
+        project_arrays(gaussians, lens)
+    gaussians.means[3, 2] = -4.0  # behind the camera it is not drawn
+    project_arrays(gaussians, lens)
