@@ -28,7 +28,9 @@ from splat.raster.compositing import (
     alpha_row,
     alpha_terms,
     broadcast3,
+    clear_entries,
     corner_of,
+    dark,
     formula,
     kernel,
     load3,
@@ -82,6 +84,10 @@ def block_moments(counter, params, lists, frame, pixels, gradient, curvature, su
             store3(state, b + 7 * L, L, load3(curvature, p, frame.size))
             store(state, b + 10 * L, load(pixels.stop, p))
         first, count = reached(lists, tile, pixels, corner, frame.stride)
+        plain = dark(gradient, 0, 4, corner, frame.size, frame.stride)
+        if plain and dark(curvature, 0, 3, corner, frame.size, frame.stride):
+            clear_entries(lists, first, count, BLOCK_SUMS, sums)
+            count = 0
         for k in range(count - 1, -1, -1):
             later = first + max(k - AHEAD, 0)
             prefetch(params, np.int64(lists.splat[later]) * PARAMS)

@@ -223,6 +223,26 @@ def reached(lists, tile, pixels, corner, stride):
 
 
 @formula
+def dark(planes, first_plane, count, corner, size, stride):
+    """Whether `count` planes are exactly 0 all over a tile: a cotangent that leaves nothing to do."""
+    lit, one = broadcast(planes, 0.0), broadcast(planes, 1.0)
+    for plane in range(first_plane, first_plane + count):
+        for y in range(TILE_ROWS):
+            value = load(planes, plane * size + corner + y * stride)
+            lit = select((value >= 0.0) & (value <= 0.0), lit, one)  # NaN is neither
+    return not any_lane(lit > 0.0)
+
+
+@formula
+def clear_entries(lists, first, count, width, sums):
+    """Zeros for the sums, `width` an entry, of a tile's entries."""
+    for e in range(first, first + count):
+        at = np.int64(lists.slots[e]) * width
+        for j in range(width):
+            sums[at + j] = 0
+
+
+@formula
 def no_moments(params):
     zero = broadcast(params, 0.0)
     return zero, zero, zero, zero, zero, zero
@@ -336,6 +356,9 @@ def backward(counter, params, lists, frame, pixels, cotangent, sums):
         for y in range(TILE_ROWS):
             begin_backward_row(state, 6 * L * y, L, frame, pixels, cotangent, corner + y * frame.stride)
         first, count = reached(lists, tile, pixels, corner, frame.stride)
+        if dark(cotangent, 0, 4, corner, frame.size, frame.stride):
+            clear_entries(lists, first, count, SUMS, sums)
+            count = 0
         for k in range(count - 1, -1, -1):
             later = first + max(k - AHEAD, 0)
             prefetch(params, np.int64(lists.splat[later]) * PARAMS)
@@ -515,6 +538,10 @@ def curvature(counter, params, tangents, lists, frame, pixels, cotangent, transm
                 b = width * y + (6 + 5 * i) * L
                 begin_curvature_row(state, b, L, frame, pixels, cotangent, transmittances, cotangents, i, p)
         first, count = reached(lists, tile, pixels, corner, frame.stride)
+        plain = dark(cotangent, 0, 4, corner, frame.size, frame.stride)
+        if plain and dark(cotangents, 0, 4 * K, corner, frame.size, frame.stride):
+            clear_entries(lists, first, count, K * SUMS, sums)
+            count = 0
         for k in range(count - 1, -1, -1):
             later = first + max(k - AHEAD, 0)
             splat = np.int64(lists.splat[later])

@@ -5,8 +5,10 @@ no second thread runtime spins beside torch's.  The number of threads is torch's
 depends on it: kernels write to places of their own and sum in a fixed order.
 """
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
@@ -18,8 +20,22 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads - 1, thread_name_prefix="splat")
 
 
+_here = threading.local()
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Kernels called from this thread use it alone: for work that is spread over threads already."""
+    before, _here.alone = getattr(_here, "alone", False), True
+    try:
+        yield
+    finally:
+        _here.alone = before
+
+
 def thread_count() -> int:
-    return torch.get_num_threads()
+    """How many threads a kernel that is called here runs on."""
+    return 1 if getattr(_here, "alone", False) else torch.get_num_threads()
 
 
 def _run(calls: list[tuple]) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from splat.raster.compositing import TILE_ROWS
 from splat.raster.cpu import Raster
 from splat.settings import RenderSettings
 from tests.oracles import central_difference
@@ -142,3 +143,34 @@ def test_padding_outside_the_image_carries_no_derivative():
     raster = expected.raster(torch.float64)
     padded = raster.pad(np.ones((4, raster.height, raster.width)))
     assert padded.sum() == 4 * raster.height * raster.width
+
+
+@pytest.mark.parametrize("K", [1, 3])
+def test_tiles_with_a_cotangent_of_zero_are_left_out_and_add_nothing(monkeypatch, K):
+    def poisoned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        return np.full(shape, np.nan, dtype)
+
+    monkeypatch.setattr("splat.raster.cpu.aligned", poisoned)  # what a tile leaves unwritten shows
+    expected = truth("typical")
+    raster = expected.raster(torch.float64)
+    tangent = raster.jvp(expected.U[:, :K].numpy())
+    lit = np.zeros((raster.height, raster.width))
+    lit[:TILE_ROWS, :] = 1  # the first row of tiles
+    lit[-1, -1] = 1  # and one pixel of the last
+    curvature = np.random.default_rng(0).random((3, *raster.plane))
+    index = np.arange(len(expected.splats))
+    results = []
+    for part in (np.ones_like(lit), lit, 1 - lit):
+        adjoint = raster.backward(raster.pad(part * expected.G.numpy()))
+        product = tangent.curvature(adjoint, raster.pad(part * expected.dG[:K].numpy()))
+        own = raster.own_blocks(adjoint, raster.pad(part) * curvature, index, False)
+        results.append((adjoint.gradient, product, np.tril(own)))
+    for whole, one, other in zip(*results, strict=True):
+        assert np.abs(one).max() > 0 and relative_error(one + other, whole) < 1e-13
+
+
+def test_a_cotangent_that_is_not_a_number_is_not_taken_for_zero():
+    raster = truth("typical").raster(torch.float64)
+    cotangent = raster.pad(np.zeros((4, raster.height, raster.width)))
+    cotangent[1, 20, 30] = np.nan
+    assert np.isnan(raster.backward(cotangent).gradient).any()

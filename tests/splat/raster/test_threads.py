@@ -1,6 +1,7 @@
 """No number depends on how many threads made it."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
-from splat.raster.threads import over_range
+from splat.raster.threads import over_range, single_threaded, thread_count
 from splat.render import render
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import DTYPES, random_gaussians, random_like
@@ -71,3 +72,15 @@ def test_an_error_in_another_thread_is_not_swallowed():
     torch.set_num_threads(2)
     with pytest.raises(ArithmeticError, match=r"part 5\.\.10"):
         over_range(10, fail_late)
+
+
+@pytest.mark.usefixtures("threads")
+def test_a_thread_that_asks_for_it_works_alone_and_only_that_one():
+    torch.set_num_threads(2)
+    with single_threaded(), ThreadPoolExecutor(1) as other:
+        assert thread_count() == 1
+        with single_threaded():
+            pass
+        assert thread_count() == 1
+        assert other.submit(thread_count).result() == torch.get_num_threads()
+    assert thread_count() == 2
