@@ -3,9 +3,9 @@
 Everything here sees a `SymmetricOperator` and a `torch.Generator`, and returns a frozen result that carries its error.
 """
 
-from landscape.anisotropy import anisotropy, effective_rank, literal, saddle, share
+from landscape.anisotropy import anisotropy, effective_rank, literal, mass_quantile, saddle, share
 from landscape.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
-from landscape.density import absolute_sum, spectral_density
+from landscape.density import ActiveSpace, absolute_sum, spectral_density
 from landscape.distributed import DistributedOperator, Ranks
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.lanczos import LanczosFactorization, lanczos
@@ -20,6 +20,7 @@ from landscape.operator import (
     SymmetricOperator,
 )
 from landscape.power import PowerSettings, power_ends, power_iteration
+from landscape.quantiles import absolute_quantile, quantile
 from landscape.results import (
     Anisotropy,
     Bracket,
@@ -36,6 +37,7 @@ from landscape.trace import PAPER, TraceSettings, estimate_traces
 
 __all__ = [
     "PAPER",
+    "ActiveSpace",
     "Anisotropy",
     "Bracket",
     "CountingOperator",
@@ -61,6 +63,7 @@ __all__ = [
     "SymmetricOperator",
     "TraceEstimate",
     "TraceSettings",
+    "absolute_quantile",
     "absolute_sum",
     "anisotropy",
     "check_gradient",
@@ -73,8 +76,10 @@ __all__ = [
     "extreme_eigenpairs",
     "lanczos",
     "literal",
+    "mass_quantile",
     "power_ends",
     "power_iteration",
+    "quantile",
     "saddle",
     "share",
     "spectral_density",

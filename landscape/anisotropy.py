@@ -4,6 +4,8 @@
     saddle          lambda_1 / |lambda_n|                          of an indefinite operator only
     share           lambda_1 / sum |lambda_i|                      how much of all curvature is in one direction
     effective_rank  (sum |lambda_i|)^2 / sum lambda_i^2            over how many directions it is spread, 1 to n
+    mass_quantile   lambda_1 / t, t the magnitude that the share   how far the steepest direction stands above those that
+                    p = 0.05 of sum |lambda_i| lies at or below    hardly add to all curvature; null directions do not count
 
 Brackets follow from the eigenvalues' residuals, the round-off and the sums' intervals (each at a level that gives the
 quotient 95%).  The literal index is negative for an indefinite operator; where lambda_n may be zero it has no upper
@@ -15,6 +17,7 @@ from math import inf
 import torch
 
 from landscape.density import absolute_sum
+from landscape.quantiles import absolute_quantile
 from landscape.results import Anisotropy, Bracket, EigenEnds, SpectralDensity
 
 CONFIDENCE = 0.95
@@ -28,6 +31,7 @@ def anisotropy(ends: EigenEnds, density: SpectralDensity | None = None) -> Aniso
         saddle=saddle(ends),
         share=None if density is None else share(ends, density),
         effective_rank=None if density is None else effective_rank(ends, density),
+        mass_quantile=None if density is None else mass_quantile(ends, density),
     )
 
 
@@ -79,6 +83,15 @@ def effective_rank(ends: EigenEnds, density: SpectralDensity) -> Bracket:
     high = total.high**2 / square if square else inf
     value = min(max(total.value**2 / squares.value, 1.0), float(density.dim))
     return Bracket(value, max(low, 1.0), min(high, float(density.dim)), total.note)
+
+
+def mass_quantile(ends: EigenEnds, density: SpectralDensity, p: float = 0.05) -> Bracket:
+    """lambda_max / the |lambda| that the share p of sum |lambda| lies at or below."""
+    top, small = _intervals(ends)[0], absolute_quantile(density, p, JOINT)
+    if not small.value:
+        return Bracket(None, inf, inf, small.note)
+    quotients = [a / b if b else inf for a in top for b in (small.low, small.high)]
+    return Bracket(float(ends.largest.values[0]) / small.value, min(quotients), max(quotients), small.note)
 
 
 def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -9,7 +9,13 @@ eigenvectors are the Gauss rule of the measure mu_z(x) = sum_i (z . v_i)^2 delta
 sum |lambda_i|, which has a kink at 0, is bracketed without any assumption on the spectrum.  In y = x^2 it is the
 integral of sqrt(y), whose derivatives alternate in sign on y > 0; hence the Gauss rule in y lies above it and the
 Gauss-Radau rule with a node at y = 0 lies below.  Both rules follow from the m nodes in x alone.
+
+Where a null space is known, with P the projector off it and r the rank of P, the start vectors are P z / |P z|.  The density is
+then that of the r other eigenvalues, and sums over them are r times its integrals.
 """
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float64
@@ -21,6 +27,18 @@ from landscape.probes import draw_probes
 from landscape.results import Bracket, Progress, SpectralDensity, t_interval
 
 
+@dataclass(frozen=True, eq=False)
+class ActiveSpace:
+    """What a known null space of P H P leaves: the orthogonal projector `project(V) -> P V` and its rank."""
+
+    project: Callable[[Tensor], Tensor]
+    rank: int
+
+    def __post_init__(self) -> None:
+        if self.rank < 1:
+            raise ValueError(f"expected a projector of rank 1 or more, got {self.rank}")
+
+
 def spectral_density(
     operator: SymmetricOperator,
     generator: torch.Generator,
@@ -28,8 +46,11 @@ def spectral_density(
     steps: int = 32,
     batch: int = 2,
     progress: Progress | None = None,
+    active: ActiveSpace | None = None,
 ) -> SpectralDensity:
     """Gauss rules of `starts` random vectors, `batch` of them at a time (memory: batch * steps vectors).
+
+    active: leaves the eigenvalues of a known null space out; `dim` of the result is then the rank.
 
     >>> H = DenseOperator(torch.diag(torch.tensor([-1.0, 2.0, 5.0], dtype=torch.float64)))
     >>> density = spectral_density(H, torch.Generator().manual_seed(0), starts=2, steps=3)
@@ -38,7 +59,8 @@ def spectral_density(
     """
     if starts < 2 or steps < 2 or batch < 1:
         raise ValueError(f"expected starts >= 2, steps >= 2 and batch >= 1, got {starts}, {steps} and {batch}")
-    n, steps = operator.dim, min(steps, operator.dim)
+    rank = operator.dim if active is None else active.rank
+    steps = min(steps, rank)
     nodes = torch.zeros(starts, steps, dtype=torch.float64)
     weights = torch.zeros(starts, steps, dtype=torch.float64)
     matvecs = 0
@@ -49,14 +71,17 @@ def spectral_density(
 
     for first in range(0, starts, batch):
         count = min(batch, starts - first)
-        Z = draw_probes(n, count, generator, operator.dtype, "rademacher")
+        Z = draw_probes(operator.dim, count, generator, operator.dtype, "rademacher")
+        if active is not None:
+            Z = active.project(Z)
+        seen = Z.double().square().sum(dim=0) / rank  # 1, or 1 on average: keeps the sums unbiased
         factorizations = lanczos(operator, Z, steps, report)
         matvecs += sum(len(f.T) for f in factorizations)
-        for row, factorization in enumerate(factorizations, first):
+        for row, factorization, share in zip(range(first, starts), factorizations, seen, strict=False):
             size = len(factorization.T)  # below steps where the start vector's invariant subspace is complete
             values, vectors = torch.linalg.eigh(factorization.T)
-            nodes[row, :size], weights[row, :size] = values, vectors[0].square()
-    return SpectralDensity(nodes, weights, n, matvecs)
+            nodes[row, :size], weights[row, :size] = values, share * vectors[0].square()
+    return SpectralDensity(nodes, weights, rank, matvecs)
 
 
 def absolute_sum(density: SpectralDensity, confidence: float = 0.95) -> Bracket:

@@ -176,7 +176,8 @@ class SpectralDensity:
     """The spectrum as seen by stochastic Lanczos quadrature: for every start vector, nodes and weights of a Gauss rule.
 
     The density of eigenvalues, normalised to 1, is about the mean over starts of sum_j weights_j delta(x - nodes_j);
-    it is exact in expectation for polynomials of degree below 2 steps.
+    it is exact in expectation for polynomials of degree below 2 steps.  dim: of how many eigenvalues, those of a known
+    null space left out (the weights of a start vector then sum to 1 on average only).
     """
 
     nodes: Float64[Tensor, "starts steps"]
@@ -205,6 +206,7 @@ class Anisotropy:
     saddle: Bracket
     share: Bracket | None = None
     effective_rank: Bracket | None = None
+    mass_quantile: Bracket | None = None
 
     def record(self) -> dict[str, object]:
         members = {
@@ -212,6 +214,7 @@ class Anisotropy:
             "saddle": self.saddle,
             "share": self.share,
             "effective_rank": self.effective_rank,
+            "mass_quantile": self.mass_quantile,
         }
         return {name: bracket.record() for name, bracket in members.items() if bracket is not None}
 

@@ -3,7 +3,7 @@ from math import inf, isclose
 import pytest
 import torch
 
-from landscape.anisotropy import anisotropy, effective_rank, literal, saddle, share
+from landscape.anisotropy import anisotropy, effective_rank, literal, mass_quantile, saddle, share
 from landscape.density import spectral_density
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.operator import DenseOperator
@@ -70,6 +70,11 @@ def test_every_bracket_holds_the_truth(name):
     assert family.share is not None and family.effective_rank is not None
     assert family.share.low <= float(true[-1] / magnitude) <= family.share.high
     assert family.effective_rank.low <= float(magnitude**2 / true.square().sum()) <= family.effective_rank.high
+    small = float(
+        true.abs().sort().values[int(torch.searchsorted(true.abs().sort().values.cumsum(0), 0.05 * magnitude))]
+    )
+    assert family.mass_quantile is not None
+    assert family.mass_quantile.low <= float(true[-1]) / small <= family.mass_quantile.high
     if name == "rank-deficient":
         assert family.literal.high == inf and family.literal.low > 1e10 and family.saddle.value is None
         return
@@ -86,13 +91,15 @@ def test_a_multiple_of_the_identity_has_full_effective_rank_and_even_share():
     rank = effective_rank(found, density)
     assert (rank.low, rank.value, rank.high) == pytest.approx((N, N, N))
     assert share(found, density).value == pytest.approx(-1 / N)
+    quotient = mass_quantile(found, density)
+    assert quotient.value == pytest.approx(-1) and quotient.low <= -1 <= quotient.high <= 0
 
 
 def test_the_zero_operator_has_no_index():
     H = operator("zero")
     found, density = extreme_eigenpairs(H, generator()), spectral_density(H, generator())
     family = anisotropy(found, density)
-    for index in (family.literal, family.saddle, family.share, family.effective_rank):
+    for index in (family.literal, family.saddle, family.share, family.effective_rank, family.mass_quantile):
         assert index is not None and index.value is None
 
 
@@ -115,7 +122,7 @@ def test_splitting_a_direction_in_two_halves_changes_the_literal_index_but_not_t
     assert before.share is not None and after.share is not None
     assert after.share.low <= float(twice[-1] / twice.abs().sum()) <= after.share.high
     assert float(twice[-1] / twice.abs().sum()) == pytest.approx(float(true[-1] / true.abs().sum()))
-    assert before.record().keys() == {"literal", "saddle", "share", "effective_rank"}
+    assert before.record().keys() == {"literal", "saddle", "share", "effective_rank", "mass_quantile"}
 
 
 def test_without_a_density_only_the_ends_indices_are_given():

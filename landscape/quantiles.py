@@ -1,0 +1,137 @@
+"""Quantiles of a spectrum from stochastic Lanczos quadrature, with brackets that assume nothing of the spectrum.
+
+    quantile            lambda that the share p of all eigenvalues lies at or below
+    absolute_quantile   t such that the share p of sum |lambda_i| comes from |lambda_i| <= t
+
+**One start vector.**  Its measure mu has a Gauss rule, nodes x_1 < x_2 < ... and weights w_j.  Whatever mu is (Chebyshev,
+Markov and Stieltjes; Akhiezer 1965, Sec. 2.5),
+
+    sum_{j<k} w_j  <=  mu(x < x_k)  <=  mu(x <= x_k)  <=  sum_{j<=k} w_j
+
+and the same holds for integrals from a node to infinity of an f whose derivatives f, f', f'', ... have the signs +, -, +, ...
+there.  For the curvature at magnitudes above t take y = x^2 and the measure y dmu, whose Gauss rule (nodes y_j, weights u_j)
+follows from that of mu: f(y) = y^(-1/2) gives
+
+    sum_{j>k} u_j / sqrt(y_j)  <=  sum of |lambda| over lambda^2 > y_k, or >= y_k  <=  sum_{j>=k} u_j / sqrt(y_j)
+
+**All start vectors.**  For random signs z the share of eigenvalues that z sees in a set of true share F is F on average, with
+a variance of at most 2 F (1 - F) / n a start vector: the beta distribution of that mean and variance says how far the mean
+over the start vectors may be off at F = p.  The sums of curvature are compared by Student's interval of (curvature above t) -
+(1 - p) (all curvature), which is linear in what the start vectors see.  A bracket ends where the test just fails to exclude t.
+"""
+
+from math import inf
+
+import torch
+from jaxtyping import Float64
+from scipy.stats import beta
+from scipy.stats import t as student
+from torch import Tensor
+
+from landscape.density import absolute_bounds
+from landscape.lanczos import lanczos
+from landscape.operator import DenseOperator
+from landscape.results import Bracket, SpectralDensity
+
+
+def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Bracket:
+    """The eigenvalue with the share p of all of them at or below it; an end that no node bounds is infinite.
+
+    >>> from landscape.density import spectral_density
+    >>> H = DenseOperator(torch.diag(torch.linspace(0, 1, 1001, dtype=torch.float64)))
+    >>> median = quantile(spectral_density(H, torch.Generator().manual_seed(0), starts=4, steps=40), 0.5)
+    >>> 0.4 < median.low < 0.5 < median.high < 0.6
+    True
+    """
+    _require_share(p)
+    rules = list(zip(density.nodes, density.weights, strict=True))
+    grid = density.nodes[density.weights > 0].unique()
+    below, upto = (torch.zeros(len(rules), len(grid), dtype=torch.float64) for _ in range(2))
+    for i, (nodes, weights) in enumerate(rules):
+        nodes, order = nodes[weights > 0].sort()
+        sums = torch.nn.functional.pad((weights[weights > 0][order] / weights.sum()).cumsum(0), (1, 0))
+        # mu(x <= grid) is at least the sum before its last node that is not above, at most the sum to the next node
+        below[i] = sums[(torch.searchsorted(nodes, grid, right=True) - 1).clamp_min(0)]
+        upto[i] = sums[(torch.searchsorted(nodes, grid) + 1).clamp_max(len(nodes))]
+    trials = len(rules) * density.dim / 2
+    least, most = beta.ppf([(1 - confidence) / 2, (1 + confidence) / 2], trials * p, trials * (1 - p))
+    above = grid[upto.mean(dim=0) < least]
+    reached = grid[below.mean(dim=0) >= most]
+    return _bracket(density, p, density.weights, above.max() if len(above) else -inf, _first(reached, inf))
+
+
+def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: float = 0.95) -> Bracket:
+    """The magnitude t such that the share p of sum |lambda| comes from |lambda| <= t."""
+    _require_share(p)
+    tails = [_Tail(*rule) for rule in zip(density.nodes, density.weights, strict=True)]
+    grid = torch.cat([torch.zeros(1, dtype=torch.float64), *(tail.magnitudes for tail in tails)]).unique()
+    if len(grid) == 1:
+        return Bracket(None, 0.0, inf, "the operator is zero")
+    least, most = (torch.stack(column) for column in zip(*(tail.excess(grid, p) for tail in tails), strict=True))
+    margin = float(student.ppf((1 + confidence) / 2, len(tails) - 1)) / len(tails) ** 0.5
+    beneath = least.mean(dim=0) - margin * least.std(dim=0) > 0  # t is certainly too low, up to the next of the grid
+    beyond = most.mean(dim=0) + margin * most.std(dim=0) <= 0  # certainly high enough
+    totals = torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64)
+    floor = p * float(totals.mean() - margin * totals.std())  # n eigenvalues up to t add up to n t at most
+    low = float(grid[int(beneath.long().cumprod(0).sum().clamp_max(len(grid) - 1))])
+    certain = int(beyond.long().flip(0).cumprod(0).sum())
+    high = float(grid[-certain]) if certain else inf
+    return _bracket(density, p, density.weights * density.nodes.abs(), max(low, floor), high, magnitudes=True)
+
+
+class _Tail:
+    """What one start vector says of the curvature at magnitudes above t."""
+
+    def __init__(self, nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"]) -> None:
+        self.total = absolute_bounds(nodes, weights)
+        scale = float(nodes.abs().max())
+        squares = (nodes / scale).square() if scale else torch.zeros_like(nodes)
+        mass = weights * squares
+        kept = mass > 0
+        steps = (len(nodes) - 1) // 2  # x^2 dmu is known to degree 2 m - 3 in x: to m - 2 in y
+        if not kept.any() or steps == 0:
+            self.magnitudes = self.carried = torch.zeros(0, dtype=torch.float64)
+            return
+        (rule,) = lanczos(DenseOperator(torch.diag(squares[kept])), mass[kept].sqrt()[:, None], steps)
+        y, vectors = torch.linalg.eigh(rule.T)
+        positive = y > 0  # all are, up to round-off
+        root = y[positive].sqrt()
+        self.magnitudes = scale * root
+        self.carried = scale * float(mass.sum()) * vectors[0, positive].square() / root
+
+    def excess(self, t: Float64[Tensor, " g"], p: float) -> tuple[Float64[Tensor, " g"], Float64[Tensor, " g"]]:
+        """Bounds of (curvature above t) - (1 - p) (all curvature), for t and all that follows up to the next node."""
+        low, high = self.total
+        above = torch.nn.functional.pad(self.carried.flip(0).cumsum(0).flip(0), (0, 2))  # at node k and beyond
+        following = torch.searchsorted(self.magnitudes, t, right=True)  # the first node above t
+        least = above[following + 1]
+        most = torch.where(following > 0, above[(following - 1).clamp_min(0)], torch.full_like(t, high)).clamp_max(high)
+        return least - (1 - p) * high, most - (1 - p) * low
+
+
+def _bracket(
+    density: SpectralDensity,
+    p: float,
+    mass: Tensor,
+    low: Tensor | float,
+    high: Tensor | float,
+    magnitudes: bool = False,
+) -> Bracket:
+    """The quantile of all nodes together, within what is certain."""
+    low, high = float(low), float(high)
+    at, order = (density.nodes.abs() if magnitudes else density.nodes).flatten().sort()
+    sums = mass.flatten()[order].cumsum(0)
+    value = float(at[int(torch.searchsorted(sums, p * sums[-1]).clamp_max(len(at) - 1))])
+    steps = int((density.weights > 0).sum(dim=1).max())
+    return Bracket(
+        min(max(value, low), high), low, high, f"{len(density.nodes)} start vectors of {steps} Lanczos steps"
+    )
+
+
+def _first(values: Tensor, otherwise: float) -> Tensor | float:
+    return values.min() if len(values) else otherwise
+
+
+def _require_share(p: float) -> None:
+    if not 0 < p < 1:
+        raise ValueError(f"expected a share p between 0 and 1, got {p}")
