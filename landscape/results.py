@@ -4,7 +4,8 @@
     standard error  of a mean over probe vectors: s / sqrt(probes)
     residual        |H v - lambda v| for a unit v: an eigenvalue lies within it of lambda, whatever v is
     reason          why the work ended: "tolerance" (the error asked for is reached), "noise floor" (more work would not
-                    help: the error left is the matvec's own), "matvec budget", "time budget", or "exact"
+                    help: the error left is the matvec's own), "matvec budget", "evaluation budget", "time budget", or
+                    "exact"
 
 `record()` gives the scalars of a result as plain Python values for JSON; what is infinite or undefined is None there.
 """
@@ -19,7 +20,7 @@ from jaxtyping import Bool, Float, Float64
 from scipy.stats import t as student
 from torch import Tensor
 
-StopReason = Literal["tolerance", "noise floor", "matvec budget", "time budget", "exact"]
+StopReason = Literal["tolerance", "noise floor", "matvec budget", "evaluation budget", "time budget", "exact"]
 Sign = Literal["positive", "negative", "zero", "undetermined"]
 Number = float | None
 
@@ -57,6 +58,13 @@ class TraceEstimate:
     matvecs: int
     reason: StopReason
     samples: Float64[Tensor, " probes"]
+    method: str = "hutchinson"
+
+    @classmethod
+    def exact(cls, block: str, dim: int, value: float, confidence: float, matvecs: int = 0) -> "TraceEstimate":
+        """A trace that nothing was left to chance in."""
+        none = torch.zeros(0, dtype=torch.float64)
+        return cls(block, dim, value, 0.0, value, value, confidence, 0, matvecs, "exact", none, "exact")
 
     @property
     def half_width(self) -> float:
@@ -84,6 +92,7 @@ class TraceEstimate:
             "probes": self.probes,
             "matvecs": self.matvecs,
             "reason": self.reason,
+            "method": self.method,
         }
 
 
@@ -223,21 +232,60 @@ class Anisotropy:
 class Slice:
     """The objective on a grid center + sum_d x_d directions[:, d], d = 1 or 2, beside its quadratic model.
 
-    loss has one axis per direction (rows follow coordinates[0], columns coordinates[1]).  model, slope and curvature
-    are None where neither gradient nor operator was given.  crossed marks points whose signature (order of sorting,
-    visible set) differs from the centre's: between them the objective may jump.
+    loss has one axis per direction (rows follow coordinates[0], columns coordinates[1]): the objective itself at points that
+    are `evaluated`, interpolated elsewhere.  holdout: |prediction - objective| at random points, which tells how good that is.
+    model, slope and curvature are None where neither gradient nor operator was given.  crossed marks evaluated points whose
+    signature (order of sorting, visible set) differs from the centre's, so that the objective may jump on the way there;
+    at points that are not evaluated it is False and nothing is known.  evaluations: of the objective, the centre's too.
     """
 
     coordinates: tuple[Float64[Tensor, " _"], ...]
     loss: Float64[Tensor, "..."]
+    evaluated: Bool[Tensor, "..."]
+    holdout: Float64[Tensor, " m"]
     center_loss: float
     model: Float64[Tensor, "..."] | None
     slope: Float64[Tensor, " d"] | None
     curvature: Float64[Tensor, "d d"] | None
     crossed: Bool[Tensor, "..."] | None
     evaluations: int
+    reason: StopReason
 
     @property
     def difference(self) -> Float64[Tensor, "..."] | None:
         """Objective minus quadratic model."""
         return None if self.model is None else self.loss - self.model
+
+    @property
+    def range(self) -> float:
+        """The largest difference between finite evaluated values."""
+        finite = self.loss[self.evaluated & self.loss.isfinite()]
+        return float(finite.max() - finite.min()) if finite.numel() else 0.0
+
+    @property
+    def interpolation_error(self) -> float:
+        """The largest error of the hold-out as a share of the range; 0 where every point is evaluated."""
+        if self.evaluated.all() or not self.holdout.any():
+            return 0.0
+        return float(self.holdout.max()) / self.range if self.range else inf
+
+    @property
+    def share_beyond(self) -> float:
+        """At most this share of the points drawn from is off by more than interpolation_error, with 95% confidence.
+
+        If a share p were, m random points would all miss it with the probability (1 - p)^m at most.
+        """
+        return 0.0 if self.evaluated.all() else 1 - 0.05 ** (1 / self.holdout.numel())
+
+    def record(self) -> dict[str, Number | int | str]:
+        return {
+            "points": self.loss.numel(),
+            "evaluated_points": int(self.evaluated.sum()),
+            "crossed_points": 0 if self.crossed is None else int(self.crossed.sum()),
+            "evaluations": self.evaluations,
+            "center_loss": self.center_loss,
+            "interpolation_error": finite_or_none(self.interpolation_error),
+            "holdout_points": self.holdout.numel(),
+            "share_beyond": self.share_beyond,
+            "reason": self.reason,
+        }

@@ -1,6 +1,6 @@
 """Slices of an objective: its values on a grid of one or two directions, beside the quadratic model there.
 
-    f(x)     = L(center + sum_d x_d e_d)              every point is a true evaluation
+    f(x)     = L(center + sum_d x_d e_d)              true evaluations where needed (`refinement`), interpolated elsewhere
     model(x) = L + b . x + x^T A x / 2                b = E^T g,  A = E^T H E
 
 x is in multiples of the directions as given: for unit eigenvectors, in parameter units.  `curvature_reach` gives ranges
@@ -8,15 +8,19 @@ in units of the curvature instead: where the quadratic along an eigenvector has 
 x = r sqrt(2 dL / |lambda|).
 """
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from math import isfinite, sqrt
+from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.grid_evaluations import GridEvaluations, Loss
 from landscape.operator import SymmetricOperator
-from landscape.results import Progress, Slice
+from landscape.refinement import SliceSettings, evaluate_adaptively
+from landscape.results import Progress, Slice, StopReason
 
 
 def symmetric_axis(radius: float, points: int = 41) -> Float64[Tensor, " points"]:
@@ -48,61 +52,74 @@ def curvature_reach(curvature: float, rise: float, multiple: float = 1.0) -> flo
 
 
 def evaluate_slice(
-    loss: Callable[[Tensor], Tensor | float],
+    loss: Loss,
     center: Float[Tensor, " n"],
     directions: Float[Tensor, "n d"],
     coordinates: Sequence[Float64[Tensor, " _"]],
     gradient: Float[Tensor, " n"] | None = None,
     operator: SymmetricOperator | None = None,
-    signature: Callable[[Tensor], Hashable] | None = None,
+    settings: SliceSettings = SliceSettings(),
+    generator: torch.Generator | None = None,
+    store: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Slice:
     """loss on the grid coordinates[0] x coordinates[1] (d = 2) or along coordinates[0] (d = 1).
 
-    Points are formed in float64 and rounded once to center's dtype.  With gradient and operator (at center) the
-    quadratic model comes beside it, for d matvecs.  signature(theta) names the piece of a piecewise smooth objective:
-    points whose signature differs from the centre's are marked.
+    loss(theta) is the objective, or (objective, signature) where it is piecewise smooth: points whose signature differs from
+    the centre's are marked.  It must be safe to call from settings.workers threads.  With gradient and operator (at center)
+    the quadratic model comes beside it, for d matvecs.  generator draws the hold-out points (`refinement`); it is not
+    needed where every point is evaluated.  store: a file that keeps the evaluations, from which a killed run continues.
 
-    >>> line = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :1], [symmetric_axis(2.0, 5)])
-    >>> line.loss
-    tensor([4., 1., 0., 1., 4.], dtype=torch.float64)
+    >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
+    >>> line = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :1], [axis], generator=generator)
+    >>> line.loss[::10], int(line.evaluated.sum()), line.reason
+    (tensor([4., 1., 0., 1., 4.], dtype=torch.float64), 13, 'tolerance')
     """
     _require_slice(center, directions, coordinates)
     if (gradient is None) != (operator is None):
         raise ValueError("expected both gradient and operator for the quadratic model, or neither; got one of them")
-    grid = torch.stack(torch.meshgrid(*coordinates, indexing="ij"), dim=-1).double()
-    points = grid.reshape(-1, len(coordinates))
-    origin, spans = center.detach().double(), directions.detach().double()
-    center_loss = float(loss(center))
-    if not isfinite(center_loss):
-        raise ValueError(f"expected a finite objective at the centre, got {center_loss}")
-    here = signature(center) if signature else None
-    values, crossed = torch.empty(len(points), dtype=torch.float64), torch.zeros(len(points), dtype=torch.bool)
-    for index, x in enumerate(points):
-        theta = (origin + spans @ x).to(center.dtype)
-        values[index] = float(loss(theta))
-        if signature:
-            crossed[index] = signature(theta) != here
-        if progress:
-            progress(index + 1, len(points), "slice")
-    shape = grid.shape[:-1]
+    if settings.tolerance is not None and generator is None:
+        raise ValueError(
+            "expected a generator for the hold-out points of an adaptive slice, got none; "
+            "pass torch.Generator().manual_seed(0), or SliceSettings(tolerance=None) to evaluate every point"
+        )
+    axes = [axis.detach().double() for axis in coordinates]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    shape, points = grid.shape[:-1], grid.reshape(-1, len(axes))
+    file = None if store is None else Path(store)
+    found = GridEvaluations(loss, center, directions, points, settings.workers, file, progress)
+    reason: StopReason
+    if settings.tolerance is None or generator is None:
+        found.require(range(len(points)))
+        values, holdout, reason = found.value, np.empty(0), "exact"
+    else:
+        x, y = axes[0].numpy(), axes[1].numpy() if len(axes) == 2 else np.zeros(1)
+        values, holdout, reason = evaluate_adaptively(found, x, y, settings, generator)
     slope = curvature = model = None
     if gradient is not None and operator is not None:
-        slope = spans.T @ gradient.double()
-        curvature = spans.T @ operator.apply(directions.to(operator.dtype)).double()
-        curvature = (curvature + curvature.T) / 2
-        model = center_loss + points @ slope + ((points @ curvature) * points).sum(dim=1) / 2
+        slope, curvature = _derivatives(gradient, operator, directions)
+        model = found.center_loss + points @ slope + ((points @ curvature) * points).sum(dim=1) / 2
         model = model.reshape(shape)
     return Slice(
-        coordinates=tuple(axis.double() for axis in coordinates),
-        loss=values.reshape(shape),
-        center_loss=center_loss,
+        coordinates=tuple(axes),
+        loss=torch.from_numpy(values).reshape(shape),
+        evaluated=torch.from_numpy(found.known).reshape(shape),
+        holdout=torch.from_numpy(holdout),
+        center_loss=found.center_loss,
         model=model,
         slope=slope,
         curvature=curvature,
-        crossed=crossed.reshape(shape) if signature else None,
-        evaluations=len(points) + 1,
+        crossed=torch.from_numpy(found.crossed).reshape(shape) if found.has_signature else None,
+        evaluations=int(found.known.sum()) + 1,
+        reason=reason,
     )
+
+
+def _derivatives(gradient: Tensor, operator: SymmetricOperator, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """b and A of the model."""
+    spans = directions.detach().double()
+    curvature = spans.T @ operator.apply(directions.to(operator.dtype)).double()
+    return spans.T @ gradient.double(), (curvature + curvature.T) / 2
 
 
 def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Tensor]) -> None:
@@ -117,6 +134,8 @@ def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Ten
             f"expected one vector of coordinates per direction ({directions.shape[1]}), got shapes "
             f"{[tuple(axis.shape) for axis in coordinates]}"
         )
+    if not all(axis.isfinite().all() and (axis.diff() > 0).all() for axis in coordinates):
+        raise ValueError("expected finite coordinates that increase, got others; sort them and drop repeated ones")
     lengths = torch.linalg.vector_norm(directions.double(), dim=0)
     if not ((lengths > 0) & torch.isfinite(lengths)).all():
         raise ValueError(f"expected finite directions that are not zero, got lengths {lengths.tolist()}")
