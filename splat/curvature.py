@@ -191,6 +191,9 @@ class SceneHessian:
     A `landscape` operator: `dim`, `blocks`, `dtype`, `apply(V)`.  P leaves out, for the Hessian, the lengths of the quaternions
     (null where the gradient vanishes, and by choice elsewhere) and the SH directions that no view sees; for Gauss-Newton all
     that no view sees.  keep_null: P = 1 instead.
+
+    passes, spared: products of a view with a vector that were made, and that were left out because the vector moves no
+    Gaussian that the view draws (V on a few Gaussians, say).
     """
 
     def __init__(self, objective: SceneObjective, *, gauss_newton: bool = False, keep_null: bool = False):
@@ -198,6 +201,7 @@ class SceneHessian:
         self.dim = objective.active.flat.numel()
         self.blocks = objective.blocks
         self.dtype = objective.active.flat.dtype
+        self.passes, self.spared = 0, 0
 
     @cached_property
     def _row_space(self) -> RowSpace:
@@ -238,25 +242,9 @@ class SceneHessian:
         for view in self.objective.linearized:
             for start in range(0, V.shape[1], at_once):
                 some = V[:, start : start + at_once]
+                if not view.concerns(some):
+                    self.spared += some.shape[1]
+                    continue
+                self.passes += some.shape[1]
                 total[:, start : start + at_once] += view.ggn(some) if self.gauss_newton else view.hvp(some)
         return self.project(self.objective.mean(total))
-
-
-def scene_units(objective: SceneObjective) -> Float[Tensor, " p"]:
-    """D for curvature D H D with positions in units of the scene's size (`ScaledOperator`); the other attributes have none.
-
-    The size: the median depth of the active Gaussians in the first view, for forward-facing views; the mean
-    distance of the cameras from their centroid otherwise.
-    """
-    cameras = [view.camera for view in objective.views]
-    directions = torch.stack([camera.forward for camera in cameras])
-    if float((directions @ directions.mean(dim=0)).min()) > 0.7 * float(directions.mean(dim=0).norm()):
-        offsets = objective.active.means.double() - cameras[0].centre
-        depth = offsets @ cameras[0].forward
-        size = float(depth[depth > 0].median())
-    else:
-        centres = torch.stack([camera.centre for camera in cameras])
-        size = float((centres - centres.mean(dim=0)).norm(dim=1).mean())
-    scale = torch.ones(objective.active.flat.numel(), dtype=objective.active.flat.dtype)
-    scale[objective.blocks["means"]] = size
-    return scale

@@ -24,7 +24,7 @@ from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.losses_cpu import LinearLoss, ViewLoss
 from splat.projection_cpu import lens_of, project_arrays
-from splat.projection_linear import Held, Projection
+from splat.projection_linear import Held, Projection, split
 from splat.raster.compositing import SUMS, TANGENTS
 from splat.raster.cpu import Adjoint, Raster
 from splat.settings import RenderSettings
@@ -127,6 +127,11 @@ class LinearizedView:
         item, planes, n = self._raster.splats.itemsize, self._raster.frame.size, len(self.gaussians)
         each = 5 * planes + SUMS * self.entries + (TANGENTS + 2 * 9) * n
         return item * (vectors * each + 3 * planes)
+
+    def concerns(self, U: Float[Tensor, "p k"]) -> bool:
+        """Whether a vector moves any Gaussian that the view draws: where none does, all products are 0."""
+        parts = split(_block(U), len(self.gaussians), self.gaussians.sh_degree)
+        return any(part[self._index].any() for part in parts)
 
     def jvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "k 4 h w"]:
         """J U: tangents of colour and accumulated alpha."""

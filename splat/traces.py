@@ -6,17 +6,17 @@ With E_b the columns of block b, J the Jacobian of the images, D the pixel-diago
     x = |J E_b z|^2 in the metric l'',  y = the same in the metric D,  z random signs;  E[y] = C_b is exact too
 
 so y is a control variate: each sample is x - c (y - C_b), with c fitted to the other samples (so that no sample takes part in
-its own coefficient and the mean stays unbiased).  A sample of all blocks costs one J u of as many vectors as there are blocks,
-and no backward pass.  Where the loss is a sum over pixels, l'' = D and the traces are exact.
+its own coefficient and the mean stays unbiased).  A sample costs one J u of as many vectors as there are blocks whose error is
+not yet small enough, and no backward pass.  Where the loss is a sum over pixels, l'' = D and the traces are exact.
 """
 
 from math import ceil
 from time import monotonic
 
 import torch
-from jaxtyping import Float64
 from torch import Tensor
 
+from landscape.control import controlled
 from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, TraceEstimate, t_interval
 from landscape.trace import TraceSettings
@@ -47,13 +47,15 @@ def exact_traces(
             for name, value in known.items()
         }
     pixelwise = objective.block_diagonal(gauss_newton=True).traces(quats)
-    names, deadline = list(known), monotonic() + settings.max_seconds
-    full, diagonal = (torch.empty(len(names), 0, dtype=torch.float64) for _ in range(2))
-    look = settings.min_probes
-    while True:
-        x, y = _sample(objective, generator)
-        full, diagonal = torch.cat([full, x[:, None]], dim=1), torch.cat([diagonal, y[:, None]], dim=1)
-        count = full.shape[1]
+    estimates: dict[str, TraceEstimate] = {}
+    open_blocks, deadline = list(known), monotonic() + settings.max_seconds
+    full, diagonal = {name: [] for name in known}, {name: [] for name in known}
+    count, look = 0, settings.min_probes
+    while open_blocks:
+        for name, x, y in zip(open_blocks, *_sample(objective, generator, open_blocks), strict=True):
+            full[name].append(x)
+            diagonal[name].append(y)
+        count += 1
         if progress:
             progress(count, settings.max_probes, f"traces: {count} samples of the coupling between pixels")
         late = monotonic() > deadline and count >= settings.min_probes
@@ -61,36 +63,26 @@ def exact_traces(
             continue
         look = min(ceil(GROWTH * count), settings.max_probes)
         reason: StopReason = "time budget" if late else "matvec budget"
-        estimates = {}
-        for i, name in enumerate(names):
-            samples = known[name] - pixelwise[name] + controlled(full[i], diagonal[i], pixelwise[name])
+        for name in open_blocks:
+            x, y = (torch.stack(samples[name]) for samples in (full, diagonal))
+            samples = known[name] - pixelwise[name] + controlled(x, y, pixelwise[name])
             estimates[name] = _estimate(name, sizes[name], samples, settings, reason)
-        if late or count == settings.max_probes or all(e.reason == "tolerance" for e in estimates.values()):
-            return estimates
+        if late or count == settings.max_probes:
+            break
+        open_blocks = [name for name in open_blocks if estimates[name].reason != "tolerance"]
+    return {name: estimates[name] for name in known}
 
 
-def controlled(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> Float64[Tensor, " s"]:
-    """samples - c (control - mean), c the least-squares slope through the other samples (0 where they do not vary)."""
-    if len(samples) < 3:
-        return samples
-    count = len(samples) - 1
-    rest_x, rest_y = (samples.sum() - samples) / count, (control.sum() - control) / count
-    cross = (samples * control).sum() - samples * control - count * rest_x * rest_y
-    spread = control.square().sum() - control.square() - count * rest_y.square()
-    slope = torch.where(spread > 0, cross / spread.clamp_min(1e-300), torch.zeros_like(cross))
-    return samples - slope * (control - mean)
-
-
-def _sample(objective: SceneObjective, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """x and y of every block, for one draw of signs."""
-    p, blocks = objective.active.flat.numel(), objective.blocks
+def _sample(objective: SceneObjective, generator: torch.Generator, names: list[str]) -> tuple[Tensor, Tensor]:
+    """x and y of the named blocks, for one draw of signs; the draw is the same whatever the names are."""
+    p = objective.active.flat.numel()
     z = draw_probes(p, 1, generator, objective.active.flat.dtype, "rademacher")
-    U = torch.zeros(p, len(blocks), dtype=z.dtype)
-    for i, rows in enumerate(blocks.values()):
+    U = torch.zeros(p, len(names), dtype=z.dtype)
+    for i, name in enumerate(names):
+        rows = objective.blocks[name]
         U[rows, i] = z[rows, 0]
-    pairs = [view.loss_curvatures(U) for view in objective.linearized]
-    full, diagonal = (torch.stack(column).sum(dim=0) for column in zip(*pairs, strict=True))
-    return objective.mean(full), objective.mean(diagonal)
+    total = torch.stack([torch.stack(view.loss_curvatures(U)) for view in objective.linearized]).sum(dim=0)
+    return tuple(objective.mean(total))  # pyright: ignore[reportReturnType]
 
 
 def _estimate(name: str, dim: int, samples: Tensor, settings: TraceSettings, reason: StopReason) -> TraceEstimate:

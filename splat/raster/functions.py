@@ -134,7 +134,13 @@ def rasterize_by_kernel(
     """Colour and accumulated alpha of `reference.rasterize_reference`, by the kernels."""
     parts = (splats.means, splats.conics, splats.opacities, splats.colours)
     raster = Raster(
-        _joined(parts), splats.depths.detach().numpy(), splats.drawn.numpy(), background.numpy(), width, height, settings
+        _joined(parts),
+        splats.depths.detach().numpy(),
+        splats.drawn.numpy(),
+        background.numpy(),
+        width,
+        height,
+        settings,
     )
     planes = _Rasterize.apply(raster, *parts)
     return planes[:3], planes[3]  # pyright: ignore

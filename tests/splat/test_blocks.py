@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from landscape.control import controlled
 from landscape.trace import TraceSettings
 from splat.camera import Camera
 from splat.curvature import SceneHessian, SceneObjective
@@ -14,7 +15,7 @@ from splat.losses import LossSettings
 from splat.losses_cpu import ViewLoss
 from splat.render import render
 from splat.scenes.view import View
-from splat.traces import controlled, exact_traces
+from splat.traces import exact_traces
 from tests.splat.random_scenes import random_camera, random_gaussians
 
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")
@@ -126,6 +127,19 @@ def test_traces_with_ssim_are_within_their_errors_over_many_seeds(noise: float) 
         # Student's t with 11 degrees of freedom has variance 11 / 9; the mean of 60 is then known to sqrt(11 / 9 / 60)
         assert abs(float(z.mean())) < 4 * sqrt(11 / 9 / seeds), name
         assert float(z.square().mean()) < 3, name
+
+
+def test_a_block_whose_error_is_small_enough_is_sampled_no_further_and_the_others_as_if_it_were() -> None:
+    objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise=0.1)
+    settings = TraceSettings(rtol=0.05, min_probes=8, max_probes=40)
+    adaptive = exact_traces(objective, torch.Generator().manual_seed(0), settings)
+    counts = {estimate.probes for estimate in adaptive.values()}
+    assert min(counts) < max(counts)
+    for count in counts:
+        fixed = exact_traces(objective, torch.Generator().manual_seed(0), TraceSettings.fixed(count))
+        for name, estimate in adaptive.items():
+            if estimate.probes == count:
+                assert estimate.value == fixed[name].value and estimate.standard_error == fixed[name].standard_error
 
 
 def test_the_control_variate_leaves_the_mean_unbiased_and_lowers_the_variance() -> None:

@@ -194,3 +194,25 @@ def test_what_cannot_be_an_objective_is_refused():
     H = SceneHessian(objective(gaussians))
     with pytest.raises(ValueError, match=r"use V\[:, None\]"):
         H.apply(torch.zeros(H.dim, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("gauss_newton", [False, True])
+def test_a_view_that_draws_nothing_of_what_the_vectors_move_is_left_out_without_a_difference(gauss_newton):
+    """Two cameras at one place, back to back, each with Gaussians of its own."""
+    gaussians, view = random_gaussians(12, 1, logit=1.0), two_views()[0]
+    about_y = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
+    behind = torch.arange(12) < 4
+    gaussians.means[behind] = 2 * view.camera.centre - gaussians.means[behind]
+    views = [view, replace(view, camera=replace(view.camera, rotation=about_y @ view.camera.rotation))]
+    scene = SceneObjective(gaussians, views, LOSS, BACKGROUND)
+    hessian = SceneHessian(scene, gauss_newton=gauss_newton, keep_null=True)
+    U = random_like((hessian.dim, 2), 5)
+    only_behind = scene.active.with_flat(torch.zeros(hessian.dim, dtype=torch.float64))
+    for part in only_behind.attributes.values():
+        part[behind[scene.mask]] = 1
+    for columns, passes, spared in ((U, 4, 0), (U * only_behind.flat[:, None], 2, 2), (torch.zeros_like(U), 0, 4)):
+        before = hessian.passes, hessian.spared
+        product = hessian.apply(columns)
+        assert (hessian.passes - before[0], hessian.spared - before[1]) == (passes, spared)
+        each = [held.ggn(columns) if gauss_newton else held.hvp(columns) for held in scene.linearized]
+        assert torch.equal(product, (each[0] + each[1]) / 2)
