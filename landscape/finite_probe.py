@@ -1,0 +1,160 @@
+"""Curvature along a direction at finite steps, beside the infinitesimal one: what probing a loss at a distance d sees.
+
+    c(d) = (L(theta + d v) - 2 L(theta) + L(theta - d v)) / d^2  =  v.H v + d^2 L4 / 12 + ...       L4 = d^4 L / dv^4
+
+round-off   4 sqrt(6 noise^2 + 2 (d s)^2) / d^2: four standard errors of a second difference of values with independent errors.
+            s = eps |theta * H v| / sqrt(12): away from theta the slope has grown by d H v, and theta + d v is rounded
+truncation  |c(d) - v.H v| as far as neighbouring steps tell it: the term in d^2 that makes their c differ.  It says nothing
+            across a kink, a jump or a crossed sort, where c(d) is no derivative at all but still what the probe sees
+noise       standard deviation of L's own error, from differences of order k = 4 of values at close, even steps along v, which
+            what is smooth does not pass: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and Wild 2011, Sec. 2);
+            at least the resolution of the numbers that the objective returns
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import factorial, isfinite, sqrt
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from landscape.grid_evaluations import Loss
+from landscape.operator import SymmetricOperator
+from landscape.results import Number, Progress, finite_or_none
+
+ORDER, NOISE_POINTS = 4, 24  # of the differences; the values they are taken of
+CLOSER = 4  # the values lie this many times closer together than the smallest step is long, ...
+ROUNDINGS = 4  # ... but so many round-offs of the parameters apart, lest their rounding be the same
+STEPS = tuple(10.0 ** (k / 2) for k in range(-10, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class FiniteProbe:
+    """c(d) at increasing steps d, in multiples of the direction, with the bound of its round-off and its truncation.
+
+    infinitesimal: v.H v; crossed: where the signature at +d or -d is not the centre's (None: the objective has none);
+    noise: the standard deviation of one evaluation's error.
+    """
+
+    steps: Float64[Tensor, " m"]
+    curvatures: Float64[Tensor, " m"]
+    round_off: Float64[Tensor, " m"]
+    truncation: Float64[Tensor, " m"]
+    crossed: Bool[Tensor, " m"] | None
+    infinitesimal: float
+    center_loss: float
+    noise: float
+    evaluations: int
+
+    @property
+    def best(self) -> int:
+        """The step whose round-off and truncation together are least."""
+        error = self.round_off + self.truncation
+        return int(torch.where(error.isnan(), torch.inf, error).argmin())
+
+    def record(self) -> dict[str, Number | int | list[Number] | list[bool] | None]:
+        columns = {
+            name: [finite_or_none(value) for value in getattr(self, name).tolist()]
+            for name in ("steps", "curvatures", "round_off", "truncation")
+        }
+        return {
+            **columns,
+            "crossed": None if self.crossed is None else self.crossed.tolist(),
+            "infinitesimal": finite_or_none(self.infinitesimal),
+            "center_loss": finite_or_none(self.center_loss),
+            "noise": finite_or_none(self.noise),
+            "best": self.best,
+            "evaluations": self.evaluations,
+        }
+
+
+def finite_probe(
+    loss: Loss,
+    center: Float[Tensor, " n"],
+    direction: Float[Tensor, " n"],
+    operator: SymmetricOperator,
+    steps: Sequence[float] = STEPS,
+    progress: Progress | None = None,
+) -> FiniteProbe:
+    """Probe along direction, for one matvec and 2 len(steps) + 25 evaluations; loss as for `evaluate_slice`.
+
+    >>> from landscape.operator import DenseOperator
+    >>> found = finite_probe(lambda x: (x**4).sum(), torch.ones(1, dtype=torch.float64), torch.ones(1),
+    ...                      DenseOperator(torch.full((1, 1), 12.0, dtype=torch.float64)), [0.1, 1.0])
+    >>> found.infinitesimal, found.curvatures, found.truncation
+    (12.0, tensor([12.0200, 14.0000], dtype=torch.float64), tensor([0.0200, 2.0000], dtype=torch.float64))
+    """
+    _require_probe(center, direction, steps)
+    origin, v = center.detach().double(), direction.detach().double()
+    done, total, resolution = 0, 2 * len(steps) + 1 + NOISE_POINTS, torch.finfo(torch.float64).eps
+
+    def at(step: float) -> tuple[float, object]:
+        nonlocal done, resolution
+        found = loss((origin + step * v).to(center.dtype))
+        value, signature = found if isinstance(found, tuple) else (found, None)
+        if isinstance(value, Tensor) and value.is_floating_point():
+            resolution = max(resolution, torch.finfo(value.dtype).eps)
+        done += 1
+        if progress:
+            progress(done, total, "finite steps")
+        return float(value), signature
+
+    middle, here = at(0.0)
+    if not isfinite(middle):
+        raise ValueError(f"expected a finite objective at the centre, got {middle}")
+    rounding = torch.finfo(center.dtype).eps * float(origin.norm() / v.norm())
+    spacing = max(steps[0] / CLOSER, ROUNDINGS * rounding)
+    close = [at((k - (NOISE_POINTS - 1) / 2) * spacing)[0] for k in range(NOISE_POINTS)]
+    noise = max(evaluation_noise(close), resolution * abs(middle))
+    ends = [(at(step), at(-step)) for step in steps]
+    d = torch.tensor(steps, dtype=torch.float64)
+    rises = torch.tensor([(ahead[0] - middle) + (behind[0] - middle) for ahead, behind in ends], dtype=torch.float64)
+    other = torch.tensor([ahead[1] != here or behind[1] != here for ahead, behind in ends])
+    curvatures = rises / d.square()
+    product = operator.apply(direction.to(operator.dtype)[:, None])[:, 0].double()
+    slope = torch.finfo(center.dtype).eps * float((origin * product).norm()) / sqrt(12)
+    return FiniteProbe(
+        steps=d,
+        curvatures=curvatures,
+        round_off=4 * (6 * noise**2 + 2 * (d * slope).square()).sqrt() / d.square(),
+        truncation=_truncation(d, curvatures),
+        crossed=None if here is None else other,
+        infinitesimal=float(torch.dot(v, product)),
+        center_loss=middle,
+        noise=noise,
+        evaluations=total,
+    )
+
+
+def evaluation_noise(values: Sequence[float]) -> float:
+    """The standard deviation of the errors of values of a smooth function at even steps.
+
+    >>> evaluation_noise([x**3 for x in range(8)])
+    0.0
+    """
+    if len(values) <= ORDER:
+        raise ValueError(f"expected more than {ORDER} values, got {len(values)}")
+    differences = np.diff(np.asarray(values, dtype=np.float64), ORDER)
+    return sqrt(factorial(ORDER) ** 2 / factorial(2 * ORDER) * float(np.mean(differences**2)))
+
+
+def _truncation(steps: Tensor, curvatures: Tensor) -> Tensor:
+    """|a| d^2 of the parabola in d through c at each step and the next larger one (for the last, the one before)."""
+    squares = steps.square()
+    slopes = (curvatures.diff() / squares.diff()).abs()
+    return torch.cat([slopes, slopes[-1:]]) * squares
+
+
+def _require_probe(center: Tensor, direction: Tensor, steps: Sequence[float]) -> None:
+    if center.ndim != 1 or center.shape != direction.shape:
+        raise ValueError(
+            f"expected a flat center and a direction of its length, got {tuple(center.shape)} and {tuple(direction.shape)}"
+        )
+    if not (torch.isfinite(direction).all() and direction.any()):
+        raise ValueError("expected a finite direction that is not zero, got another")
+    increasing = all(a < b for a, b in pairwise(steps))
+    if len(steps) < 2 or not (increasing and steps[0] > 0 and isfinite(steps[-1])):
+        raise ValueError(f"expected two or more positive steps that increase, got {tuple(steps)}")
