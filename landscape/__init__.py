@@ -6,8 +6,10 @@ Everything here sees a `SymmetricOperator` and a `torch.Generator`, and returns 
 from landscape.anisotropy import anisotropy, effective_rank, literal, mass_quantile, saddle, share
 from landscape.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
 from landscape.density import ActiveSpace, absolute_sum, spectral_density
+from landscape.directions import gradient_direction, groups_of, line_between, orthonormal, random_directions
 from landscape.distributed import DistributedOperator, Ranks
 from landscape.eigen import EigenSettings, extreme_eigenpairs
+from landscape.finite_probe import FiniteProbe, finite_probe
 from landscape.lanczos import LanczosFactorization, lanczos
 from landscape.objective import ObjectiveHessian
 from landscape.operator import (
@@ -21,6 +23,7 @@ from landscape.operator import (
 )
 from landscape.power import PowerSettings, power_ends, power_iteration
 from landscape.quantiles import absolute_quantile, quantile
+from landscape.refinement import SliceSettings
 from landscape.results import (
     Anisotropy,
     Bracket,
@@ -47,6 +50,7 @@ __all__ = [
     "EigenEnds",
     "EigenSettings",
     "Eigenpairs",
+    "FiniteProbe",
     "LanczosFactorization",
     "ObjectiveHessian",
     "OperatorCheck",
@@ -57,6 +61,7 @@ __all__ = [
     "RestrictedOperator",
     "ScaledOperator",
     "Slice",
+    "SliceSettings",
     "SpectralDensity",
     "StopReason",
     "SumOperator",
@@ -74,12 +79,18 @@ __all__ = [
     "estimate_traces",
     "evaluate_slice",
     "extreme_eigenpairs",
+    "finite_probe",
+    "gradient_direction",
+    "groups_of",
     "lanczos",
+    "line_between",
     "literal",
     "mass_quantile",
+    "orthonormal",
     "power_ends",
     "power_iteration",
     "quantile",
+    "random_directions",
     "saddle",
     "share",
     "spectral_density",
