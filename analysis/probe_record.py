@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from analysis.measurement import Findings, PlaneSlice
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, literal
 from landscape.checks import ROUND_OFFS
 from splat.curvature import ActiveCounts, SceneObjective
+from splat.localization import mass_shares
 from splat.losses import LossSettings
 
 NAMES = ("e₁", "e₂")  # of the slice's directions
@@ -85,16 +85,6 @@ def _eigenvalues(findings: Findings, blocks: Mapping[str, slice]) -> dict[str, d
 def _pair(ends: EigenEnds, pairs: Eigenpairs, index: int, blocks: Mapping[str, slice]) -> dict[str, Any]:
     shares = mass_shares(pairs.vectors[:, index], blocks)
     return {**pairs.record(index), "matvecs": ends.matvecs, "method": ends.method, "shares": shares}
-
-
-def mass_shares(vector: Tensor, blocks: Mapping[str, slice]) -> dict[str, float]:
-    """The share of a vector's squared length that lies in each block.
-
-    >>> mass_shares(torch.tensor([3.0, 0.0, 4.0]), {"a": slice(0, 2), "b": slice(2, 3)})
-    {'a': 0.36, 'b': 0.64}
-    """
-    squares = vector.double().square()
-    return {name: float(squares[rows].sum() / squares.sum()) for name, rows in blocks.items()}
 
 
 def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
