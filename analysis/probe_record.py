@@ -48,7 +48,7 @@ def probe_arrays(findings: Findings) -> dict[str, dict[str, np.ndarray]]:
         plane = findings.plane.slice
         x, y = plane.coordinates
         arrays["slice"] = {"x": x.numpy(), "y": y.numpy(), "loss": plane.loss.numpy()}
-        optional = {"model": plane.model, "crossed": plane.crossed}
+        optional = {"model": plane.model, "crossed": plane.crossed, "evaluated": plane.evaluated}
         arrays["slice"] |= {name: array.numpy() for name, array in optional.items() if array is not None}
     return arrays
 
@@ -103,7 +103,6 @@ def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
 
 def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> dict[str, Any]:
     found = plane.slice
-    crossed = 0 if found.crossed is None else int(found.crossed.sum())
     x, y = (float(axis.abs().max()) for axis in found.coordinates)
     units = [reach / unit for reach, unit in zip((x, y), plane.units, strict=True)]
     return {
@@ -112,10 +111,7 @@ def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> dict[str, Any]:
             for name, value, residual, unit in zip(NAMES, pairs.values, pairs.residuals, plane.units, strict=False)
         ],
         "loss_scale": plane.loss_scale,
-        "center_loss": found.center_loss,
-        "points": found.loss.numel(),
-        "crossed_points": crossed,
-        "evaluations": found.evaluations,
+        **found.record(),
         "note": f"±{units[0]:.3g} curvature units each way: ±{x:.3g} along e₁ and ±{y:.3g} along e₂, parameter units",
     }
 

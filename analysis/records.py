@@ -39,8 +39,13 @@ slice             null, or:
                       curvature along each, and `unit` = sqrt(2 loss_scale / |curvature|), in parameter units
     loss_scale*       a change of loss: along a direction the curvature alone makes it within one `unit`
     center_loss*      L at the centre, a render of the slice's own
-    points, crossed_points    of the grid: all, and those that `crossed` (below) marks
+    points, evaluated_points, crossed_points    of the grid: all, and those that `evaluated` and `crossed` (below) mark
     evaluations       renders of all views that the slice took
+    interpolation_error       the largest error of predictions at random points, as a share of the range of the evaluated
+                      losses; 0 where all points are evaluated, null where a prediction met a loss that is not finite
+    holdout_points, share_beyond    how many random points; with 95% confidence at most this share of the points that were
+                      not evaluated before them is off by more than interpolation_error
+    reason            why no more points were evaluated: "tolerance", "evaluation budget", "time budget" or "exact"
     note
 counts*           gaussians*, visible_gaussians*, parameters*, active_parameters*, sh_degree_stored*, sh_degree_active*,
                   views*; any further integer under a name that says what was counted
@@ -59,9 +64,11 @@ Arrays (all optional):
 spectrum          ritz_values [k], residuals [k]: approximate eigenvalues, the two ends among them; and, where the
                   density was estimated, nodes, weights [starts, steps]: a quadrature for each start vector
 traces            attribute -> [probes]: the samples whose mean is the trace
-slice             x [nx], y [ny]: steps along the two directions in parameter units; loss [nx, ny]: L at each point, a
-                  true render; where known, model [nx, ny]: the quadratic model there, and crossed [nx, ny]: true where
-                  the order of the splats or the set of visible ones is not that of the centre
+slice             x [nx], y [ny]: steps along the two directions in parameter units; loss [nx, ny]: L at each point;
+                  evaluated [nx, ny]: true where it is a true render, false where it is interpolated (absent: all are
+                  renders); where known, model [nx, ny]: the quadratic model there, and crossed [nx, ny]: true where a
+                  render's order of the splats or set of visible ones is not that of the centre (false and not known
+                  where interpolated)
 """
 
 import json

@@ -22,7 +22,7 @@ FILE = "report.html"
 PICTURES = {
     "traces": "Trace of each attribute's block of the Hessian, and the curvature scale τ that follows from it.",
     "spectrum": "Ritz values of the active operator. Bars are residuals: a true eigenvalue lies within each.",
-    "slice2d": "The loss on the plane of the two directions. Every point is a render; dashed: the quadratic model.",
+    "slice2d": "The loss on the plane of the two directions. Dots: renders, blue where sorts were crossed; dashed: the model.",
     "surface": "The same plane as a surface.",
 }
 
@@ -66,7 +66,7 @@ def interactive_surface(record: Record) -> go.Figure | None:
     if about is None or "slice" not in record.arrays:
         return None
     arrays = record.arrays["slice"]
-    layers = [("loss", "loss, true renders", "Cividis", 1.0), ("model", "quadratic model", "Greys", 0.45)]
+    layers = [("loss", "loss", "Cividis", 1.0), ("model", "quadratic model", "Greys", 0.45)]
     figure = go.Figure()
     for name, label, colours, opacity in layers:
         if name in arrays:

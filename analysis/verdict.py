@@ -145,10 +145,20 @@ def _of_counts(counts: Mapping[str, int]) -> list[Line]:
 def _of_slice(plane: Mapping[str, Any] | None) -> list[Line]:
     if plane is None:
         return [Line("No slice of the loss was recorded.", "caution")]
-    if not plane.get("crossed_points"):
-        return []
-    share = f"{plane['crossed_points']:,} of the slice's {plane['points']:,} points"
-    return [Line(f"At {share} the order of the splats or the set of visible ones is not the checkpoint's.")]
+    lines, points, rendered = [], plane.get("points", 0), plane.get("evaluated_points", plane.get("points", 0))
+    error = plane.get("interpolation_error")
+    if rendered < points:
+        size = f"of at most {100 * error:.2g}% of the range of the loss" if error is not None else "without bound"
+        lines.append(
+            Line(
+                f"Of the slice's {points:,} points {rendered:,} are renders; the others are interpolated, with an error at "
+                f"{plane['holdout_points']} random points {size}."
+            )
+        )
+    if plane.get("crossed_points"):
+        share = f"{plane['crossed_points']:,} of the slice's {rendered:,} rendered points"
+        lines.append(Line(f"At {share} the order of the splats or the set of visible ones is not the checkpoint's."))
+    return lines
 
 
 def _is_finite(number: float | None) -> bool:

@@ -3,7 +3,8 @@
 x, y        steps along the two directions, unit vectors e, so in units of the stored parameters
 change      loss minus the loss at the centre
 unit        sqrt(2 loss_scale / |curvature|): the step within which the curvature alone changes the loss by loss_scale
-crossed     a point whose order of splats or set of visible ones is not the centre's: the loss may jump on the way there
+evaluated   a point that is a true render; the others are interpolated
+crossed     a render whose order of splats or set of visible ones is not the centre's: the loss may jump on the way there
 """
 
 from dataclasses import dataclass
@@ -45,13 +46,18 @@ class Direction:
 
 @dataclass(frozen=True)
 class Plane:
-    """change, model [nx, ny], masked where not finite, in units of 10**exponent; model and crossed may be absent."""
+    """change, model [nx, ny], masked where not finite, in units of 10**exponent; model and crossed may be absent.
+
+    interpolation_error: as a share of the range of the loss; 0 where every point is evaluated, None where unbounded.
+    """
 
     x: Direction
     y: Direction
     change: np.ma.MaskedArray
     model: np.ma.MaskedArray | None
     crossed: np.ndarray | None
+    evaluated: np.ndarray
+    interpolation_error: float | None
     exponent: int
     loss_scale: float
 
@@ -61,7 +67,8 @@ class Plane:
 
     @property
     def crossed_share(self) -> float | None:
-        return None if self.crossed is None else float(np.mean(self.crossed))
+        """Of the evaluated points."""
+        return None if self.crossed is None else float(self.crossed.sum() / self.evaluated.sum())
 
 
 def plane(record: Record) -> Plane:
@@ -87,6 +94,8 @@ def plane(record: Record) -> Plane:
         change=masked[0],
         model=masked[1] if len(masked) == 2 else None,
         crossed=arrays.get("crossed"),
+        evaluated=arrays.get("evaluated", np.ones(arrays["loss"].shape, bool)),
+        interpolation_error=about.get("interpolation_error", 0.0),
         exponent=exponent,
         loss_scale=about["loss_scale"],
     )

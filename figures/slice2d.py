@@ -1,9 +1,9 @@
 """Figure: the loss on a plane through the checkpoint, as contours, and its two cross-sections through the centre.
 
-Every point is a true render.  White dashed lines: the quadratic model at the contours' levels.  Dots: crossed points,
-where the order of the splats or the set of visible ones is not the centre's.  Grey: no finite loss.  The cross-sections
-share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes count steps in
-curvature units, within one of which the curvature alone changes the loss by the amount named.
+Dots: true renders; between them the loss is interpolated.  Blue dots: crossed points, where the order of the splats or the
+set of visible ones is not the centre's.  White dashed lines: the quadratic model at the contours' levels.  Grey: no finite
+loss.  The cross-sections share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes
+count steps in curvature units, within one of which the curvature alone changes the loss by the amount named.
 """
 
 from typing import Any
@@ -21,6 +21,7 @@ from figures.plane import Direction, Plane, curvature_text, plane
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
 
 LEVELS = 12
+RENDERED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": BLACK, "markeredgewidth": 0}
 CROSSED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": SKY, "markeredgewidth": 0}
 TRUE_PROPORTIONS = 2.5  # ranges whose ratio is below this are drawn to the same scale
 
@@ -56,6 +57,9 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
     else:
         axes.text(0.5, 0.65, "the loss is the same\nat every point", transform=axes.transAxes, ha="center")
         axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+    if not field.evaluated.all():
+        rows, columns = np.nonzero(field.evaluated if field.crossed is None else field.evaluated & ~field.crossed)
+        axes.plot(x[rows], y[columns], **RENDERED)
     if field.crossed is not None:
         rows, columns = np.nonzero(field.crossed)
         axes.plot(x[rows], y[columns], **CROSSED)
@@ -82,6 +86,9 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
     other = field.y if axis == 0 else field.x
     line = field.change.take(other.centre, axis=1 - axis)
     axes.plot(direction.scaled, line, color=BLACK)
+    if not field.evaluated.all():
+        known = field.evaluated.take(other.centre, axis=1 - axis)
+        axes.plot(direction.scaled[known], line[known], **RENDERED)
     if field.model is not None:
         axes.plot(direction.scaled, field.model.take(other.centre, axis=1 - axis), "--", color=VERMILION, linewidth=0.9)
     axes.axvline(0, color="0.7", linewidth=0.5, zorder=0)
@@ -98,6 +105,11 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
 
 def _legend(field: Plane) -> list[Line2D]:
     handles = [Line2D([], [], color=BLACK, label="loss, true renders")]
+    if not field.evaluated.all():
+        error = field.interpolation_error
+        size = "unbounded" if error is None else f"{100 * error:.1g}%"
+        label = f"loss, {field.evaluated.mean():.0%} renders (error {size})"
+        handles = [Line2D([], [], color=BLACK, marker=".", markersize=4, label=label)]
     if field.model is not None:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
     if field.crossed_share:

@@ -145,6 +145,7 @@ def test_the_slice_is_made_of_true_losses_along_the_two_steepest_directions(reco
     about, arrays = record.data["slice"], record.arrays["slice"]
     assert arrays["loss"].shape == arrays["model"].shape == arrays["crossed"].shape == (5, 5)
     assert about["center_loss"] == pytest.approx(value, rel=1e-12)
+    assert about["points"] == 25 and about["evaluated_points"] == arrays["evaluated"].sum() == about["evaluations"] - 1
     assert arrays["loss"][2, 2] == about["center_loss"] == arrays["model"][2, 2] and not arrays["crossed"][2, 2]
     values, vectors = torch.linalg.eigh((H + H.T) / 2)
     for axis, (name, index) in enumerate((("x", -1), ("y", -2))):

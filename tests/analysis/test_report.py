@@ -173,8 +173,19 @@ def test_a_failed_check_comes_first_and_in_red(tmp_path):
 def test_the_verdict_says_what_was_skipped_and_what_could_not_run():
     said = sentences(synthetic()[0])
     assert "217 of 10,091 Gaussians touch no pixel" in said
-    assert "degree 0 of 3" in said and "326 of the slice's 357 points" in said
+    assert "degree 0 of 3" in said and "326 of the slice's 357 rendered points" in said
     assert "finite difference could not run (every direction crosses a sort)" in said
+
+
+def test_the_verdict_says_how_much_of_the_slice_is_interpolated_and_how_well():
+    data, _ = synthetic()
+    data["slice"] |= {"evaluated_points": 80, "crossed_points": 70, "interpolation_error": 0.004, "holdout_points": 30}
+    said = sentences(data)
+    assert "Of the slice's 357 points 80 are renders" in said
+    assert "an error at 30 random points of at most 0.4% of the range of the loss" in said
+    assert "70 of the slice's 80 rendered points" in said
+    data["slice"]["interpolation_error"] = None
+    assert "30 random points without bound" in sentences(data)
 
 
 def test_an_unbounded_ratio_is_given_by_its_bound():
