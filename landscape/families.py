@@ -1,0 +1,109 @@
+"""The anisotropy family of a whole operator and of every block on its diagonal (one attribute of a scene, say).
+
+A block's operator is E^T H E: a product with it costs a product with H.  So the budget of a block is small by default: about a
+hundred products.  What it does not resolve shows in the brackets, as `>= ...` where that is the small end.  Every run starts
+from random vectors: what the whole's eigenvectors have in a block saves a tenth of the products, but may hide its own end.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+
+from landscape.anisotropy import anisotropy
+from landscape.density import ActiveSpace, spectral_density
+from landscape.eigen import EigenSettings, extreme_eigenpairs
+from landscape.operator import RestrictedOperator, SymmetricOperator
+from landscape.probes import split
+from landscape.results import Anisotropy, EigenEnds, Progress, SpectralDensity
+
+WHOLE = "all"
+
+
+@dataclass(frozen=True)
+class FamilySettings:
+    """The budget of the whole and of each block: of both ends, and of the density (starts x steps products)."""
+
+    eigen: EigenSettings = field(default_factory=lambda: EigenSettings(rtol=1e-2, max_matvecs=60))
+    starts: int = 3
+    steps: int = 16
+    batch: int = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """The indices with what they are derived from.  rank: of the operator, rows of a known null space not counted."""
+
+    rank: int
+    ends: EigenEnds
+    density: SpectralDensity
+    indices: Anisotropy
+
+    def record(self) -> dict[str, object]:
+        return {
+            "rank": self.rank,
+            "ends": self.ends.record(),
+            "indices": self.indices.record(),
+            "matvecs": self.ends.matvecs + self.density.matvecs,
+        }
+
+
+def families(
+    operator: SymmetricOperator,
+    generator: torch.Generator,
+    settings: FamilySettings = FamilySettings(),
+    parts: Sequence[str] | None = None,
+    active: Mapping[str, ActiveSpace] | None = None,
+    known: Mapping[str, Family] | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Family]:
+    """The family of each part: "all" and every block by default; a block without rows is left out.
+
+    active: what a known null space leaves of a part.  known: parts that are there already, and are handed on.  Every part has
+    random numbers of its own, whatever the others need.
+
+    >>> from landscape.operator import DenseOperator
+    >>> H = DenseOperator(torch.diag(torch.tensor([4.0, -1.0, 2.0, 1.0]).double()), {"a": slice(0, 2), "b": slice(2, 4)})
+    >>> found = families(H, torch.Generator().manual_seed(0))
+    >>> {name: round(family.indices.literal.value, 6) for name, family in found.items()}
+    {'all': -4.0, 'a': -4.0, 'b': 2.0}
+    """
+    names = [WHOLE, *(name for name in operator.blocks if name != WHOLE)] if parts is None else list(parts)
+    unknown = [name for name in names if name != WHOLE and name not in operator.blocks]
+    if unknown:
+        raise ValueError(f"expected parts out of {WHOLE}, {', '.join(operator.blocks)}, got {unknown[0]!r}")
+    results: dict[str, Family] = {}
+    for name in names:
+        stream = split(generator)
+        if known and name in known:
+            results[name] = known[name]
+            continue
+        part = operator if name == WHOLE else RestrictedOperator(operator, name)
+        if part.dim == 0:
+            continue
+        results[name] = family(part, stream, settings, (active or {}).get(name), _named(progress, name))
+    return results
+
+
+def family(
+    operator: SymmetricOperator,
+    generator: torch.Generator,
+    settings: FamilySettings = FamilySettings(),
+    active: ActiveSpace | None = None,
+    progress: Progress | None = None,
+) -> Family:
+    """The family of one operator; active: what its known null space leaves."""
+    rank = operator.dim if active is None else active.rank
+    eigen = settings.eigen if rank >= settings.eigen.wanted else EigenSettings(1, 0, rtol=settings.eigen.rtol)
+    ends = extreme_eigenpairs(operator, generator, eigen, progress=progress)
+    if eigen.smallest == 0:  # one direction: both ends are the same
+        ends = EigenEnds(ends.largest, ends.largest, ends.method, ends.matvecs, ends.beyond, ends.noise, ends.ritz)
+    starts, steps, batch = settings.starts, settings.steps, settings.batch
+    density = spectral_density(operator, generator, starts, max(2, steps), batch, progress, active)
+    return Family(rank, ends, density, anisotropy(ends, density))
+
+
+def _named(progress: Progress | None, name: str) -> Progress | None:
+    if progress is None:
+        return None
+    return lambda done, most, state: progress(done, most, f"{name}: {state}")
