@@ -1,0 +1,60 @@
+"""The anisotropy family of a scene: of all attributes together and of each, for the Hessian or for Gauss-Newton.
+
+Left out of each part as exactly null (`null_space.py`): the lengths of the quaternions, SH directions that no view sees and,
+of Gauss-Newton as a whole, all that no view sees.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from landscape.density import ActiveSpace
+from landscape.families import WHOLE, Family, FamilySettings, families
+from landscape.results import Progress
+from splat.curvature import SceneHessian
+
+BUDGET = FamilySettings()
+
+
+def scene_families(
+    hessian: SceneHessian,
+    generator: torch.Generator,
+    settings: FamilySettings = BUDGET,
+    parts: Sequence[str] | None = None,
+    known: Mapping[str, Family] | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Family]:
+    """The family of "all" and of each attribute (see `landscape.families`); hessian: exact, or its Gauss-Newton part."""
+    return families(hessian, generator, settings, parts, active_spaces(hessian), known, progress)
+
+
+def active_spaces(hessian: SceneHessian) -> dict[str, ActiveSpace]:
+    """What the exact null space leaves of the whole and of each attribute.
+
+    Of Gauss-Newton's attributes, what it leaves of the Hessian's: they may be flat along more.
+    """
+    if hessian.keep_null:
+        return {}
+    exact = SceneHessian(hessian.objective) if hessian.gauss_newton else hessian
+    return {WHOLE: ActiveSpace(hessian.project, hessian.rank), **_of_attributes(exact)}
+
+
+def _of_attributes(hessian: SceneHessian) -> dict[str, ActiveSpace]:
+    """The Hessian's projector acts on each attribute by itself, and leaves 3 of a quaternion's 4 rows."""
+    count = len(hessian.objective.active)
+    ranks = {name: rows.stop - rows.start for name, rows in hessian.blocks.items()}
+    ranks["quats"] -= count
+    ranks["sh"] = hessian.rank - sum(rank for name, rank in ranks.items() if name != "sh")
+    return {name: ActiveSpace(_within(hessian, name), rank) for name, rank in ranks.items() if rank}
+
+
+def _within(hessian: SceneHessian, name: str) -> Callable[[Tensor], Tensor]:
+    rows = hessian.blocks[name]
+
+    def project(V: Tensor) -> Tensor:
+        padded = V.new_zeros(hessian.dim, V.shape[1])
+        padded[rows] = V
+        return hessian.project(padded)[rows]
+
+    return project

@@ -1,0 +1,57 @@
+"""Per attribute: what is exactly flat is left out and counted, and the indices are those of the dense blocks."""
+
+import pytest
+import torch
+
+from splat.curvature import SceneHessian, SceneObjective
+from splat.families import active_spaces, scene_families
+from splat.losses import LossSettings
+from tests.splat.tiny import tiny_gaussians, tiny_views
+
+
+@pytest.fixture(scope="module")
+def objective() -> SceneObjective:
+    return SceneObjective(
+        tiny_gaussians(6, sh_degree=2, dtype=torch.float64), tiny_views(torch.float64), LossSettings("l2")
+    )
+
+
+@pytest.mark.parametrize("gauss_newton", [False, True])
+def test_projectors_have_their_ranks_and_leave_nothing_out_that_is_curved(
+    objective: SceneObjective, gauss_newton: bool
+) -> None:
+    hessian = SceneHessian(objective, gauss_newton=gauss_newton)
+    H = hessian.apply(torch.eye(hessian.dim, dtype=torch.float64))
+    spaces = active_spaces(hessian)
+    assert list(spaces) == ["all", *hessian.blocks]
+    for name, space in spaces.items():
+        rows = hessian.blocks.get(name, slice(0, hessian.dim))
+        P = space.project(torch.eye(rows.stop - rows.start, dtype=torch.float64))
+        block = H[rows, rows]
+        assert float(P.diagonal().sum()) == pytest.approx(space.rank, abs=1e-6)
+        assert float((P @ block - block).norm()) <= 1e-10 * float(block.norm())
+    n = len(objective.active)
+    assert [spaces[name].rank for name in ("means", "log_scales", "quats", "opacity_logits")] == [3 * n] * 3 + [n]
+    assert spaces["sh"].rank < 27 * n  # three views see 9 of 27 coefficients a channel and Gaussian at most
+
+
+@pytest.mark.parametrize("gauss_newton", [False, True])
+def test_the_indices_of_every_attribute_are_those_of_its_dense_block(
+    objective: SceneObjective, gauss_newton: bool
+) -> None:
+    hessian = SceneHessian(objective, gauss_newton=gauss_newton)
+    H = hessian.apply(torch.eye(hessian.dim, dtype=torch.float64))
+    found = scene_families(hessian, torch.Generator().manual_seed(0))
+    for name, part in found.items():
+        rows = hessian.blocks.get(name, slice(0, hessian.dim))
+        true = torch.linalg.eigvalsh((H[rows, rows] + H[rows, rows].T) / 2)
+        total = float(true.abs().sum())
+        share, rank = part.indices.share, part.indices.effective_rank
+        assert share is not None and rank is not None
+        assert share.low <= float(true[-1]) / total * (1 + 1e-9) and float(true[-1]) / total <= share.high * (1 + 1e-9)
+        assert rank.low <= total**2 / float(true.square().sum()) <= rank.high
+        assert rank.high <= part.rank
+
+
+def test_with_the_null_space_kept_nothing_is_left_out(objective: SceneObjective) -> None:
+    assert active_spaces(SceneHessian(objective, keep_null=True)) == {}
