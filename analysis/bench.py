@@ -4,6 +4,7 @@ OUT/kernels.csv   a line a stage and size: milliseconds, and over the prototype'
 OUT/bench.csv     a line a time: what was timed (`stage`), why (`study`: stages, or what was scaled), on what, milliseconds
 OUT/bounds.csv    the ratios that the project promises, measured, with their bounds
 OUT/bench.png     the scaling, drawn by `figures.bench` from bench.csv
+OUT/stress.csv    `landscape bench stress`: errors at the limits of the renderer (`stress`)
 
 Times are minima and medians of repetitions in turns (`timing`); ratios are of minima.  Products are per vector.
 """
@@ -26,6 +27,7 @@ from analysis.options import BenchOptions
 from analysis.peak import fma_peak
 from analysis.prototype import prototype_in
 from analysis.provenance import machine
+from analysis.stress import run_stress
 from analysis.timing import Timing, interleaved
 from analysis.workloads import Size, Workload, synthetic_workload, workload_of
 from splat.checkpoint import write_atomically
@@ -54,6 +56,8 @@ def run_bench(options: BenchOptions) -> int:
         raise ValueError(
             "expected --prototype with the kernels it is compared with: landscape bench kernels --prototype ..."
         )
+    if options.subject == "stress":
+        return run_stress(options)
     options.out.mkdir(parents=True, exist_ok=True)
     console = Console()
     about = machine(lanes_of(np.float32))

@@ -75,10 +75,11 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """Measure speed and memory: of the compositing kernels, or of first and second order on a scene."""
+    """Measure speed and memory: of the compositing kernels, or of first and second order on a scene; or errors at limits."""
 
-    subject: Positional[Literal["kernels"] | Path | None] = None
-    """kernels; or a scene's folder or a checkpoint. Default: a synthetic scene."""
+    subject: Positional[Literal["kernels", "stress"] | Path | None] = None
+    """kernels; stress: errors at the limits of the renderer, against bounds (exit code 1 where one is missed);
+    or a scene's folder or a checkpoint. Default: a synthetic scene."""
     out: Path = Path("runs/bench")
     """Folder of the tables (CSV) and figures; files of an earlier run are replaced."""
     repetitions: int = 15

@@ -26,21 +26,23 @@ def rasterize_reference(
     width: int,
     height: int,
     settings: RenderSettings = RenderSettings(),
+    tile: int = TILE,
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Colour, accumulated alpha and expected depth of one view, tile by tile.
 
-    Splats of the same depth are composited in the order of their index.
+    Splats of the same depth are composited in the order of their index.  tile: pixels along a tile's edge; larger ones take
+    less time for few splats, and more memory for many.
     """
     order = torch.argsort(splats.depths, stable=True)
     order = order[splats.drawn[order]]
     reach = _reach(splats, settings)[order]
     centres = splats.means.detach()[order]
     rows = []
-    for top in range(0, height, TILE):
+    for top in range(0, height, tile):
         row = []
-        for left in range(0, width, TILE):
-            xs = torch.arange(left, min(left + TILE, width), dtype=centres.dtype) + 0.5
-            ys = torch.arange(top, min(top + TILE, height), dtype=centres.dtype) + 0.5
+        for left in range(0, width, tile):
+            xs = torch.arange(left, min(left + tile, width), dtype=centres.dtype) + 0.5
+            ys = torch.arange(top, min(top + tile, height), dtype=centres.dtype) + 0.5
             low, high = torch.stack([xs[0], ys[0]]), torch.stack([xs[-1], ys[-1]])
             touched = ((centres + reach >= low) & (centres - reach <= high)).all(dim=1)
             row.append(_composite(splats, order[touched], background, xs, ys, settings))
