@@ -5,7 +5,9 @@ Everything here sees a `SymmetricOperator` and a `torch.Generator`, and returns 
 
 from landscape.anisotropy import anisotropy, effective_rank, literal, mass_quantile, saddle, share
 from landscape.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
+from landscape.control import PartlyKnown
 from landscape.density import ActiveSpace, absolute_sum, spectral_density
+from landscape.diagonal import DiagonalEstimate, GroupSums, estimate_diagonal
 from landscape.directions import gradient_direction, groups_of, line_between, orthonormal, random_directions
 from landscape.distributed import DistributedOperator, Ranks
 from landscape.eigen import EigenSettings, extreme_eigenpairs
@@ -46,14 +48,17 @@ __all__ = [
     "CountingOperator",
     "DenseOperator",
     "DerivativeCheck",
+    "DiagonalEstimate",
     "DistributedOperator",
     "EigenEnds",
     "EigenSettings",
     "Eigenpairs",
     "FiniteProbe",
+    "GroupSums",
     "LanczosFactorization",
     "ObjectiveHessian",
     "OperatorCheck",
+    "PartlyKnown",
     "PowerSettings",
     "Progress",
     "ProjectedOperator",
@@ -76,6 +81,7 @@ __all__ = [
     "check_operator",
     "curvature_reach",
     "effective_rank",
+    "estimate_diagonal",
     "estimate_traces",
     "evaluate_slice",
     "extreme_eigenpairs",

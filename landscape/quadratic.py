@@ -140,7 +140,7 @@ def _ratios(skewness: float, kurtosis: float, k: int) -> tuple[float, float]:
     k / c^2 (k p_2^2 / p_4) degrees of freedom, with the corrected ratio in it.
     """
     c, fourth = (min(max(value, -1.0), 1.0) for value in (skewness, kurtosis))
-    for _ in range(8):  # a contraction
+    for _ in range(20):  # a contraction, by 0.56 or less from 8 probes on
         c = skewness * (1 + 4 * c * c / k) / sqrt(1 + 2 * c * c / k)
         c = min(max(c, -1.0), 1.0)
         fourth = kurtosis * (1 + 4 * fourth / k) * (1 + 6 * fourth / k) / (1 + 2 * fourth / k)

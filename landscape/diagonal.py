@@ -1,0 +1,126 @@
+"""The diagonal of H by random signs (Bekas, Kokiopoulou and Saad 2007), and how much of it lies on groups of rows.
+
+    a_i = z_i * (H z_i),   diag H ~ mean of a_i,   variance of an entry: the other entries of its row, squared, over k
+
+Where the operator knows the diagonal d of a part K of itself (`control.PartlyKnown`), z * (K z) - d has the mean zero and is
+taken off with the slope that the other probes have in all rows together: unbiased, as no probe has a part in its own slope.
+An operator that knows all of its diagonal is not probed.
+
+The sensitivity of a group of rows (a Gaussian, say) is the sum of |H_rr| over them.  The modulus of an estimate is too large on
+average: for a normal error s by at most s sqrt(2 / pi), where the entry is zero.  `GroupSums.bias` is that expected excess
+at the estimated entries.  The standard error is of the sum with the estimated signs, so that it knows how the errors of a
+group's rows go together.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import pi, sqrt
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from landscape.control import PartlyKnown
+from landscape.operator import SymmetricOperator
+from landscape.probes import draw_probes
+from landscape.quadratic import gram
+from landscape.results import Progress
+
+
+@dataclass(frozen=True, eq=False)
+class GroupSums:
+    """sum |H_rr| over the rows of each group, with its standard error and the share of it that noise alone makes."""
+
+    values: Float64[Tensor, " groups"]
+    standard_errors: Float64[Tensor, " groups"]
+    bias: Float64[Tensor, " groups"]
+
+
+@dataclass(frozen=True, eq=False)
+class DiagonalEstimate:
+    """diag H.  samples: one column a probe, with the mean `values`; no column where it is exact."""
+
+    values: Float64[Tensor, " n"]
+    standard_errors: Float64[Tensor, " n"]
+    samples: Float64[Tensor, "n probes"]
+    blocks: Mapping[str, slice]
+    matvecs: int
+
+    def block(self, name: str) -> "DiagonalEstimate":
+        """The rows of one block."""
+        rows = self.blocks[name]
+        own = {name: slice(0, rows.stop - rows.start)}
+        return DiagonalEstimate(self.values[rows], self.standard_errors[rows], self.samples[rows], own, self.matvecs)
+
+    def sensitivity(self, groups: Int64[Tensor, " n"], count: int) -> GroupSums:
+        """sum |H_rr| over the rows of each of `count` groups; groups: the group of every row."""
+        if groups.shape != self.values.shape or not ((groups >= 0) & (groups < count)).all():
+            raise ValueError(
+                f"expected a group in 0..{count - 1} for each of {len(self.values)} rows, got shape {tuple(groups.shape)}"
+            )
+        zero = torch.zeros(count, dtype=torch.float64)
+        sums = zero.index_add(0, groups, self.values.abs())
+        probes = self.samples.shape[1]
+        if probes == 0:
+            return GroupSums(sums, zero, zero)
+        signed = torch.zeros(count, probes, dtype=torch.float64)
+        signed.index_add_(0, groups, self.values.sign()[:, None] * self.samples)
+        excess = zero.index_add(0, groups, _folded_excess(self.values.abs(), self.standard_errors))
+        return GroupSums(sums, signed.std(dim=1) / sqrt(probes), excess)
+
+
+def estimate_diagonal(
+    operator: SymmetricOperator,
+    generator: torch.Generator,
+    probes: int = 32,
+    batch: int = 4,
+    progress: Progress | None = None,
+) -> DiagonalEstimate:
+    """diag H with a standard error for every entry, from `probes` matvecs.  Keeps n x probes numbers in float64.
+
+    >>> from landscape.operator import DenseOperator
+    >>> H = DenseOperator(torch.diag(torch.tensor([1.0, -2.0])))
+    >>> estimate_diagonal(H, torch.Generator().manual_seed(0)).values  # exact on a diagonal
+    tensor([ 1., -2.], dtype=torch.float64)
+    """
+    if probes < 3:
+        raise ValueError(f"expected at least 3 probes, got {probes}")
+    if isinstance(operator, PartlyKnown) and operator.known is operator:
+        exact = operator.known_diagonal().double()
+        return DiagonalEstimate(exact, torch.zeros_like(exact), exact.new_zeros(len(exact), 0), operator.blocks, 0)
+    parts, controls = [], []
+    for start in range(0, probes, batch):
+        Z = draw_probes(operator.dim, min(batch, probes - start), generator, operator.dtype, "rademacher")
+        parts.append((Z * operator.apply(Z)).double())
+        if not torch.isfinite(parts[-1]).all():
+            raise ValueError("expected finite products H z, got NaN or infinite entries")
+        if isinstance(operator, PartlyKnown):
+            controls.append((Z * operator.known.apply(Z)).double() - operator.known_diagonal().double()[:, None])
+        if progress:
+            progress(start + Z.shape[1], probes, f"diagonal: {start + Z.shape[1]} probes")
+    samples = torch.cat(parts, dim=1)
+    if controls:
+        samples = _controlled(samples, torch.cat(controls, dim=1))
+    errors = samples.std(dim=1) / sqrt(probes)
+    return DiagonalEstimate(samples.mean(dim=1), errors, samples, operator.blocks, probes)
+
+
+def _controlled(A: Float64[Tensor, "n k"], B: Float64[Tensor, "n k"]) -> Float64[Tensor, "n k"]:
+    """a_i - c_i b_i, c_i the slope of a on b over all rows and all probes but the i-th, a and b less their means there."""
+    k = A.shape[1]
+    cross, spread = gram(A, B), gram(B, B)
+    slopes = _without_own(cross, k) / _without_own(spread, k).clamp_min(1e-300)
+    return A - slopes * B
+
+
+def _without_own(G: Float64[Tensor, "k k"], k: int) -> Float64[Tensor, " k"]:
+    """sum over j of (a_j - a) . (b_j - b), j and the means a and b over all but one, for each one; G_ij = a_i . b_j."""
+    trace, total = G.trace() - G.diagonal(), G.sum() - G.sum(dim=0) - G.sum(dim=1) + G.diagonal()
+    return trace - total / (k - 1)
+
+
+def _folded_excess(size: Tensor, error: Tensor) -> Tensor:
+    """E |x| - size for a normal x of the mean size and the standard deviation error."""
+    z = size / error.clamp_min(1e-300)
+    normal = torch.exp(-z.square() / 2) * sqrt(2 / pi)
+    return error * (normal - z * torch.special.erfc(z / sqrt(2)))
