@@ -105,7 +105,8 @@ def finite_probe(
     middle, here = at(0.0)
     if not isfinite(middle):
         raise ValueError(f"expected a finite objective at the centre, got {middle}")
-    rounding = torch.finfo(center.dtype).eps * float(origin.norm() / v.norm())
+    # theta_i / v_i, weighted by v_i^4: of the parameters that make up the direction
+    rounding = torch.finfo(center.dtype).eps * float((origin * v).norm() / v.square().norm())
     spacing = max(steps[0] / CLOSER, ROUNDINGS * rounding)
     close = [at((k - (NOISE_POINTS - 1) / 2) * spacing)[0] for k in range(NOISE_POINTS)]
     noise = max(evaluation_noise(close), resolution * abs(middle))
