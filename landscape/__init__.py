@@ -4,6 +4,7 @@ Everything here sees a `SymmetricOperator` and a `torch.Generator`, and returns 
 """
 
 from landscape.anisotropy import anisotropy, effective_rank, literal, mass_quantile, saddle, share
+from landscape.block_size import fastest_block
 from landscape.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
 from landscape.control import PartlyKnown
 from landscape.density import ActiveSpace, absolute_sum, spectral_density
@@ -11,6 +12,7 @@ from landscape.diagonal import DiagonalEstimate, GroupSums, estimate_diagonal
 from landscape.directions import gradient_direction, groups_of, line_between, orthonormal, random_directions
 from landscape.distributed import DistributedOperator, Ranks
 from landscape.eigen import EigenSettings, extreme_eigenpairs
+from landscape.families import Family, FamilySettings, families, family
 from landscape.finite_probe import FiniteProbe, finite_probe
 from landscape.lanczos import LanczosFactorization, lanczos
 from landscape.objective import ObjectiveHessian
@@ -53,6 +55,8 @@ __all__ = [
     "EigenEnds",
     "EigenSettings",
     "Eigenpairs",
+    "Family",
+    "FamilySettings",
     "FiniteProbe",
     "GroupSums",
     "LanczosFactorization",
@@ -85,6 +89,9 @@ __all__ = [
     "estimate_traces",
     "evaluate_slice",
     "extreme_eigenpairs",
+    "families",
+    "family",
+    "fastest_block",
     "finite_probe",
     "gradient_direction",
     "groups_of",

@@ -177,6 +177,23 @@ def test_a_warm_start_needs_fewer_products():
     assert torch.allclose(warm.largest.values, again.largest.values, rtol=1e-6, atol=0)
 
 
+@pytest.mark.parametrize("spectrum", ["gaps", "cluster", "dense"])
+def test_over_many_seeds_the_reported_ends_are_the_ends(spectrum):
+    """At the default tolerance, which a dense end may be missed by a little more than."""
+    n = 60
+    diagonal = torch.linspace(-0.2, 0.3, n, dtype=torch.float64)
+    if spectrum == "gaps":
+        diagonal[-2:] = torch.tensor([1.0, 1.01])
+    if spectrum == "cluster":
+        diagonal[-6:] = 1 + 0.002 * torch.arange(6)
+    H, top, bottom = DenseOperator(torch.diag(diagonal)), float(diagonal.max()), float(diagonal.min())
+    for seed in range(30):
+        ends = extreme_eigenpairs(H, generator(seed))
+        for pairs, end in ((ends.largest, top), (ends.smallest, bottom)):
+            assert pairs.reason == "tolerance"
+            assert abs(float(pairs.values[0]) - end) <= max(float(pairs.residuals[0]), 2e-3 * abs(end))
+
+
 def test_a_warm_start_at_inner_eigenvectors_still_finds_the_ends():
     H = operator("indefinite")
     true, vectors = torch.linalg.eigh(H.matrix)
