@@ -3,7 +3,8 @@
 An adaptive run stops when the interval's half width is below max(rtol |trace|, atol).  Every look is a chance to stop on a
 spread that is too small by luck, so it looks only when the number of probes has grown by half since the last look, stops
 when the tolerance still holds four probes later (Simons 1968), and takes its interval 5% wider.  Cover measured over 2,000
-seeds, tolerances that take 12 to 70 probes, relative and absolute: 93 to 97% on all spectra of `quadratic`.
+seeds, tolerances that take 12 to 70 probes, relative and absolute: 93 to 97.1% on all spectra of `quadratic`; up to 97.7%
+where the tolerance is as large as the trace of one dominant eigenvalue, and the first look decides.
 """
 
 from collections.abc import Mapping
