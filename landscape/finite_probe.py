@@ -50,10 +50,12 @@ class FiniteProbe:
     evaluations: int
 
     @property
-    def best(self) -> int:
-        """The step whose round-off and truncation together are least."""
-        error = self.round_off + self.truncation
-        return int(torch.where(error.isnan(), torch.inf, error).argmin())
+    def best(self) -> int | None:
+        """Of the steps that cross nothing, the one whose round-off and truncation together are least; None without any."""
+        error = (self.round_off + self.truncation).nan_to_num(torch.inf, posinf=torch.inf)
+        if self.crossed is not None:
+            error = error.masked_fill(self.crossed, torch.inf)
+        return int(error.argmin()) if error.isfinite().any() else None
 
     def record(self) -> dict[str, Number | int | list[Number] | list[bool] | None]:
         columns = {

@@ -84,15 +84,21 @@ def test_along_one_direction_a_kink_is_found():
     assert found.evaluated[262] and found.evaluated[:100].double().mean() < 0.2
 
 
-def test_the_interpolation_error_is_that_of_random_points_before_they_were_known():
-    # what the refinement cannot see: its first points lie where the wave is 0
-    def wave(theta):
-        return float(np.sin(20 * np.pi * float(theta[0])))
+def hidden(theta):
+    """A wave that is 0 wherever the refinement looks first."""
+    height = float(np.sin(4 * np.pi * float(theta[0])))
+    return height if abs(height) > 1e-9 else 0.0
 
-    found = sliced(wave, max_evaluations=60)
-    assert found.reason == "evaluation budget" and found.interpolation_error > 0.1
-    assert errors(wave, found).max() > 0.1
-    assert errors(wave, sliced(wave)).max() < 0.01
+
+def test_the_interpolation_error_is_that_of_random_points_before_they_were_known():
+    found = sliced(hidden, max_evaluations=60)
+    assert found.reason == "evaluation budget" and found.interpolation_error > 0.4
+    assert errors(hidden, found).max() > 0.4
+
+
+def test_what_the_hold_out_finds_is_refined():
+    found = sliced(hidden)
+    assert found.reason == "tolerance" and found.evaluations < 0.5 * 41**2 and errors(hidden, found).max() < 0.01
 
 
 def test_the_interpolation_error_covers_the_true_error_as_often_as_it_says():
@@ -139,6 +145,17 @@ def test_a_region_without_finite_values_is_not_papered_over():
     found = sliced(broken)
     assert found.evaluated[SIDE > 0.2].all() and not found.loss[SIDE > 0.2].isfinite().any()
     assert found.loss[SIDE <= 0.2].isfinite().all() and float(found.evaluated[SIDE <= 0.2].double().mean()) < 0.4
+
+
+def test_losses_that_are_not_finite_and_met_by_the_hold_out_alone_are_found():
+    def broken(theta):
+        return float("inf") if 0.26 < theta[0] < 0.49 else bowl(theta)
+
+    found = sliced(broken)
+    gap = (SIDE > 0.26) & (SIDE < 0.49)
+    assert gap.sum() == 4 and found.evaluated[gap].all() and found.loss[gap].isinf().all()
+    stopped = sliced(broken, max_evaluations=70)
+    assert stopped.interpolation_error == float("inf") and stopped.record()["interpolation_error"] is None
 
 
 def test_a_constant_is_known_from_the_coarse_grid():
