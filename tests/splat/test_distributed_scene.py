@@ -27,7 +27,7 @@ def gaussians():
 def measured(objective: SceneObjective, hessians: list[SceneHessian]) -> Findings:
     p = objective.active.flat.numel()
     V = torch.randn(p, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    traces = exact_traces(objective, torch.Generator().manual_seed(1), TraceSettings.fixed(4))
+    traces = exact_traces(objective, torch.Generator().manual_seed(1), TraceSettings.fixed(8))
     ends = extreme_eigenpairs(hessians[0], torch.Generator().manual_seed(2), EigenSettings(1, 1, rtol=1e-6))
     blocks = objective.block_diagonal()
     return {
