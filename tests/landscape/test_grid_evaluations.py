@@ -44,8 +44,8 @@ def test_a_killed_slice_continues_and_ends_as_if_it_had_not_been(tmp_path, setti
     for name in ("loss", "evaluated", "holdout", "crossed"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
     assert found.evaluations == expected.evaluations == whole.calls
-    # the centre is evaluated anew; evaluations of the batch that the other workers had finished may be lost
-    lost = settings.get("workers", 1) - 1
+    # the centre is evaluated anew; what other workers had finished of the batch behind the one that died is lost
+    lost = SliceSettings().batch if "workers" in settings else 0
     assert whole.calls - 49 <= rest.calls <= whole.calls - 49 + lost
     again = Objective()
     sliced(again, store, **settings)
