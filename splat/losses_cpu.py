@@ -13,7 +13,7 @@ from scipy.ndimage import correlate1d
 from torch import Tensor
 
 from splat.losses import LossSettings, window
-from splat.losses_kernels import CHARBONNIER, L1, L2, diagonal_rows, gradient_rows, product_rows, value_rows
+from splat.losses_kernels import CHARBONNIER, L1, L2, SECONDS, diagonal_rows, gradient_rows, product_rows, value_rows
 from splat.raster.compositing import TILE_ROWS
 from splat.raster.cpu import aligned
 from splat.raster.functions import last_derivative
@@ -60,7 +60,7 @@ class ViewLoss:
         return torch.from_numpy(np.ascontiguousarray(planes[:3, : self.shape[0], : self.shape[1]]))
 
     def _blurs_of_target(self) -> np.ndarray:
-        """mu_y and var_y."""
+        """mu and var."""
         height, width = self.shape[:2]
         taps = window(torch.float64).numpy()
 
@@ -82,34 +82,37 @@ class ViewLoss:
         eps, pixel, structural = scalar(self.settings.eps), scalar(self.pixel), scalar(self.structural)
         return KINDS[self.settings.pixel], eps, pixel, structural
 
-    def _value(self, pixels: np.ndarray, similarities: np.ndarray) -> float:
-        return float(self.pixel * pixels.sum() + self.settings.ssim_weight - self.structural * similarities.sum())
+    def _residual(self, image: np.ndarray) -> np.ndarray:
+        return np.subtract(image[:3], self.target, out=self.planes(1)[0]).reshape(-1)
+
+    def _value(self, pixels: np.ndarray, distances: np.ndarray) -> float:
+        return float(self.pixel * pixels.sum() + self.structural * distances.sum())
 
     def value(self, image: np.ndarray) -> float:
         """The loss at padded planes: two blurs instead of the gradient's four."""
-        x, kind, eps = np.ascontiguousarray(image[:3], self.dtype).reshape(-1), *self._pointwise()[:2]
-        pixels, similarities = np.zeros((2, 3 * self.shape[0]))
+        r, kind, eps = self._residual(image), *self._pointwise()[:2]
+        pixels, distances = np.zeros((2, 3 * self.shape[0]))
         over_range(
-            len(pixels), value_rows, self.shape, self.taps, x, self.target.reshape(-1), self._target_moments.reshape(-1),
-            kind, eps, self._pointwise()[3], pixels, similarities,
+            len(pixels), value_rows, self.shape, self.taps, r, self.target.reshape(-1), self._target_moments.reshape(-1),
+            kind, eps, self._pointwise()[3], pixels, distances,
         )  # fmt: skip
-        return self._value(pixels, similarities)
+        return self._value(pixels, distances)
 
     def linearize(self, image: np.ndarray, second_order: bool = True) -> "LinearLoss":
         """Value and gradient at padded planes (at least three), and what the Hessian's product needs if second_order."""
-        x = np.ascontiguousarray(image[:3], self.dtype).reshape(-1)
+        r = self._residual(image)
         second = blurred_sp = np.empty(0, self.dtype)
         if self.structural and second_order:
-            second, blurred_sp = self.planes(5).reshape(-1), self.planes(1).reshape(-1)
+            second, blurred_sp = self.planes(SECONDS).reshape(-1), self.planes(1).reshape(-1)
         gradient = aligned((4, *self.shape[2:]), self.dtype)
         gradient[:, self.shape[0] :] = 0
         gradient[3] = 0
-        pixels, similarities = np.zeros((2, 3 * self.shape[0]))
+        pixels, distances = np.zeros((2, 3 * self.shape[0]))
         over_range(
-            len(pixels), gradient_rows, self.shape, self.taps, x, self.target.reshape(-1), self._target_moments.reshape(-1),
-            *self._pointwise(), second, blurred_sp, gradient.reshape(-1), pixels, similarities,
+            len(pixels), gradient_rows, self.shape, self.taps, r, self.target.reshape(-1), self._target_moments.reshape(-1),
+            *self._pointwise(), second, blurred_sp, gradient.reshape(-1), pixels, distances,
         )  # fmt: skip
-        return LinearLoss(self, self._value(pixels, similarities), gradient, x, second, blurred_sp)
+        return LinearLoss(self, self._value(pixels, distances), gradient, r, second, blurred_sp)
 
 
 class LinearLoss:
@@ -120,15 +123,15 @@ class LinearLoss:
         loss: ViewLoss,
         value: float,
         gradient: np.ndarray,
-        image: np.ndarray,
+        residual: np.ndarray,
         second: np.ndarray,
         blurred: np.ndarray,
     ):
         self.loss, self.value, self.gradient = loss, value, gradient
-        self._image, self._second, self._blurred = image, second, blurred
+        self._residual, self._second, self._blurred = residual, second, blurred
 
     def _held(self) -> tuple:
-        return self._image, self.loss.target.reshape(-1), *self.loss._pointwise(), self._second, self._blurred
+        return self._residual, self.loss.target.reshape(-1), *self.loss._pointwise(), self._second, self._blurred
 
     def hvp(self, tangents: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """l'' v for K padded tangents (K, 4, ...), to out (which may be the tangents themselves)."""
@@ -148,7 +151,7 @@ class LinearLoss:
     @property
     def bytes(self) -> int:
         """Memory of what is held, the target's included."""
-        loss, held = self.loss, (self.gradient, self._image, self._second, self._blurred)
+        loss, held = self.loss, (self.gradient, self._residual, self._second, self._blurred)
         return loss.target.nbytes + loss._target_moments.nbytes + sum(array.nbytes for array in held)
 
     @cached_property

@@ -1,16 +1,18 @@
 """The kernels of the losses: SSIM's value, gradient, Hessian-vector product and diagonal in one sweep down the rows.
 
-Per pixel and channel, with x the image, y the target (its own blurs are constants) and m, p, q the window's means of x, x^2
-and x y, SSIM is
+SSIM of an image x against a target y is taken in the residual r = x - y, because the variances of the usual formula cancel:
+in float32 its curvature is wrong by 3e-5 (in r: 3e-7).  With mu and var the window's mean and variance of y, c = 1/2 (which
+centres pictures), and m, p, q the window's means of r, r^2 and (y - c) r, at a pixel and channel:
 
-    S(m, p, q) = A1 A2 / (B1 B2)      A1 = 2 m mu_y + C1     B1 = m^2 + mu_y^2 + C1
-                                      A2 = 2 (q - m mu_y) + C2     B2 = p - m^2 + var_y + C2
+    1 - S = 1 - l s       l = 1 - m^2 / B1     B1 = (mu + m)^2 + mu^2 + C1
+                          s = 1 - w / B2       w = p - m^2, the variance of r
+                                               B2 = 2 (var + q - (mu - c) m) + w + C2
 
 The window's blur is its own adjoint, so with S_m, S_p, S_q the partial derivatives
 
-    gradient of sum S      blur(S_m) + 2 x blur(S_p) + y blur(S_q)
+    gradient of sum S      blur(S_m) + 2 r blur(S_p) + (y - c) blur(S_q)
     its tangent for v      the same of S_m', S_p', S_q', plus 2 v blur(S_p), a dash the second derivative of S applied to
-                           m' = blur(v), p' = 2 blur(x v), q' = blur(y v)
+                           m' = blur(v), p' = 2 blur(r v), q' = blur((y - c) v)
 
 A blur is separable: along each row at once, down the columns out of a `ring` of the last RING rows.  A sweep has up to three
 stages, each REACH rows behind the one before: products blurred along the row; partial derivatives at a row, blurred along
@@ -28,6 +30,8 @@ BORDER = 16  # floats before a row in scratch, so that the window may look past 
 REACH = WINDOW // 2
 RING = 16  # rows; a power of two, at least WINDOW
 L1, CHARBONNIER, L2 = range(3)
+CENTRE = 0.5
+SECONDS = 6  # S_mm, S_mp, S_mq, S_pp, S_pq, S_qq
 
 
 # --- blurs ------------------------------------------------------------------------------------------------------------
@@ -94,13 +98,13 @@ def row_sum(values, width):
 
 
 @formula
-def blur_products(v, x, y, at, width, stride, taps, b0, b1, b2, ring, row):
-    """Stage one: row `row` of v, x v and y v, which begins at `at` in its field, blurred along itself."""
+def blur_products(v, r, y, at, width, stride, taps, b0, b1, b2, ring, row):
+    """Stage one: row `row` of v, r v and (y - c) v, which begins at `at` in its field, blurred along itself."""
     for i in range(0, stride, lanes(v)):
         value = load(v, at + i)
         store(b0, BORDER + i, value)
-        store(b1, BORDER + i, value * load(x, at + i))
-        store(b2, BORDER + i, value * load(y, at + i))
+        store(b1, BORDER + i, value * load(r, at + i))
+        store(b2, BORDER + i, value * (load(y, at + i) - CENTRE))
     blur_three(b0, b1, b2, width, stride, taps, ring, row)
 
 
@@ -123,28 +127,30 @@ def clear_three(ring, row, stride):
 
 @formula
 def similarity(m, p, q, mu, var):
-    """S and its partial derivatives in (m, p, q), with what the second derivatives need."""
-    A1, B1 = 2.0 * m * mu + C1, m * m + mu * mu + C1
-    A2, B2 = 2.0 * (q - m * mu) + C2, p - m * m + var + C2
-    r1, r2 = 1.0 / B1, 1.0 / B2
-    l, s = A1 * r1, A2 * r2  # S = l s; l depends on m alone
-    dl = (2.0 * mu - 2.0 * m * l) * r1
-    ds = (2.0 * m * s - 2.0 * mu) * r2  # ds/dm; ds/dp = -s r2, ds/dq = 2 r2
-    return l, s, dl, ds, r1, r2
+    """1 - l and 1 - s, their first derivatives l_m and s_m, s_p, s_q, and what the second ones need."""
+    mean = mu + m
+    r1 = 1.0 / (mean * mean + mu * mu + C1)
+    variance, centred = p - m * m, mean - CENTRE
+    r2 = 1.0 / (2.0 * (var + q - (mu - CENTRE) * m) + variance + C2)
+    far, apart = m * m * r1, variance * r2
+    dl = 2.0 * (mean * far - m) * r1
+    sm, sp, sq = 2.0 * (m - centred * apart) * r2, -((1.0 - apart) * r2), 2.0 * apart * r2
+    return far, apart, dl, sm, sp, sq, mean, centred, r1, r2
 
 
 @formula
-def store_second(second, at, size, m, l, s, dl, ds, r1, r2):
-    """S_mm, S_mp, S_mq, S_pp, S_pq at a row (S_qq is 0)."""
-    sp, sq = -(s * r2), 2.0 * r2
-    ddl = (-2.0 * l - 4.0 * m * dl) * r1
-    dds = (2.0 * s + 4.0 * m * ds) * r2
-    smp, smq = (2.0 * m * sp - ds) * r2, 2.0 * m * sq * r2
-    store(second, at, ddl * s + 2.0 * dl * ds + l * dds)
+def store_second(second, at, size, far, apart, dl, sm, sp, sq, mean, centred, r1, r2):
+    """The SECONDS second derivatives of S at a row."""
+    l, s = 1.0 - far, 1.0 - apart
+    ddl = -((2.0 * l + 4.0 * mean * dl) * r1)
+    smm, smp = (2.0 * s + 4.0 * centred * sm) * r2, (2.0 * centred * sp - sm) * r2
+    smq = 2.0 * (centred * sq - sm) * r2
+    store(second, at, ddl * s + 2.0 * dl * sm + l * smm)
     store(second, size + at, dl * sp + l * smp)
     store(second, 2 * size + at, dl * sq + l * smq)
     store(second, 3 * size + at, -2.0 * l * sp * r2)
-    store(second, 4 * size + at, -(l * sq * r2))
+    store(second, 4 * size + at, -(l * (sq + 2.0 * sp) * r2))
+    store(second, 5 * size + at, -4.0 * l * sq * r2)
 
 
 @formula
@@ -179,25 +185,25 @@ def channel_part(start, stop, channel, height):
 
 
 @kernel
-def value_rows(start, stop, shape, taps, x, y, target, kind, eps, structural, pixels, similarities):
-    """Sums over each row of the pixel loss and, unless structural = 0, of S.  target: mu_y and var_y (2 plane sets)."""
+def value_rows(start, stop, shape, taps, r, y, target, kind, eps, structural, pixels, distances):
+    """Sums over each row of the pixel loss and, unless structural = 0, of 1 - S.  target: mu and var (2 plane sets)."""
     height, width, plane_rows, stride = shape
-    L, size = lanes(x), 3 * plane_rows * stride
-    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
-    ring, values = ring_buffer(x, 3, stride), row_buffer(x, stride)
+    L, size = lanes(r), 3 * plane_rows * stride
+    b0, b1, b2 = row_buffer(r, stride), row_buffer(r, stride), row_buffer(r, stride)
+    ring, values = ring_buffer(r, 3, stride), row_buffer(r, stride)
     for channel in range(3):
         first, last = channel_part(start, stop, channel, height)
         top = channel * plane_rows * stride
         for row in range(first, last):
             at = top + row * stride
             for i in range(0, stride, L):
-                store(values, BORDER + i, pixel_slope(load(x, at + i) - load(y, at + i), kind, eps)[0])
+                store(values, BORDER + i, pixel_slope(load(r, at + i), kind, eps)[0])
             pixels[channel * height + row] = row_sum(values, width)
         if structural == 0 or first >= last:
             continue
         for ahead in range(first - REACH, last + REACH):
             if 0 <= ahead < height:
-                blur_products(x, x, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
+                blur_products(r, r, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
             else:
                 clear_three(ring, ahead, stride)
             row = ahead - REACH
@@ -207,14 +213,14 @@ def value_rows(start, stop, shape, taps, x, y, target, kind, eps, structural, pi
             for i in range(0, stride, L):
                 m, p = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
                 q = blur_down(ring, 2, row, i, stride, taps)
-                l, s, _dl, _ds, _r1, _r2 = similarity(m, p, q, load(target, at + i), load(target, size + at + i))
-                store(values, BORDER + i, l * s)
-            similarities[channel * height + row] = row_sum(values, width)
+                found = similarity(m, p, q, load(target, at + i), load(target, size + at + i))
+                store(values, BORDER + i, found[0] + found[1] - found[0] * found[1])
+            distances[channel * height + row] = row_sum(values, width)
 
 
 @formula
 def differentiate_row(ring, row, at, size, shape, taps, target, second, inside, b0, b1, b2, values, slopes):
-    """Stage two of the gradient: S_m, S_p, S_q of a row, blurred along it; the sum of S.
+    """Stage two of the gradient: S_m, S_p, S_q of a row, blurred along it; the sum of 1 - S.
 
     The second derivatives go to `second` where that is not empty and the row is one of the range's own (inside).
     """
@@ -222,30 +228,32 @@ def differentiate_row(ring, row, at, size, shape, taps, target, second, inside, 
     for i in range(0, stride, lanes(ring)):
         m, p = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
         q = blur_down(ring, 2, row, i, stride, taps)
-        l, s, dl, ds, r1, r2 = similarity(m, p, q, load(target, at + i), load(target, size + at + i))
-        store(values, BORDER + i, l * s)
-        store(b0, BORDER + i, dl * s + l * ds)
-        store(b1, BORDER + i, -(l * s * r2))
-        store(b2, BORDER + i, 2.0 * l * r2)
+        found = similarity(m, p, q, load(target, at + i), load(target, size + at + i))
+        far, apart, dl, sm, sp, sq, mean, centred, r1, r2 = found
+        l = 1.0 - far
+        store(values, BORDER + i, far + apart - far * apart)
+        store(b0, BORDER + i, dl * (1.0 - apart) + l * sm)
+        store(b1, BORDER + i, l * sp)
+        store(b2, BORDER + i, l * sq)
         if inside and second.size:
-            store_second(second, at + i, size, m, l, s, dl, ds, r1, r2)
+            store_second(second, at + i, size, far, apart, dl, sm, sp, sq, mean, centred, r1, r2)
     blur_three(b0, b1, b2, width, stride, taps, slopes, row)
     return row_sum(values, width)
 
 
 @kernel
 def gradient_rows(
-    start, stop, shape, taps, x, y, target, kind, eps, pixel, structural, second, blurred_sp, gradient, pixels, similarities
+    start, stop, shape, taps, r, y, target, kind, eps, pixel, structural, second, blurred_sp, gradient, pixels, distances
 ):  # fmt: skip
-    """The gradient of the loss; sums over each row of the pixel loss and of S (unless structural = 0).
+    """The gradient of the loss; sums over each row of the pixel loss and of 1 - S (unless structural = 0).
 
-    pixel, structural: weights of the two losses over the number of values.  target: mu_y and var_y (2 plane sets).
-    second: S_mm, S_mp, S_mq, S_pp, S_pq (5 plane sets), and blurred_sp: blur(S_p); or both empty.
+    pixel, structural: weights of the two losses over the number of values.  target: mu and var (2 plane sets).
+    second: the SECONDS second derivatives of S (plane sets), and blurred_sp: blur(S_p); or both empty.
     """
     height, width, plane_rows, stride = shape
-    L, size = lanes(x), 3 * plane_rows * stride
-    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
-    ring, slopes, values = ring_buffer(x, 3, stride), ring_buffer(x, 3, stride), row_buffer(x, stride)
+    L, size = lanes(r), 3 * plane_rows * stride
+    b0, b1, b2 = row_buffer(r, stride), row_buffer(r, stride), row_buffer(r, stride)
+    ring, slopes, values = ring_buffer(r, 3, stride), ring_buffer(r, 3, stride), row_buffer(r, stride)
     for channel in range(3):
         first, last = channel_part(start, stop, channel, height)
         top = channel * plane_rows * stride
@@ -253,7 +261,7 @@ def gradient_rows(
         for ahead in range(first - lead, last + lead if first < last else first - lead):
             if structural != 0:
                 if 0 <= ahead < height:
-                    blur_products(x, x, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
+                    blur_products(r, r, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
                 else:
                     clear_three(ring, ahead, stride)
                 row = ahead - REACH
@@ -264,7 +272,7 @@ def gradient_rows(
                             ring, row, at, size, shape, taps, target, second, inside, b0, b1, b2, values, slopes
                         )
                         if inside:
-                            similarities[channel * height + row] = total
+                            distances[channel * height + row] = total
                     else:
                         clear_three(slopes, row, stride)
             row = ahead - lead
@@ -272,14 +280,14 @@ def gradient_rows(
                 continue
             at = top + row * stride
             for i in range(0, stride, L):
-                image, aim = load(x, at + i), load(y, at + i)
-                value, slope = pixel_slope(image - aim, kind, eps)
+                residual = load(r, at + i)
+                value, slope = pixel_slope(residual, kind, eps)
                 slope = slope * pixel
                 store(values, BORDER + i, value)
                 if structural != 0:
                     bm, bp = blur_down(slopes, 0, row, i, stride, taps), blur_down(slopes, 1, row, i, stride, taps)
                     bq = blur_down(slopes, 2, row, i, stride, taps)
-                    slope -= structural * (bm + 2.0 * image * bp + aim * bq)
+                    slope -= structural * (bm + 2.0 * residual * bp + (load(y, at + i) - CENTRE) * bq)
                     if blurred_sp.size:
                         store(blurred_sp, at + i, bp)
                 store(gradient, at + i, slope)
@@ -295,20 +303,20 @@ def curve_row(ring, row, at, size, width, stride, taps, second, b0, b1, b2, slop
         dm, dp = blur_down(ring, 0, row, i, stride, taps), 2.0 * blur_down(ring, 1, row, i, stride, taps)
         dq = blur_down(ring, 2, row, i, stride, taps)
         mm, mp, mq = load(second, at + i), load(second, size + at + i), load(second, 2 * size + at + i)
-        pp, pq = load(second, 3 * size + at + i), load(second, 4 * size + at + i)
+        pp, pq, qq = load(second, 3 * size + at + i), load(second, 4 * size + at + i), load(second, 5 * size + at + i)
         store(b0, BORDER + i, mm * dm + mp * dp + mq * dq)
         store(b1, BORDER + i, mp * dm + pp * dp + pq * dq)
-        store(b2, BORDER + i, mq * dm + pq * dp)
+        store(b2, BORDER + i, mq * dm + pq * dp + qq * dq)
     blur_three(b0, b1, b2, width, stride, taps, slopes, row)
 
 
 @kernel
-def product_rows(start, stop, shape, taps, v, x, y, kind, eps, pixel, structural, second, blurred_sp, product):
+def product_rows(start, stop, shape, taps, v, r, y, kind, eps, pixel, structural, second, blurred_sp, product):
     """The Hessian of the loss times v.  product must not be v: another range may still read it."""
     height, width, plane_rows, stride = shape
-    L, size = lanes(x), 3 * plane_rows * stride
-    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
-    ring, slopes = ring_buffer(x, 3, stride), ring_buffer(x, 3, stride)
+    L, size = lanes(r), 3 * plane_rows * stride
+    b0, b1, b2 = row_buffer(r, stride), row_buffer(r, stride), row_buffer(r, stride)
+    ring, slopes = ring_buffer(r, 3, stride), ring_buffer(r, 3, stride)
     for channel in range(3):
         first, last = channel_part(start, stop, channel, height)
         top = channel * plane_rows * stride
@@ -316,7 +324,7 @@ def product_rows(start, stop, shape, taps, v, x, y, kind, eps, pixel, structural
         for ahead in range(first - lead, last + lead if first < last else first - lead):
             if structural != 0:
                 if 0 <= ahead < height:
-                    blur_products(v, x, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
+                    blur_products(v, r, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
                 else:
                     clear_three(ring, ahead, stride)
                 row = ahead - REACH
@@ -331,30 +339,31 @@ def product_rows(start, stop, shape, taps, v, x, y, kind, eps, pixel, structural
                 continue
             at = top + row * stride
             for i in range(0, stride, L):
-                image, aim, tangent = load(x, at + i), load(y, at + i), load(v, at + i)
-                total = pixel_curvature(image - aim, kind, eps, broadcast(x, pixel)) * tangent
+                residual, tangent = load(r, at + i), load(v, at + i)
+                total = pixel_curvature(residual, kind, eps, broadcast(r, pixel)) * tangent
                 if structural != 0:
                     bm, bp = blur_down(slopes, 0, row, i, stride, taps), blur_down(slopes, 1, row, i, stride, taps)
                     bq = blur_down(slopes, 2, row, i, stride, taps)
-                    total -= structural * (bm + 2.0 * image * bp + aim * bq + 2.0 * tangent * load(blurred_sp, at + i))
+                    bent = 2.0 * (residual * bp + tangent * load(blurred_sp, at + i))
+                    total -= structural * (bm + bent + (load(y, at + i) - CENTRE) * bq)
                 store(product, at + i, total)
             for i in range(width, stride):
                 product[at + i] = 0
 
 
 @kernel
-def diagonal_rows(start, stop, shape, taps, x, y, kind, eps, pixel, structural, second, blurred_sp, diagonal):
+def diagonal_rows(start, stop, shape, taps, r, y, kind, eps, pixel, structural, second, blurred_sp, diagonal):
     """The diagonal of the loss's Hessian.  taps: the window squared."""
     height, width, plane_rows, stride = shape
-    L, size = lanes(x), 3 * plane_rows * stride
-    buffer, ring = row_buffer(x, stride), ring_buffer(x, 5, stride)
+    L, size = lanes(r), 3 * plane_rows * stride
+    buffer, ring = row_buffer(r, stride), ring_buffer(r, SECONDS, stride)
     for channel in range(3):
         first, last = channel_part(start, stop, channel, height)
         top = channel * plane_rows * stride
         lead = REACH if structural != 0 else 0
         for ahead in range(first - lead, last + lead if first < last else first - lead):
             if structural != 0:
-                for f in range(5):
+                for f in range(SECONDS):
                     if 0 <= ahead < height:
                         for i in range(0, stride, L):
                             store(buffer, BORDER + i, load(second, f * size + top + ahead * stride + i))
@@ -366,13 +375,13 @@ def diagonal_rows(start, stop, shape, taps, x, y, kind, eps, pixel, structural, 
                 continue
             at = top + row * stride
             for i in range(0, stride, L):
-                image, aim = load(x, at + i), load(y, at + i)
-                total = pixel_curvature(image - aim, kind, eps, broadcast(x, pixel))
+                residual, aim = load(r, at + i), load(y, at + i) - CENTRE
+                total = pixel_curvature(residual, kind, eps, broadcast(r, pixel))
                 if structural != 0:
                     mm, mp = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
                     mq, pp = blur_down(ring, 2, row, i, stride, taps), blur_down(ring, 3, row, i, stride, taps)
-                    pq = blur_down(ring, 4, row, i, stride, taps)
-                    coupled = mm + 4.0 * image * (mp + image * pp + aim * pq) + 2.0 * aim * mq
+                    pq, qq = blur_down(ring, 4, row, i, stride, taps), blur_down(ring, 5, row, i, stride, taps)
+                    coupled = mm + 4.0 * residual * (mp + residual * pp + aim * pq) + aim * (2.0 * mq + aim * qq)
                     total -= structural * (coupled + 2.0 * load(blurred_sp, at + i))
                 store(diagonal, at + i, total)
             for i in range(width, stride):
