@@ -3,6 +3,7 @@
 OUT/kernels.csv   a line a stage and size: milliseconds, and over the prototype's where one was measured
 OUT/bench.csv     a line a time: what was timed (`stage`), why (`study`: stages, or what was scaled), on what, milliseconds
 OUT/bounds.csv    the ratios that the project promises, measured, with their bounds
+OUT/precision.csv what float32 costs at a scene or checkpoint, view by view (`precision`)
 OUT/bench.png     the scaling, drawn by `figures.bench` from bench.csv
 OUT/stress.csv    `landscape bench stress`: errors at the limits of the renderer (`stress`)
 
@@ -10,6 +11,7 @@ Times are minima and medians of repetitions in turns (`timing`); ratios are of m
 """
 
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,7 @@ from analysis.bench_scene import OPERATIONS, VECTORS, ViewBench, per_vector, sca
 from analysis.drawing import draw
 from analysis.options import BenchOptions
 from analysis.peak import fma_peak
+from analysis.precision import precision
 from analysis.prototype import prototype_in
 from analysis.provenance import machine
 from analysis.stress import run_stress
@@ -45,6 +48,7 @@ HEADINGS = {
     "ratio_of_medians": "of medians",
     "difference": "apart",
 }
+PRECISION = 1e-5  # asked for, of H v and of traces, with decisions held equal
 SCALING_SHARE = 3  # scaling is timed with this fraction of the repetitions
 
 
@@ -122,12 +126,25 @@ def _bench_scenes(options: BenchOptions, console: Console) -> None:
         console.print(_rich(held.drop(columns="scene"), "asked for"))
         times.append(lines)
         bounds.append(held)
+    if options.subject is not None:
+        _precision(workloads[0], options.out / "precision.csv", console)
     times.append(pd.DataFrame(_scaling(workloads[0], max(1, options.repetitions // SCALING_SHARE))))
     table = pd.concat(times, ignore_index=True)
     _write(table, options.out / "bench.csv", console)
     _write(pd.concat(bounds, ignore_index=True), options.out / "bounds.csv", console)
     draw("bench", options.out / "bench.csv")
     console.print(str(options.out / "bench.png"), soft_wrap=True, highlight=False)
+
+
+def _precision(workload: Workload, path: Path, console: Console) -> None:
+    """The worst error of any view, quantity by quantity."""
+    table = pd.DataFrame([asdict(line) for line in precision(workload)])
+    worst = table.pivot_table("error", ["quantity", "scale"], "decisions", aggfunc="max", sort=False).reset_index()
+    bounds = [PRECISION if name.startswith(("H v", "trace")) else np.nan for name in worst["quantity"]]
+    worst["at_most"] = bounds
+    worst["holds"] = [not error > bound for error, bound in zip(worst["held equal"], bounds, strict=True)]
+    console.print(_rich(worst, "float32 against float64, the worst view: error over the scale"))
+    _write(table, path, console)
 
 
 def _lines(
@@ -197,11 +214,12 @@ def _bounds(
         allowed = K * (40 * view.entries + 28 * workload.pixels + 500 * view.touched)
         lines.append(_line(f"workspace of K = {K} ({used / 1e6:.1f} MB) / allowance", used / allowed, 1.0))
     if reference:
-        seconds, memory = times["H v 1"].minimum, kept + workspaces[1]
+        seconds, work = times["H v 1"].minimum, workspaces[1]
         name = f"reference's double backward ({reference.product:.1f} s) / H v 1"
         lines.append(_line(name, reference.product / seconds, 300, least=True))
-        name = f"its memory ({reference.peak / 1e9:.2f} GB) / kept + workspace"
-        lines.append(_line(name, reference.peak / memory, 50, least=True))
+        name = f"its memory ({reference.peak / 1e9:.2f} GB) / "
+        lines.append(_line(name + "workspace of K = 1", reference.peak / work, 50, least=True))
+        lines.append(_line(name + "workspace + kept", reference.peak / (work + kept), 50, least=True))
     return pd.DataFrame({"scene": workload.name, **line} for line in lines)
 
 
