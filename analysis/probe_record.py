@@ -30,7 +30,7 @@ def probe_data(findings: Findings, objective: SceneObjective, loss: LossSettings
         "eigenvalues": _eigenvalues(findings, objective.blocks),
         "anisotropy": _anisotropy(findings),
         "slice": None if findings.plane is None else _slice(findings.plane, findings.ends.largest),
-        "counts": {**_counts(objective.counts), **_work(findings, objective)},
+        "counts": {**counts(objective.counts), **_work(findings, objective)},
         "checks": _checks(findings),
         "notes": list(findings.notes),
     }
@@ -42,6 +42,7 @@ def probe_arrays(findings: Findings) -> dict[str, dict[str, np.ndarray]]:
     assert findings.ends.ritz is not None
     values, residuals = findings.ends.ritz.numpy()
     arrays["spectrum"] = {"ritz_values": values, "residuals": residuals}
+    arrays["eigenvectors"] = {"largest": findings.ends.largest.vectors.numpy()}
     if findings.density is not None:
         arrays["spectrum"] |= {"nodes": findings.density.nodes.numpy(), "weights": findings.density.weights.numpy()}
     if findings.plane is not None:
@@ -116,17 +117,17 @@ def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> dict[str, Any]:
     }
 
 
-def _counts(counts: ActiveCounts) -> dict[str, int]:
+def counts(active: ActiveCounts) -> dict[str, int]:
     return {
-        "gaussians": counts.gaussians,
-        "visible_gaussians": counts.active_gaussians,
-        "skipped_gaussians": counts.gaussians - counts.active_gaussians,
-        "parameters": counts.parameters,
-        "active_parameters": counts.active_parameters,
-        "skipped_quaternion_lengths": counts.radial_quaternions,
-        "sh_degree_stored": counts.sh_degree,
-        "sh_degree_active": counts.active_sh_degree,
-        "views": counts.views,
+        "gaussians": active.gaussians,
+        "visible_gaussians": active.active_gaussians,
+        "skipped_gaussians": active.gaussians - active.active_gaussians,
+        "parameters": active.parameters,
+        "active_parameters": active.active_parameters,
+        "skipped_quaternion_lengths": active.radial_quaternions,
+        "sh_degree_stored": active.sh_degree,
+        "sh_degree_active": active.active_sh_degree,
+        "views": active.views,
     }
 
 

@@ -63,6 +63,7 @@ Arrays (all optional):
 
 spectrum          ritz_values [k], residuals [k]: approximate eigenvalues, the two ends among them; and, where the
                   density was estimated, nodes, weights [starts, steps]: a quadrature for each start vector
+eigenvectors      largest [parameters, k]: unit vectors of the k largest eigenvalues, of the Gaussians in sight
 traces            attribute -> [probes]: the samples whose mean is the trace
 slice             x [nx], y [ny]: steps along the two directions in parameter units; loss [nx, ny]: L at each point;
                   evaluated [nx, ny]: true where it is a true render, false where it is interpolated (absent: all are
