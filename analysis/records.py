@@ -2,6 +2,7 @@
 
 A record is a folder `RUN/probe/` with `probe.json` (every number), one `.npz` per group of arrays, and whatever
 pictures and pages were drawn from them.  `record_folder` makes the whole folder appear at once.  Needs no torch.
+Folders of `landscape slice` are made alike, with `slice.json`, whose keys `analysis.slice_record` lists.
 
 Numbers.  `probe.json` is strict JSON.  What is not finite is a string, "NaN", "Infinity" or "-Infinity" (the convention
 of protobuf's JSON), and comes back as a float.  `null` means *not determined*, and the `note` beside it says why.
@@ -87,8 +88,29 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = {"name": "landscape probe", "version": 1}
-FILE = "probe.json"
+
+@dataclass(frozen=True)
+class Kind:
+    """The records of one subcommand.  sections: objects that must be there; axes: how many directions a slice may have."""
+
+    command: str
+    version: int
+    sections: tuple[str, ...]
+    axes: tuple[int, ...]
+
+    @property
+    def file(self) -> str:
+        return f"{self.command}.json"
+
+    @property
+    def format(self) -> dict[str, str | int]:
+        return {"name": f"landscape {self.command}", "version": self.version}
+
+
+_EVERY = ("counts", "timing", "provenance", "arrays")
+PROBE = Kind("probe", 1, ("traces", "eigenvalues", "anisotropy", "checks", *_EVERY), axes=(2,))
+SLICE = Kind("slice", 1, ("objective", "slice", *_EVERY), axes=(1, 2))
+FILE, FORMAT = PROBE.file, PROBE.format
 
 _REQUIRED = {
     "traces": ("value", "standard_error", "tau", "dim", "probes", "sign", "method"),
@@ -116,7 +138,7 @@ _ABANDONED_AFTER = 3600.0  # seconds; filling a folder takes seconds: an older p
 
 @dataclass(frozen=True)
 class Record:
-    """A record as read: `data` is probe.json with non-finite numbers as floats, `arrays` is group -> name -> array."""
+    """A record as read: `data` is its JSON with non-finite numbers as floats, `arrays` is group -> name -> array."""
 
     folder: Path
     data: dict[str, Any]
@@ -124,14 +146,14 @@ class Record:
 
 
 @contextmanager
-def record_folder(folder: str | Path) -> Iterator[Path]:
+def record_folder(folder: str | Path, kind: Kind = PROBE) -> Iterator[Path]:
     """A new, empty folder that becomes `folder` when the block ends, all at once; nothing changes if the block fails.
 
     An old record at `folder` is replaced.  Killed at any point, `folder` is the old record, the new one, or (between
     two renames) absent with the old record complete in `.NAME.previous` beside it, from where the next use restores it.
     """
     folder = Path(folder).absolute()
-    require_replaceable(folder)
+    require_replaceable(folder, kind)
     folder.parent.mkdir(parents=True, exist_ok=True)
     previous = folder.with_name(f".{folder.name}.previous")
     _clean_up_after_kills(folder, previous)
@@ -153,23 +175,25 @@ def record_folder(folder: str | Path) -> Iterator[Path]:
     shutil.rmtree(previous, ignore_errors=True)
 
 
-def write_record(folder: str | Path, data: Mapping[str, Any], arrays: Mapping[str, Mapping[str, np.ndarray]]) -> Path:
-    """Write probe.json and the arrays into `folder` (which `record_folder` gave); returns the path of probe.json.
+def write_record(
+    folder: str | Path, data: Mapping[str, Any], arrays: Mapping[str, Mapping[str, np.ndarray]], kind: Kind = PROBE
+) -> Path:
+    """Write the JSON and the arrays into `folder` (which `record_folder` gave); returns the path of the JSON.
 
     `data` holds the keys of the module's glossary save `format` and `arrays`, which are added here.
     Raises ValueError where a required key is missing or a value has no place in JSON.
     """
     folder = Path(folder)
     shapes = {group: {name: list(np.shape(array)) for name, array in names.items()} for group, names in arrays.items()}
-    whole = {"format": dict(FORMAT), **data, "arrays": shapes}
-    check_layout(whole)
+    whole = {"format": kind.format, **data, "arrays": shapes}
+    check_layout(whole, kind)
     text = json.dumps(_encoded(whole, ""), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     for group, names in arrays.items():
         numeric: dict[str, Any] = {name: np.asarray(array) for name, array in names.items()}
         if objects := [name for name, array in numeric.items() if array.dtype.hasobject]:
             raise ValueError(f"expected numbers in the array {group}.{objects[0]}, got objects")
         np.savez_compressed(folder / f"{group}.npz", **numeric)
-    path = folder / FILE
+    path = folder / kind.file
     temporary = path.with_suffix(".json.tmp")
     temporary.write_text(text, encoding="utf-8")
     temporary.replace(path)
@@ -177,39 +201,43 @@ def write_record(folder: str | Path, data: Mapping[str, Any], arrays: Mapping[st
 
 
 def read_record(folder: str | Path) -> Record:
-    """Read the record in `folder` (or the probe.json given).  FileNotFoundError or ValueError say what is wrong."""
+    """Read the record in `folder` (or the JSON given).  FileNotFoundError or ValueError say what is wrong."""
     folder = Path(folder)
-    folder = folder.parent if folder.name == FILE else folder
-    path = folder / FILE
+    folder = folder.parent if folder.name in (PROBE.file, SLICE.file) else folder
+    kind = SLICE if (folder / SLICE.file).is_file() else PROBE
+    path = folder / kind.file
     if not path.is_file():
         raise FileNotFoundError(_why_not_found(folder))
+    again = f"{kind.command} again"
     try:
         raw = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except ValueError as error:
         raise ValueError(
-            f"expected JSON in {path}, got a file that is damaged or truncated ({error}); probe again"
+            f"expected JSON in {path}, got a file that is damaged or truncated ({error}); {again}"
         ) from None
     match raw:
-        case {"format": {"name": name, "version": version}} if name == FORMAT["name"]:
+        case {"format": {"name": name, "version": version}} if name == kind.format["name"]:
             pass
         case _:
-            raise ValueError(f'expected a record of `landscape probe` in {path}, got JSON without "format": {FORMAT}')
-    if not isinstance(version, int) or version > FORMAT["version"]:
+            raise ValueError(
+                f'expected a record of `landscape {kind.command}` in {path}, got JSON without "format": {kind.format}'
+            )
+    if not isinstance(version, int) or version > kind.version:
         raise ValueError(
-            f"expected a record of format version {FORMAT['version']} or older in {path}, got version {version}; "
-            "update splat-landscape or probe the checkpoint again"
+            f"expected a record of format version {kind.version} or older in {path}, got version {version}; "
+            f"update splat-landscape or {kind.command} the checkpoint again"
         )
     try:
-        check_layout(raw)
+        check_layout(raw, kind)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}; probe again") from None
-    arrays = {group: _read_arrays(folder / f"{group}.npz", shapes) for group, shapes in raw["arrays"].items()}
+        raise ValueError(f"{path}: {error}; {again}") from None
+    arrays = {group: _read_arrays(folder / f"{group}.npz", shapes, kind) for group, shapes in raw["arrays"].items()}
     return Record(folder, _decoded(raw), arrays)
 
 
-def check_layout(data: Mapping[str, Any]) -> None:
+def check_layout(data: Mapping[str, Any], kind: Kind = PROBE) -> None:
     """Raise ValueError naming the first required key of the module's glossary that `data` lacks."""
-    for section in (*_REQUIRED, "counts", "timing", "provenance", "arrays"):
+    for section in kind.sections:
         entries = data.get(section)
         if not isinstance(entries, Mapping):
             raise ValueError(f'expected an object "{section}", got {type(entries).__name__}')
@@ -223,8 +251,9 @@ def check_layout(data: Mapping[str, Any]) -> None:
             raise ValueError(f'expected the key "{missing[0]}", got none')
     plane = data.get("slice")
     if plane is not None:
-        if not {"loss_scale", "center_loss"} <= set(plane) or len(plane.get("directions", ())) != 2:
-            raise ValueError('expected "slice" to be null or to hold "loss_scale", "center_loss" and two "directions"')
+        if not {"loss_scale", "center_loss"} <= set(plane) or len(plane.get("directions", ())) not in kind.axes:
+            axes = " or ".join(map(str, kind.axes))
+            raise ValueError(f'expected "slice" to hold "loss_scale", "center_loss" and {axes} "directions"')
         for direction in plane["directions"]:
             if missing := {"name", "curvature", "unit"} - set(direction):
                 raise ValueError(f'expected the key "slice.directions.{min(missing)}", got none')
@@ -270,18 +299,19 @@ def _decoded(value: Any) -> Any:
     return value
 
 
-def _read_arrays(path: Path, shapes: Mapping[str, list[int]]) -> dict[str, np.ndarray]:
+def _read_arrays(path: Path, shapes: Mapping[str, list[int]], kind: Kind) -> dict[str, np.ndarray]:
+    again = f"{kind.command} again"
     if not path.is_file():
-        raise FileNotFoundError(f"expected the arrays of {FILE} in {path}, got no such file; probe again")
+        raise FileNotFoundError(f"expected the arrays of {kind.file} in {path}, got no such file; {again}")
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"expected arrays in {path}, got a damaged or truncated file ({error}); probe again") from None
+        raise ValueError(f"expected arrays in {path}, got a damaged or truncated file ({error}); {again}") from None
     for name, shape in shapes.items():
         got = list(arrays[name].shape) if name in arrays else None
         if got != shape:
-            raise ValueError(f"expected {name} of shape {shape} in {path}, got {got}; probe again")
+            raise ValueError(f"expected {name} of shape {shape} in {path}, got {got}; {again}")
     return arrays
 
 
@@ -295,11 +325,11 @@ def _why_not_found(folder: Path) -> str:
     return f"{expected}{state}; run `landscape probe CHECKPOINT` first"
 
 
-def require_replaceable(folder: Path) -> None:
-    """Replacing deletes: raise ValueError unless folder is absent, empty or an older record."""
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / FILE).is_file():
+def require_replaceable(folder: Path, kind: Kind = PROBE) -> None:
+    """Replacing deletes: raise ValueError unless folder is absent, empty or an older record of this kind."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / kind.file).is_file():
         raise ValueError(
-            f"expected an empty folder or an older record to replace, got {folder} without {FILE}; move it away"
+            f"expected an empty folder or an older record to replace, got {folder} without {kind.file}; move it away"
         )
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"expected a folder to write a record to, got the file {folder}; move it away")
