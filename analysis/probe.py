@@ -58,13 +58,14 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
     return CHECK_FAILED if options.strict and failed else 0
 
 
-def scene_objective(checkpoint: Checkpoint, scene: Scene) -> SceneObjective:
-    """The training's loss over its views, at the checkpoint."""
+def scene_objective(checkpoint: Checkpoint, scene: Scene, *, keep_unseen: bool = False) -> SceneObjective:
+    """The training's loss over its views, at the checkpoint.  keep_unseen: see `SceneObjective`."""
     training = checkpoint.training
     config = training.config
     background = torch.tensor(config.background, dtype=training.gaussians.flat.dtype)
     views = scene.load(checkpoint.scene.train)
-    return SceneObjective(training.gaussians, views, config.loss, background, config.render)
+    gaussians = training.gaussians
+    return SceneObjective(gaussians, views, config.loss, background, config.render, keep_unseen=keep_unseen)
 
 
 def _settings(options: ProbeOptions) -> ProbeSettings:

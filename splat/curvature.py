@@ -65,6 +65,7 @@ class SceneObjective:
     gaussians: those of the checkpoint; sh_degree: the bands in use (all by default).  `active` are the Gaussians that touch
     a pixel of some view, with unit quaternions; `mask` says which of the given ones they are.  memory: bytes that
     linearised views and the workspace of their products may take (half of what is free by default); see `memory_plan`.
+    keep_unseen: all Gaussians are active, for steps so long that they may bring into sight what no view sees here.
     Raises ValueError where no Gaussian is seen or a parameter is not finite.
     """
 
@@ -77,6 +78,7 @@ class SceneObjective:
         settings: RenderSettings = RenderSettings(),
         sh_degree: int | None = None,
         memory: int | None = None,
+        keep_unseen: bool = False,
     ):
         if not views:
             raise ValueError("expected at least one view, got none")
@@ -90,6 +92,8 @@ class SceneObjective:
         self.mask: Bool[Tensor, " n"] = self._support(everyone)
         if not self.mask.any():
             raise ValueError(f"expected Gaussians in sight, got {len(gaussians)} of which no view sees any")
+        if keep_unseen:
+            self.mask = torch.ones_like(self.mask)
         active = everyone.select(self.mask)
         quats = active.quats
         quats /= quats.norm(dim=1, keepdim=True)
