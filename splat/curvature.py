@@ -8,7 +8,7 @@ unit length first: the image does not change, and the trace of their block, whic
     L(theta) = 1/M sum_m l(I_m(theta)),   theta the stored parameters of the active Gaussians, laid out like Gaussians.flat
 """
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from operator import add
@@ -156,7 +156,7 @@ class SceneObjective:
     @cached_property
     def memory_plan(self) -> "MemoryPlan":
         """Which views are kept linearised and how many vectors a product takes at a time; linearises the first view."""
-        first = self._linearize(0)
+        first = self.linearize(0)
         self._kept[0] = first
         spare = self._memory - first.bytes - first.workspace(1)
         per_vector = max(first.workspace(2) - first.workspace(1), 1)
@@ -170,12 +170,13 @@ class SceneObjective:
         kept = self.memory_plan.kept
         for index in range(len(self.views)):
             if index < kept and index not in self._kept:
-                self._kept[index] = self._linearize(index)
-            yield self._kept[index] if index < kept else self._linearize(index)
+                self._kept[index] = self.linearize(index)
+            yield self._kept[index] if index < kept else self.linearize(index)
 
-    def _linearize(self, index: int) -> LinearizedView:
-        camera = self.views[index].camera
-        return LinearizedView(self.active, camera, self._losses[index], self.background, self.settings)
+    def linearize(self, index: int, gaussians: Gaussians | None = None) -> LinearizedView:
+        """A view held still at the active Gaussians or, for comparison, at others; nothing is kept."""
+        camera, at = self.views[index].camera, self.active if gaussians is None else gaussians
+        return LinearizedView(at, camera, self._losses[index], self.background, self.settings)
 
     @cached_property
     def gradient(self) -> Float[Tensor, " p"]:
@@ -227,16 +228,32 @@ class SceneHessian:
         """P V."""
         if self.keep_null:
             return V
+        return self._projected(V, self._row_space, self.objective.active.quats)
+
+    def scaled_projector(self, scale: Float[Tensor, " p"]) -> Callable[[Tensor], Tensor]:
+        """Of D P H P D, D = diag(scale) > 0 and alike for the channels of a colour: the orthogonal projector onto all D P x."""
+        if self.keep_null:
+            return self.project
+        n, quats = len(self.objective.active), self.objective.active.quats
+        parts = {name: scale[rows].view(n, -1) for name, rows in self.blocks.items()}
+        space = self._row_space.scaled(
+            torch.cat([*parts.values()], dim=1) if self.gauss_newton else parts["sh"][:, ::3]
+        )
+        radial = torch.nn.functional.normalize(quats / parts["quats"], dim=1)
+        return lambda V: self._projected(V, space, radial)
+
+    def _projected(self, V: Tensor, seen: RowSpace, radial: Tensor) -> Tensor:
+        """What of V is seen; of the Hessian: the part of V in the seen harmonics and at right angles to `radial`."""
         n, K = len(self.objective.active), V.shape[1]
         if self.gauss_newton:
             parts = [V[rows].reshape(n, -1, K) for rows in self.blocks.values()]
             sizes = [part.shape[1] for part in parts]
-            seen = self._row_space.project(torch.cat(parts, dim=1)).split(sizes, dim=1)
-            return torch.cat([part.reshape(-1, K) for part in seen])
-        V, quats = V.clone(), self.objective.active.quats
+            kept = seen.project(torch.cat(parts, dim=1)).split(sizes, dim=1)
+            return torch.cat([part.reshape(-1, K) for part in kept])
+        V = V.clone()
         turns, harmonics = V[self.blocks["quats"]].view(n, 4, K), V[self.blocks["sh"]]
-        turns -= quats[:, :, None] * (quats[:, :, None] * turns).sum(dim=1, keepdim=True)
-        harmonics.copy_(self._row_space.project(harmonics.view(n, -1, 3 * K)).reshape(-1, K))
+        turns -= radial[:, :, None] * (radial[:, :, None] * turns).sum(dim=1, keepdim=True)
+        harmonics.copy_(seen.project(harmonics.view(n, -1, 3 * K)).reshape(-1, K))
         return V
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:

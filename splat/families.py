@@ -1,16 +1,19 @@
 """The anisotropy family of a scene: of all attributes together and of each, for the Hessian or for Gauss-Newton.
 
 Left out of each part as exactly null (`null_space.py`): the lengths of the quaternions, SH directions that no view sees and,
-of Gauss-Newton as a whole, all that no view sees.
+of Gauss-Newton as a whole, all that no view sees.  In another metric (`metrics.py`) the operator is D P H P D, and what is not
+null is the space of all D P x.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from landscape.density import ActiveSpace
 from landscape.families import WHOLE, Family, FamilySettings, families
+from landscape.operator import ScaledOperator
 from landscape.results import Progress
 from splat.curvature import SceneHessian
 
@@ -24,12 +27,17 @@ def scene_families(
     parts: Sequence[str] | None = None,
     known: Mapping[str, Family] | None = None,
     progress: Progress | None = None,
+    scale: Float[Tensor, " p"] | None = None,
 ) -> dict[str, Family]:
-    """The family of "all" and of each attribute (see `landscape.families`); hessian: exact, or its Gauss-Newton part."""
-    return families(hessian, generator, settings, parts, active_spaces(hessian), known, progress)
+    """The family of "all" and of each attribute (see `landscape.families`); hessian: exact, or its Gauss-Newton part.
+
+    scale: D, above 0; 1 by default.
+    """
+    operator = hessian if scale is None else ScaledOperator(hessian, scale)
+    return families(operator, generator, settings, parts, active_spaces(hessian, scale), known, progress)
 
 
-def active_spaces(hessian: SceneHessian) -> dict[str, ActiveSpace]:
+def active_spaces(hessian: SceneHessian, scale: Float[Tensor, " p"] | None = None) -> dict[str, ActiveSpace]:
     """What the exact null space leaves of the whole and of each attribute.
 
     Of Gauss-Newton's attributes, what it leaves of the Hessian's: they may be flat along more.
@@ -37,24 +45,25 @@ def active_spaces(hessian: SceneHessian) -> dict[str, ActiveSpace]:
     if hessian.keep_null:
         return {}
     exact = SceneHessian(hessian.objective) if hessian.gauss_newton else hessian
-    return {WHOLE: ActiveSpace(hessian.project, hessian.rank), **_of_attributes(exact)}
+    whole, each = (h.project if scale is None else h.scaled_projector(scale) for h in (hessian, exact))
+    return {WHOLE: ActiveSpace(whole, hessian.rank), **_of_attributes(exact, each)}
 
 
-def _of_attributes(hessian: SceneHessian) -> dict[str, ActiveSpace]:
+def _of_attributes(hessian: SceneHessian, project: Callable[[Tensor], Tensor]) -> dict[str, ActiveSpace]:
     """The Hessian's projector acts on each attribute by itself, and leaves 3 of a quaternion's 4 rows."""
     count = len(hessian.objective.active)
     ranks = {name: rows.stop - rows.start for name, rows in hessian.blocks.items()}
     ranks["quats"] -= count
     ranks["sh"] = hessian.rank - sum(rank for name, rank in ranks.items() if name != "sh")
-    return {name: ActiveSpace(_within(hessian, name), rank) for name, rank in ranks.items() if rank}
+    return {name: ActiveSpace(_within(hessian, name, project), rank) for name, rank in ranks.items() if rank}
 
 
-def _within(hessian: SceneHessian, name: str) -> Callable[[Tensor], Tensor]:
+def _within(hessian: SceneHessian, name: str, project: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     rows = hessian.blocks[name]
 
-    def project(V: Tensor) -> Tensor:
+    def within(V: Tensor) -> Tensor:
         padded = V.new_zeros(hessian.dim, V.shape[1])
         padded[rows] = V
-        return hessian.project(padded)[rows]
+        return project(padded)[rows]
 
-    return project
+    return within

@@ -31,10 +31,10 @@ def scene_size(objective: SceneObjective) -> float:
     return float((centres - centres.mean(dim=0)).norm(dim=1).mean())
 
 
-def scene_units(objective: SceneObjective) -> Float[Tensor, " p"]:
-    """D with the scene's size for positions."""
+def scene_units(objective: SceneObjective, size: float | None = None) -> Float[Tensor, " p"]:
+    """D with the scene's size for positions; size: world units, `scene_size` by default."""
     scale = torch.ones_like(objective.active.flat)
-    scale[objective.blocks["means"]] = scene_size(objective)
+    scale[objective.blocks["means"]] = scene_size(objective) if size is None else size
     return scale
 
 

@@ -35,6 +35,12 @@ class RowSpace:
         """x without its null components."""
         return self.basis.mT @ (self.basis @ x)
 
+    def scaled(self, scale: Float[Tensor, "n d"]) -> "RowSpace":
+        """The space of all D x, D = diag(scale) > 0 and x in this space."""
+        directions = torch.linalg.qr((self.basis.double() * scale[:, None].double()).mT).Q.mT
+        held = torch.arange(self.basis.shape[1]) < self.rank[:, None]  # the padding is at the end
+        return RowSpace(torch.where(held[:, :, None], directions, 0.0).to(self.basis.dtype), self.rank)
+
 
 Stacked = Callable[[Tensor], Tensor]
 

@@ -3,9 +3,12 @@
 import pytest
 import torch
 
+from landscape import ScaledOperator
 from splat.curvature import SceneHessian, SceneObjective
 from splat.families import active_spaces, scene_families
 from splat.losses import LossSettings
+from splat.metrics import optimiser_units
+from splat.train import LearningRates
 from tests.splat.tiny import tiny_gaussians, tiny_views
 
 
@@ -16,19 +19,23 @@ def objective() -> SceneObjective:
     )
 
 
+@pytest.mark.parametrize("metric", ["parameters", "optimiser"])
 @pytest.mark.parametrize("gauss_newton", [False, True])
 def test_projectors_have_their_ranks_and_leave_nothing_out_that_is_curved(
-    objective: SceneObjective, gauss_newton: bool
+    objective: SceneObjective, gauss_newton: bool, metric: str
 ) -> None:
     hessian = SceneHessian(objective, gauss_newton=gauss_newton)
-    H = hessian.apply(torch.eye(hessian.dim, dtype=torch.float64))
-    spaces = active_spaces(hessian)
+    scale = None if metric == "parameters" else optimiser_units(objective, LearningRates(), extent=3.0)
+    operator = hessian if scale is None else ScaledOperator(hessian, scale)
+    H = operator.apply(torch.eye(hessian.dim, dtype=torch.float64))
+    spaces = active_spaces(hessian, scale)
     assert list(spaces) == ["all", *hessian.blocks]
     for name, space in spaces.items():
         rows = hessian.blocks.get(name, slice(0, hessian.dim))
         P = space.project(torch.eye(rows.stop - rows.start, dtype=torch.float64))
         block = H[rows, rows]
         assert float(P.diagonal().sum()) == pytest.approx(space.rank, abs=1e-6)
+        assert float((P - P.T).norm()) <= 1e-10 and float((P @ P - P).norm()) <= 1e-10
         assert float((P @ block - block).norm()) <= 1e-10 * float(block.norm())
     n = len(objective.active)
     assert [spaces[name].rank for name in ("means", "log_scales", "quats", "opacity_logits")] == [3 * n] * 3 + [n]
