@@ -14,11 +14,12 @@ from typing import Annotated
 
 import tyro
 
-from analysis.options import BenchOptions, DemoOptions, ProbeOptions, TrainOptions
+from analysis.options import BenchOptions, DemoOptions, ProbeOptions, SliceOptions, TrainOptions
 
 Options = (
     Annotated[TrainOptions, tyro.conf.subcommand("train")]
     | Annotated[ProbeOptions, tyro.conf.subcommand("probe")]
+    | Annotated[SliceOptions, tyro.conf.subcommand("slice")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
     | Annotated[BenchOptions, tyro.conf.subcommand("bench")]
 )
@@ -55,6 +56,10 @@ def run(options: Options, arguments: Sequence[str]) -> int:
             from analysis.probe import run_probe
 
             return run_probe(options, ["landscape", *arguments])
+        case SliceOptions():
+            from analysis.slicing import run_slice
+
+            return run_slice(options, ["landscape", *arguments])
         case DemoOptions():
             from analysis.demo import run_demo
 

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+Along = Literal["eigenvectors", "random", "gradient", "line"]
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,49 @@ class ProbeOptions:
     """Points along each side of the slice, odd.  Default: 21, with --quick 11."""
     slice_rise: float = 0.001
     """Rise of the loss, as a share of it, that the slice's curvature units stand for; it reaches 3 units each way."""
+
+
+@dataclass(frozen=True)
+class SliceOptions:
+    """Slice the training loss through a checkpoint: along a line or over a plane, with the quadratic model beside it.
+
+    Points are rendered where the others do not predict them well.  A slice that was killed continues when it is run again.
+    """
+
+    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
+    """RUN/checkpoint.pt, as written by landscape train."""
+    other: Annotated[Positional[Path | None], arg(metavar="[OTHER]", help_behavior_hint="")] = None
+    """Where a line leads to: a checkpoint with as many Gaussians and the same SH degree."""
+    along: UseAppendAction[tuple[Along, ...]] = ()
+    """Directions; given twice, the plane of two kinds.  Default: eigenvectors, or line where OTHER is given.
+    eigenvectors: of the two largest eigenvalues, from RUN/probe or else computed.
+    random: filter-normalised, each attribute of each Gaussian by its own size.
+    gradient: the steepest ascent.
+    line: to OTHER."""
+    dimension: Annotated[Literal[1, 2] | None, arg(help_behavior_hint="")] = None
+    """1: a line; 2: a plane.  Default: 2 for eigenvectors and random, 1 for gradient and line."""
+    radius: UseAppendAction[tuple[float, ...]] = ()
+    """How far to look each way; given twice, one for each direction.
+    eigenvectors: in curvature units, steps within which the curvature alone changes the loss by 0.1%.  Default: 3.
+    random: as a share of each parameter's size.  Default: 0.001.
+    gradient: in parameter units.  Default: 3 curvature units.
+    line: how far beyond both ends, as a share of their distance.  Default: 0.5."""
+    points: int = 41
+    """Points along each direction, odd."""
+    tolerance: float = 0.01
+    """Error of what lies between renders, as a share of the range of the loss."""
+    all_points: FlagCreatePairsOff[bool] = False
+    """Render every point, whatever the tolerance."""
+    max_renders: Annotated[int | None, arg(help_behavior_hint="")] = None
+    """Points that are rendered at most (each in all training views).  Default: no limit."""
+    workers: Annotated[int | None, arg(help_behavior_hint="")] = None
+    """Points rendered at a time, each on one thread.  Default: one for each processor."""
+    seed: int = 0
+    """Of random directions, of the start of Lanczos, and of the points that judge the interpolation."""
+    scene: Annotated[Path | None, arg(help_behavior_hint="")] = None
+    """Folder of the scene, where it has moved since the training."""
+    out: Annotated[Path | None, arg(help_behavior_hint="")] = None
+    """Folder of the results.  Default: beside the checkpoint, such as slice-eigenvectors-2d or slice-line-1d."""
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def verdict(data: Mapping[str, Any]) -> list[Line]:
         *_of_ends(data["eigenvalues"]),
         *_of_anisotropy(data["anisotropy"]),
         *_of_counts(data["counts"]),
-        *_of_slice(data.get("slice")),
+        *of_slice(data.get("slice")),
         *(Line(note, "caution") for note in data.get("notes", ())),
     ]
     return sorted(lines, key=lambda line: line.level != "failure")
@@ -142,7 +142,8 @@ def _of_counts(counts: Mapping[str, int]) -> list[Line]:
     return lines
 
 
-def _of_slice(plane: Mapping[str, Any] | None) -> list[Line]:
+def of_slice(plane: Mapping[str, Any] | None) -> list[Line]:
+    """The sentences of a slice alone."""
     if plane is None:
         return [Line("No slice of the loss was recorded.", "caution")]
     lines, points, rendered = [], plane.get("points", 0), plane.get("evaluated_points", plane.get("points", 0))

@@ -1,21 +1,28 @@
-"""All figures of a recorded probe: `python -m figures.make_all RUN/probe` or `draw_probe(folder)`."""
+"""All figures of a recorded probe or slice: `python -m figures.make_all RUN/probe` or `draw_probe(folder)`."""
 
 import argparse
 import sys
 from pathlib import Path
 
 from analysis.records import Record, read_record
-from figures import slice2d, spectrum, surface, traces
+from figures import slice1d, slice2d, spectrum, surface, traces
 from figures.style import save
 
-FIGURES = {"traces": traces.draw, "spectrum": spectrum.draw, "slice2d": slice2d.draw, "surface": surface.draw}
+FIGURES = {
+    "traces": traces.draw,
+    "spectrum": spectrum.draw,
+    "slice1d": slice1d.draw,
+    "slice2d": slice2d.draw,
+    "surface": surface.draw,
+}
 
 
 def recorded_figures(record: Record) -> tuple[str, ...]:
     """Names of the figures that the record has the numbers for."""
-    without = {"spectrum": "spectrum" not in record.arrays}
-    without |= dict.fromkeys(("slice2d", "surface"), record.data.get("slice") is None or "slice" not in record.arrays)
-    return tuple(name for name in FIGURES if not without.get(name, False))
+    axes = len(record.data["slice"]["directions"]) if record.data.get("slice") and "slice" in record.arrays else 0
+    known = {"traces": "traces" in record.data, "spectrum": "spectrum" in record.arrays}
+    known |= {"slice1d": axes == 1, "slice2d": axes == 2, "surface": axes == 2}
+    return tuple(name for name in FIGURES if known[name])
 
 
 def draw_probe(folder: str | Path, suffix: str = "png") -> list[Path]:

@@ -1,13 +1,15 @@
 """The recorded 2-D slice as the figures want it: losses relative to the centre, axes with their names and units.
 
-x, y        steps along the two directions, unit vectors e, so in units of the stored parameters
+x, y        steps along the two directions: in units of the stored parameters where they are unit vectors, else as `scale` says
 change      loss minus the loss at the centre
 unit        sqrt(2 loss_scale / |curvature|): the step within which the curvature alone changes the loss by loss_scale
 evaluated   a point that is a true render; the others are interpolated
 crossed     a render whose order of splats or set of visible ones is not the centre's: the loss may jump on the way there
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,17 +20,18 @@ from figures.style import exponent_of, literal, unit_suffix
 
 @dataclass(frozen=True)
 class Direction:
-    """One axis of the slice; `exponent` is the power of ten taken out of its labels."""
+    """One axis of the slice; `exponent` is the power of ten taken out of its labels, `scale` what a step of 1 is."""
 
     name: str
     curvature: float
     unit: float
     steps: np.ndarray
     exponent: int
+    scale: str = "param. units"
 
     @property
     def label(self) -> str:
-        return f"step along {self.name}, param. units{unit_suffix(self.exponent)}"
+        return f"step along {self.name}, {self.scale}{unit_suffix(self.exponent)}"
 
     @property
     def short_label(self) -> str:
@@ -77,6 +80,8 @@ def plane(record: Record) -> Plane:
     if about is None or "slice" not in record.arrays:
         raise ValueError(f"expected a recorded slice in {record.folder / 'slice.npz'}, got none; probe with a slice")
     arrays = record.arrays["slice"]
+    if "y" not in arrays:
+        raise ValueError(f"expected a slice over a plane in {record.folder / 'slice.npz'}, got one along a line")
     changes = [arrays[name] - about["center_loss"] for name in ("loss", "model") if name in arrays]
     if not np.isfinite(changes[0]).any():
         raise ValueError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
@@ -84,9 +89,7 @@ def plane(record: Record) -> Plane:
     masked = [np.ma.masked_invalid(change / 10.0**exponent) for change in changes]
     common = exponent_of(arrays["x"], arrays["y"])
     directions = [
-        Direction(
-            literal(d["name"]), d["curvature"], d["unit"], steps, common if _alike(arrays) else exponent_of(steps)
-        )
+        direction(d, steps, common if _alike(arrays) else exponent_of(steps))
         for d, steps in zip(about["directions"], (arrays["x"], arrays["y"]), strict=True)
     ]
     return Plane(
@@ -99,6 +102,12 @@ def plane(record: Record) -> Plane:
         exponent=exponent,
         loss_scale=about["loss_scale"],
     )
+
+
+def direction(about: Mapping[str, Any], steps: np.ndarray, exponent: int) -> Direction:
+    """An axis as it was recorded."""
+    scale = literal(about.get("scale", Direction.scale))
+    return Direction(literal(about["name"]), about["curvature"], about["unit"], steps, exponent, scale)
 
 
 def _alike(arrays: dict[str, np.ndarray]) -> bool:

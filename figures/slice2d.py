@@ -116,7 +116,7 @@ def _legend(field: Plane) -> list[Line2D]:
         handles.append(
             Line2D([], [], label=f"sorts crossed: {field.crossed_share:.0%}", **{**CROSSED, "markersize": 6})
         )
-    handles.append(Line2D([], [], linestyle="none", label=f"1 curvature unit: ΔL = {quantity(field.loss_scale)}"))
+    handles.append(Line2D([], [], linestyle="none", label=f"1 unit: ΔL = {quantity(field.loss_scale)}"))
     return handles
 
 

@@ -1,0 +1,111 @@
+"""Figure: the loss along a line through the checkpoint, and the curvature there that steps of finite length see.
+
+Above: dots are true renders, blue where the order of the splats or the set of visible ones is not the checkpoint's; between
+them the loss is interpolated.  Dashed: the quadratic model.  Below: second differences of renders at steps to both sides, with
+the bounds of their round-off (grey where it hides them); hollow where an end is crossed.  The line is the infinitesimal
+curvature.  What steps that cross sorts see beside it is the loss's shape at that distance: its kinks and jumps, smoothed.
+"""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from analysis.quantities import quantity
+from analysis.records import Record
+from figures.plane import Direction, direction
+from figures.slice2d import CROSSED, RENDERED
+from figures.style import BLACK, BLUE, VERMILION, exponent_of, new_figure, script, style, unit_suffix
+
+DOT = {"markersize": 5}
+
+
+def draw(record: Record) -> Figure:
+    """The slice along a line.  Raises ValueError where none was recorded, or none of its points is finite."""
+    about = record.data.get("slice")
+    if about is None or len(about["directions"]) != 1 or "slice" not in record.arrays:
+        raise ValueError(f"expected a slice along a line in {record.folder}, got none; slice with --dimension 1")
+    arrays, probe = record.arrays["slice"], record.data.get("finite_probe")
+    if not np.isfinite(arrays["loss"]).any():
+        raise ValueError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
+    along = direction(about["directions"][0], arrays["x"], exponent_of(arrays["x"]))
+    with style():
+        figure = new_figure(2.6 if probe is None else 5.0)
+        parts = figure.subfigures(1 if probe is None else 2, 1, squeeze=False)[:, 0]
+        axes = [part.subplots() for part in parts]
+        _draw_loss(axes[0], along, about, arrays)
+        if probe is not None:
+            _draw_curvatures(axes[1], along, probe)
+        for part, each in zip(parts, axes, strict=True):
+            part.legend(*each.get_legend_handles_labels(), loc="outside lower center", ncols=2, columnspacing=1)
+    return figure
+
+
+def _draw_loss(axes: Axes, along: Direction, about: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    change = np.ma.masked_invalid(arrays["loss"] - about["center_loss"])
+    exponent = exponent_of(change.compressed())
+    change /= 10.0**exponent
+    known = arrays.get("evaluated", np.ones(change.shape, bool))
+    crossed = known & arrays.get("crossed", np.zeros(change.shape, bool))
+    axes.plot(along.scaled, change, color=BLACK, linewidth=0.8)
+    axes.plot(along.scaled[known & ~crossed], change[known & ~crossed], **{**RENDERED, **DOT}, label="render")
+    if crossed.any():
+        axes.plot(along.scaled[crossed], change[crossed], **{**CROSSED, **DOT}, label="render, sorts crossed")
+    if "model" in arrays:
+        model = (arrays["model"] - about["center_loss"]) / 10.0**exponent
+        low, high = axes.get_ylim()
+        axes.plot(along.scaled, model, "--", color=VERMILION, linewidth=0.9, label="quadratic model")
+        axes.set_ylim(low, high)
+    axes.axvline(0, color="0.7", linewidth=0.5, zorder=0)
+    axes.set_xlabel(along.label)
+    axes.set_ylabel(f"change of loss{unit_suffix(exponent)}")
+    axes.grid(True)
+    axes.set_title("Loss along the line", loc="left")
+
+
+def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> None:
+    steps, values, bounds = (np.array(probe[name], float) for name in ("steps", "curvatures", "round_off"))
+    crossed = np.array(probe["crossed"] or [False] * len(steps))
+    exact = probe["infinitesimal"]
+    axes.axhline(exact, color=VERMILION, linewidth=0.9, label=f"infinitesimal: {quantity(exact)}")
+    sure = _resolved(exact, values, bounds)
+    if not sure.all():
+        hidden: dict[str, Any] = {"fmt": "none", "ecolor": "0.7", "elinewidth": 1.6, "label": "hidden by round-off"}
+        axes.errorbar(steps[~sure], values[~sure], bounds[~sure], **hidden)
+    for where, face, label in (
+        (~crossed, BLUE, "at finite steps"),
+        (crossed, "white", "at finite steps, sorts crossed"),
+    ):
+        if (where & sure).any():
+            drawn: dict[str, Any] = {"color": BLUE, "markerfacecolor": face, "markersize": 3.5, "elinewidth": 0.8}
+            axes.errorbar(*(each[where & sure] for each in (steps, values, bounds)), fmt="o", label=label, **drawn)
+    axes.set_xscale("log")
+    axes.set_ylim(*_limits(exact, values, bounds))
+    axes.set_xlabel(f"step along {along.name}, {along.scale}")
+    axes.set_ylabel("curvature")
+    axes.grid(True)
+    axes.set_title("Curvature at finite steps (bars: round-off)", loc="left")
+
+
+def _resolved(exact: float, values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Which values round-off does not hide."""
+    return np.isfinite(values) & (bounds <= np.maximum(np.abs(values), abs(exact)) / 2)
+
+
+def _limits(exact: float, values: np.ndarray, bounds: np.ndarray) -> tuple[float, float]:
+    """Of what is resolved, with a margin: bars of the other steps reach beyond."""
+    sure = _resolved(exact, values, bounds)
+    ends = np.concatenate([[exact], values[sure] - bounds[sure], values[sure] + bounds[sure]])
+    low, high = float(ends.min()), float(ends.max())
+    margin = 0.2 * (high - low) or abs(exact) or 1.0
+    return low - margin, high + margin
+
+
+def main() -> None:
+    """`python -m figures.slice1d RUN/slice-gradient-1d`"""
+    script(draw, "slice1d")
+
+
+if __name__ == "__main__":
+    main()
