@@ -5,14 +5,15 @@
     traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
     eigenvalues         Lanczos: the two largest and the smallest
     power iteration     both ends as the paper takes them
-    density             stochastic Lanczos quadrature, for the sums of |lambda|
+    density             stochastic Lanczos quadrature, for sums and quantiles of |lambda|
+    finite probe        the second difference of the loss along the first eigenvector, over a range of steps
     slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
 
 The estimators stop at their tolerance, at their budget of products, or when their share of the time is spent; each result
 says which.  Time that a stage leaves goes to the later ones.  The numbers depend on the seed alone unless time ran out.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from math import isqrt
@@ -42,11 +43,14 @@ from landscape import (
     spectral_density,
     symmetric_axis,
 )
+from landscape.density import ActiveSpace
+from landscape.finite_probe import NOISE_POINTS, STEPS, FiniteProbe, finite_probe
 from landscape.probes import split
 from landscape.refinement import SliceSettings
 from landscape.results import Progress
 from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
+from splat.raster.threads import single_threaded, thread_count
 from splat.traces import exact_traces
 
 GIB = 2**30
@@ -54,7 +58,7 @@ FEWEST_STEPS, FEWEST_POINTS = 8, 5  # of a density and along a side of a slice t
 FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds
 # shares of the time; measured on 8,000 Gaussians in 3 views of 504 x 378 pixels
-SHARES = {"traces": 2.0, "eigenvalues": 4.0, "power iteration": 2.0, "density": 3.0, "slice": 5.0}
+SHARES = {"traces": 4.0, "eigenvalues": 4.0, "power iteration": 2.0, "density": 3.0, "finite probe": 1.0, "slice": 4.0}
 
 
 @dataclass(frozen=True)
@@ -62,18 +66,20 @@ class ProbeSettings:
     """How much of everything.
 
     slice_radius: half the slice's side, in curvature units, sqrt(2 rise / lambda); slice_rise: that rise of the loss, as
-    a share of the loss.  seconds: for all estimators together.  memory: GiB for the vectors of a basis.
+    a share of the loss.  probe_steps: of the finite probe, parameter units.  seconds: for all estimators together.
+    memory: GiB for the vectors of a basis.
     """
 
-    traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.02, max_probes=64))
+    traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.01, max_probes=128))
     eigen: EigenSettings = field(default_factory=lambda: EigenSettings(largest=2, smallest=1, max_matvecs=150))
     power: PowerSettings = field(default_factory=lambda: PowerSettings(max_matvecs=40))
     density_starts: int = 4
     density_steps: int = 24
-    slice_points: int = 21
+    slice_points: int = 41
     slice_radius: float = 3.0
     slice_rise: float = 0.001
-    seconds: float = 70.0
+    probe_steps: tuple[float, ...] = STEPS
+    seconds: float = 45.0
     memory: float = 2.0
 
     def __post_init__(self) -> None:
@@ -88,14 +94,16 @@ class ProbeSettings:
 
     @classmethod
     def quick(cls) -> "ProbeSettings":
-        """Rough numbers in about a third of the time."""
+        """Rough numbers in about a sixth of the time."""
         return cls(
             traces=TraceSettings(rtol=0.1, max_probes=16),
             eigen=EigenSettings(largest=2, smallest=1, rtol=1e-2, max_matvecs=60),
-            power=PowerSettings(rtol=1e-2, max_matvecs=20),
+            power=PowerSettings(rtol=1e-2, max_matvecs=10),
             density_starts=2,
-            density_steps=12,
+            density_steps=10,
             slice_points=11,
+            probe_steps=STEPS[::5],
+            seconds=8.0,
         )
 
 
@@ -110,9 +118,10 @@ class PlaneSlice:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What was measured; density and plane are None where a note says why.
+    """What was measured; density, finite and plane are None where a note says why.
 
-    matvecs: products H v of all stages; rank: of the directions that are not exactly flat.
+    matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
+    of the directions that are not exactly flat.
     """
 
     value: float
@@ -123,8 +132,10 @@ class Findings:
     ends: EigenEnds
     power: EigenEnds
     density: SpectralDensity | None
+    finite: FiniteProbe | None
     plane: PlaneSlice | None
     matvecs: int
+    spared: int
     rank: int
     notes: tuple[str, ...]
 
@@ -158,7 +169,10 @@ def measure(
         power = power_ends(operator, streams["power iteration"], each, report)
     with stage("density") as report:
         seconds = budget.share("density")
-        density = _density(operator, streams["density"], settings, seconds, report, notes)
+        active = ActiveSpace(hessian.project, hessian.rank)
+        density = _density(operator, active, streams["density"], settings, seconds, report, notes)
+    with stage("finite probe") as report:
+        finite = _finite(objective, operator, ends, settings, budget.share("finite probe"), report, notes)
     with stage("slice") as report:
         seconds, stream = budget.share("slice"), streams["slice"]
         plane = _plane(objective, operator, gradient, ends, settings, seconds, stream, report, notes)
@@ -171,8 +185,10 @@ def measure(
         ends=ends,
         power=power,
         density=density,
+        finite=finite,
         plane=plane,
         matvecs=operator.matvecs,
+        spared=hessian.spared,
         rank=hessian.rank,
         notes=tuple(notes),
     )
@@ -212,6 +228,7 @@ def _basis(operator: CountingOperator, eigen: EigenSettings, memory: float, note
 
 def _density(
     operator: CountingOperator,
+    active: ActiveSpace,
     generator: torch.Generator,
     settings: ProbeSettings,
     seconds: float,
@@ -224,7 +241,7 @@ def _density(
     start = monotonic()
     operator.apply(torch.ones(operator.dim, starts, dtype=operator.dtype))
     steps = int(min(steps, seconds / (monotonic() - start), room))
-    if steps < min(FEWEST_STEPS, operator.dim):
+    if steps < min(FEWEST_STEPS, active.rank):
         notes.append(
             f"the spectral density was left out: time and memory allowed {steps} steps for each of {starts} start vectors"
         )
@@ -232,7 +249,28 @@ def _density(
     if steps < settings.density_steps:
         notes.append(f"the spectral density took {steps} steps instead of {settings.density_steps}, to stay in budget")
     batch = max(1, min(starts, room // steps))
-    return spectral_density(operator, generator, starts, steps, batch, report)
+    return spectral_density(operator, generator, starts, steps, batch, report, active)
+
+
+def _finite(
+    objective: SceneObjective,
+    operator: CountingOperator,
+    ends: EigenEnds,
+    settings: ProbeSettings,
+    seconds: float,
+    report: Progress,
+    notes: list[str],
+) -> FiniteProbe | None:
+    """Along the first eigenvector; None where its renders would take longer than they may."""
+    center = objective.active.flat
+    objective.loss(center)  # the first may compile
+    start = monotonic()
+    objective.loss(center)
+    if (2 * len(settings.probe_steps) + NOISE_POINTS + 1) * (monotonic() - start) > max(seconds, SHORTEST):
+        notes.append("the finite probe was left out: its renders would have taken more than its share of the time")
+        return None
+    vector = ends.largest.vectors[:, 0]
+    return finite_probe(objective.evaluate, center, vector, operator, settings.probe_steps, report)
 
 
 def _plane(
@@ -256,10 +294,14 @@ def _plane(
         return None
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, points) for unit in (first, second)]
-    vectors, allowed = ends.largest.vectors[:, :2], SliceSettings(max_seconds=max(seconds, SHORTEST))
-    plane = evaluate_slice(
-        objective.evaluate, center, vectors, axes, gradient, operator, allowed, generator, progress=report
-    )
+    vectors = ends.largest.vectors[:, :2]
+    allowed = SliceSettings(workers=thread_count(), max_seconds=max(seconds, SHORTEST))
+
+    def evaluate(theta: Tensor) -> tuple[float, Hashable]:
+        with single_threaded():  # the workers are as many as the cores
+            return objective.evaluate(theta)
+
+    plane = evaluate_slice(evaluate, center, vectors, axes, gradient, operator, allowed, generator, progress=report)
     if plane.reason not in ("tolerance", "exact"):
         notes.append(
             f"the slice's interpolation stopped at its {plane.reason}, before its error was down to the tolerance"

@@ -8,13 +8,15 @@ import numpy as np
 import torch
 
 from analysis.measurement import Findings, PlaneSlice
-from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, literal
+from landscape import EigenEnds, Eigenpairs, SpectralDensity, TraceEstimate, anisotropy, literal
 from landscape.checks import ROUND_OFFS
+from landscape.quantiles import quantile
 from splat.curvature import ActiveCounts, SceneObjective
-from splat.localization import mass_shares
+from splat.localization import conditions, localize, mass_shares
 from splat.losses import LossSettings
 
 NAMES = ("e₁", "e₂")  # of the slice's directions
+QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
 def probe_data(findings: Findings, objective: SceneObjective, loss: LossSettings) -> dict[str, Any]:
@@ -27,8 +29,10 @@ def probe_data(findings: Findings, objective: SceneObjective, loss: LossSettings
             "gradient_norm": findings.gradient_norm,
         },
         "traces": {name: _trace(trace) for name, trace in findings.traces.items()},
-        "eigenvalues": _eigenvalues(findings, objective.blocks),
+        "eigenvalues": _eigenvalues(findings, objective),
         "anisotropy": _anisotropy(findings),
+        "quantiles": _quantiles(findings.density),
+        "finite_probe": None if findings.finite is None else {"direction": NAMES[0], **findings.finite.record()},
         "slice": None if findings.plane is None else _slice(findings.plane, findings.ends.largest),
         "counts": {**counts(objective.counts), **_work(findings, objective)},
         "checks": _checks(findings),
@@ -72,20 +76,29 @@ def _trace(trace: TraceEstimate) -> dict[str, Any]:
     return {**trace.record(), "tau": sqrt(max(trace.value, 0.0) / trace.dim) if trace.dim else 0.0, "method": method}
 
 
-def _eigenvalues(findings: Findings, blocks: Mapping[str, slice]) -> dict[str, dict[str, Any]]:
-    ends, power = findings.ends, findings.power
-    return {
-        "max": _pair(ends, ends.largest, 0, blocks),
-        "second": _pair(ends, ends.largest, 1, blocks),
-        "min": _pair(ends, ends.smallest, 0, blocks),
-        "power_max": _pair(power, power.largest, 0, blocks),
-        "power_min": _pair(power, power.smallest, 0, blocks),
-    }
+def _eigenvalues(findings: Findings, objective: SceneObjective) -> dict[str, dict[str, Any]]:
+    ends, power, gaussians = findings.ends, findings.power, objective.active
+    needles = conditions(gaussians, [view.camera for view in objective.views], objective.settings)
+    exact = {"max": (ends.largest, 0), "second": (ends.largest, 1), "min": (ends.smallest, 0)}
+    rows = {}
+    for name, (pairs, index) in exact.items():
+        where = localize(pairs.vectors[:, index], gaussians, needles)
+        rows[name] = {**_pair(ends, pairs, index, gaussians.blocks), "lives_on": where.record()}
+    rows["power_max"] = _pair(power, power.largest, 0, gaussians.blocks)
+    rows["power_min"] = _pair(power, power.smallest, 0, gaussians.blocks)
+    return rows
 
 
 def _pair(ends: EigenEnds, pairs: Eigenpairs, index: int, blocks: Mapping[str, slice]) -> dict[str, Any]:
     shares = mass_shares(pairs.vectors[:, index], blocks)
     return {**pairs.record(index), "matvecs": ends.matvecs, "method": ends.method, "shares": shares}
+
+
+def _quantiles(density: SpectralDensity | None) -> dict[str, dict[str, Any]] | None:
+    """Of the eigenvalues, those of the exact null space left out."""
+    if density is None:
+        return None
+    return {f"{share:g}": quantile(density, share).record() for share in QUANTILES}
 
 
 def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
@@ -99,7 +112,7 @@ def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
         note += f" ({certain.note})"
     family["literal"] = {**certain.record(), "value": paper.record()["value"], "note": note}
     left_out = {"value": None, "low": None, "high": None, "note": "needs the spectral density, which was left out"}
-    return {**family, **{name: left_out for name in ("share", "effective_rank") if name not in family}}
+    return {**family, **{name: left_out for name in ("share", "effective_rank", "mass_quantile") if name not in family}}
 
 
 def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> dict[str, Any]:

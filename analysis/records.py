@@ -32,9 +32,25 @@ eigenvalues*      max*, min* (of the active operator, signed) and power_max, pow
     vector_error      about the sine of the angle between v and the true eigenvector
     method, matvecs, reason, note     as for the traces
     shares            attribute -> share of the eigenvector's squared mass
+    lives_on          where the eigenvector lives (`splat.localization`): attributes: its shares; participation: over how
+                      many Gaussians; needles, needles_bare: share of mass on Gaussians with kappa > 100, with and without
+                      the blur of 0.3 px^2, and needle_count, needle_bare_count: how many those are; heaviest: [index, share]
 anisotropy*       literal, saddle, share, effective_rank, mass_quantile, each with:
     value*, low*, high*   the index and its bracket; null where undefined (see note) or unbounded
     note*             why, or ""
+quantiles         null, or share -> the eigenvalue that this share of all active ones does not exceed: value, low, high, note
+finite_probe      null, or the second difference (L(+d v) + L(-d v) - 2 L) / d^2 along the direction named, for all of:
+    steps, curvatures, round_off, truncation    d, the second difference, bounds of its errors
+    crossed           at which steps the order of the splats or the set of visible ones changed
+    infinitesimal     v.H v;  center_loss, noise: L and the standard deviation of one evaluation's error
+    best              index of the step with the least error of those that cross nothing; null without any
+    evaluations       renders of all views
+families          absent, or rows of the anisotropy families (`analysis.family_stage`), each with: operator ("hessian" or
+                  "gauss-newton"), block ("all" or an attribute), metric and unit, split (whether of the split scene),
+                  gaussians, dim, rank (dim without the exact null space); lambda_max, lambda_min: value, residual, ...;
+                  indices: as anisotropy; starts, steps of the density; matvecs
+split_control     absent, or gaussians; rms, largest, psnr of the images' change; effects: operator, block, index, and value,
+                  low, high, note of the split scene's index over the trained scene's
 slice             null, or:
     directions*       two of {name*, curvature*, residual, unit*}: the unit vectors of the x and the y axis, the
                       curvature along each, and `unit` = sqrt(2 loss_scale / |curvature|), in parameter units
@@ -50,6 +66,7 @@ slice             null, or:
     note
 counts*           gaussians*, visible_gaussians*, parameters*, active_parameters*, sh_degree_stored*, sh_degree_active*,
                   views*; any further integer under a name that says what was counted
+skipped           what the scene did not need (`analysis.skips`) -> count, seconds_saved (measured, not reproducible)
 checks*           e.g. symmetry, repeatability, finite_difference, finiteness, each with:
     value*, bound*    what was measured and what it must not exceed
     passed*           true, false, or null where the check could not run (see note)
@@ -66,6 +83,7 @@ spectrum          ritz_values [k], residuals [k]: approximate eigenvalues, the t
                   density was estimated, nodes, weights [starts, steps]: a quadrature for each start vector
 eigenvectors      largest [parameters, k]: unit vectors of the k largest eigenvalues, of the Gaussians in sight
 traces            attribute -> [probes]: the samples whose mean is the trace
+families          SCENE.OPERATOR.BLOCK.nodes and .weights [starts, steps]: the quadrature of each family's density
 slice             x [nx], y [ny]: steps along the two directions in parameter units; loss [nx, ny]: L at each point;
                   evaluated [nx, ny]: true where it is a true render, false where it is interpolated (absent: all are
                   renders); where known, model [nx, ny]: the quadratic model there, and crossed [nx, ny]: true where a

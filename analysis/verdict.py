@@ -39,7 +39,10 @@ def verdict(data: Mapping[str, Any]) -> list[Line]:
         *_of_traces(data["traces"]),
         *_of_ends(data["eigenvalues"]),
         *_of_anisotropy(data["anisotropy"]),
+        *_of_needles(data["eigenvalues"]["max"].get("lives_on"), data["counts"]),
+        *_of_finite_probe(data.get("finite_probe")),
         *_of_counts(data["counts"]),
+        *_of_skips(data.get("skipped", {})),
         *of_slice(data.get("slice")),
         *(Line(note, "caution") for note in data.get("notes", ())),
     ]
@@ -125,6 +128,41 @@ def _of_anisotropy(family: Mapping[str, Any]) -> list[Line]:
             Line(f"The steepest direction alone holds {share['value']:.2%} of all absolute curvature{_bracket(share)}.")
         )
     return lines
+
+
+def _of_needles(where: Mapping[str, Any] | None, counts: Mapping[str, int]) -> list[Line]:
+    """The paper's claim that Gaussians with an ill-conditioned projection dominate the steepest directions."""
+    if where is None:
+        return []
+    share, of_all = where["needles"], where["needle_count"] / counts["visible_gaussians"]
+    text = (
+        f"Gaussians with a condition number above 100 are {of_all:.0%} of those in sight and hold {share:.0%} of the "
+    )
+    text += f"steepest direction, which is spread over about {quantity(where['participation'])} Gaussians."
+    return [Line(text)]
+
+
+def _of_finite_probe(probe: Mapping[str, Any] | None) -> list[Line]:
+    if probe is None:
+        return []
+    here, best = probe["infinitesimal"], probe["best"]
+    text = f"Along {probe['direction']} the curvature is {quantity(here)}; over finite steps it is "
+    far = probe["curvatures"][-1]
+    if best is not None:
+        error = math.hypot(probe["round_off"][best] or math.inf, probe["truncation"][best] or math.inf)
+        text += f"{measured(probe['curvatures'][best], error)} at ±{quantity(probe['steps'][best])} and "
+    return [Line(f"{text}{quantity(far)} at ±{quantity(probe['steps'][-1])}.")]
+
+
+def _of_skips(skipped: Mapping[str, Mapping[str, float]]) -> list[Line]:
+    """What was left out, the largest saving first."""
+    present = {name: skip for name, skip in skipped.items() if skip["count"]}
+    order = sorted(present, key=lambda name: -present[name]["seconds_saved"])
+    parts = [
+        f"{present[name]['count']:,} {name.replace('_', ' ')} ({present[name]['seconds_saved']:.1f} s)"
+        for name in order
+    ]
+    return [Line(f"Left out, with the time it saved: {', '.join(parts)}.")] if parts else []
 
 
 def _of_counts(counts: Mapping[str, int]) -> list[Line]:

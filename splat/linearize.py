@@ -25,6 +25,7 @@ from splat.gaussians import Gaussians
 from splat.losses_cpu import LinearLoss, ViewLoss
 from splat.projection_cpu import lens_of, project_arrays
 from splat.projection_linear import Held, Projection, split
+from splat.raster import compositing
 from splat.raster.compositing import SUMS, TANGENTS
 from splat.raster.cpu import Adjoint, Raster
 from splat.settings import RenderSettings
@@ -105,6 +106,21 @@ class LinearizedView:
     def entries(self) -> int:
         """How many (splat, tile) pairs a product passes over."""
         return int(self._raster.slot_start[-1])
+
+    @property
+    def entries_behind(self) -> int:
+        """How many (splat, tile) pairs are left out because every pixel has stopped in front of them."""
+        return self._raster.listed - self.entries
+
+    @property
+    def dark_tiles(self) -> int:
+        """How many tiles with entries are left out of products: the loss has neither slope nor curvature all over them."""
+        raster = self._raster
+        rows, lanes = compositing.TILE_ROWS, raster.plane[1] // raster.frame.columns
+        planes = np.concatenate([self._adjoint.cotangent.reshape(4, *raster.plane), self._loss.diagonal])
+        lit = (planes != 0).reshape(len(planes), -1, rows, raster.frame.columns, lanes).any(axis=(0, 2, 4)).reshape(-1)
+        _ = raster.slot_start  # entries that no pixel reaches are dropped by now
+        return int(((np.diff(raster.lists.start) > 0) & ~lit).sum())
 
     @property
     def touched(self) -> int:

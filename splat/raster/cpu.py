@@ -30,7 +30,8 @@ class Raster:
     """One view of one set of splats, composited and held still.
 
     splats: (n, 9), finite; depths: (n,) positive where drawn; background: (3,).  With transmittance_min = 0 a pixel still
-    stops at LEAST_TRANSMITTANCE, an error of the image far beneath round-off.
+    stops at LEAST_TRANSMITTANCE, an error of the image far beneath round-off.  listed: how many entries the tile lists had
+    before those that no pixel reaches were dropped.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class Raster:
         dtype, n = splats.dtype, len(splats)
         lanes = lanes_of(dtype)
         self.lists = binning.bin_splats(splats, depths, drawn, width, height, settings)
+        self.listed = self.lists.splat.size
         columns, tile_rows = -(-width // lanes), -(-height // compositing.TILE_ROWS)
         self.plane = (tile_rows * compositing.TILE_ROWS, columns * lanes)
         size = self.plane[0] * self.plane[1]

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from analysis.cli import main
-from analysis.measurement import ProbeSettings
+from analysis.measurement import SHARES, ProbeSettings
 from analysis.probe import scene_objective
 from analysis.records import Record, read_record
 from splat.adam import Adam
@@ -176,7 +176,7 @@ def test_the_record_has_the_layout_and_says_what_was_skipped_and_from_where_it_c
     assert set(data["checks"]) == {"symmetry", "round_off", "finiteness", "finite_difference"}
     assert data["objective"]["value"] == pytest.approx(value, rel=1e-12)
     assert data["objective"]["gradient_norm"] == pytest.approx(float(gradient.norm()), rel=1e-9)
-    stages = ["load", "linearise", "checks", "traces", "eigenvalues", "power iteration", "density", "slice", "pictures"]
+    stages = ["load", "linearise", "checks", *SHARES, "skips", "pictures"]
     assert list(data["timing"]) == [*stages, "total"]
     assert sum(data["timing"][stage] for stage in stages) <= data["timing"]["total"]
     provenance = data["provenance"]
@@ -189,9 +189,63 @@ def test_the_record_has_the_layout_and_says_what_was_skipped_and_from_where_it_c
     assert all((record.folder / file).stat().st_size > 5000 for file in files)
 
 
+def test_what_was_skipped_is_counted_and_its_time_said(record, dense, run):
+    objective, _, _, _ = dense
+    skipped, gaussians = record.data["skipped"], load_checkpoint(run / "double.pt").training.gaussians
+    views = list(objective.linearized)
+    assert {name: skip["count"] for name, skip in skipped.items()} == {
+        "gaussians_out_of_sight": len(gaussians) - len(objective.active),
+        "sh_bands_not_in_use": 0,
+        "entries_behind_opaque_fronts": sum(view.entries_behind for view in views),
+        "tiles_of_zero_cotangent": sum(view.dark_tiles for view in views),
+        "products_of_views_not_concerned": 0,
+        "samples_of_finished_traces": sum(128 - trace["probes"] for trace in record.data["traces"].values()),
+        "points_of_the_slice_predicted": int((~record.arrays["slice"]["evaluated"]).sum()),
+    }
+    assert all((skip["seconds_saved"] > 0) <= (skip["count"] > 0) for skip in skipped.values())
+
+
+def test_the_eigenvectors_are_said_to_live_where_the_dense_ones_do(record, dense):
+    objective, H, _, _ = dense
+    vectors = torch.linalg.eigh((H + H.T) / 2).eigenvectors
+    for name, index in (("max", -1), ("min", 0)):
+        where = record.data["eigenvalues"][name]["lives_on"]
+        v = objective.active.with_flat(vectors[:, index])
+        mass = sum(part.reshape(len(v), -1).square().sum(dim=1) for part in v.attributes.values())
+        assert where["participation"] == pytest.approx(float(1 / mass.square().sum()), rel=1e-2)
+        heaviest, share = where["heaviest"][0]
+        assert heaviest == int(mass.argmax()) and share == pytest.approx(float(mass.max()), rel=1e-2)
+
+
+def test_the_finite_probe_meets_the_curvature_where_nothing_is_crossed(record):
+    probe = record.data["finite_probe"]
+    assert probe["infinitesimal"] == pytest.approx(record.data["eigenvalues"]["max"]["value"], rel=1e-5)
+    best = probe["best"]
+    bound = probe["round_off"][best] + probe["truncation"][best]
+    assert not probe["crossed"][best]
+    assert abs(probe["curvatures"][best] - probe["infinitesimal"]) <= bound < 0.1 * probe["infinitesimal"]
+
+
+def test_quantiles_ascend_and_hold_those_of_the_dense_spectrum(record, dense):
+    _, H, _, _ = dense
+    found, null = record.data["quantiles"], len(H) - record.data["counts"]["rank"]
+    true = torch.linalg.eigvalsh((H + H.T) / 2)
+    true = true[true.abs().argsort()][null:].sort().values  # the exact null space left out
+    values = [found[share]["value"] for share in found]
+    assert values == sorted(values) and len(values) == 7
+    held = 0
+    for share, entry in found.items():
+        at = float(true[min(int(float(share) * len(true)), len(true) - 1)])
+        low = -math.inf if entry["low"] is None else entry["low"]
+        high = math.inf if entry["high"] is None else entry["high"]
+        held += low - rounding(H) <= at <= high + rounding(H)
+    assert held == 7
+
+
 def numbers(record: Record) -> tuple[dict, dict]:
     """All that may not differ between two runs."""
     data = {key: value for key, value in record.data.items() if key not in ("timing", "provenance")}
+    data["skipped"] = {name: skip["count"] for name, skip in data["skipped"].items()}
     return data, {group: {k: v.tolist() for k, v in arrays.items()} for group, arrays in record.arrays.items()}
 
 
@@ -222,7 +276,7 @@ def test_a_budget_that_ends_is_said_and_what_was_reached_is_recorded(run, tmp_pa
     assert main(["probe", str(run / "checkpoint.pt"), "--out", str(out), "--seconds", "1e-6"]) == 0
     data = read_record(out).data
     assert data["eigenvalues"]["max"]["reason"] == "time budget"
-    assert data["slice"]["points"] == 25 and "5 x 5 points instead of 21 x 21" in " ".join(data["notes"])
+    assert data["slice"]["points"] == 25 and "5 x 5 points instead of 41 x 41" in " ".join(data["notes"])
     assert data["anisotropy"]["share"]["value"] is None
     assert any("density was left out" in note for note in data["notes"])
     assert "density was left out" in " ".join(capsys.readouterr().out.split())
