@@ -65,6 +65,17 @@ class ProbeOptions:
     """Points along each side of the slice, odd.  Default: 21, with --quick 11."""
     slice_rise: float = 0.001
     """Rise of the loss, as a share of it, that the slice's curvature units stand for; it reaches 3 units each way."""
+    families: FlagCreatePairsOff[bool] = False
+    """Also the anisotropy family of the whole and of each attribute, for the Hessian and for Gauss-Newton: takes about
+    four times as many products as the rest."""
+    split_control: FlagCreatePairsOff[bool] = False
+    """The families, and the same of the scene with every Gaussian split in two: takes about 2.5 times as long as the
+    families alone."""
+    metric: Literal["parameters", "scene", "optimiser"] = "parameters"
+    """Units in which the families compare curvature.  parameters: as stored; scene: positions by the scene's size;
+    optimiser: steps of the training's first learning rates."""
+    family_seconds: float = 1800.0
+    """Time for the families together, beside SECONDS.  inf: no limit."""
 
 
 @dataclass(frozen=True)

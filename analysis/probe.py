@@ -15,7 +15,9 @@ import torch
 from rich.console import Console
 
 from analysis.drawing import draw
-from analysis.measurement import Findings, ProbeSettings, measure
+from analysis.family_stage import FamilyOptions, measure_families
+from analysis.family_table import family_table
+from analysis.measurement import ProbeSettings, measure
 from analysis.options import ProbeOptions
 from analysis.probe_record import probe_arrays, probe_data
 from analysis.provenance import provenance
@@ -25,18 +27,20 @@ from analysis.report import write_report
 from analysis.stages import Stages
 from analysis.tables import probe_table
 from analysis.verdict import verdict
+from landscape.probes import split
 from splat.checkpoint import Checkpoint, load_checkpoint
 from splat.curvature import SceneObjective
 from splat.raster.simd import lanes_of
 from splat.scenes.scene import Scene
 
 CHECK_FAILED = 1
+Arrays = dict[str, dict[str, np.ndarray]]
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
     """Probe the checkpoint; returns the exit code.  command: as typed, for the record."""
     out = options.out or options.checkpoint.parent / "probe"
-    settings = _settings(options)
+    settings, family_options = _settings(options), _family_options(options)
     require_replaceable(out)
     console, start = Console(stderr=True), perf_counter()
     stages = Stages(console)
@@ -51,8 +55,15 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
         findings = measure(objective, loss, settings, generator, stages.stage)
         data = probe_data(findings, objective, loss)
         data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
+        arrays = probe_arrays(findings)
+        if family_options is not None:
+            found = measure_families(objective, checkpoint.training, family_options, split(generator), stages.stage)
+            data |= found.record()
+            data["notes"] += found.notes
+            data["provenance"]["families"] = asdict(family_options)
+            arrays["families"] = found.arrays()
         with record_folder(out) as folder:
-            _write(folder, data, findings, stages, start)
+            _write(folder, data, arrays, stages, start)
     _conclude(data, out)
     failed = any(check["passed"] is False for check in data["checks"].values())
     return CHECK_FAILED if options.strict and failed else 0
@@ -72,6 +83,13 @@ def _settings(options: ProbeOptions) -> ProbeSettings:
     settings = ProbeSettings.quick() if options.quick else ProbeSettings()
     points = settings.slice_points if options.slice_points is None else options.slice_points
     return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=options.seconds)
+
+
+def _family_options(options: ProbeOptions) -> FamilyOptions | None:
+    """None where no families are asked for; the split control and a metric ask for them too."""
+    if not (options.families or options.split_control or options.metric != "parameters"):
+        return None
+    return FamilyOptions(options.metric, options.split_control, seconds=options.family_seconds)
 
 
 def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjective) -> str:
@@ -103,10 +121,9 @@ def _provenance(
     )
 
 
-def _write(folder: Path, data: dict[str, Any], findings: Findings, stages: Stages, start: float) -> None:
+def _write(folder: Path, data: dict[str, Any], arrays: Arrays, stages: Stages, start: float) -> None:
     """The record, its pictures and its page."""
     data["timing"] = {"total": perf_counter() - start}
-    arrays = probe_arrays(findings)
     write_record(folder, data, arrays)
     with stages.stage("pictures"):
         try:
@@ -123,6 +140,8 @@ def _conclude(data: dict[str, Any], out: Path) -> None:
     """The table, what was not reached or failed, and the files to open."""
     console = Console()
     console.print(probe_table(data))
+    if "families" in data:
+        console.print(family_table(data))
     for line in verdict(data):
         if line.level != "fact":
             console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False)

@@ -15,6 +15,7 @@ import plotly.io
 from plotly.offline import get_plotlyjs
 
 from analysis.quantities import measured, quantity
+from analysis.family_table import INDICES, family_lines
 from analysis.records import Record, read_record
 from analysis.verdict import attribute_name, verdict
 
@@ -55,6 +56,8 @@ def render_report(record: Record) -> str:
         data=record.data,
         verdict=verdict(record.data),
         pictures=_pictures(record.folder),
+        families=family_lines(record.data),
+        indices=INDICES,
         surface="" if surface is None else _embedded(surface),
         plotly_js="" if surface is None else get_plotlyjs(),
     )

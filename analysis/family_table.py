@@ -1,0 +1,110 @@
+"""The anisotropy families of a record as text: one line for each operator and block, for the terminal and the report."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from analysis.quantities import UNDETERMINED, measured, quantity
+from analysis.verdict import attribute_name
+
+INDICES = ("literal", "saddle", "share", "effective_rank", "mass_quantile")
+OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
+NARROW = 0.1  # of the value: a bracket that is written as an error
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number as text, what its bracket leaves open, and a note."""
+
+    value: str
+    bracket: str = ""
+    note: str = ""
+
+
+BLANK = (Cell(""), Cell(""))
+
+
+@dataclass(frozen=True)
+class Line:
+    """One family, or what the split does to it: ends, two cells, and indices, one of each in INDICES."""
+
+    operator: str
+    block: str
+    scene: str
+    gaussians: str
+    directions: str
+    ends: tuple[Cell, ...]
+    indices: tuple[Cell, ...]
+
+
+def family_lines(data: Mapping[str, Any]) -> list[Line]:
+    """Of every operator and block: the families, that of the split scene beneath the other, and what the split changes."""
+    rows = data.get("families", [])
+    control = data.get("split_control")
+    lines = []
+    for row in (row for row in rows if not row["split"]):
+        same = [other for other in rows if _key(other) == _key(row)]
+        lines += [_line(one, bool(control)) for one in same]
+        if control:
+            effects = {e["index"]: e for e in control["effects"] if _key(e) == _key(row)}
+            factors = tuple(_factor(effects[name]) for name in INDICES)
+            lines.append(
+                replace(lines[-1], scene="changes by", gaussians="", directions="", ends=BLANK, indices=factors)
+            )
+    return lines
+
+
+def family_table(data: Mapping[str, Any]) -> Table:
+    """The indices of the lines, brackets beneath the values."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"Anisotropy by attribute ({data['families'][0]['unit']})")
+    table.add_column("", no_wrap=True)
+    for name in INDICES:
+        table.add_column(name.replace("_", " "), justify="right", no_wrap=True)
+    operator = ""
+    for line in family_lines(data):
+        if line.operator != operator:
+            table.add_section()
+            table.add_row(operator := line.operator, style="bold")
+        label = line.block if line.scene in ("", "trained") else f"  {line.scene}"
+        table.add_row(label, *("\n".join(filter(None, (cell.value, cell.bracket))) for cell in line.indices))
+    return table
+
+
+def bracketed(index: Mapping[str, Any]) -> Cell:
+    """An index as text: a narrow bracket as an error, and one without upper end as the bound that it is.
+
+    >>> bracketed({"value": 7.0, "low": 34.2, "high": None, "note": "lambda_min is not resolved"}).value
+    '≥ 34.2'
+    >>> bracketed({"value": 2.0, "low": 1.95, "high": 2.04, "note": ""}).value
+    '2.000 ± 0.050'
+    """
+    value, low, high, note = (index[key] for key in ("value", "low", "high", "note"))
+    if (low is None and high is None) or (high is None and low == 0):
+        return Cell(UNDETERMINED, "", note)
+    if high is None or low is None:
+        return Cell(f"≥ {quantity(low)}" if high is None else f"≤ {quantity(high)}", "", note)
+    if value is not None and low <= value <= high and high - low < NARROW * abs(value):
+        return Cell(measured(value, max(high - value, value - low)), "", note)
+    return Cell(quantity(value), f"{quantity(low)} … {quantity(high)}", note)
+
+
+def _line(row: Mapping[str, Any], several: bool) -> Line:
+    pairs = row["lambda_max"], row["lambda_min"]
+    ends = tuple(Cell(measured(pair["value"], pair["residual"]), "", pair["reason"]) for pair in pairs)
+    indices = tuple(bracketed(row["indices"][name]) for name in INDICES)
+    scene = "" if not several else "split" if row["split"] else "trained"
+    operator, block = OPERATOR_NAMES[row["operator"]], attribute_name(row["block"])
+    return Line(operator, block, scene, f"{row['gaussians']:,}", f"{row['rank']:,}", ends, indices)
+
+
+def _factor(effect: Mapping[str, Any]) -> Cell:
+    """What an index is multiplied by."""
+    cell = bracketed(effect)
+    return cell if cell.value == UNDETERMINED else Cell(f"× {cell.value}", cell.bracket, cell.note)
+
+
+def _key(row: Mapping[str, Any]) -> tuple[str, str]:
+    return row["operator"], row["block"]
