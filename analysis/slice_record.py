@@ -16,13 +16,17 @@ counts*, timing*, notes, provenance*    as for a probe
 Arrays:
 
 slice             x, y, loss, model, crossed, evaluated as for a probe; without y, all are [nx]
+directions        vectors [parameters, d], of the Gaussians in sight or, for a line, of all
 """
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from math import inf, sqrt
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from analysis.probe_record import counts, loss_name
 from analysis.slice_directions import Direction, cosine
@@ -31,58 +35,72 @@ from splat.curvature import SceneObjective
 from splat.losses import LossSettings
 
 
-def slice_data(
-    found: Slice,
-    probe: FiniteProbe | None,
-    directions: Sequence[Direction],
-    lengths: Sequence[float],
-    loss_scale: float,
-    objective: SceneObjective,
-    loss: LossSettings,
-    matvecs: int,
-) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A slice and what it was taken along: directions as found, and as columns.  probe: the finite steps of a line."""
+
+    slice: Slice
+    probe: FiniteProbe | None
+    directions: list[Direction]
+    vectors: Float[Tensor, "n d"]
+    loss_scale: float
+    matvecs: int
+
+
+def slice_data(found: Found, objective: SceneObjective, loss: LossSettings) -> dict[str, Any]:
     """All scalars save timing, notes and provenance."""
-    assert found.slope is not None and found.curvature is not None
-    evaluations = found.evaluations + (0 if probe is None else probe.evaluations)
+    grid, probe = found.slice, found.probe
+    assert grid.slope is not None and grid.curvature is not None
+    lengths = torch.linalg.vector_norm(found.vectors.double(), dim=0)
+    numbers = [each.tolist() for each in (grid.slope, grid.curvature.diagonal(), lengths)]
+    evaluations = grid.evaluations + (0 if probe is None else probe.evaluations)
     return {
         "objective": {
             "loss": loss_name(loss),
             "operator": "hessian",
-            "value": found.center_loss,
+            "value": grid.center_loss,
             "gradient_norm": float(objective.gradient.double().norm()),
         },
         "slice": {
             "directions": [
-                {
-                    "name": direction.name,
-                    "kind": direction.kind,
-                    "slope": float(slope),
-                    "curvature": float(curvature),
-                    "residual": direction.residual,
-                    "unit": sqrt(2 * loss_scale / abs(float(curvature))) if curvature else inf,
-                    "length": length,
-                    "scale": direction.scale,
-                }
-                for direction, slope, curvature, length in zip(
-                    directions, found.slope, found.curvature.diagonal(), lengths, strict=True
-                )
+                _direction(direction, slope, curvature, length, found.loss_scale)
+                for direction, slope, curvature, length in zip(found.directions, *numbers, strict=True)
             ],
-            "loss_scale": loss_scale,
-            "cosine": cosine(directions),
-            **found.record(),
+            "loss_scale": found.loss_scale,
+            "cosine": cosine(found.directions),
+            **grid.record(),
         },
         "finite_probe": None if probe is None else probe.record(),
         "counts": {
             **counts(objective.counts),
-            "products": matvecs,
+            "products": found.matvecs,
             "renders": evaluations * objective.counts.views,
         },
     }
 
 
-def slice_arrays(found: Slice) -> dict[str, dict[str, np.ndarray]]:
+def _direction(
+    direction: Direction, slope: float, curvature: float, length: float, loss_scale: float
+) -> dict[str, Any]:
+    return {
+        "name": direction.name,
+        "kind": direction.kind,
+        "slope": slope,
+        "curvature": curvature,
+        "residual": direction.residual,
+        "unit": sqrt(2 * loss_scale / abs(curvature)) if curvature else inf,
+        "length": length,
+        "scale": direction.scale,
+    }
+
+
+def slice_arrays(found: Found) -> dict[str, dict[str, np.ndarray]]:
     """The arrays, by file."""
-    optional = {"model": found.model, "crossed": found.crossed, "evaluated": found.evaluated}
-    axes = {name: axis.numpy() for name, axis in zip("xy", found.coordinates, strict=False)}
+    grid = found.slice
+    optional = {"model": grid.model, "crossed": grid.crossed, "evaluated": grid.evaluated}
+    axes = {name: axis.numpy() for name, axis in zip("xy", grid.coordinates, strict=False)}
     known = {name: array.numpy() for name, array in optional.items() if array is not None}
-    return {"slice": {**axes, "loss": found.loss.numpy(), **known}}
+    return {
+        "slice": {**axes, "loss": grid.loss.numpy(), **known},
+        "directions": {"vectors": found.vectors.numpy()},
+    }

@@ -14,7 +14,7 @@ import os
 import shlex
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from math import ceil, inf
 from pathlib import Path
@@ -43,10 +43,10 @@ from analysis.slice_directions import (
     find_directions,
     recorded_eigenvectors,
 )
-from analysis.slice_record import slice_arrays, slice_data
+from analysis.slice_record import Found, slice_arrays, slice_data
 from analysis.stages import Stages
 from analysis.verdict import of_slice
-from landscape import CountingOperator, FiniteProbe, Slice, SliceSettings, evaluate_slice, finite_probe
+from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
 from landscape.grid_evaluations import Loss, slice_digest
 from landscape.probes import split
 from splat.checkpoint import Checkpoint, load_checkpoint
@@ -57,18 +57,6 @@ from splat.scenes.scene import Scene
 
 COARSE = {1: 9, 2: 21}  # points that an adaptive slice begins with, by its dimension
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """A slice and what it was taken along; probe: the finite steps of a line."""
-
-    slice: Slice
-    probe: FiniteProbe | None
-    directions: list[Direction]
-    lengths: list[float]
-    loss_scale: float
-    matvecs: int
 
 
 def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
@@ -87,17 +75,12 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
     with stages:
         known = _known(options.checkpoint.parent / "probe", unfinished, checkpoint, objective)
-        found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
-        data = slice_data(
-            found.slice,
-            found.probe,
-            found.directions,
-            found.lengths,
-            found.loss_scale,
-            objective,
-            checkpoint.training.config.loss,
-            found.matvecs,
-        )
+        try:
+            found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
+        except ValueError:  # it would not end better the next time
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise
+        data = slice_data(found, objective, checkpoint.training.config.loss)
         data["notes"] = _notes(found)
         data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
         with record_folder(out, SLICE) as folder:
@@ -191,8 +174,7 @@ def _measure(
         with stages.stage("finite steps") as report:
             steps = [reach * step for step in DECADES]
             probe = finite_probe(_evaluation(objective, 1), center, vectors[:, 0], true, steps, report)
-    lengths = vectors.double().norm(dim=0).tolist()
-    return Found(found, probe, directions, lengths, loss_scale, operator.matvecs + true.matvecs)
+    return Found(found, probe, directions, vectors, loss_scale, operator.matvecs + true.matvecs)
 
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:
@@ -252,7 +234,7 @@ def _provenance(
 def _write(folder: Path, data: dict[str, Any], found: Found, stages: Stages, start: float) -> None:
     """The record and its pictures."""
     data["timing"] = {"total": perf_counter() - start}
-    arrays = slice_arrays(found.slice)
+    arrays = slice_arrays(found)
     write_record(folder, data, arrays, SLICE)
     with stages.stage("pictures"):
         try:
@@ -276,9 +258,8 @@ def _conclude(data: dict[str, Any], out: Path) -> None:
         say(line.text)
     for note in data["notes"]:
         say(note, style="yellow")
-    pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-    renders, total = data["counts"]["renders"], data["timing"]["total"]
-    say(f"{total:.1f} s, {renders:,} renders of a view")
+    say(f"{data['timing']['total']:.1f} s, {data['counts']['renders']:,} renders of a view")
+    pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))) or "none"
     say(f"pictures: {pictures}; numbers: {SLICE.file}, in {out}")
 
 
