@@ -41,11 +41,9 @@ from landscape.results import Progress
 from splat.curvature import SceneObjective
 
 RISE = 0.001  # of the loss, within a curvature unit
-UNITS, SHARE, BEYOND = (
-    3.0,
-    0.01,
-    0.5,
-)  # default radii: in curvature units, of the parameters' sizes, beyond a line's ends
+UNITS = 3.0  # default radii: in curvature units, ...
+SHARE = 0.001  # ... as a share of the parameters' sizes, ...
+BEYOND = 0.5  # ... beyond a line's ends
 PLANES = {"eigenvectors", "random"}  # kinds that are two directions, where no other is named
 RTOL, MAX_MATVECS = 1e-3, 300  # of the eigenvectors
 

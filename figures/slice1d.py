@@ -71,7 +71,7 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> Non
     axes.axhline(exact, color=VERMILION, linewidth=0.9, label=f"infinitesimal: {quantity(exact)}")
     sure = _resolved(exact, values, bounds)
     if not sure.all():
-        hidden: dict[str, Any] = {"fmt": "none", "ecolor": "0.7", "elinewidth": 1.6, "label": "hidden by round-off"}
+        hidden: dict[str, Any] = {"fmt": "none", "ecolor": "0.8", "elinewidth": 1.2, "label": "hidden by round-off"}
         axes.errorbar(steps[~sure], values[~sure], bounds[~sure], **hidden)
     for where, face, label in (
         (~crossed, BLUE, "at finite steps"),

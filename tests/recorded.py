@@ -119,3 +119,48 @@ def _grid(top: float, second: float) -> dict[str, np.ndarray]:
     model = 0.0832 + slope + u**2 + v**2
     loss = model + 0.004 * np.abs(u) ** 1.5 - 40 * v**4
     return {"x": x, "y": y, "loss": loss, "model": model, "crossed": np.hypot(u, v) > 0.03}
+
+
+def synthetic_line(scale: float = 1.0) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:
+    """(data, arrays) of a slice along a line of curvature 40 scale, with a kink that finite steps see from 1e-4 on."""
+    whole, _ = synthetic()
+    x, curvature, center = np.linspace(-3, 3, 21) * 1e-3, 40.0 * scale, 0.0832
+    model = center + 2e-3 * scale * x + curvature * x**2 / 2
+    evaluated = np.arange(21) % 2 == 0
+    steps = np.array([1e-6, 1e-5, 1e-4, 1e-3])
+    direction = {
+        "name": "gradient",
+        "kind": "gradient",
+        "slope": 2e-3 * scale,
+        "curvature": curvature,
+        "residual": None,
+    }
+    data = {
+        "objective": whole["objective"],
+        "slice": {
+            "directions": [direction | {"unit": 2e-3, "length": 1.0, "scale": "param. units"}],
+            "loss_scale": 8e-5 * scale,
+            "cosine": None,
+            "center_loss": center,
+            "points": 21,
+            "evaluated_points": 11,
+            "crossed_points": 6,
+            "evaluations": 12,
+            "interpolation_error": 0.004,
+            "holdout_points": 3,
+        },
+        "finite_probe": {
+            "steps": steps.tolist(),
+            "curvatures": [-3e4 * scale, 41.0 * scale, 55.0 * scale, 70.0 * scale],
+            "round_off": [4e4 * scale, 4.0 * scale, 0.04 * scale, 4e-4 * scale],
+            "truncation": [1.0, 1.0, 1.0, 1.0],
+            "crossed": [False, False, True, True],
+            "infinitesimal": curvature,
+            "best": 1,
+        },
+        **{name: whole[name] for name in ("counts", "timing", "notes", "provenance")},
+    }
+    loss = model + 15.0 * scale * x * np.abs(x)
+    return data, {
+        "slice": {"x": x, "loss": loss, "model": model, "crossed": evaluated & (x > 0), "evaluated": evaluated}
+    }

@@ -63,13 +63,17 @@ def difficult(case):
         data["traces"]["sh"] |= {"value": -1e-12, "standard_error": 1e-13, "low": -1.2e-12, "high": -8e-13}
         data["traces"]["opacity_logits"] |= {"value": -50.0, "standard_error": 80.0, "low": -210.0, "high": 110.0}
         data["traces"]["opacity_logits"]["sign"] = "undetermined"
+    if case == "long legend":
+        data["slice"] |= {"loss_scale": 7.49e-5, "interpolation_error": 0.005}
+        arrays["slice"]["evaluated"] = (np.arange(21 * 17) % 5 == 0).reshape(21, 17)
+        arrays["slice"]["crossed"] = arrays["slice"]["evaluated"]
     if case == "least":
         arrays = {"slice": {k: arrays["slice"][k] for k in ("x", "y", "loss")}, "spectrum": arrays["spectrum"]}
         arrays["spectrum"] = {k: arrays["spectrum"][k][[0, -1]] for k in ("ritz_values", "residuals")}
     return data, arrays
 
 
-CASES = ("plain", "1e-12", "1e9", "no numbers", "flat", "extremes", "least")
+CASES = ("plain", "1e-12", "1e9", "no numbers", "flat", "extremes", "least", "long legend")
 
 
 @pytest.mark.parametrize("case", CASES)
