@@ -6,6 +6,7 @@ OUT/bounds.csv    the ratios that the project promises, measured, with their bou
 OUT/precision.csv what float32 costs at a scene or checkpoint, view by view (`precision`)
 OUT/bench.png     the scaling, drawn by `figures.bench` from bench.csv
 OUT/stress.csv    `landscape bench stress`: errors at the limits of the renderer (`stress`)
+OUT/accuracy.csv  `landscape bench accuracy`: work against true error of every estimator, beside peers (`accuracy`)
 
 Times are minima and medians of repetitions in turns (`timing`); ratios are of minima.  Products are per vector.
 """
@@ -22,6 +23,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from analysis import bench_kernels
+from analysis.accuracy import run_accuracy
 from analysis.bench_reference import ReferenceCost, reference_cost
 from analysis.bench_scene import OPERATIONS, VECTORS, ViewBench, per_vector, scaling
 from analysis.drawing import draw
@@ -60,8 +62,14 @@ def run_bench(options: BenchOptions) -> int:
         raise ValueError(
             "expected --prototype with the kernels it is compared with: landscape bench kernels --prototype ..."
         )
+    if options.checkpoint is not None and options.subject != "accuracy":
+        raise ValueError(
+            f"expected one subject, got a second one, {options.checkpoint}; only accuracy takes a checkpoint"
+        )
     if options.subject == "stress":
         return run_stress(options)
+    if options.subject == "accuracy":
+        return run_accuracy(options)
     options.out.mkdir(parents=True, exist_ok=True)
     console = Console()
     about = machine(lanes_of(np.float32))

@@ -133,13 +133,16 @@ class DemoOptions:
 class BenchOptions:
     """Measure speed and memory: of the compositing kernels, or of first and second order on a scene; or errors at limits."""
 
-    subject: Positional[Literal["kernels", "stress"] | Path | None] = None
-    """kernels; stress: errors at the limits of the renderer, against bounds (exit code 1 where one is missed);
-    or a scene's folder or a checkpoint. Default: a synthetic scene."""
+    subject: Positional[Literal["kernels", "stress", "accuracy"] | Path | None] = None
+    """kernels; stress: errors at the limits of the renderer, against bounds (exit code 1 where one is missed); accuracy:
+    work against true error of every estimator, beside peers; or a scene's folder or a checkpoint.
+    Default: a synthetic scene."""
+    checkpoint: Positional[Path | None] = None
+    """accuracy only: a checkpoint to take instead of small scenes and matrices. Its truth is a long run, kept in OUT."""
     out: Path = Path("runs/bench")
     """Folder of the tables (CSV) and figures; files of an earlier run are replaced."""
     repetitions: int = 15
-    """How often each thing is timed, in turns with what it is compared with."""
+    """How often each thing is timed, in turns with what it is compared with; accuracy: seeds of each trace on a matrix."""
     sizes: tuple[str, ...] = ()
     """Synthetic sizes, GAUSSIANS@WIDTHxHEIGHT. Default: 10k@504x378 100k@504x378, and for kernels 500k@1600x1060."""
     prototype: Path | None = None

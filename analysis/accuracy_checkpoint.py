@@ -1,0 +1,83 @@
+"""A trained scene as a case of the accuracy study: its truth is a long run, kept beside the results.
+
+    traces    `exact_traces` of SAMPLES samples
+    ends      Lanczos to a residual of FINE
+    sums      quadrature with STARTS x STEPS products
+
+OUT/truth.json belongs to one checkpoint at one size of its pictures; for another it is computed anew.  The truth of the sums
+has an error of a few percent (half its brackets); estimates that are better than that cannot be told apart.  The diagonal
+is left out: nothing but as many products as rows gives it.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from analysis.accuracy_cases import Case, Truth
+from analysis.workloads import workload_of
+from landscape.anisotropy import effective_rank, mass_quantile
+from landscape.density import ActiveSpace, absolute_sum, spectral_density
+from landscape.eigen import EigenSettings, extreme_eigenpairs
+from landscape.results import Progress
+from landscape.trace import TraceSettings
+from splat.checkpoint import write_atomically
+from splat.curvature import SceneHessian, SceneObjective
+from splat.traces import exact_traces
+
+BUDGETS = (12, 24, 48)  # matvecs a block: a scene's products cost too much for more
+SAMPLES, FINE, MOST = 128, 1e-6, 250
+STARTS, STEPS = 6, 24
+TRUTH = "truth.json"
+
+
+def checkpoint_case(path: Path, out: Path, downscale: float = 1.0, progress: Progress | None = None) -> Case:
+    """The case of a checkpoint; its truth is read from OUT/truth.json, or computed and written there."""
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a checkpoint as written by `landscape train`, got no file {path}")
+    workload = workload_of(path)
+    if downscale != 1:
+        workload = workload.resized(1 / downscale)
+    objective = SceneObjective(
+        workload.gaussians, workload.views, workload.loss, workload.background, workload.settings
+    )
+    hessian = SceneHessian(objective)
+    key = {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "downscale": downscale, "dim": hessian.dim}
+    stored = out / TRUTH
+    kept = json.loads(stored.read_text()) if stored.is_file() else {}
+    if kept.get("of") != key:
+        kept = {"of": key, "truth": asdict(_truth(objective, hessian, progress))}
+        write_atomically(stored, json.dumps(kept, indent=1).encode())
+    active = ActiveSpace(hessian.project, hessian.rank)
+    return Case(workload.name, "checkpoint", hessian, Truth(**kept["truth"]), None, objective, active)
+
+
+def _truth(objective: SceneObjective, hessian: SceneHessian, progress: Progress | None) -> Truth:
+    def generator(stream: int) -> torch.Generator:
+        return torch.Generator().manual_seed(1_000_000 + stream)  # far from the seeds of what is compared
+
+    traces = exact_traces(objective, generator(0), TraceSettings.fixed(SAMPLES), progress)
+    own = objective.block_diagonal()
+    diagonal = own.geometry.double().diagonal(dim1=1, dim2=2).abs()
+    columns = {"means": (0, 3), "log_scales": (3, 6), "quats": (6, 10), "opacity_logits": (10, 11)}
+    scales = {name: float(diagonal[:, a:b].sum()) for name, (a, b) in columns.items()}
+    scales["sh"] = float(own.sh.double().abs().sum())
+    ends = extreme_eigenpairs(
+        hessian, generator(1), EigenSettings(rtol=FINE, basis=128, max_matvecs=MOST), progress=progress
+    )
+    active = ActiveSpace(hessian.project, hessian.rank)
+    density = spectral_density(hessian, generator(2), STARTS, STEPS, progress=progress, active=active)
+    rank, quantile = effective_rank(ends, density).value, mass_quantile(ends, density).value
+    assert rank is not None and quantile is not None
+    return Truth(
+        traces={name: trace.value for name, trace in traces.items()},
+        scales=scales,
+        largest=float(ends.largest.values[0]),
+        smallest=float(ends.smallest.values[0]),
+        absolute_sum=absolute_sum(density).value or 0.0,
+        effective_rank=rank,
+        mass_quantile=quantile,
+        diagonal=None,
+    )

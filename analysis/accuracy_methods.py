@@ -1,0 +1,236 @@
+"""Every estimator of `landscape` and `splat.traces` at the settings that the accuracy study compares.
+
+A method is run on an operator that counts, with a seed, and returns an `Answer` for each part of its quantity:
+
+    traces            one part a block
+    ends              "largest" and "smallest"
+    sum of |lambda|, effective rank, mass quantile     one part, from one spectral density ("sums")
+    diagonal          one part, a vector
+
+Work that is not products H v is charged in products: a pass over the pixels for all own blocks PASS of them (what
+`landscape bench` allows it in gradients, over what it allows a product), a product with the images' Jacobian JACOBIAN (its
+share of a product's arithmetic; there is no backward pass).
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from math import inf, nan
+from typing import Literal
+
+import torch
+from jaxtyping import Float64
+from scipy.stats import t as student
+from torch import Tensor
+
+from analysis.accuracy_cases import Case, Meter
+from analysis.bench_scene import OPERATIONS
+from landscape.anisotropy import effective_rank, mass_quantile
+from landscape.density import absolute_sum, spectral_density
+from landscape.diagonal import estimate_diagonal
+from landscape.eigen import EigenSettings, extreme_eigenpairs
+from landscape.power import PowerSettings, power_ends
+from landscape.results import Bracket, EigenEnds
+from landscape.trace import PAPER, TraceSettings, estimate_traces
+from splat.traces import ONE_PERCENT, exact_traces
+
+Origin = Literal["default", "own", "peer"]
+PASS = 3.0 / 1.6
+JACOBIAN = OPERATIONS["J u 1"] / (OPERATIONS["J u 1"] + OPERATIONS["tangent of backward 1"])
+BUDGETS = (12, 24, 48, 96)  # matvecs a block
+TOLERANCES = (1e-1, 1e-2, 1e-4)  # of residuals; 1e-3 is the default
+DENSITIES = ((2, 12), (4, 24), (8, 48))  # start vectors and steps; (6, 32) is the default
+PROBES = (8, 16, 64)  # of a diagonal; 32 is the default
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """An estimate.  error: as the method reports it (nan: it does not); low, high: where it says that the truth is.
+
+    error, low and high of a diagonal are vectors, too.
+    """
+
+    part: str
+    value: float | Float64[Tensor, " n"]
+    error: float | Float64[Tensor, " n"] = nan
+    low: float | Float64[Tensor, " n"] = nan
+    high: float | Float64[Tensor, " n"] = nan
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """One estimator at one setting.  run(case, operator, seed): the answers, one a part."""
+
+    quantity: str
+    name: str
+    settings: str
+    run: Callable[[Case, Meter, int], list[Answer]]
+    origin: Origin = "own"
+    applies: Callable[[Case], bool] = lambda case: True
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def own_methods(budgets: tuple[int, ...] = BUDGETS) -> Iterator[Method]:
+    """All of them; the library's defaults are marked."""
+    yield from trace_methods(budgets)
+    yield from end_methods()
+    yield from density_methods()
+    yield from diagonal_methods()
+
+
+# --- traces -----------------------------------------------------------------------------------------------------------
+
+
+def trace_methods(budgets: tuple[int, ...]) -> Iterator[Method]:
+    yield _traces("Hutchinson, adaptive", "rtol 0.05", TraceSettings(), "default", lambda case: case.objective is None)
+    for rtol in (0.2, 0.1, 0.05):
+        yield _traces("Hutchinson, adaptive", f"rtol {rtol:g}", TraceSettings(rtol=rtol))
+    yield _traces("StableGS", "10 probes", PAPER)
+    for budget in budgets:
+        fixed = TraceSettings.fixed(budget)
+        yield _traces("Hutchinson, Rademacher", f"{budget} probes", fixed)
+        yield _traces("Hutchinson, Gaussian", f"{budget} probes", replace(fixed, distribution="gaussian"))
+        yield _traces("Hutchinson, one probe for all", f"{budget} probes", replace(fixed, reading="full"))
+        for method in ("hutch++", "xtrace"):
+            if budget >= TraceSettings(max_probes=100, method=method).least:
+                name = {"hutch++": "Hutch++", "xtrace": "XTrace"}[method]
+                yield _traces(name, f"{budget} matvecs", replace(fixed, method=method))
+    yield _exact("rtol 0.01", ONE_PERCENT, "default")
+    for samples in (8, 64):
+        yield _exact(f"{samples} samples", TraceSettings.fixed(samples))
+
+
+def _traces(
+    name: str,
+    text: str,
+    settings: TraceSettings,
+    origin: Origin = "own",
+    applies: Callable[[Case], bool] = lambda case: True,
+) -> Method:
+    def run(_: Case, operator: Meter, seed: int) -> list[Answer]:
+        found = estimate_traces(operator, generator(seed), settings)
+        return [Answer(part, x.value, x.standard_error, x.low, x.high) for part, x in found.items()]
+
+    return Method("traces", name, text, run, origin, applies)
+
+
+def _exact(text: str, settings: TraceSettings, origin: Origin = "own") -> Method:
+    def run(case: Case, operator: Meter, seed: int) -> list[Answer]:
+        assert case.objective is not None
+        found = exact_traces(case.objective, generator(seed), settings)
+        passes = 2 if case.objective.couples_pixels else 1
+        operator.charge(passes * PASS + JACOBIAN * sum(x.matvecs for x in found.values()))
+        return [Answer(part, x.value, x.standard_error, x.low, x.high) for part, x in found.items()]
+
+    return Method("traces", "exact pass, sampled coupling", text, run, origin, lambda case: case.objective is not None)
+
+
+# --- both ends --------------------------------------------------------------------------------------------------------
+
+
+def end_methods() -> Iterator[Method]:
+    yield _lanczos("rtol 0.001", EigenSettings(), "default")
+    for rtol in TOLERANCES:
+        yield _lanczos(f"rtol {rtol:g}", EigenSettings(rtol=rtol))
+    yield _lanczos("basis 20", EigenSettings(basis=20))
+    yield _lanczos("block 2", EigenSettings(block=2))
+    for rtol in (1e-1, 1e-2, 1e-3):
+        power = PowerSettings(rtol, max_matvecs=300)
+        yield Method("ends", "power iteration, shifted", f"rtol {rtol:g}", _power(power))
+
+
+def _lanczos(text: str, settings: EigenSettings, origin: Origin = "own") -> Method:
+    def run(_: Case, operator: Meter, seed: int) -> list[Answer]:
+        return end_answers(extreme_eigenpairs(operator, generator(seed), settings))
+
+    name = "Lanczos, both ends"
+    return Method("ends", name if settings.block == 1 else f"{name}, in blocks", text, run, origin)
+
+
+def _power(settings: PowerSettings) -> Callable[[Case, Meter, int], list[Answer]]:
+    def run(_: Case, operator: Meter, seed: int) -> list[Answer]:
+        return end_answers(power_ends(operator, generator(seed), settings))
+
+    return run
+
+
+def end_answers(ends: EigenEnds) -> list[Answer]:
+    """Eigenvalues with their residuals."""
+    pairs = {"largest": ends.largest, "smallest": ends.smallest}
+    return [
+        Answer(part, float(p.values[0]), float(p.residuals[0]), *p.interval()) for part, p in pairs.items() if len(p)
+    ]
+
+
+# --- sums over the spectrum -------------------------------------------------------------------------------------------
+
+
+def density_methods() -> Iterator[Method]:
+    """The quantile's lambda_1 is that of Lanczos as it is by default, which a probe has anyway: its products do not count."""
+    for (starts, steps), origin in {(6, 32): "default", **dict.fromkeys(DENSITIES, "own")}.items():
+
+        def run(case: Case, operator: Meter, seed: int, starts: int = starts, steps: int = steps) -> list[Answer]:
+            ends = case.ends
+            density = spectral_density(operator, generator(seed + 1), starts, steps, active=case.active)
+            found = {
+                "sum of |lambda|": absolute_sum(density),
+                "effective rank": effective_rank(ends, density),
+                "mass quantile": mass_quantile(ends, density),
+            }
+            return [_bracketed(part, bracket) for part, bracket in found.items()]
+
+        yield Method("sums", "Lanczos quadrature", f"{starts} x {steps}", run, origin)  # pyright: ignore[reportArgumentType]
+
+
+def _bracketed(part: str, bracket: Bracket) -> Answer:
+    value = nan if bracket.value is None else bracket.value
+    return Answer(part, value, (bracket.high - bracket.low) / 2, bracket.low, bracket.high)
+
+
+# --- the diagonal -----------------------------------------------------------------------------------------------------
+
+
+def diagonal_methods() -> Iterator[Method]:
+    for probes, origin in {32: "default", **dict.fromkeys(PROBES, "own")}.items():
+
+        def run(_: Case, operator: Meter, seed: int, probes: int = probes) -> list[Answer]:
+            found = estimate_diagonal(operator, generator(seed), probes)
+            half = float(student.ppf((1 + CONFIDENCE) / 2, probes - 1)) * found.standard_errors
+            return [Answer("all", found.values, found.standard_errors, found.values - half, found.values + half)]
+
+        yield Method("diagonal", "random signs", f"{probes} probes", run, origin)  # pyright: ignore[reportArgumentType]
+
+    def own_blocks(case: Case, operator: Meter, _: int) -> list[Answer]:
+        assert case.objective is not None
+        values = block_diagonal(case)
+        operator.charge(PASS)
+        known = torch.zeros_like(values) if not case.objective.couples_pixels else torch.full_like(values, inf)
+        return [Answer("all", values, known, values - known, values + known)]
+
+    yield Method(
+        "diagonal", "own blocks, no coupling", "one pass", own_blocks, applies=lambda c: c.objective is not None
+    )
+
+
+def block_diagonal(case: Case) -> Float64[Tensor, " n"]:
+    """The diagonal of the own blocks, less the radial directions of the quaternions."""
+    assert case.objective is not None
+    own, q = case.objective.block_diagonal(), case.objective.active.quats.double()
+    geometry = own.geometry.double()
+    radial = torch.eye(4, dtype=torch.float64) - q[:, :, None] * q[:, None, :]
+    turns = radial @ geometry[:, 6:10, 6:10] @ radial
+    diagonal = geometry.diagonal(dim1=1, dim2=2)
+    parts = {
+        "means": diagonal[:, 0:3],
+        "log_scales": diagonal[:, 3:6],
+        "quats": turns.diagonal(dim1=1, dim2=2),
+        "opacity_logits": diagonal[:, 10],
+        "sh": own.sh.double(),
+    }
+    result = torch.empty(case.operator.dim, dtype=torch.float64)
+    for name, rows in case.operator.blocks.items():
+        result[rows] = parts[name].reshape(-1)
+    return result

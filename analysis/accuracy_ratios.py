@@ -1,0 +1,154 @@
+"""What an accuracy study's runs mean: a point a setting, and the defaults' work over others' at equal true error.
+
+See `analysis.accuracy` for the definition; the numbers are those of its table of runs.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from rich import box
+from rich.table import Table
+
+ASKED = {
+    ("splats", "traces"): 0.5,
+    ("splats", "ends"): 0.85,
+    ("checkpoint", "traces"): 0.5,
+    ("checkpoint", "ends"): 0.85,
+}
+MATRICES = 1.1  # of any quantity
+DRAWS = 200  # of the bootstrap
+CONFIDENCE = 0.95
+QUANTITIES = ("traces", "ends", "sum of |lambda|", "effective rank", "mass quantile", "diagonal")
+SETTING = ["case", "family", "quantity", "origin", "method", "settings"]
+
+
+def points(table: pd.DataFrame, floors: Mapping[str, float]) -> pd.DataFrame:
+    """A line a setting: means over seeds and parts, root mean squares of errors."""
+    table = table.assign(
+        true_error=_squares(table, "true_error", floors), reported_error=table["reported_error"].pow(2)
+    )
+    columns = ["matvecs", "seconds", "true_error", "reported_error", "covered"]
+    means = pd.DataFrame(table.groupby(SETTING, sort=False)[columns].mean()).reset_index()
+    return means.assign(true_error=means["true_error"].pow(0.5), reported_error=means["reported_error"].pow(0.5))
+
+
+def _squares(table: pd.DataFrame, column: str, floors: Mapping[str, float]) -> np.ndarray:
+    """Squared errors, none below its case's round-off; what failed has an infinite one."""
+    floor = [
+        0.0 if quantity == "precision" else floors[case] for case, quantity in zip(table["case"], table["quantity"])
+    ]
+    return np.maximum(table[column].fillna(np.inf).to_numpy(float), floor) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """The settings of one method.  squares, costs: (settings, seeds); a setting's error is the root of its mean square."""
+
+    squares: np.ndarray
+    costs: np.ndarray
+
+    @classmethod
+    def of(cls, runs: pd.DataFrame, cost: str) -> "Curve":
+        by_seed = pd.DataFrame(runs.groupby(["settings", "seed"], sort=False)[["square", cost]].mean()).reset_index()
+        grids = [by_seed.pivot(index="settings", columns="seed", values=name).to_numpy() for name in ("square", cost)]
+        return cls(*grids)
+
+    def drawn(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Errors and costs of the settings over the seeds chosen."""
+        return np.sqrt(self.squares[:, chosen].mean(axis=1)), self.costs[:, chosen].mean(axis=1)
+
+
+def needed(errors: np.ndarray, costs: np.ndarray, goal: float) -> tuple[float, str]:
+    """What a method needs for an error, and whether that is exact (""), an upper (">=" of a ratio) or a lower bound ("<=").
+
+    >>> errors, costs = np.array([1e-1, 1e-3]), np.array([10.0, 1000.0])
+    >>> needed(errors, costs, 1e-2)[0].round(9), needed(errors, costs, 0.5), needed(errors, costs, 1e-9)
+    (np.float64(100.0), (10.0, '≥'), (1000.0, '≤'))
+    """
+    order = np.argsort(costs)
+    costs, errors = costs[order], np.minimum.accumulate(errors[order])
+    if goal >= errors[0]:
+        return float(costs[0]), "≥" if goal > errors[0] else ""
+    if goal < errors[-1]:
+        return float(costs[-1]), "≤"
+    k = int(np.argmax(errors <= goal))
+    if not np.isfinite(errors[k - 1]):
+        return float(costs[k]), "≥"
+    share = np.log(errors[k - 1] / goal) / np.log(errors[k - 1] / errors[k])
+    return np.exp(np.log(costs[k - 1]) + share * np.log(costs[k] / costs[k - 1])), ""
+
+
+def ratios(table: pd.DataFrame, floors: Mapping[str, float], seed: int = 0) -> pd.DataFrame:
+    """A line a case, quantity and kind of rival ("peer", "own"): the default's matvecs and seconds over the best rival's."""
+    table = table.assign(square=_squares(table, "true_error", floors))
+    rng, lines = np.random.default_rng(seed), []
+    places = table[["case", "family", "quantity"]].drop_duplicates().itertuples(index=False, name=None)
+    for case, family, quantity in places:
+        part = pd.DataFrame(table[(table["case"] == case) & (table["quantity"] == quantity)])
+        default = pd.DataFrame(part[part["origin"] == "default"])
+        for against in ("peer", "own"):
+            rivals = pd.DataFrame(part[part["origin"] == against])
+            if rivals.empty or default.empty or quantity not in QUANTITIES:
+                continue
+            asked = MATRICES if family == "matrices" else ASKED.get((family, quantity), np.nan)
+            line = {"case": case, "family": family, "quantity": quantity, "against": against}
+            line |= _compared(default, rivals, "matvecs", rng)
+            seconds = _compared(default, rivals, "seconds", rng)
+            line |= {"seconds_ratio": seconds["ratio"], "seconds_bound": seconds["bound"], "asked": asked}
+            lines.append(line | {"holds": verdict(line, asked)})
+    return pd.DataFrame(lines)
+
+
+def _compared(default: pd.DataFrame, rivals: pd.DataFrame, cost: str, rng: np.random.Generator) -> dict:
+    """The ratio with the best rival, its bootstrap interval, and the two points compared."""
+    own = Curve.of(default, cost)
+    others = {str(name): Curve.of(runs, cost) for name, runs in rivals.groupby("method", sort=False)}
+    seeds = own.costs.shape[1]
+    errors, costs = own.drawn(np.arange(seeds))
+    found = {name: needed(*curve.drawn(np.arange(seeds)), errors[0]) for name, curve in others.items()}
+    best = _best(found)
+    draws = []
+    for _ in range(DRAWS):
+        error, mine = own.drawn(rng.integers(seeds, size=seeds))
+        again = {n: needed(*curve.drawn(rng.integers(seeds, size=seeds)), error[0]) for n, curve in others.items()}
+        draws.append(mine[0] / again[_best(again)][0])
+    low, high = np.quantile(draws, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    need, bound = found[best]
+    return {
+        "error": errors[0], "needs": costs[0], "rival": best, "rival_needs": need,
+        "ratio": costs[0] / need, "bound": bound, "low": low, "high": high,
+    }  # fmt: skip
+
+
+def _best(found: Mapping[str, tuple[float, str]]) -> str:
+    """Who needs least; those whose settings end before they reach the error only where nobody reaches it."""
+    return min(found, key=lambda name: (found[name][1] == "≤", found[name][0] * (-1 if found[name][1] == "≤" else 1)))
+
+
+def verdict(line: Mapping[str, object], asked: float) -> str:
+    """ "yes" or "no" where interval and bound leave no doubt."""
+    low, high, bound = float(line["low"]), float(line["high"]), line["bound"]  # pyright: ignore[reportArgumentType]
+    if np.isnan(asked):
+        return ""
+    if high <= asked and bound != "≥":
+        return "yes"
+    return "no" if low > asked and bound != "≤" else "open"
+
+
+def ratio_table(found: pd.DataFrame, title: str) -> Table:
+    """For the terminal."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for heading in ("case", "quantity", "error", "H v", "best rival", "H v", "ratio", "asked", "holds"):
+        table.add_column(heading, justify="left" if heading in ("case", "quantity", "best rival", "holds") else "right")
+    styles = {"yes": "green", "no": "bold red", "open": "yellow", "": ""}
+    for row in found.to_dict("records"):
+        ratio = f"{row['bound']}{row['ratio']:.2f} ({row['low']:.2f}-{row['high']:.2f})"
+        asked = "" if np.isnan(row["asked"]) else f"{row['asked']:g}"
+        held = f"[{styles[row['holds']]}]{row['holds']}[/]" if row["holds"] else ""
+        needs, rival = f"{row['needs']:.0f}", f"{row['rival_needs']:.0f}"
+        table.add_row(
+            row["case"], row["quantity"], f"{row['error']:.1e}", needs, row["rival"], rival, ratio, asked, held
+        )
+    return table
