@@ -10,20 +10,22 @@ its own coefficient and the mean stays unbiased).  A sample costs one J u of as 
 not yet small enough, and no backward pass.  Where the loss is a sum over pixels, l'' = D and the traces are exact.
 """
 
-from math import ceil
+from math import ceil, sqrt
 from time import monotonic
 
 import torch
+from jaxtyping import Float64
+from scipy.stats import t as student
 from torch import Tensor
 
 from landscape.control import controlled
+from landscape.hutchinson import CONFIRMATION, GROWTH, WIDENING, TraceSettings
 from landscape.probes import draw_probes
-from landscape.results import Progress, StopReason, TraceEstimate, t_interval
-from landscape.trace import TraceSettings
+from landscape.results import Progress, StopReason, TraceEstimate
 from splat.curvature import SceneObjective
 
 ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
-GROWTH = 1.5  # of the number of samples between two looks
+COLUMNS = 5  # vectors in a pass over the pixels: one for each block
 
 
 def exact_traces(
@@ -47,48 +49,85 @@ def exact_traces(
             for name, value in known.items()
         }
     pixelwise = objective.block_diagonal(gauss_newton=True).traces(quats)
-    estimates: dict[str, TraceEstimate] = {}
-    open_blocks, deadline = list(known), monotonic() + settings.max_seconds
-    full, diagonal = {name: [] for name in known}, {name: [] for name in known}
-    count, look = 0, settings.min_probes
-    while open_blocks:
-        for name, x, y in zip(open_blocks, *_sample(objective, generator, open_blocks), strict=True):
-            full[name].append(x)
-            diagonal[name].append(y)
-        count += 1
+    blocks = [_Block(name, sizes[name], known[name], pixelwise[name], settings) for name in known]
+    deadline = monotonic() + settings.max_seconds
+    while still := [block for block in blocks if block.open]:
+        count, next_look = still[0].count, min(block.look for block in still)
+        # few blocks leave room for several samples in the pass over the pixels
+        together = min(max(COLUMNS // len(still), 1), next_look - count)
+        sampled = _sample(objective, generator, [block.name for block in still], together)
+        late = monotonic() > deadline
+        for block, x, y in zip(still, *sampled, strict=True):
+            block.add(x, y, late)
         if progress:
-            progress(count, settings.max_probes, f"traces: {count} samples of the coupling between pixels")
-        late = monotonic() > deadline and count >= settings.min_probes
-        if count < look and not late:
-            continue
-        look = min(ceil(GROWTH * count), settings.max_probes)
-        reason: StopReason = "time budget" if late else "matvec budget"
-        for name in open_blocks:
-            x, y = (torch.stack(samples[name]) for samples in (full, diagonal))
-            samples = known[name] - pixelwise[name] + controlled(x, y, pixelwise[name])
-            estimates[name] = _estimate(name, sizes[name], samples, settings, reason)
-        if late or count == settings.max_probes:
-            break
-        open_blocks = [name for name in open_blocks if estimates[name].reason != "tolerance"]
-    return {name: estimates[name] for name in known}
+            state = f"traces: {count + together} samples of the coupling between pixels"
+            progress(count + together, settings.max_probes, state)
+    return {block.name: block.estimate() for block in blocks}
 
 
-def _sample(objective: SceneObjective, generator: torch.Generator, names: list[str]) -> tuple[Tensor, Tensor]:
-    """x and y of the named blocks, for one draw of signs; the draw is the same whatever the names are."""
+class _Block:
+    """The samples of one block, and whether it needs more: it looks, and confirms, as `landscape.hutchinson` does."""
+
+    def __init__(self, name: str, dim: int, known: float, pixelwise: float, settings: TraceSettings):
+        self.name, self.dim, self.settings = name, dim, settings
+        self.exact, self.mean = known - pixelwise, pixelwise
+        self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
+        self.look, self.open, self.late, self.confirming = settings.min_probes, True, False, False
+
+    @property
+    def count(self) -> int:
+        return len(self.full)
+
+    def add(self, x: Float64[Tensor, " s"], y: Float64[Tensor, " s"], late: bool) -> None:
+        self.full, self.diagonal = torch.cat([self.full, x]), torch.cat([self.diagonal, y])
+        settings, self.late = self.settings, late and self.count >= self.settings.min_probes
+        if self.late or self.count == settings.max_probes:
+            self.open = False
+        elif self.count == self.look:
+            reached = self.estimate().reason == "tolerance"
+            self.open = not (reached and self.confirming)
+            self.look = min(self.count + CONFIRMATION if reached else ceil(GROWTH * self.count), settings.max_probes)
+            self.confirming = reached
+
+    def estimate(self) -> TraceEstimate:
+        settings = self.settings
+        samples = self.exact + controlled(self.full, self.diagonal, self.mean)
+        value = float(samples.mean())
+        error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.mean))
+        # the slope of the control variate is one more number that the samples had to give
+        quantile = float(student.ppf((1 + settings.confidence) / 2, self.count - 2))
+        half = quantile * error * (WIDENING if settings.adaptive else 1.0)
+        reason: StopReason = "time budget" if self.late else "matvec budget"
+        if settings.reached(value, value - half, value + half):
+            reason = "tolerance"
+        return TraceEstimate(
+            self.name, self.dim, value, error, value - half, value + half, settings.confidence, self.count, self.count,
+            reason, samples,
+        )  # fmt: skip
+
+
+def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> float:
+    """The standard error of samples at control = mean on the line through them: for few samples often more than the spread of
+    the controlled ones says, because their slopes share it.  0 where the control does not vary."""
+    count, centred = len(samples), control - control.mean()
+    spread = float(centred.square().sum())
+    if count < 3 or spread == 0:
+        return 0.0
+    rest = samples - samples.mean() - float((samples * centred).sum()) / spread * centred
+    off = float(control.mean()) - mean
+    return sqrt(float(rest.square().sum()) / (count - 2) * (1 / count + off**2 / spread))
+
+
+def _sample(
+    objective: SceneObjective, generator: torch.Generator, names: list[str], count: int
+) -> tuple[Float64[Tensor, "b s"], Float64[Tensor, "b s"]]:
+    """x and y of the named blocks for so many draws of signs, which are the same whatever the names and the count are."""
     p = objective.active.flat.numel()
-    z = draw_probes(p, 1, generator, objective.active.flat.dtype, "rademacher")
-    U = torch.zeros(p, len(names), dtype=z.dtype)
+    draws = [draw_probes(p, 1, generator, objective.active.flat.dtype, "rademacher")[:, 0] for _ in range(count)]
+    U = torch.zeros(p, len(names), count, dtype=draws[0].dtype)
     for i, name in enumerate(names):
         rows = objective.blocks[name]
-        U[rows, i] = z[rows, 0]
-    total = torch.stack([torch.stack(view.loss_curvatures(U)) for view in objective.linearized]).sum(dim=0)
-    return tuple(objective.mean(total))  # pyright: ignore[reportReturnType]
-
-
-def _estimate(name: str, dim: int, samples: Tensor, settings: TraceSettings, reason: StopReason) -> TraceEstimate:
-    value, error, low, high = t_interval(samples, settings.confidence)
-    reached = (high - low) / 2 <= max(settings.rtol * abs(value), settings.atol)
-    return TraceEstimate(
-        name, dim, value, error, low, high, settings.confidence, len(samples), len(samples),
-        "tolerance" if reached else reason, samples,
-    )  # fmt: skip
+        U[rows, i] = torch.stack([z[rows] for z in draws], dim=1)
+    views = [torch.stack(view.loss_curvatures(U.flatten(1))) for view in objective.linearized]
+    x, y = objective.mean(torch.stack(views).sum(dim=0))
+    return x.view(len(names), count), y.view(len(names), count)

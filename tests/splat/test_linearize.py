@@ -1,5 +1,7 @@
 """A view held still, against the specification, dense matrices and finite differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from splat.gaussians import Gaussians
 from splat.linearize import LinearizedView
 from splat.losses import LossSettings, photometric_loss
 from splat.losses_cpu import ViewLoss
+from splat.raster.simd import lanes_of
 from splat.render import render
 from splat.scenes.view import View
 from splat.settings import SMOOTH, RenderSettings
@@ -184,3 +187,24 @@ def test_a_gaussian_that_is_not_finite_is_named():
     gaussians.log_scales[2, 1] = float("nan")
     with pytest.raises(ValueError, match=r"expected finite log_scales, got .*nan.* at Gaussian 2"):
         hold(gaussians, two_views()[0], LossSettings())
+
+
+def test_entries_behind_opaque_fronts_are_those_that_a_view_without_stops_has_more():
+    gaussians, view, loss = random_gaussians(40, 0), two_views()[0], LossSettings()
+    gaussians.means[:4] = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)  # four walls over the whole image
+    gaussians.log_scales[:4], gaussians.opacity_logits[:4] = 3.0, 8.0
+    gaussians.means[4:, 2] = 9.0
+    held = hold(gaussians, view, loss)
+    endless = hold(gaussians, view, loss, settings=RenderSettings(transmittance_min=0.0))
+    assert held.entries_behind > 0 == endless.entries_behind
+    assert held.entries + held.entries_behind == endless.entries
+
+
+def test_tiles_are_dark_where_the_picture_is_met_exactly_and_the_loss_does_not_couple_pixels():
+    gaussians, view = random_gaussians(40, 1, logit=1.0), two_views(45, 37)[0]
+    met = hold(gaussians, view, LossSettings()).image[:, :16]  # a row of tiles
+    view = replace(view, image=torch.cat([met, view.image[:, 16:].double()], dim=1))
+    alone, coupled = (hold(gaussians, view, LossSettings(ssim_weight=weight)) for weight in (0.0, 0.2))
+    first_row = -(-45 // lanes_of(np.float64))
+    assert (np.diff(alone._raster.lists.start)[:first_row] > 0).all()
+    assert alone.dark_tiles == first_row and coupled.dark_tiles == 0
