@@ -8,12 +8,12 @@
 
     curvature unit  sqrt(2 rise L / |d.H d|): the step within which the curvature alone changes the loss by rise L
 
-Of two kinds in one plane the second counts with its part at a right angle to the first alone, drawn out to its old length.
+Of two kinds in one plane the second (then e₁⊥, say) is its part at a right angle to the first, drawn out to its old length.
 Eigenvectors that are known already are taken where H itself confirms them: |H v - lambda v| within the tolerance.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isclose, nan
 from pathlib import Path
 
@@ -126,16 +126,18 @@ def find_directions(
             found.append(Direction(kind, "gradient", gradient_direction(objective.gradient)[:, 0]))
         else:
             assert other is not None
-            found.append(Direction(kind, "line", line_between(center, other)[:, 0], scale="0: here, 1: the other"))
+            found.append(Direction(kind, "line", line_between(center, other)[:, 0], scale="share of the way"))
     return found
 
 
-def columns(directions: Sequence[Direction]) -> Float[Tensor, "n d"]:
-    """The vectors; those of two kinds at a right angle."""
-    vectors = torch.stack([direction.vector for direction in directions], dim=1)
-    if len({direction.kind for direction in directions}) < 2:
-        return vectors
-    return orthonormal(vectors) * torch.linalg.vector_norm(vectors.double(), dim=0).to(vectors.dtype)
+def at_right_angles(found: Sequence[Direction]) -> list[Direction]:
+    """The directions of a slice: those found, but of two kinds the second's part at a right angle to the first, as long."""
+    if len({direction.kind for direction in found}) < 2:
+        return list(found)
+    first, second = found
+    across = orthonormal(torch.stack([first.vector, second.vector], dim=1))[:, 1]
+    length = torch.linalg.vector_norm(second.vector.double()).to(across.dtype)
+    return [first, replace(second, name=f"{second.name}⊥", vector=across * length, residual=None)]
 
 
 def cosine(directions: Sequence[Direction]) -> float | None:

@@ -29,7 +29,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from analysis.probe_record import counts, loss_name
-from analysis.slice_directions import Direction, cosine
+from analysis.slice_directions import Direction
 from landscape import FiniteProbe, Slice
 from splat.curvature import SceneObjective
 from splat.losses import LossSettings
@@ -37,12 +37,13 @@ from splat.losses import LossSettings
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A slice and what it was taken along: directions as found, and as columns.  probe: the finite steps of a line."""
+    """A slice and its directions, also as columns.  probe: the finite steps of a line; cosine: see the glossary."""
 
     slice: Slice
     probe: FiniteProbe | None
     directions: list[Direction]
     vectors: Float[Tensor, "n d"]
+    cosine: float | None
     loss_scale: float
     matvecs: int
 
@@ -67,7 +68,7 @@ def slice_data(found: Found, objective: SceneObjective, loss: LossSettings) -> d
                 for direction, slope, curvature, length in zip(found.directions, *numbers, strict=True)
             ],
             "loss_scale": found.loss_scale,
-            "cosine": cosine(found.directions),
+            "cosine": found.cosine,
             **grid.record(),
         },
         "finite_probe": None if probe is None else probe.record(),

@@ -38,8 +38,9 @@ from analysis.slice_directions import (
     RISE,
     Direction,
     Shape,
+    at_right_angles,
     axis_of,
-    columns,
+    cosine,
     find_directions,
     recorded_eigenvectors,
 )
@@ -152,9 +153,10 @@ def _measure(
     operator = CountingOperator(SceneHessian(objective))
     true = CountingOperator(SceneHessian(objective, keep_null=True))  # H itself: a line may lead anywhere
     with stages.stage("directions") as report:
-        directions = find_directions(shape, objective, operator, other, known, generators, report)
-        _keep_eigenvectors(directions, unfinished)
-        vectors = columns(directions)
+        exact = find_directions(shape, objective, operator, other, known, generators, report)
+        _keep_eigenvectors(exact, unfinished)
+        directions = at_right_angles(exact)
+        vectors = torch.stack([direction.vector for direction in directions], dim=1)
         curvatures = (vectors.double() * true.apply(vectors).double()).sum(dim=0).tolist()
     loss_scale = RISE * objective.loss(center)
     axes = [
@@ -174,7 +176,7 @@ def _measure(
         with stages.stage("finite steps") as report:
             steps = [reach * step for step in DECADES]
             probe = finite_probe(_evaluation(objective, 1), center, vectors[:, 0], true, steps, report)
-    return Found(found, probe, directions, vectors, loss_scale, operator.matvecs + true.matvecs)
+    return Found(found, probe, directions, vectors, cosine(exact), loss_scale, operator.matvecs + true.matvecs)
 
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:

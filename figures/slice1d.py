@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from analysis.quantities import quantity
 from analysis.records import Record
@@ -59,9 +60,18 @@ def _draw_loss(axes: Axes, along: Direction, about: dict[str, Any], arrays: dict
         axes.set_ylim(low, high)
     axes.axvline(0, color="0.7", linewidth=0.5, zorder=0)
     axes.set_xlabel(along.label)
+    axes.xaxis.set_major_locator(MaxNLocator(7))
     axes.set_ylabel(f"change of loss{unit_suffix(exponent)}")
     axes.grid(True)
-    axes.set_title("Loss along the line", loc="left")
+    axes.set_title("Loss along a line through the checkpoint", loc="left")
+    step = along.unit / 10.0**along.exponent
+    if about["directions"][0].get("kind") == "line":
+        axes.axvline(1, color="0.7", linewidth=0.5, zorder=0)
+        axes.secondary_xaxis("top").set_xticks([0, 1], ["this checkpoint", "the other"])
+    elif np.isfinite(step) and step > 0:
+        upper = axes.secondary_xaxis("top", functions=(lambda x: np.divide(x, step), lambda u: np.multiply(u, step)))
+        upper.xaxis.set_major_locator(MaxNLocator(7))
+        upper.set_xlabel("steps in curvature units")
 
 
 def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> None:

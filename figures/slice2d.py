@@ -35,7 +35,7 @@ def draw(record: Record) -> Figure:
         axes = above.subplots()
         contours = _draw_plane(axes, field)
         if contours is not None:
-            above.colorbar(contours, ax=axes, label=field.label, pad=0.02, aspect=25)
+            above.colorbar(contours, cax=axes.inset_axes((1.03, 0.0, 0.045, 1.0)), label=field.label)
         first, second = below.subplots(1, 2, sharey=True)
         _draw_section(first, field.x, field, axis=0)
         _draw_section(second, field.y, field, axis=1)

@@ -32,6 +32,7 @@ from figures.style import BLACK, FIELD_MAP, VERMILION, new_figure, script, style
 RENDERER = [sys.executable, str(Path(render_surface.__file__))]
 TIME_LIMIT = 120  # seconds for one picture
 LEVELS = 10
+CORNER = 0.06  # of half an axis, from its start on, without a tick: another axis has one there
 
 
 class RendererMissing(UserWarning):
@@ -124,7 +125,7 @@ def _floor_axis(
     middle, half = (steps[-1] + steps[0]) / 2, (steps[-1] - steps[0]) / 2
     align = "right" if outwards[0] == 0 else "left"
     for value in MaxNLocator(4).tick_values(steps[0], steps[-1]):
-        if steps[0] <= value <= steps[-1]:
+        if steps[0] + CORNER * half < value <= steps[-1]:
             text = f"{value:g}".replace("-", "−")
             _tick(axes, np.array(place((value - middle) / half)), outwards, text, align)
     ends = Box.project(np.array([place(-1.0), place(1.0)]))

@@ -202,7 +202,8 @@ def test_of_two_kinds_the_second_is_put_at_a_right_angle_and_keeps_its_length(ru
     assert vectors.T @ vectors == pytest.approx(np.eye(2), abs=1e-12)
     assert abs(record.data["slice"]["cosine"]) > 1e-6  # so that there was something to do
     first, second = record.data["slice"]["directions"]
-    assert (first["kind"], second["kind"]) == ("gradient", "eigenvectors")
+    assert (first["kind"], second["kind"], second["name"]) == ("gradient", "eigenvectors", "e₁⊥")
+    assert second["residual"] is None
     assert record.arrays["slice"]["x"][-1] == 0.01
     assert record.arrays["slice"]["y"][-1] == pytest.approx(2 * second["unit"])
 
