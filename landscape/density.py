@@ -6,9 +6,10 @@ eigenvectors are the Gauss rule of the measure mu_z(x) = sum_i (z . v_i)^2 delta
     z^T f(H) z = sum_j w_j f(theta_j)     exactly for polynomials f of degree below 2m
     tr f(H)    = n E z^T f(H) z           for z = +-1 / sqrt(n)
 
-sum |lambda_i|, which has a kink at 0, is bracketed without any assumption on the spectrum.  In y = x^2 it is the
-integral of sqrt(y), whose derivatives alternate in sign on y > 0; hence the Gauss rule in y lies above it and the
-Gauss-Radau rule with a node at y = 0 lies below.  Both rules follow from the m nodes in x alone.
+sum |lambda_i|, which has a kink at 0, is bracketed without any assumption on the spectrum.  The measures of at most m points
+entry (Golub 1973).  The least and the largest integral of |x| over all with these moments are among theirs, as a
+entry (Golub 1973).  The least and the largest integral of |x| over all measures with these moments are among theirs, as a
+polynomial of degree 2m - 2 on one side of |x| touches it in m points at most.  The least has a node at 0: T(a) is singular.
 
 Where a null space is known, with P the projector off it and r the rank of P, the start vectors are P z / |P z|.  The density is
 then that of the r other eigenvalues, and sums over them are r times its integrals.
@@ -16,6 +17,7 @@ then that of the r other eigenvalues, and sums over them are r times its integra
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 
 import torch
 from jaxtyping import Float64
@@ -25,6 +27,9 @@ from landscape.lanczos import lanczos
 from landscape.operator import DenseOperator, SymmetricOperator
 from landscape.probes import draw_probes
 from landscape.results import Bracket, Progress, SpectralDensity, t_interval
+
+REACH, RESOLUTION, ROUNDS = 20.0, 40, 4  # a = centre +- sinh(20) |b| in steps of half an e-fold, refined three times
+FAR = 1e8  # in units of the largest node; a node there adds 1 / FAR to the integral at most, and costs eps FAR in precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +90,10 @@ def spectral_density(
 
 
 def absolute_sum(density: SpectralDensity, confidence: float = 0.95) -> Bracket:
-    """sum_i |lambda_i|: the quadrature's bracket, widened by the spread over start vectors."""
+    """sum_i |lambda_i| by the Gauss rules, in the bounds of `absolute_bounds`, widened by the spread over start vectors."""
     rules = zip(density.nodes, density.weights, strict=True)
     below, above = torch.tensor([absolute_bounds(*rule) for rule in rules], dtype=torch.float64).T * density.dim
-    middle = float((below + above).mean()) / 2
+    middle = float((density.weights * density.nodes.abs()).sum(dim=1).mean()) * density.dim
     low, high = t_interval(below, confidence)[2], t_interval(above, confidence)[3]
     width = float((above - below).mean())
     return Bracket(middle, max(low, 0.0), high, f"quadrature width {width:.3g}, {len(below)} start vectors")
@@ -97,33 +102,52 @@ def absolute_sum(density: SpectralDensity, confidence: float = 0.95) -> Bracket:
 def absolute_bounds(nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"]) -> tuple[float, float]:
     """Lower and upper bound of the integral of |x| over any measure that has this m-point Gauss rule.
 
+    A rule with weights of 0 is that of an invariant subspace: the measure itself.
+
     >>> nodes, weights = torch.tensor([[-1.0, 1.0], [0.5, 0.5]], dtype=torch.float64)  # E x = 0, E x^2 = 1, E x^3 = 0
     >>> absolute_bounds(nodes, weights)
     (0.0, 1.0)
     """
-    scale = float(nodes.abs().max())
-    if scale == 0:
-        return 0.0, 0.0
-    squares = (nodes / scale).square()
-    kept = weights > 0
-    rule = DenseOperator(torch.diag(squares[kept]))
-    (jacobi,) = lanczos(rule, weights[kept].sqrt()[:, None], steps=max(len(nodes) // 2, 1))
-    total, size = float(weights.sum()), len(jacobi.T)
-    above = _root_integral(jacobi.T)
-    below = above
-    if size < int(kept.sum()):  # else the rule in y has all the measure's points, and is exact
-        radau = jacobi.T.clone()
-        # the last diagonal entry that makes the matrix singular: its last pivot becomes 0
-        pivot = torch.tensor(0.0, dtype=torch.float64)
-        for j in range(size):
-            coupling = radau[j, j - 1].square() / pivot if j else torch.zeros_like(pivot)
-            pivot = radau[j, j] - coupling
-        radau[-1, -1] -= pivot
-        below = _root_integral(radau)
-    return scale * total * min(below, above), scale * total * above  # the roots may cross by their round-off
+    kept, scale = weights > 0, float(nodes.abs().max())
+    gauss = float((weights * nodes.abs()).sum())
+    if scale == 0 or int(kept.sum()) == 1 or not kept.all():
+        return gauss, gauss
+    (rule,) = lanczos(DenseOperator(torch.diag(nodes / scale)), weights.sqrt()[:, None], len(nodes))
+    T, size = rule.T, scale * float(weights.sum())
+    if len(T) == 1:  # all nodes are the same to round-off
+        return gauss, gauss
+    least, unit = _singular_end(T), float(T[-1, -2].abs())
+    centre = least if abs(least) < FAR else float(T[-1, -1])
+
+    def integrals(steps: Tensor) -> Float64[Tensor, " s"]:
+        """At a = centre + unit sinh(step)."""
+        return size * _absolute_integrals(T, centre + unit * torch.sinh(steps))
+
+    steps = torch.linspace(-REACH, REACH, 2 * RESOLUTION + 1, dtype=torch.float64)
+    for _ in range(ROUNDS):  # the largest lies between the neighbours of the largest of the grid
+        found = integrals(steps)
+        best = int(found.argmax().clamp(1, len(steps) - 2))
+        steps = torch.linspace(float(steps[best - 1]), float(steps[best + 1]), len(steps), dtype=torch.float64)
+    below = size * float(_absolute_integrals(T, torch.tensor([least], dtype=torch.float64)))
+    return min(below, gauss), max(float(found.max()), gauss)
 
 
-def _root_integral(jacobi: Float64[Tensor, "m m"]) -> float:
-    """The integral of sqrt(y) by the rule of a Jacobi matrix."""
-    values, vectors = torch.linalg.eigh(jacobi)
-    return float((vectors[0].square() * values.clamp_min(0).sqrt()).sum())
+def _singular_end(T: Float64[Tensor, "m m"]) -> float:
+    """The last diagonal entry that makes T singular: its last pivot becomes 0."""
+    pivot, coupling = float(T[0, 0]), 0.0
+    for j in range(1, len(T)):
+        coupling = float(T[j, j - 1]) ** 2 / pivot if pivot else inf
+        pivot = float(T[j, j]) - coupling
+    return coupling
+
+
+def _absolute_integrals(T: Float64[Tensor, "m m"], ends: Float64[Tensor, " s"]) -> Float64[Tensor, " s"]:
+    """The integral of |x| by the rules of T with each of `ends` as its last diagonal entry, for T of size 1.
+
+    Beyond FAR that entry's node has no weight left, and the rule is that of T without its last row.
+    """
+    rules = T.repeat(len(ends), 1, 1)
+    rules[:, -1, -1] = ends.clamp(-FAR, FAR)
+    rules[ends.abs() > FAR, -1, -2] = rules[ends.abs() > FAR, -2, -1] = 0.0
+    values, vectors = torch.linalg.eigh(rules)
+    return (vectors[:, 0].square() * values.abs()).sum(dim=1)

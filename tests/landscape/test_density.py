@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from landscape.density import absolute_bounds, absolute_sum, spectral_density
+from landscape.density import FAR, absolute_bounds, absolute_sum, spectral_density
 from landscape.probes import draw_probes
 from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
 from tests.oracles import absolute_matrix
@@ -44,11 +44,27 @@ def test_the_sum_of_magnitudes_of_each_start_vector_lies_within_its_bounds(name,
     Z = draw_probes(N, 4, generator(), torch.float64, "rademacher") / N**0.5
     exact = (Z * (torch.from_numpy(absolute_matrix(H.matrix.numpy())) @ Z)).sum(dim=0)
     # the bounds are square roots of quantities of the size of |H|^2: round-off of the root of eps
-    rounding = 4 * torch.finfo(torch.float64).eps ** 0.5 * float(H.matrix.norm())
+    rounding = float(H.matrix.norm()) / FAR  # what a node that is left out, so far away, may add
     for nodes, weights, truth in zip(density.nodes, density.weights, exact, strict=True):
         low, high = absolute_bounds(nodes, weights)
         assert low - rounding <= truth <= high + rounding
         assert low <= high
+
+
+def test_the_bounds_of_the_sum_of_magnitudes_are_reached_by_measures_of_the_same_moments():
+    """Lemma: of mean mu and variance 1, E |x| is at least |mu| and at most sqrt(mu^2 + 1)."""
+    for mu in (0.0, 0.3, -2.0, 40.0):
+        nodes = torch.tensor([mu - 1, mu + 1], dtype=torch.float64)
+        low, high = absolute_bounds(nodes, torch.tensor([0.5, 0.5], dtype=torch.float64))
+        assert low == pytest.approx(abs(mu), abs=1e-12) and high == pytest.approx((mu**2 + 1) ** 0.5, rel=1e-9)
+
+
+def test_the_bounds_see_the_sign_of_the_mean_and_an_invariant_subspace_is_exact():
+    nodes = torch.tensor([1.0, 2.0, 5.0, 0.0], dtype=torch.float64)
+    weights = torch.tensor([0.2, 0.3, 0.5, 0.0], dtype=torch.float64)
+    assert absolute_bounds(nodes, weights) == (pytest.approx(3.3), pytest.approx(3.3))
+    low, high = absolute_bounds(nodes[:3], weights[:3])  # all that is known to be positive is the mean
+    assert low == pytest.approx(3.3, rel=1e-12) and high > 3.3
 
 
 def test_more_steps_narrow_the_bounds():
