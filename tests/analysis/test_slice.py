@@ -14,14 +14,17 @@ import torch
 
 from analysis.cli import main
 from analysis.probe import scene_objective
-from analysis.records import Record, read_record
+from analysis.probe_record import loss_name
+from analysis.records import Record, read_record, record_folder, write_record
 from figures.make_all import recorded_figures
 from splat.adam import Adam
 from splat.checkpoint import load_checkpoint, save_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
 from splat.densify import ScreenGradients
+from splat.losses import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from tests.recorded import synthetic
 
 ROOT = Path(__file__).parents[2]
 SCENE = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
@@ -125,24 +128,31 @@ def test_the_default_is_the_plane_of_the_two_largest_eigenvalues(eigen, objectiv
     assert eigen.data["counts"]["renders"] == 3 * (81 + 1) and eigen.data["finite_probe"] is None
 
 
-def test_eigenvectors_of_the_probe_beside_the_checkpoint_are_taken_where_it_is_its_own(run, eigen, tmp_path):
-    folder = shutil.copytree(run, tmp_path / "run")
-    path = folder / "double.pt"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("analysis.probe.draw", lambda module, target: [])
-        assert main(["probe", str(path), "--scene", str(run.parent / "still"), "--slice-points", "5"]) == 0
-    scene = ["--scene", str(run.parent / "still")]
+def probed(folder: Path, value: float, vectors: np.ndarray, loss: LossSettings) -> None:
+    """The record of a probe with these eigenvectors, beside a checkpoint whose loss has this value."""
+    data, _ = synthetic()
+    data["objective"] |= {"loss": loss_name(loss), "operator": "hessian", "value": value}
+    with record_folder(folder / "probe") as partial:
+        write_record(partial, data, {"eigenvectors": {"largest": vectors}})
+
+
+def test_eigenvectors_of_the_probe_beside_the_checkpoint_are_taken_where_they_are_its_own(run, eigen, tmp_path):
+    path, scene = tmp_path / "run" / "double.pt", ["--scene", str(run.parent / "still")]
+    path.parent.mkdir()
+    shutil.copy(run / "double.pt", path)
+    loss = load_checkpoint(path).training.config.loss
+    vectors, value = eigen.arrays["directions"]["vectors"], eigen.data["slice"]["center_loss"]
+    probed(path.parent, value, vectors[:, ::-1].copy(), loss)  # told apart from those that Lanczos finds
     taken = sliced(tmp_path / "taken", path, *scene, *POINTS)
-    recorded = read_record(folder / "probe")
-    vectors = recorded.arrays["eigenvectors"]["largest"]
-    assert np.array_equal(taken.arrays["directions"]["vectors"], vectors[:, :2])
-    assert taken.data["slice"]["directions"][0]["curvature"] == pytest.approx(
-        recorded.data["eigenvalues"]["max"]["value"]
-    )
-    # two vectors: to confirm them, for their curvatures, for the model
-    assert taken.data["counts"]["products"] == 6 < eigen.data["counts"]["products"]
-    other = sliced(tmp_path / "other", folder / "turned.pt", *scene, *POINTS)
-    assert other.data["counts"]["products"] > 6
+    assert np.array_equal(taken.arrays["directions"]["vectors"], vectors[:, ::-1])
+    assert taken.data["counts"]["products"] == 6  # of two vectors: to confirm them, for their curvatures, for the model
+    turned = vectors @ np.array([[0.8, -0.6], [0.6, 0.8]])
+    for number, (recorded, of) in enumerate([(vectors, 1.001 * value), (turned, value), (vectors[:-1], value)]):
+        probed(path.parent, of, recorded, loss)
+        computed = sliced(tmp_path / str(number), path, *scene, *POINTS)
+        assert computed.data["counts"]["products"] > 6
+        for found, exact in zip(computed.data["slice"]["directions"], eigen.data["slice"]["directions"], strict=True):
+            assert abs(found["curvature"] - exact["curvature"]) <= found["residual"] + exact["residual"]
 
 
 def test_random_directions_are_as_long_as_each_attribute_of_each_gaussian(run, objective, tmp_path):
