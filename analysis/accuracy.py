@@ -31,8 +31,8 @@ from torch import Tensor
 
 from analysis.accuracy_cases import Case, Meter, matrix_cases, splat_cases
 from analysis.accuracy_checkpoint import BUDGETS as FEW_BUDGETS
-from analysis.accuracy_checkpoint import checkpoint_case
-from analysis.accuracy_methods import Answer, Method, own_methods
+from analysis.accuracy_checkpoint import affordable, checkpoint_case
+from analysis.accuracy_methods import BUDGETS, Answer, Method, own_methods
 from analysis.accuracy_peers import peer_methods
 from analysis.accuracy_ratios import points, ratio_table, ratios
 from analysis.drawing import draw
@@ -155,15 +155,15 @@ def run_accuracy(options: BenchOptions) -> int:
     with Progress(console=errors, transient=True) as progress:
         bar = progress.add_task("accuracy: making the cases", total=None)
         cases = _cases(options)
-        checkpoint = options.checkpoint is not None
-        peers, missing = peer_methods(FEW_BUDGETS) if checkpoint else peer_methods()
-        methods = [*(own_methods(FEW_BUDGETS) if checkpoint else own_methods()), *peers]
+        budgets = BUDGETS if options.checkpoint is None else FEW_BUDGETS
+        peers, missing = peer_methods(budgets)
+        methods = [*own_methods(budgets), *peers]
         jobs = [
             (case, method, seed)
             for case in cases
             for method in methods
             for seed in range(seeds_of(case, method, options.repetitions))
-            if method.applies(case) and (method.quantity != "diagonal" or case.truth.diagonal is not None)
+            if method.applies(case) and (case.family != "checkpoint" or affordable(method))
         ]
         progress.update(bar, total=len(jobs))
         for case, method, seed in jobs:

@@ -302,8 +302,10 @@ def test_errors_only_count_downwards():
 def small(monkeypatch, matrix):
     monkeypatch.setattr(accuracy, "_cases", lambda options: [matrix])
     chosen = {"Hutchinson, adaptive", "Hutch++", "Lanczos, both ends"}
-    monkeypatch.setattr(accuracy, "own_methods", lambda: (m for m in own_methods() if m.name in chosen))
-    monkeypatch.setattr(accuracy, "peer_methods", lambda: (list(scipy_methods()), ["curvlinops is left out (why)"]))
+    monkeypatch.setattr(accuracy, "own_methods", lambda budgets: (m for m in own_methods(budgets) if m.name in chosen))
+    monkeypatch.setattr(
+        accuracy, "peer_methods", lambda budgets: (list(scipy_methods()), ["curvlinops is left out (why)"])
+    )
 
 
 def test_the_command_prints_writes_and_draws(small, tmp_path, capsys):
