@@ -211,7 +211,7 @@ def test_the_eigenvectors_are_said_to_live_where_the_dense_ones_do(record, dense
     for name, index in (("max", -1), ("min", 0)):
         where = record.data["eigenvalues"][name]["lives_on"]
         v = objective.active.with_flat(vectors[:, index])
-        mass = sum(part.reshape(len(v), -1).square().sum(dim=1) for part in v.attributes.values())
+        mass = torch.stack([part.reshape(len(v), -1).square().sum(dim=1) for part in v.attributes.values()]).sum(dim=0)
         assert where["participation"] == pytest.approx(float(1 / mass.square().sum()), rel=1e-2)
         heaviest, share = where["heaviest"][0]
         assert heaviest == int(mass.argmax()) and share == pytest.approx(float(mass.max()), rel=1e-2)

@@ -210,7 +210,7 @@ def test_json_of_something_else_is_refused(tmp_path, foreign):
 def test_a_newer_format_is_refused_with_what_to_do(tmp_path):
     folder = written(tmp_path / "probe")
     raw = json.loads((folder / "probe.json").read_text(encoding="utf-8"))
-    raw["format"]["version"] = FORMAT["version"] + 1
+    raw["format"]["version"] = int(FORMAT["version"]) + 1
     (folder / "probe.json").write_text(json.dumps(raw))
     with pytest.raises(ValueError, match="got version 2; update"):
         read_record(folder)
