@@ -28,7 +28,8 @@ from landscape.operator import DenseOperator, SymmetricOperator
 from landscape.probes import draw_probes
 from landscape.results import Bracket, Progress, SpectralDensity, t_interval
 
-REACH, RESOLUTION, ROUNDS = 20.0, 40, 4  # a = centre +- sinh(20) |b| in steps of half an e-fold, refined three times
+REACH, RESOLUTION = 20.0, 40  # a = centre +- sinh(20) |b| in steps of half an e-fold
+ROUNDS, FINER = 7, 11  # of these steps, each round but the first refines them by a factor of 5
 FAR = 1e8  # in units of the largest node; a node there adds 1 / FAR to the integral at most, and costs eps FAR in precision
 
 
@@ -127,7 +128,7 @@ def absolute_bounds(nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"]
     for _ in range(ROUNDS):  # the largest lies between the neighbours of the largest of the grid
         found = integrals(steps)
         best = int(found.argmax().clamp(1, len(steps) - 2))
-        steps = torch.linspace(float(steps[best - 1]), float(steps[best + 1]), len(steps), dtype=torch.float64)
+        steps = torch.linspace(float(steps[best - 1]), float(steps[best + 1]), FINER, dtype=torch.float64)
     below = size * float(_absolute_integrals(T, torch.tensor([least], dtype=torch.float64)))
     return min(below, gauss), max(float(found.max()), gauss)
 

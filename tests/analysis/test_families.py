@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.stats import binom
 
 from analysis.cli import main
 from analysis.family_stage import FamilyFindings, FamilyOptions, measure_families, quotient
@@ -15,7 +16,7 @@ from analysis.family_table import family_lines
 from analysis.probe import scene_objective
 from analysis.records import Record, read_record
 from analysis.report import render_report
-from landscape import Bracket
+from landscape import Bracket, EigenSettings, FamilySettings
 from splat.adam import Adam
 from splat.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
@@ -25,6 +26,7 @@ from splat.scenes.write import write_transforms_scene
 from splat.split_control import split_in_two
 
 SCENE = SyntheticSettings(gaussians=50, views=4, width=16, height=12)
+BUDGET = FamilySettings(EigenSettings(rtol=1e-2, max_matvecs=40), starts=3, steps=6)
 BLOCKS = ["all", "means", "log_scales", "quats", "opacity_logits", "sh"]
 QUICK = ["--quick", "--seconds", "inf", "--slice-points", "5", "--family-seconds", "inf"]
 
@@ -60,6 +62,7 @@ def silent(name: str) -> nullcontext:
 
 def found(objective: SceneObjective, checkpoint: Checkpoint, **options) -> FamilyFindings:
     generator = torch.Generator().manual_seed(0)
+    options = {"family": BUDGET, **options}
     return measure_families(objective, checkpoint.training, FamilyOptions(**options), generator, silent)
 
 
@@ -101,6 +104,11 @@ def indices(spectrum: torch.Tensor) -> dict[str, float]:
     return {"share": float(spectrum[-1]) / total, "effective_rank": total**2 / float(spectrum.square().sum())}
 
 
+def most_misses(brackets: int, level: float) -> int:
+    """Brackets that each miss with the probability `level` miss more often than this once in ten thousand runs."""
+    return int(binom.ppf(1 - 1e-4, brackets, level))
+
+
 def of_split(objective: SceneObjective, checkpoint: Checkpoint) -> SceneObjective:
     return SceneObjective(
         split_in_two(objective.active), objective.views, checkpoint.training.config.loss, objective.background
@@ -109,6 +117,7 @@ def of_split(objective: SceneObjective, checkpoint: Checkpoint) -> SceneObjectiv
 
 @pytest.mark.parametrize("operator", ["hessian", "gauss-newton"])
 def test_every_family_is_that_of_the_dense_block_in_the_metrics_units(split, objective, checkpoint, operator):
+    held = []
     for scene, of in (("trained", objective), ("split", of_split(objective, checkpoint))):
         true = spectra(of, checkpoint, operator)
         rows = [row for row in split.rows if (row.scene, row.operator) == (scene, operator)]
@@ -123,20 +132,23 @@ def test_every_family_is_that_of_the_dense_block_in_the_metrics_units(split, obj
             assert ends.smallest.interval()[0] <= float(spectrum[0]) + 1e-9 * size
             for name, value in indices(spectrum).items():
                 bracket = getattr(family.indices, name)
-                assert bracket.low * (1 - 1e-9) <= value <= bracket.high * (1 + 1e-9), (row.block, scene, name)
+                held.append(bracket.low * (1 - 1e-9) <= value <= bracket.high * (1 + 1e-9))
+    assert held.count(False) <= most_misses(len(held), 0.05), held
 
 
 def test_the_effect_of_the_split_brackets_the_quotient_of_the_dense_indices(split, objective, checkpoint):
     assert {(e.operator, e.block) for e in split.effects} == {
         (o, b) for o in ("hessian", "gauss-newton") for b in BLOCKS
     }
+    held = []
     for operator in ("hessian", "gauss-newton"):
         before, after = (spectra(of, checkpoint, operator) for of in (objective, of_split(objective, checkpoint)))
         for effect in (e for e in split.effects if e.operator == operator and e.index in ("share", "effective_rank")):
             true = indices(after[effect.block])[effect.index] / indices(before[effect.block])[effect.index]
-            assert effect.factor.low <= true <= effect.factor.high
+            held.append(effect.factor.low <= true <= effect.factor.high)
             values = [getattr(row.family.indices, effect.index).value for row in split.rows if matches(row, effect)]
             assert effect.factor.value == values[1] / values[0]
+    assert held.count(False) <= most_misses(len(held), 0.1), held
 
 
 def matches(row, effect) -> bool:
