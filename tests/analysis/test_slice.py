@@ -200,6 +200,9 @@ def test_a_line_leads_to_the_other_checkpoint_and_what_is_in_sight_there_alone(r
             len(load_checkpoint(run / "double.pt").training.gaussians.flat),
             1,
         )
+    gaussians = load_checkpoint(run / "double.pt").training.gaussians
+    way = gaussians.with_flat(torch.from_numpy(record.arrays["directions"]["vectors"][:, 0])).quats
+    assert way.norm(dim=1).max() <= math.sqrt(2)  # unit quaternions that turn the same way, the shorter one
 
 
 def test_of_two_kinds_the_second_is_put_at_a_right_angle_and_keeps_its_length(run, objective, tmp_path):
