@@ -28,7 +28,7 @@ from splat.losses import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 
 SHARE = 0.05  # of the sum of |lambda|, for the mass quantile
-ROWS = 300  # of a random matrix
+ROWS = 200  # of a random matrix
 WIDTHS = (1, 2, 4, 8)  # vectors at a time whose product is timed
 SETTINGS = SyntheticSettings(60, 2, 24, 18, sh_degree=0)
 

@@ -92,13 +92,18 @@ def ratios(table: pd.DataFrame, floors: Mapping[str, float], seed: int = 0) -> p
             rivals = pd.DataFrame(part[part["origin"] == against])
             if rivals.empty or default.empty or quantity not in QUANTITIES:
                 continue
-            asked = MATRICES if family == "matrices" else ASKED.get((family, quantity), np.nan)
+            asked = _asked(family, quantity) if against == "peer" else np.nan
             line = {"case": case, "family": family, "quantity": quantity, "against": against}
             line |= _compared(default, rivals, "matvecs", rng)
             seconds = _compared(default, rivals, "seconds", rng)
             line |= {"seconds_ratio": seconds["ratio"], "seconds_bound": seconds["bound"], "asked": asked}
             lines.append(line | {"holds": verdict(line, asked)})
     return pd.DataFrame(lines)
+
+
+def _asked(family: str, quantity: str) -> float:
+    """What the ratio may be at most; nan: nothing is asked for."""
+    return MATRICES if family == "matrices" else ASKED.get((family, quantity), np.nan)
 
 
 def _compared(default: pd.DataFrame, rivals: pd.DataFrame, cost: str, rng: np.random.Generator) -> dict:

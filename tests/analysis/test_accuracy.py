@@ -105,7 +105,8 @@ def test_the_products_counted_are_those_applied(matrix):
     # of a matrix a block's product skips columns: hidden in a sum, it is applied as it is
     case = Case("counted", "matrices", SumOperator([seen]), matrix.truth)
     _ = case.ends  # kept, and not counted
-    for method in (*own_methods((24,)), *scipy_methods()):
+    methods = {method.name: method for method in (*own_methods((24,)), *scipy_methods())}
+    for method in methods.values():
         if method.applies(case):
             seen.count = 0
             assert {run.matvecs for run in measure(case, method, 0)} == {seen.count}, method.name
@@ -144,9 +145,9 @@ def test_sampled_coupling_is_charged_by_its_jacobian_products(with_ssim):
 
 def test_intervals_of_the_defaults_cover(matrix):
     (default,) = by_name("traces", "Hutchinson, adaptive", "default")
-    covered = [run.covered for seed in range(20) for run in measure(matrix, default, seed)]
-    # 40 at 95%: 29 or fewer have a probability of 3e-6, were they independent
-    assert sum(covered) > 29
+    covered = [run.covered for seed in range(10) for run in measure(matrix, default, seed)]
+    # 20 at 95%: 12 or fewer have a probability of 1e-6, were they independent
+    assert sum(covered) > 12
 
 
 def test_true_errors_are_shares_of_their_scale(matrix):
@@ -193,11 +194,14 @@ def test_the_same_seed_gives_the_same_runs_but_for_the_seconds(matrix):
 
 
 def test_scipy_finds_both_ends(matrix):
-    tight = [m for m in scipy_methods() if m.settings == "tol 0.0001"]
+    tight = [m for m in scipy_methods() if m.settings == "tol 0.001"]
     assert len(tight) == 3
+    larger = max(abs(matrix.truth.largest), abs(matrix.truth.smallest))
     for method in tight:
-        # lobpcg's and eigsh's tolerances are of residuals; the values' errors go with their squares, over gaps of 0.04
-        assert max(run.true_error for run in measure(matrix, method, 0)) < 1e-4, method.name
+        for run in measure(matrix, method, 0):
+            # a value is as near to an eigenvalue as its residual is small; lobpcg's is a share of the larger end
+            _, scale = truth_of(matrix, "ends", run.part)
+            assert run.true_error <= 1e-3 * (larger / scale if "lobpcg" in method.name else 1), method.name
 
 
 @pytest.mark.parametrize("module", PACKAGES)
