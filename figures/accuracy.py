@@ -42,7 +42,8 @@ def draw(table: pd.DataFrame, quantity: str) -> Figure:
             axes.set_visible(False)
         for axes in panels[:, 0]:
             axes.set_ylabel("true error")
-        figure.supxlabel("products H v", fontsize=7)
+        for axes in panels.flat[max(len(cases) - 2, 0) : len(cases)]:  # the lowest of each column
+            axes.set_xlabel("products H v")
         handles = {label: h for axes in panels.flat for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
         figure.suptitle(literal(quantity), fontsize=7.5)
         figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=1, handletextpad=0.4)
