@@ -24,6 +24,7 @@ from analysis.provenance import provenance
 from analysis.records import FILE, record_folder, require_replaceable, write_record
 from analysis.report import FILE as REPORT
 from analysis.report import write_report
+from analysis.skips import estimator_skips, product_skips
 from analysis.stages import Stages
 from analysis.tables import probe_table
 from analysis.verdict import verdict
@@ -54,6 +55,10 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
         generator = torch.Generator().manual_seed(options.seed)
         findings = measure(objective, loss, settings, generator, stages.stage)
         data = probe_data(findings, objective, loss)
+        with stages.stage("skips"):
+            skips = product_skips(objective, checkpoint.training.gaussians, findings.matvecs, findings.spared)
+            skips |= estimator_skips(findings, stages.timing)
+            data["skipped"] = {name: skip.record() for name, skip in skips.items()}
         data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
         arrays = probe_arrays(findings)
         if family_options is not None:
@@ -82,7 +87,8 @@ def scene_objective(checkpoint: Checkpoint, scene: Scene, *, keep_unseen: bool =
 def _settings(options: ProbeOptions) -> ProbeSettings:
     settings = ProbeSettings.quick() if options.quick else ProbeSettings()
     points = settings.slice_points if options.slice_points is None else options.slice_points
-    return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=options.seconds)
+    seconds = settings.seconds if options.seconds is None else options.seconds
+    return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=seconds)
 
 
 def _family_options(options: ProbeOptions) -> FamilyOptions | None:

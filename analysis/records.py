@@ -51,12 +51,6 @@ families          absent, or rows of the anisotropy families (`analysis.family_s
                   indices: as anisotropy; starts, steps of the density; matvecs
 split_control     absent, or gaussians; rms, largest, psnr of the images' change; effects: operator, block, index, and value,
                   low, high, note of the split scene's index over the trained scene's
-families          absent, or rows of the anisotropy families (`analysis.family_stage`), each with: operator ("hessian" or
-                  "gauss-newton"), block ("all" or an attribute), metric and unit, split (whether of the split scene),
-                  gaussians, dim, rank (dim without the exact null space); lambda_max, lambda_min: value, residual, ...;
-                  indices: as anisotropy; starts, steps of the density; matvecs
-split_control     absent, or gaussians; rms, largest, psnr of the images' change; effects: operator, block, index, and value,
-                  low, high, note of the split scene's index over the trained scene's
 slice             null, or:
     directions*       two of {name*, curvature*, residual, unit*}: the unit vectors of the x and the y axis, the
                       curvature along each, and `unit` = sqrt(2 loss_scale / |curvature|), in parameter units
@@ -89,7 +83,6 @@ spectrum          ritz_values [k], residuals [k]: approximate eigenvalues, the t
                   density was estimated, nodes, weights [starts, steps]: a quadrature for each start vector
 eigenvectors      largest [parameters, k]: unit vectors of the k largest eigenvalues, of the Gaussians in sight
 traces            attribute -> [probes]: the samples whose mean is the trace
-families          SCENE.OPERATOR.BLOCK.nodes and .weights [starts, steps]: the quadrature of each family's density
 families          SCENE.OPERATOR.BLOCK.nodes and .weights [starts, steps]: the quadrature of each family's density
 slice             x [nx], y [ny]: steps along the two directions in parameter units; loss [nx, ny]: L at each point;
                   evaluated [nx, ny]: true where it is a true render, false where it is interpolated (absent: all are

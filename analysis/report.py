@@ -14,8 +14,8 @@ import plotly.graph_objects as go
 import plotly.io
 from plotly.offline import get_plotlyjs
 
-from analysis.quantities import measured, quantity
 from analysis.family_table import INDICES, family_lines
+from analysis.quantities import measured, quantity
 from analysis.records import Record, read_record
 from analysis.verdict import attribute_name, verdict
 
