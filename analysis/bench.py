@@ -147,7 +147,9 @@ def _bench_scenes(options: BenchOptions, console: Console) -> None:
 def _precision(workload: Workload, path: Path, console: Console) -> None:
     """The worst error of any view, quantity by quantity."""
     table = pd.DataFrame([asdict(line) for line in precision(workload)])
-    worst = table.pivot_table("error", ["quantity", "scale"], "decisions", aggfunc="max", sort=False).reset_index()
+    known = table.fillna({"error": -np.inf})  # a row without any error stays
+    worst = known.pivot_table("error", ["quantity", "scale"], "decisions", aggfunc="max", sort=False).reset_index()
+    worst = worst.replace(-np.inf, np.nan)
     bounds = [PRECISION if name.startswith(("H v", "trace")) else np.nan for name in worst["quantity"]]
     worst["at_most"] = bounds
     worst["holds"] = [not error > bound for error, bound in zip(worst["held equal"], bounds, strict=True)]
