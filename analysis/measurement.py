@@ -94,7 +94,7 @@ class ProbeSettings:
 
     @classmethod
     def quick(cls) -> "ProbeSettings":
-        """Rough numbers in about a sixth of the time."""
+        """Rough numbers in about a third of the time."""
         return cls(
             traces=TraceSettings(rtol=0.1, max_probes=16),
             eigen=EigenSettings(largest=2, smallest=1, rtol=1e-2, max_matvecs=60),
@@ -103,7 +103,7 @@ class ProbeSettings:
             density_steps=10,
             slice_points=11,
             probe_steps=STEPS[::5],
-            seconds=8.0,
+            seconds=12.0,
         )
 
 

@@ -58,10 +58,10 @@ class ProbeOptions:
     strict: FlagCreatePairsOff[bool] = False
     """Exit with 1 if a self-check fails; the record is written all the same."""
     quick: FlagCreatePairsOff[bool] = False
-    """Rough numbers in about a fifth of the time."""
+    """Rough numbers in about a third of the time."""
     seconds: float | None = None
     """Time for the estimators together; what a stage did not reach in its share is said. inf: no limit.  Default: 45, with
-    --quick 8."""
+    --quick 12."""
     slice_points: int | None = None
     """Points along each side of the slice, odd.  Default: 41, with --quick 11."""
     slice_rise: float = 0.001

@@ -7,12 +7,12 @@
     mass_quantile   lambda_1 / t, t the magnitude that the share   how far the steepest direction stands above those that
                     p = 0.05 of sum |lambda_i| lies at or below    hardly add to all curvature; null directions do not count
 
-Brackets follow from the eigenvalues' residuals, the round-off and the sums' intervals (each at a level that gives the
-quotient 95%).  The literal index is negative for an indefinite operator; where lambda_n may be zero it has no upper
-bound.
+Brackets follow from the eigenvalues' residuals, how far out an end that has not converged may lie, the round-off and the sums'
+intervals (each at a level that gives the quotient 95%).  The literal index is negative for an indefinite operator; where
+lambda_n may be zero it has no upper bound.
 """
 
-from math import inf
+from math import inf, isfinite
 
 import torch
 
@@ -21,6 +21,7 @@ from landscape.quantiles import absolute_quantile
 from landscape.results import Anisotropy, Bracket, EigenEnds, SpectralDensity
 
 CONFIDENCE = 0.95
+ARRIVED = ("tolerance", "noise floor", "exact")  # reasons to stop that leave no end behind
 JOINT = 1 - (1 - CONFIDENCE) / 2  # each of two intervals, so that both hold with CONFIDENCE (Bonferroni)
 
 
@@ -44,7 +45,7 @@ def literal(ends: EigenEnds) -> Bracket:
         return Bracket(
             value, _at_least(top, bottom), inf, "lambda_min is not resolved from zero: the bracket is for |A|"
         )
-    quotients = [a / b for a in top for b in bottom]
+    quotients = [a / b for a in top for b in bottom if isfinite(a) or isfinite(b)]
     return Bracket(value, min(quotients), max(quotients), "definite" if top[0] * bottom[0] > 0 else "indefinite")
 
 
@@ -95,10 +96,15 @@ def mass_quantile(ends: EigenEnds, density: SpectralDensity, p: float = 0.05) ->
 
 
 def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Where lambda_max and lambda_min lie: residuals, plus one unit of round-off of the larger magnitude."""
+    """Where lambda_max and lambda_min lie: residuals, plus one unit of round-off of the larger magnitude.
+
+    A residual says that an eigenvalue is near, not that none is farther out: an end that ran out of its budget reaches
+    out by `ends.beyond`.
+    """
     (a, b), (c, d) = ends.largest.interval(), ends.smallest.interval()
     slack = torch.finfo(ends.largest.vectors.dtype).eps * max(abs(a), abs(b), abs(c), abs(d))
-    return (a - slack, b + slack), (c - slack, d + slack)
+    above, below = (0.0 if end.reason in ARRIVED else ends.beyond for end in (ends.largest, ends.smallest))
+    return (a - slack, b + slack + above), (c - slack - below, d + slack)
 
 
 def _farthest(ends: EigenEnds) -> float:

@@ -127,3 +127,16 @@ def test_splitting_a_direction_in_two_halves_changes_the_literal_index_but_not_t
 
 def test_without_a_density_only_the_ends_indices_are_given():
     assert anisotropy(ends(4.0, -0.1)).record().keys() == {"literal", "saddle"}
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_an_end_that_the_budget_left_behind_is_not_claimed(seed):
+    """Eight products on a spectrum with one small negative eigenvalue: its Ritz value is still positive."""
+    values = torch.cat([torch.tensor([-0.02]), torch.logspace(-4, 1, 199)]).double()
+    H, generator = DenseOperator(torch.diag(values)), torch.Generator().manual_seed(seed)
+    ends = extreme_eigenpairs(H, generator, EigenSettings(max_matvecs=8))
+    assert ends.smallest.reason == "matvec budget" and float(ends.smallest.values[0]) > -0.02
+    found, down = literal(ends), saddle(ends)
+    truth = 10 / -0.02
+    assert found.low <= abs(truth) if "for |A|" in found.note else found.low <= truth <= found.high
+    assert down.low <= abs(truth) <= down.high
