@@ -14,7 +14,6 @@ among the families to come in proportion to their Gaussians.
 """
 
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
@@ -25,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from analysis.measurement import Stage, basis_within, vectors_within
 from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
 from landscape.families import WHOLE
 from landscape.operator import SymmetricOperator
@@ -39,11 +39,8 @@ from splat.train import Training
 SceneName = Literal["trained", "split"]
 OPERATORS = {"hessian": False, "gauss-newton": True}  # name -> gauss_newton
 PARTS = 6  # the whole and five attributes
-GIB = 2**30
 FEWEST_STEPS = 2  # that make a density
 DENSITY_SHARE = 0.45  # of a family's time: 48 of 108 products by default
-
-Stage = Callable[[str], AbstractContextManager[Progress]]
 
 
 @dataclass(frozen=True)
@@ -250,8 +247,8 @@ def _fitted(
 ) -> FamilySettings:
     """The budget, as far as time and memory allow it.  each: seconds of a product with as many vectors as a batch has."""
     settings, eigen = options.family, options.family.eigen
-    room = int(options.memory * GIB // (operator.dim * torch.empty((), dtype=operator.dtype).element_size()))
-    basis = min(eigen.basis, max(eigen.wanted + 3 * eigen.block, room))
+    room = vectors_within(operator, options.memory)
+    basis = basis_within(eigen, room)
     if basis < eigen.basis:
         notes.append(f"the families' Lanczos kept {basis} vectors instead of {eigen.basis}, to stay within memory")
     batch = max(1, min(settings.batch, room // settings.steps))

@@ -33,6 +33,7 @@ from landscape import (
     PowerSettings,
     Slice,
     SpectralDensity,
+    SymmetricOperator,
     TraceEstimate,
     TraceSettings,
     check_operator,
@@ -45,6 +46,7 @@ from landscape import (
 )
 from landscape.density import ActiveSpace
 from landscape.finite_probe import NOISE_POINTS, STEPS, FiniteProbe, finite_probe
+from landscape.grid_evaluations import Loss
 from landscape.probes import split
 from landscape.refinement import SliceSettings
 from landscape.results import Progress
@@ -172,12 +174,13 @@ def measure(
         active = ActiveSpace(hessian.project, hessian.rank)
         density = _density(operator, active, streams["density"], settings, seconds, report, notes)
     with stage("finite probe") as report:
-        finite = _finite(objective, operator, ends, settings, budget.share("finite probe"), report, notes)
+        value, render = _rendered(objective)
+        finite = _finite(objective, operator, ends, settings, budget.share("finite probe"), render, report, notes)
     with stage("slice") as report:
         seconds, stream = budget.share("slice"), streams["slice"]
-        plane = _plane(objective, operator, gradient, ends, settings, seconds, stream, report, notes)
+        plane = _plane(objective, operator, gradient, value, ends, settings, seconds, render, stream, report, notes)
     return Findings(
-        value=objective.loss(objective.active.flat),
+        value=value,
         gradient_norm=float(gradient.double().norm()),
         operator_check=operator_check,
         gradient_check=gradient_check,
@@ -213,14 +216,18 @@ def _linearised_gradient(objective: SceneObjective, report: Progress) -> Tensor:
     return gradient
 
 
-def _vectors(operator: CountingOperator, memory: float) -> int:
+def vectors_within(operator: SymmetricOperator, memory: float) -> int:
     """How many vectors of the operator's length fit into so many GiB."""
     return int(memory * GIB // (operator.dim * torch.empty((), dtype=operator.dtype).element_size()))
 
 
+def basis_within(eigen: EigenSettings, room: int) -> int:
+    """How many vectors Lanczos may keep where there is room for so many; as many as it needs at least."""
+    return min(eigen.basis, max(eigen.wanted + 3 * eigen.block, room))
+
+
 def _basis(operator: CountingOperator, eigen: EigenSettings, memory: float, notes: list[str]) -> int:
-    least = eigen.wanted + 3 * eigen.block
-    basis = min(eigen.basis, max(least, _vectors(operator, memory)))
+    basis = basis_within(eigen, vectors_within(operator, memory))
     if basis < eigen.basis:
         notes.append(f"Lanczos kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB")
     return basis
@@ -237,7 +244,7 @@ def _density(
 ) -> SpectralDensity | None:
     """As many steps as time and memory allow; None where that is too few to say anything."""
     starts, steps = settings.density_starts, settings.density_steps
-    room = _vectors(operator, settings.memory)
+    room = vectors_within(operator, settings.memory)
     start = monotonic()
     operator.apply(torch.ones(operator.dim, starts, dtype=operator.dtype))
     steps = int(min(steps, seconds / (monotonic() - start), room))
@@ -252,42 +259,46 @@ def _density(
     return spectral_density(operator, generator, starts, steps, batch, report, active)
 
 
+def _rendered(objective: SceneObjective) -> tuple[float, float]:
+    """The loss at the centre, and the seconds that rendering it takes; for the first render the kernels may compile."""
+    objective.loss(objective.active.flat)
+    start = monotonic()
+    return objective.loss(objective.active.flat), monotonic() - start
+
+
 def _finite(
     objective: SceneObjective,
     operator: CountingOperator,
     ends: EigenEnds,
     settings: ProbeSettings,
     seconds: float,
+    render: float,
     report: Progress,
     notes: list[str],
 ) -> FiniteProbe | None:
-    """Along the first eigenvector; None where its renders would take longer than they may."""
-    center = objective.active.flat
-    objective.loss(center)  # the first may compile
-    start = monotonic()
-    objective.loss(center)
-    if (2 * len(settings.probe_steps) + NOISE_POINTS + 1) * (monotonic() - start) > max(seconds, SHORTEST):
+    """Along the first eigenvector; None where its renders, of so many seconds each, would take longer than they may."""
+    if (2 * len(settings.probe_steps) + NOISE_POINTS + 1) * render > max(seconds, SHORTEST):
         notes.append("the finite probe was left out: its renders would have taken more than its share of the time")
         return None
     vector = ends.largest.vectors[:, 0]
-    return finite_probe(objective.evaluate, center, vector, operator, settings.probe_steps, report)
+    return finite_probe(objective.evaluate, objective.active.flat, vector, operator, settings.probe_steps, report)
 
 
 def _plane(
     objective: SceneObjective,
     operator: CountingOperator,
     gradient: Tensor,
+    value: float,
     ends: EigenEnds,
     settings: ProbeSettings,
     seconds: float,
+    render: float,
     generator: torch.Generator,
     report: Progress,
     notes: list[str],
 ) -> PlaneSlice | None:
-    center = objective.active.flat
-    start = monotonic()
-    loss_scale = settings.slice_rise * objective.loss(center)
-    points = _side(settings.slice_points, seconds, monotonic() - start, notes)
+    center, loss_scale = objective.active.flat, settings.slice_rise * value
+    points = _side(settings.slice_points, seconds, render, notes)
     curvatures: Float64[Tensor, 2] = ends.largest.values[:2]
     if loss_scale <= 0 or not curvatures.all():
         notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")
@@ -296,17 +307,29 @@ def _plane(
     axes = [symmetric_axis(settings.slice_radius * unit, points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
     allowed = SliceSettings(workers=thread_count(), max_seconds=max(seconds, SHORTEST))
+    evaluate = evaluation(objective, allowed.workers)
+    plane = evaluate_slice(evaluate, center, vectors, axes, gradient, operator, allowed, generator, progress=report)
+    notes += slice_notes(plane)
+    return PlaneSlice(plane, loss_scale, (first, second))
 
-    def evaluate(theta: Tensor) -> tuple[float, Hashable]:
-        with single_threaded():  # the workers are as many as the cores
+
+def evaluation(objective: SceneObjective, workers: int) -> Loss:
+    """The objective for so many threads at once: each alone, or one with all processors to itself."""
+    if workers == 1:
+        return objective.evaluate
+
+    def alone(theta: Tensor) -> tuple[float, Hashable]:
+        with single_threaded():
             return objective.evaluate(theta)
 
-    plane = evaluate_slice(evaluate, center, vectors, axes, gradient, operator, allowed, generator, progress=report)
-    if plane.reason not in ("tolerance", "exact"):
-        notes.append(
-            f"the slice's interpolation stopped at its {plane.reason}, before its error was down to the tolerance"
-        )
-    return PlaneSlice(plane, loss_scale, (first, second))
+    return alone
+
+
+def slice_notes(found: Slice) -> list[str]:
+    """That a slice is not as good as was asked for."""
+    if found.reason in ("tolerance", "exact"):
+        return []
+    return [f"the slice's interpolation stopped at its {found.reason}, before its error was down to the tolerance"]
 
 
 def _side(points: int, seconds: float, each: float, notes: list[str]) -> int:

@@ -32,9 +32,6 @@ from splat.settings import RenderSettings
 VECTORS = 2
 NOTHING = 1e-8  # an alpha, or a transmittance, beneath the round-off of float32
 CLEAR = 2e-5  # of pictures in 0..1: some ten times the image's error in float32
-GEOMETRY_COLUMNS = {
-    "means": slice(0, 3), "log_scales": slice(3, 6), "quats": slice(6, 10), "opacity_logits": slice(10, 11),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -108,10 +105,8 @@ def _derivatives(
     flat = gaussians.flat
     loss = ViewLoss.of(view.image, workload.loss, flat.dtype)
     held = LinearizedView(gaussians, view.camera, loss, workload.background.to(flat), settings)
-    own = held.block_diagonal()
-    diagonal = own.geometry.double().diagonal(dim1=1, dim2=2)
-    parts = {name: diagonal[:, columns] for name, columns in GEOMETRY_COLUMNS.items()} | {"sh": own.sh.double()}
-    traces = {name: (float(part.sum()), float(part.abs().sum())) for name, part in parts.items()}
+    diagonals = held.block_diagonal().diagonals
+    traces = {name: (float(part.sum()), float(part.abs().sum())) for name, part in diagonals.items()}
     return {"image": held.image, "gradient": held.gradient, "H v": held.hvp(U), "traces": traces}
 
 

@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from analysis.drawing import draw
 from analysis.family_stage import FamilyOptions, measure_families
 from analysis.family_table import family_table
 from analysis.measurement import ProbeSettings, measure
 from analysis.options import ProbeOptions
 from analysis.probe_record import probe_arrays, probe_data
 from analysis.provenance import provenance
-from analysis.records import FILE, record_folder, require_replaceable, write_record
+from analysis.recording import write_with_pictures
+from analysis.records import FILE, PROBE, record_folder, require_replaceable
 from analysis.report import FILE as REPORT
 from analysis.report import write_report
 from analysis.skips import estimator_skips, product_skips
@@ -35,7 +35,6 @@ from splat.raster.simd import lanes_of
 from splat.scenes.scene import Scene
 
 CHECK_FAILED = 1
-Arrays = dict[str, dict[str, np.ndarray]]
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
@@ -68,7 +67,8 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
             data["provenance"]["families"] = asdict(family_options)
             arrays["families"] = found.arrays()
         with record_folder(out) as folder:
-            _write(folder, data, arrays, stages, start)
+            write_with_pictures(folder, data, arrays, PROBE, stages, start)
+            write_report(folder)
     _conclude(data, out)
     failed = any(check["passed"] is False for check in data["checks"].values())
     return CHECK_FAILED if options.strict and failed else 0
@@ -125,21 +125,6 @@ def _provenance(
         command=shlex.join(command),
         settings=asdict(settings),
     )
-
-
-def _write(folder: Path, data: dict[str, Any], arrays: Arrays, stages: Stages, start: float) -> None:
-    """The record, its pictures and its page."""
-    data["timing"] = {"total": perf_counter() - start}
-    write_record(folder, data, arrays)
-    with stages.stage("pictures"):
-        try:
-            data["notes"] += draw("make_all", folder)
-        except RuntimeError as error:  # the numbers stand without pictures
-            data["notes"].append(" ".join(str(error).split()))
-    # the pictures are drawn from the record; only now is it known how long they took
-    data["timing"] = {**stages.timing, "total": perf_counter() - start}
-    write_record(folder, data, arrays)
-    write_report(folder)
 
 
 def _conclude(data: dict[str, Any], out: Path) -> None:

@@ -27,13 +27,14 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
-from analysis.drawing import draw
+from analysis.measurement import evaluation, slice_notes
 from analysis.options import SliceOptions
 from analysis.probe import scene_objective
 from analysis.probe_record import loss_name
 from analysis.provenance import provenance
 from analysis.quantities import measured, quantity
-from analysis.records import SLICE, record_folder, require_replaceable, write_record
+from analysis.recording import write_with_pictures
+from analysis.records import SLICE, record_folder, require_replaceable
 from analysis.slice_directions import (
     RISE,
     Direction,
@@ -48,12 +49,11 @@ from analysis.slice_record import Found, slice_arrays, slice_data
 from analysis.stages import Stages
 from analysis.verdict import of_slice
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
-from landscape.grid_evaluations import Loss, slice_digest
+from landscape.grid_evaluations import Evaluation, Loss, slice_digest
 from landscape.probes import split
 from splat.checkpoint import Checkpoint, load_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
 from splat.gaussians import Gaussians
-from splat.raster.threads import single_threaded
 from splat.scenes.scene import Scene
 
 COARSE = {1: 9, 2: 21}  # points that an adaptive slice begins with, by its dimension
@@ -82,10 +82,10 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
             shutil.rmtree(unfinished, ignore_errors=True)
             raise
         data = slice_data(found, objective, checkpoint.training.config.loss)
-        data["notes"] = _notes(found)
+        data["notes"] = slice_notes(found.slice)
         data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
         with record_folder(out, SLICE) as folder:
-            _write(folder, data, found, stages, start)
+            write_with_pictures(folder, data, slice_arrays(found), SLICE, stages, start)
     shutil.rmtree(unfinished, ignore_errors=True)
     _conclude(data, out)
     return 0
@@ -192,27 +192,16 @@ def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> Non
 
 
 def _evaluation(objective: SceneObjective, workers: int) -> Loss:
-    """The objective for so many threads at once: each alone, or one with all processors to itself."""
+    """`evaluation`, with words for steps that lead too far."""
+    inner = evaluation(objective, workers)
 
-    def evaluate(flat: Tensor) -> tuple[float, Any]:
+    def evaluate(flat: Tensor) -> Evaluation:
         try:
-            if workers == 1:
-                return objective.evaluate(flat)
-            with single_threaded():
-                return objective.evaluate(flat)
+            return inner(flat)
         except ValueError as error:
             raise ValueError(f"expected steps to where there is an image, got one that is too long ({error})") from None
 
     return evaluate
-
-
-def _notes(found: Found) -> list[str]:
-    notes = []
-    if found.slice.reason not in ("tolerance", "exact"):
-        notes.append(
-            f"the slice's interpolation stopped at its {found.slice.reason}, before its error was down to the tolerance"
-        )
-    return notes
 
 
 def _provenance(
@@ -231,20 +220,6 @@ def _provenance(
         command=shlex.join(command),
         settings=asdict(settings),
     )
-
-
-def _write(folder: Path, data: dict[str, Any], found: Found, stages: Stages, start: float) -> None:
-    """The record and its pictures."""
-    data["timing"] = {"total": perf_counter() - start}
-    arrays = slice_arrays(found)
-    write_record(folder, data, arrays, SLICE)
-    with stages.stage("pictures"):
-        try:
-            data["notes"] += draw("make_all", folder)
-        except RuntimeError as error:  # the numbers stand without pictures
-            data["notes"].append(" ".join(str(error).split()))
-    data["timing"] = {**stages.timing, "total": perf_counter() - start}
-    write_record(folder, data, arrays, SLICE)
 
 
 def _conclude(data: dict[str, Any], out: Path) -> None:

@@ -41,6 +41,7 @@ from analysis.stress_condition import Condition, cancellation, specified
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from splat.checkpoint import write_atomically
 from splat.curvature import SceneHessian, SceneObjective
+from splat.linearize import GEOMETRY_COLUMNS
 from splat.losses import LossSettings
 from splat.raster.simd import EXP2_ERROR
 from splat.scenes.view import View
@@ -97,8 +98,7 @@ class Scene:
     def own_blocks(self) -> dict[str, Tensor]:
         """The own blocks of every attribute, (n, d, d); of SH the diagonal."""
         blocks = self.pixels.block_diagonal()
-        rows = {"means": slice(0, 3), "log_scales": slice(3, 6), "quats": slice(6, 10), "opacity_logits": slice(10, 11)}
-        result = {name: blocks.geometry[:, part, part].double() for name, part in rows.items()}
+        result = {name: blocks.geometry[:, part, part].double() for name, part in GEOMETRY_COLUMNS.items()}
         return {**result, "sh": blocks.sh.double()}
 
     def values(self, U: Float64[Tensor, "p k"]) -> dict[str, Tensor]:

@@ -7,7 +7,7 @@ eigenvectors are the Gauss rule of the measure mu_z(x) = sum_i (z . v_i)^2 delta
     tr f(H)    = n E z^T f(H) z           for z = +-1 / sqrt(n)
 
 sum |lambda_i|, which has a kink at 0, is bracketed without any assumption on the spectrum.  The measures of at most m points
-entry (Golub 1973).  The least and the largest integral of |x| over all with these moments are among theirs, as a
+that share the moments of degree up to 2m - 2 are the rules of T(a), which is T with any number a for its last diagonal
 entry (Golub 1973).  The least and the largest integral of |x| over all measures with these moments are among theirs, as a
 polynomial of degree 2m - 2 on one side of |x| touches it in m points at most.  The least has a node at 0: T(a) is singular.
 

@@ -95,6 +95,21 @@ class TraceSettings:
         return asked and (high - low) / 2 <= max(self.rtol * abs(value), self.atol)
 
 
+class Looks:
+    """When an adaptive run looks at its error, and whether it may then stop.  next: the number of probes at the next look."""
+
+    def __init__(self, settings: TraceSettings) -> None:
+        self.next, self._most, self._confirming = settings.min_probes, settings.max_probes, False
+
+    def end(self, probes: int, reached: bool) -> bool:
+        """Whether the run ends with this look, at which the error asked for was reached or not."""
+        if probes == self._most or (reached and self._confirming):
+            return True
+        self.next = min(probes + CONFIRMATION if reached else ceil(GROWTH * probes), self._most)
+        self._confirming = reached
+        return False
+
+
 class Hutchinson:
     """One operator, probed until every one of its groups of rows has the error asked for.
 
@@ -127,23 +142,21 @@ class Hutchinson:
         self, done_before: int = 0, most: int = 0, progress: Progress | None = None
     ) -> dict[str, TraceEstimate]:
         """Progress counts matvecs, from done_before to most."""
-        settings, probes, look, confirming = self.settings, 0, self.settings.min_probes, False
+        settings, probes, looks = self.settings, 0, Looks(self.settings)
         if self.operator.dim == 0 or self.part is self.operator:
             return self._exact()
         while True:
-            self._draw(min(settings.batch, look - probes, GROUP - probes % GROUP))
+            self._draw(min(settings.batch, looks.next - probes, GROUP - probes % GROUP))
             probes = self.samples.shape[2]
             if progress:
                 progress(done_before + probes, most, f"trace of {', '.join(self.rows)}: {probes} probes")
             late = monotonic() > self.deadline and probes >= settings.min_probes
-            if probes < look and not late:
+            if probes < looks.next and not late:
                 continue
             estimates = self._estimates("time budget" if late else "matvec budget")
             reached = all(estimate.reason == "tolerance" for estimate in estimates.values())
-            if late or probes == settings.max_probes or (reached and confirming):
+            if late or looks.end(probes, reached):
                 return estimates
-            look = min(probes + CONFIRMATION if reached else ceil(GROWTH * probes), settings.max_probes)
-            confirming = reached
 
     def _draw(self, count: int) -> None:
         Z = draw_probes(self.operator.dim, count, self.generator, self.operator.dtype, self.settings.distribution)

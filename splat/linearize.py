@@ -40,11 +40,16 @@ def rasterize_view(
     return Raster(splats, depths, drawn, background.to(gaussians.flat).numpy(), camera.width, camera.height, settings)
 
 
+GEOMETRY_COLUMNS = {
+    "means": slice(0, 3), "log_scales": slice(3, 6), "quats": slice(6, 10), "opacity_logits": slice(10, 11),
+}  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class OwnBlocks:
     """The diagonal blocks of a Hessian that belong to one Gaussian each.
 
-    geometry: over mean (0-2), log-scales (3-5), quaternion (6-9) and opacity logit (10); sh: the diagonal of the SH block.
+    geometry: over the attributes in GEOMETRY_COLUMNS; sh: the diagonal of the SH block.
     """
 
     geometry: Float[Tensor, "n 11 11"]
@@ -58,18 +63,17 @@ class OwnBlocks:
 
     def traces(self, quats: Float[Tensor, "n 4"] | None = None) -> dict[str, float]:
         """Trace of each attribute's block, summed in double precision; without the radial directions of unit quats."""
-        diagonal = self.geometry.double().diagonal(dim1=1, dim2=2)
-        result = {
-            "means": float(diagonal[:, 0:3].sum()),
-            "log_scales": float(diagonal[:, 3:6].sum()),
-            "quats": float(diagonal[:, 6:10].sum()),
-            "opacity_logits": float(diagonal[:, 10].sum()),
-            "sh": float(self.sh.double().sum()),
-        }
+        result = {name: float(part.sum()) for name, part in self.diagonals.items()}
         if quats is not None:
-            q = quats.double()
-            result["quats"] -= float(torch.einsum("ni,nij,nj->", q, self.geometry[:, 6:10, 6:10].double(), q))
+            q, columns = quats.double(), GEOMETRY_COLUMNS["quats"]
+            result["quats"] -= float(torch.einsum("ni,nij,nj->", q, self.geometry[:, columns, columns].double(), q))
         return result
+
+    @property
+    def diagonals(self) -> dict[str, Float64[Tensor, "n ..."]]:
+        """The diagonal, attribute by attribute."""
+        diagonal = self.geometry.double().diagonal(dim1=1, dim2=2)
+        return {**{name: diagonal[:, columns] for name, columns in GEOMETRY_COLUMNS.items()}, "sh": self.sh.double()}
 
 
 class LinearizedView:

@@ -98,17 +98,6 @@ def row_sum(values, width):
 
 
 @formula
-def blur_products(v, r, y, at, width, stride, taps, b0, b1, b2, ring, row):
-    """Stage one: row `row` of v, r v and (y - c) v, which begins at `at` in its field, blurred along itself."""
-    for i in range(0, stride, lanes(v)):
-        value = load(v, at + i)
-        store(b0, BORDER + i, value)
-        store(b1, BORDER + i, value * load(r, at + i))
-        store(b2, BORDER + i, value * (load(y, at + i) - CENTRE))
-    blur_three(b0, b1, b2, width, stride, taps, ring, row)
-
-
-@formula
 def blur_three(b0, b1, b2, width, stride, taps, ring, row):
     blur_along(b0, width, stride, taps, ring, ring_row(0, row, stride))
     blur_along(b1, width, stride, taps, ring, ring_row(1, row, stride))
@@ -120,6 +109,22 @@ def clear_three(ring, row, stride):
     clear(ring, 0, row, stride)
     clear(ring, 1, row, stride)
     clear(ring, 2, row, stride)
+
+
+@formula
+def feed(v, r, y, top, row, shape, taps, b0, b1, b2, ring):
+    """Stage one: row `row` of v, r v and (y - c) v of the channel that begins at `top`, blurred along itself, to the ring."""
+    height, width, _plane_rows, stride = shape
+    if row < 0 or row >= height:
+        clear_three(ring, row, stride)
+        return
+    at = top + row * stride
+    for i in range(0, stride, lanes(v)):
+        value = load(v, at + i)
+        store(b0, BORDER + i, value)
+        store(b1, BORDER + i, value * load(r, at + i))
+        store(b2, BORDER + i, value * (load(y, at + i) - CENTRE))
+    blur_three(b0, b1, b2, width, stride, taps, ring, row)
 
 
 # --- the losses of a pixel --------------------------------------------------------------------------------------------
@@ -193,19 +198,18 @@ def value_rows(start, stop, shape, taps, r, y, target, kind, eps, structural, pi
     ring, values = ring_buffer(r, 3, stride), row_buffer(r, stride)
     for channel in range(3):
         first, last = channel_part(start, stop, channel, height)
+        if first >= last:
+            continue
         top = channel * plane_rows * stride
         for row in range(first, last):
             at = top + row * stride
             for i in range(0, stride, L):
                 store(values, BORDER + i, pixel_slope(load(r, at + i), kind, eps)[0])
             pixels[channel * height + row] = row_sum(values, width)
-        if structural == 0 or first >= last:
+        if structural == 0:
             continue
         for ahead in range(first - REACH, last + REACH):
-            if 0 <= ahead < height:
-                blur_products(r, r, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
-            else:
-                clear_three(ring, ahead, stride)
+            feed(r, r, y, top, ahead, shape, taps, b0, b1, b2, ring)
             row = ahead - REACH
             if row < first:
                 continue
@@ -256,14 +260,13 @@ def gradient_rows(
     ring, slopes, values = ring_buffer(r, 3, stride), ring_buffer(r, 3, stride), row_buffer(r, stride)
     for channel in range(3):
         first, last = channel_part(start, stop, channel, height)
+        if first >= last:
+            continue
         top = channel * plane_rows * stride
         lead = 2 * REACH if structural != 0 else 0
-        for ahead in range(first - lead, last + lead if first < last else first - lead):
+        for ahead in range(first - lead, last + lead):
             if structural != 0:
-                if 0 <= ahead < height:
-                    blur_products(r, r, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
-                else:
-                    clear_three(ring, ahead, stride)
+                feed(r, r, y, top, ahead, shape, taps, b0, b1, b2, ring)
                 row = ahead - REACH
                 if first - REACH <= row < last + REACH:
                     if 0 <= row < height:
@@ -319,14 +322,13 @@ def product_rows(start, stop, shape, taps, v, r, y, kind, eps, pixel, structural
     ring, slopes = ring_buffer(r, 3, stride), ring_buffer(r, 3, stride)
     for channel in range(3):
         first, last = channel_part(start, stop, channel, height)
+        if first >= last:
+            continue
         top = channel * plane_rows * stride
         lead = 2 * REACH if structural != 0 else 0
-        for ahead in range(first - lead, last + lead if first < last else first - lead):
+        for ahead in range(first - lead, last + lead):
             if structural != 0:
-                if 0 <= ahead < height:
-                    blur_products(v, r, y, top + ahead * stride, width, stride, taps, b0, b1, b2, ring, ahead)
-                else:
-                    clear_three(ring, ahead, stride)
+                feed(v, r, y, top, ahead, shape, taps, b0, b1, b2, ring)
                 row = ahead - REACH
                 if first - REACH <= row < last + REACH:
                     if 0 <= row < height:
@@ -359,9 +361,11 @@ def diagonal_rows(start, stop, shape, taps, r, y, kind, eps, pixel, structural, 
     buffer, ring = row_buffer(r, stride), ring_buffer(r, SECONDS, stride)
     for channel in range(3):
         first, last = channel_part(start, stop, channel, height)
+        if first >= last:
+            continue
         top = channel * plane_rows * stride
         lead = REACH if structural != 0 else 0
-        for ahead in range(first - lead, last + lead if first < last else first - lead):
+        for ahead in range(first - lead, last + lead):
             if structural != 0:
                 for f in range(SECONDS):
                     if 0 <= ahead < height:

@@ -10,7 +10,7 @@ its own coefficient and the mean stays unbiased).  A sample costs one J u of as 
 not yet small enough, and no backward pass.  Where the loss is a sum over pixels, l'' = D and the traces are exact.
 """
 
-from math import ceil, sqrt
+from math import sqrt
 from time import monotonic
 
 import torch
@@ -19,7 +19,7 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from landscape.control import controlled
-from landscape.hutchinson import CONFIRMATION, GROWTH, WIDENING, TraceSettings
+from landscape.hutchinson import WIDENING, Looks, TraceSettings
 from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, TraceEstimate
 from splat.curvature import SceneObjective
@@ -43,16 +43,14 @@ def exact_traces(
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
     if not objective.couples_pixels:
-        exact = torch.zeros(0, dtype=torch.float64)
         return {
-            name: TraceEstimate(name, sizes[name], value, 0.0, value, value, settings.confidence, 0, 0, "exact", exact)
-            for name, value in known.items()
+            name: TraceEstimate.exact(name, sizes[name], value, settings.confidence) for name, value in known.items()
         }
     pixelwise = objective.block_diagonal(gauss_newton=True).traces(quats)
     blocks = [_Block(name, sizes[name], known[name], pixelwise[name], settings) for name in known]
     deadline = monotonic() + settings.max_seconds
     while still := [block for block in blocks if block.open]:
-        count, next_look = still[0].count, min(block.look for block in still)
+        count, next_look = still[0].count, min(block.looks.next for block in still)
         # few blocks leave room for several samples in the pass over the pixels
         together = min(max(COLUMNS // len(still), 1), next_look - count)
         sampled = _sample(objective, generator, [block.name for block in still], together)
@@ -66,13 +64,13 @@ def exact_traces(
 
 
 class _Block:
-    """The samples of one block, and whether it needs more: it looks, and confirms, as `landscape.hutchinson` does."""
+    """The samples of one block, and whether it needs more."""
 
     def __init__(self, name: str, dim: int, known: float, pixelwise: float, settings: TraceSettings):
         self.name, self.dim, self.settings = name, dim, settings
         self.exact, self.mean = known - pixelwise, pixelwise
         self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
-        self.look, self.open, self.late, self.confirming = settings.min_probes, True, False, False
+        self.looks, self.open, self.late = Looks(settings), True, False
 
     @property
     def count(self) -> int:
@@ -80,14 +78,11 @@ class _Block:
 
     def add(self, x: Float64[Tensor, " s"], y: Float64[Tensor, " s"], late: bool) -> None:
         self.full, self.diagonal = torch.cat([self.full, x]), torch.cat([self.diagonal, y])
-        settings, self.late = self.settings, late and self.count >= self.settings.min_probes
-        if self.late or self.count == settings.max_probes:
+        self.late = late and self.count >= self.settings.min_probes
+        if self.late:
             self.open = False
-        elif self.count == self.look:
-            reached = self.estimate().reason == "tolerance"
-            self.open = not (reached and self.confirming)
-            self.look = min(self.count + CONFIRMATION if reached else ceil(GROWTH * self.count), settings.max_probes)
-            self.confirming = reached
+        elif self.count == self.looks.next:
+            self.open = not self.looks.end(self.count, self.estimate().reason == "tolerance")
 
     def estimate(self) -> TraceEstimate:
         settings = self.settings

@@ -14,7 +14,7 @@ def small(monkeypatch):
     monkeypatch.setattr("analysis.demo.SCENE", SyntheticSettings(gaussians=60, views=5, width=24, height=18))
     monkeypatch.setattr("analysis.demo.ITERATIONS", 12)
     monkeypatch.setattr("analysis.demo.SECONDS", 1)
-    monkeypatch.setattr("analysis.probe.draw", lambda module, target: [])
+    monkeypatch.setattr("analysis.recording.draw", lambda module, target: [])
 
 
 def test_the_demo_makes_a_scene_trains_probes_and_says_what_to_open_and_again(small, tmp_path, capsys):

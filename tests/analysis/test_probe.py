@@ -67,7 +67,7 @@ def record(run) -> Record:
 @pytest.fixture
 def no_pictures(monkeypatch):
     """For tests of the numbers alone."""
-    monkeypatch.setattr("analysis.probe.draw", lambda module, target: [])
+    monkeypatch.setattr("analysis.recording.draw", lambda module, target: [])
 
 
 @pytest.fixture(scope="module")
@@ -365,7 +365,7 @@ def test_an_interrupted_probe_writes_nothing(run, tmp_path, monkeypatch):
     def interrupt(module, target):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("analysis.probe.draw", interrupt)
+    monkeypatch.setattr("analysis.recording.draw", interrupt)
     assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 130
     assert list(tmp_path.iterdir()) == []
 
@@ -374,7 +374,7 @@ def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
     def fail(module, target):
         raise RuntimeError("drawing failed: no fonts")
 
-    monkeypatch.setattr("analysis.probe.draw", fail)
+    monkeypatch.setattr("analysis.recording.draw", fail)
     assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 0
     assert "drawing failed: no fonts" in read_record(tmp_path / "probe").data["notes"]
     assert "drawing failed: no fonts" in (tmp_path / "probe" / "report.html").read_text()

@@ -68,7 +68,7 @@ def run(tmp_path_factory) -> Path:
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch):
     """For tests of the numbers alone."""
-    monkeypatch.setattr("analysis.slicing.draw", lambda module, target: [])
+    monkeypatch.setattr("analysis.recording.draw", lambda module, target: [])
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def check_renders(record: Record, objective: SceneObjective) -> None:
 def eigen(run, tmp_path_factory) -> Record:
     """Along the eigenvectors, computed: no probe lies beside the checkpoint."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("analysis.slicing.draw", lambda module, target: [])
+        patch.setattr("analysis.recording.draw", lambda module, target: [])
         return sliced(tmp_path_factory.mktemp("eigen") / "slice", run / "double.pt", *POINTS)
 
 
@@ -292,7 +292,7 @@ def test_an_interrupted_slice_keeps_the_old_record(run, eigen, tmp_path, monkeyp
     def interrupt(module, target):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("analysis.slicing.draw", interrupt)
+    monkeypatch.setattr("analysis.recording.draw", interrupt)
     assert main(["slice", str(run / "double.pt"), "--out", str(out), "--points", "5", "--all-points"]) == 130
     assert (out / "slice.json").read_bytes() == before
 
@@ -301,7 +301,7 @@ def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
     def fail(module, target):
         raise RuntimeError("drawing failed: no fonts")
 
-    monkeypatch.setattr("analysis.slicing.draw", fail)
+    monkeypatch.setattr("analysis.recording.draw", fail)
     record = sliced(tmp_path / "slice", run / "double.pt", "--along", "gradient", *POINTS)
     assert "drawing failed: no fonts" in record.data["notes"]
 
@@ -309,7 +309,7 @@ def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
 def test_the_pictures_are_those_of_a_plane_or_of_a_line(run, eigen, tmp_path, monkeypatch):
     from analysis.drawing import draw
 
-    monkeypatch.setattr("analysis.slicing.draw", draw)
+    monkeypatch.setattr("analysis.recording.draw", draw)
     sliced(tmp_path / "line", run / "double.pt", "--along", "gradient", *POINTS)
     assert [path.name for path in (tmp_path / "line").glob("*.png")] == ["slice1d.png"]
     assert recorded_figures(eigen) == ("slice2d", "surface")

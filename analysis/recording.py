@@ -1,0 +1,33 @@
+"""A record with its pictures: the one way in which the commands write what they found."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from analysis.drawing import draw
+from analysis.records import Kind, write_record
+from analysis.stages import Stages
+
+
+def write_with_pictures(
+    folder: Path,
+    data: dict[str, Any],
+    arrays: Mapping[str, Mapping[str, np.ndarray]],
+    kind: Kind,
+    stages: Stages,
+    start: float,
+) -> None:
+    """Write the record into `folder`, draw its pictures, and add to data how long all took since `start` and what was said."""
+    data["timing"] = {"total": perf_counter() - start}
+    write_record(folder, data, arrays, kind)
+    with stages.stage("pictures"):
+        try:
+            data["notes"] += draw("make_all", folder)
+        except RuntimeError as error:  # the numbers stand without pictures
+            data["notes"].append(" ".join(str(error).split()))
+    # the pictures are drawn from the record; only now is it known how long they took
+    data["timing"] = {**stages.timing, "total": perf_counter() - start}
+    write_record(folder, data, arrays, kind)
