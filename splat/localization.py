@@ -84,6 +84,18 @@ def participation(mass: Float[Tensor, " n"]) -> float:
     return float(mass.sum().square() / mass.square().sum())
 
 
+def condition(conics: Float[Tensor, "n 3"]) -> Float64[Tensor, " n"]:
+    """The condition number of every splat's covariance, which is that of its conic, with the blur in it.
+
+    >>> condition(torch.tensor([[0.5, 0.0, 2.0], [1.0, 0.0, 1.0]])).tolist()
+    [4.0, 1.0]
+    """
+    a, b, c = conics.double().unbind(-1)
+    largest = (a + c) / 2 + torch.hypot((a - c) / 2, b)
+    kappa = largest.square() / (a * c - b * b)
+    return kappa.nan_to_num(nan=torch.inf).abs()  # edge on and infinitely thin
+
+
 @torch.no_grad()
 def conditions(
     gaussians: Gaussians, cameras: Sequence[Camera], settings: RenderSettings = RenderSettings()
@@ -95,10 +107,7 @@ def conditions(
     for camera in cameras:
         shown = on_screen(project(gaussians, camera, settings), camera)
         for worst, how in ((rendered, settings), (bare, unblurred)):
-            a, b, c = project(gaussians, camera, how).conics.unbind(-1)
-            largest = (a + c) / 2 + torch.hypot((a - c) / 2, b)
-            kappa = (largest.square() / (a * c - b * b)).nan_to_num(nan=torch.inf)  # edge on and infinitely thin
-            worst[shown] = torch.maximum(worst, kappa.abs())[shown]
+            worst[shown] = torch.maximum(worst, condition(project(gaussians, camera, how).conics))[shown]
     return Conditions(rendered, bare)
 
 
