@@ -46,3 +46,18 @@ class Camera:
     def forward(self) -> Float[Tensor, "3"]:
         """The viewing direction (unit, world frame): R^T e_z."""
         return self.rotation[2]
+
+
+def look_at(centre: Float[Tensor, "3"], target: Float[Tensor, "3"], down: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """World-to-camera rotation at a centre that looks at a target, held level: +x is perpendicular to `down`.
+
+    Raises ValueError where the target is the centre, or straight above or below it.
+    """
+    forward = (target - centre) / (target - centre).norm()
+    right = torch.linalg.cross(down, forward)
+    if not right.norm() > 1e-9 * down.norm():
+        raise ValueError(
+            f"expected a target away from the centre, not along {down.tolist()} from it, got {target.tolist()}"
+        )
+    right = right / right.norm()
+    return torch.stack([right, torch.linalg.cross(forward, right), forward])

@@ -21,6 +21,7 @@ from torch import Tensor
 from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.harmonics import Y00
+from splat.scenes.capture import common_target
 from splat.scenes.scene import Scene
 from splat.scenes.view import Frame, Points, View, inside_image
 
@@ -130,17 +131,11 @@ def _random_batch(
 
 
 def _range_around_target(views: Sequence[View], camera: Camera) -> tuple[float, float]:
-    """Depths round the point that is nearest to all optical axes, in the least-squares sense."""
-    axes = torch.stack([view.camera.forward for view in views])
-    centres = torch.stack([view.camera.centre for view in views])
-    across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]  # removes what lies along an axis
-    normal = across.sum(dim=0)
-    if float(torch.linalg.eigvalsh(normal)[0]) > 1e-6 * len(views):
-        target = torch.linalg.solve(normal, (across @ centres[:, :, None]).sum(dim=0)[:, 0])
-        depths = ((target - centres) * axes).sum(dim=1)
-        if bool((depths > 0).all()):
-            depth = float((target - camera.centre) @ camera.forward)
-            return NEAR * depth, FAR * depth
+    """Depths round the point that is nearest to all optical axes."""
+    target = common_target([view.camera for view in views])
+    if target is not None:
+        depth = float((target - camera.centre) @ camera.forward)
+        return NEAR * depth, FAR * depth
     raise ValueError(
         f"expected {len(views)} cameras that look at a common place, got parallel or diverging ones: the scene's depth "
         "is unknown; give the scene points (COLMAP), or depth ranges (poses_bounds.npy)"

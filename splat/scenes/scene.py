@@ -11,7 +11,6 @@ its size compared with its camera's here, before any training; the pixels are re
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, radians
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.camera import Camera
+from splat.scenes.capture import forward_facing
 from splat.scenes.colmap import MODEL_FOLDERS, find_model, read_colmap
 from splat.scenes.images import Photo, frame, image_header, require_files
 from splat.scenes.llff import POSES, read_llff
@@ -29,7 +29,6 @@ from splat.scenes.view import Frame, Points, View
 __all__ = ["Frame", "Points", "Scene", "View", "camera_extent", "load_scene"]
 
 Kind = Literal["colmap", "llff", "blender", "transforms", "synthetic"]
-FORWARD_FACING_ANGLE = 45.0  # degrees; LLFF captures stay within about 20, inward orbits exceed 90
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +68,7 @@ class Scene:
     @property
     def forward_facing(self) -> bool:
         """Whether all cameras look the same way: within 45 degrees of their mean viewing direction."""
-        directions = torch.stack([frame.camera.forward for frame in self.frames])
-        mean = directions.mean(dim=0)
-        return bool((directions @ mean > cos(radians(FORWARD_FACING_ANGLE)) * mean.norm()).all())
+        return forward_facing([frame.camera for frame in self.frames])
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:

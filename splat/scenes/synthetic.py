@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.camera import Camera
+from splat.camera import Camera, look_at
 from splat.gaussians import Gaussians
 from splat.harmonics import Y00
 from splat.render import Rendering, render
@@ -205,10 +205,7 @@ def _arc_of_cameras(settings: SyntheticSettings) -> list[Camera]:
         angle = settings.arc * pi / 180 * place
         offset = _vector(sin(angle), -0.3 + 0.1 * cos(3 * pi * place), -cos(angle))
         centre = target + 4.6 * offset
-        forward = (target - centre) / (target - centre).norm()
-        right = torch.linalg.cross(down, forward)
-        right = right / right.norm()
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        rotation = look_at(centre, target, down)
         size = settings.width, settings.height
         cameras.append(Camera(rotation, centre, focal, focal, size[0] / 2, size[1] / 2, *size))
     return cameras
