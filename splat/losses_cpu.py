@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.ndimage import correlate1d
 from torch import Tensor
 
 from splat.losses import LossSettings, window
@@ -19,6 +18,7 @@ from splat.raster.cpu import aligned
 from splat.raster.functions import last_derivative
 from splat.raster.simd import lanes_of
 from splat.raster.threads import over_range
+from splat.window_kernels import moments_rows
 
 KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
 
@@ -37,7 +37,7 @@ class ViewLoss:
         self.target[:, :height, :width] = target
         count = 3 * height * width
         self.pixel, self.structural = settings.pixel_weight / count, settings.ssim_weight / count
-        self._target_moments = self._blurs_of_target() if settings.ssim_weight else np.empty(0, self.dtype)
+        self._target_moments = self._moments_of_target() if settings.ssim_weight else np.empty(0, self.dtype)
 
     def planes(self, sets: int) -> np.ndarray:
         """Uninitialised plane sets, (sets, 3, padded height, padded width)."""
@@ -59,22 +59,11 @@ class ViewLoss:
         """The first three planes without their padding, as a tensor."""
         return torch.from_numpy(np.ascontiguousarray(planes[:3, : self.shape[0], : self.shape[1]]))
 
-    def _blurs_of_target(self) -> np.ndarray:
+    def _moments_of_target(self) -> np.ndarray:
         """mu and var."""
-        height, width = self.shape[:2]
-        taps = window(torch.float64).numpy()
-
-        def blur(field: np.ndarray) -> np.ndarray:
-            for axis in (1, 2):
-                field = correlate1d(field, taps, axis=axis, mode="constant")
-            return field
-
-        inside = self.target[:, :height, :width].astype(np.float64)
         moments = self.planes(2)
-        moments[:] = 0
-        mu = blur(inside)
-        moments[0, :, :height, :width] = mu
-        moments[1, :, :height, :width] = blur(inside * inside) - mu * mu
+        flat = self.target.reshape(-1), moments.reshape(-1)
+        over_range(3 * self.shape[0], moments_rows, self.shape, self.taps, *flat)
         return moments
 
     def _pointwise(self) -> tuple:
@@ -201,3 +190,32 @@ class _PhotometricGradient(torch.autograd.Function):
 def view_loss(image: Float[Tensor, "3 h w"], loss: ViewLoss) -> Float[Tensor, ""]:
     """The loss of an image as a torch scalar, twice differentiable, by the kernels."""
     return _Photometric.apply(image, loss)  # pyright: ignore[reportReturnType]
+
+
+SECOND = "expected one derivative of the consistency of two images, got a second; use photometric_loss for more"
+
+
+class _Consistency(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, y: Tensor, settings: LossSettings) -> Tensor:
+        sides = []
+        for image, target in ((x, y), (y, x)):
+            loss = ViewLoss.of(target.detach(), settings, x.dtype)
+            linear = loss.linearize(loss.padded(image), second_order=False)
+            sides.append((linear.value, loss.cropped(linear.gradient)))
+        ctx.gradients = [gradient for _, gradient in sides]
+        ctx.save_for_backward(x, y)
+        return x.new_tensor(sides[0][0])
+
+    @staticmethod
+    def backward(ctx, *outputs: Tensor):
+        values = tuple(outputs[0].detach() * gradient for gradient in ctx.gradients)
+        return *last_derivative(values, *ctx.saved_tensors, outputs[0], refusal=SECOND), None
+
+
+def consistency_loss(x: Float[Tensor, "3 h w"], y: Float[Tensor, "3 h w"], settings: LossSettings) -> Float[Tensor, ""]:
+    """The loss between two images that both depend on the parameters, once differentiable in each; symmetric."""
+    if (x.shape, x.dtype) != (y.shape, y.dtype):
+        kinds = " and ".join(f"{tuple(image.shape)} of {image.dtype}" for image in (x, y))
+        raise ValueError(f"expected two images of one shape and dtype, got {kinds}; render both alike")
+    return _Consistency.apply(x, y, settings)  # pyright: ignore[reportReturnType]

@@ -14,87 +14,30 @@ The window's blur is its own adjoint, so with S_m, S_p, S_q the partial derivati
     its tangent for v      the same of S_m', S_p', S_q', plus 2 v blur(S_p), a dash the second derivative of S applied to
                            m' = blur(v), p' = 2 blur(r v), q' = blur((y - c) v)
 
-A blur is separable: along each row at once, down the columns out of a `ring` of the last RING rows.  A sweep has up to three
-stages, each REACH rows behind the one before: products blurred along the row; partial derivatives at a row, blurred along
-it; the result at a row.  So nothing of the size of an image is written but the result.
-
-Kernels take a range of `rows`, those of the three channels one after the other; fields are flat plane sets (3, plane_rows,
-stride) of `shape` = (height, width, plane_rows, stride).  What a range needs beyond its ends it works out for itself.
+A sweep (`window_kernels.py`) has up to three stages, each REACH rows behind the one before: products blurred along the row;
+partial derivatives at a row, blurred along it; the result at a row.  So nothing of the size of an image is written but the
+result.
 """
 
-from splat.losses import C1, C2, WINDOW
-from splat.raster.compositing import formula, kernel, scratch
+from splat.losses import C1, C2
+from splat.raster.compositing import formula, kernel
 from splat.raster.simd import broadcast, lanes, load, maximum, select, sqrt, store
+from splat.window_kernels import (
+    BORDER,
+    REACH,
+    blur_along,
+    blur_down,
+    channel_part,
+    clear,
+    ring_buffer,
+    ring_row,
+    row_buffer,
+    row_sum,
+)
 
-BORDER = 16  # floats before a row in scratch, so that the window may look past its ends
-REACH = WINDOW // 2
-RING = 16  # rows; a power of two, at least WINDOW
 L1, CHARBONNIER, L2 = range(3)
 CENTRE = 0.5
 SECONDS = 6  # S_mm, S_mp, S_mq, S_pp, S_pq, S_qq
-
-
-# --- blurs ------------------------------------------------------------------------------------------------------------
-
-
-@formula
-def row_buffer(like, stride):
-    return scratch(like, stride + 2 * BORDER + 16)
-
-
-@formula
-def ring_buffer(like, fields, stride):
-    return scratch(like, fields * RING * stride)
-
-
-@formula
-def ring_row(field, y, stride):
-    """Where row y of a field lies in a ring."""
-    return (field * RING + (y & (RING - 1))) * stride
-
-
-@formula
-def clear(ring, field, y, stride):
-    """Rows outside the image are 0."""
-    at = ring_row(field, y, stride)
-    for i in range(stride):
-        ring[at + i] = 0
-
-
-@formula
-def blur_along(buffer, width, stride, taps, ring, at):
-    """The window along a bordered row of `width` numbers, to ring[at:]."""
-    for i in range(BORDER):
-        buffer[i] = 0
-    for i in range(BORDER + width, buffer.size):
-        buffer[i] = 0
-    for i in range(0, stride, lanes(buffer)):
-        total = load(buffer, BORDER + i) * taps[REACH]
-        for k in range(1, REACH + 1):
-            total += (load(buffer, BORDER + i - k) + load(buffer, BORDER + i + k)) * taps[REACH + k]
-        store(ring, at + i, total)
-
-
-@formula
-def blur_down(ring, field, y, i, stride, taps):
-    """The window over the rows round y of a ring, at the lanes at i."""
-    total = load(ring, ring_row(field, y, stride) + i) * taps[REACH]
-    for k in range(1, REACH + 1):
-        above, below = ring_row(field, y - k, stride) + i, ring_row(field, y + k, stride) + i
-        total += (load(ring, above) + load(ring, below)) * taps[REACH + k]
-    return total
-
-
-@formula
-def row_sum(values, width):
-    """In float64; four chains of additions, because one would wait for itself."""
-    a = b = c = d = 0.0
-    whole = width & ~3
-    for i in range(BORDER, BORDER + whole, 4):
-        a, b, c, d = a + values[i], b + values[i + 1], c + values[i + 2], d + values[i + 3]
-    for i in range(BORDER + whole, BORDER + width):
-        a += values[i]
-    return (a + b) + (c + d)
 
 
 @formula
@@ -181,12 +124,6 @@ def pixel_curvature(residual, kind, eps, weight):
 
 
 # --- sweeps -----------------------------------------------------------------------------------------------------------
-
-
-@formula
-def channel_part(start, stop, channel, height):
-    """The rows of a channel that a range of rows covers; none where the first is not beneath the second."""
-    return max(start - channel * height, 0), min(stop - channel * height, height)
 
 
 @kernel

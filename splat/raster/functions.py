@@ -31,23 +31,25 @@ def _joined(parts: tuple[Tensor, ...]) -> np.ndarray:
     return torch.cat([part.detach().reshape(len(part), -1) for part in parts], dim=1).numpy()
 
 
+THIRD = "expected at most two derivatives of the kernels, got a third; render with backend='reference' for more"
+
+
 class _Last(torch.autograd.Function):
     """The first `count` tensors, on the graph of them all, with a derivative that is an error."""
 
     @staticmethod
-    def forward(ctx, count: int, *tensors: Tensor):
+    def forward(ctx, refusal: str, count: int, *tensors: Tensor):
+        ctx.refusal = refusal
         return tensors[:count]
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
-        raise NotImplementedError(
-            "expected at most two derivatives of the kernels, got a third; render with backend='reference' for more"
-        )
+        raise NotImplementedError(ctx.refusal)
 
 
-def last_derivative(values: tuple[Tensor, ...], *sources: Tensor) -> tuple[Tensor, ...]:
-    """Second derivatives by a kernel: on the graph of what they came from, so that a third is refused, not taken for 0."""
-    return _Last.apply(len(values), *values, *sources)  # pyright: ignore[reportReturnType]
+def last_derivative(values: tuple[Tensor, ...], *sources: Tensor, refusal: str = THIRD) -> tuple[Tensor, ...]:
+    """Derivatives by a kernel: on the graph of what they came from, so that the next is refused, not taken for 0."""
+    return _Last.apply(refusal, len(values), *values, *sources)  # pyright: ignore[reportReturnType]
 
 
 class _Project(torch.autograd.Function):

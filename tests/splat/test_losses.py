@@ -7,10 +7,11 @@ import kornia.metrics
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import correlate1d
 from torch import Tensor
 
-from splat.losses import WINDOW, LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map
-from splat.losses_cpu import ViewLoss, view_loss
+from splat.losses import WINDOW, LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map, window
+from splat.losses_cpu import ViewLoss, consistency_loss, view_loss
 from tests.oracles import similarity_by_windows
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, random_like, relative_error
 
@@ -120,6 +121,26 @@ def test_kernels_give_the_specifications_value_gradient_and_products(size, setti
         assert relative_error(loss.cropped(product), each) < DERIVATIVE[dtype]
 
 
+@each_dtype
+@each_size
+@pytest.mark.parametrize("contrast", [1.0, 0.01])
+def test_the_windows_mean_and_variance_of_a_target_are_scipys(size, contrast, dtype):
+    """Relative to the variance itself, which the difference of the squares would lose at a low contrast."""
+    target = (0.7 + contrast * (image_and_target(size)[1] - 0.5)).float()
+    taps = window(torch.float64).numpy()
+
+    def blur(field: np.ndarray) -> np.ndarray:
+        return correlate1d(correlate1d(field, taps, axis=1, mode="constant"), taps, axis=2, mode="constant")
+
+    picture = target.double().numpy()
+    mean, square = blur(picture), blur(picture**2)
+    moments = ViewLoss.of(target, LossSettings(), dtype)._target_moments[:, :, : size[0], : size[1]]
+    assert relative_error(moments[0], mean) < IMAGE[dtype]
+    variance = square - mean**2
+    cancelled = torch.finfo(torch.float64).eps * np.linalg.norm(square) / np.linalg.norm(variance)
+    assert relative_error(moments[1], variance) < 2 * WINDOW * (torch.finfo(dtype).eps + cancelled)
+
+
 def test_near_a_fit_of_a_smooth_picture_ssim_keeps_its_digits_in_float32():
     """Variances far beneath the squared means: the usual formula loses two digits more (2e-5 instead of 3e-7)."""
     y, x = torch.meshgrid(torch.linspace(0, 3, 60), torch.linspace(0, 2, 80), indexing="ij")
@@ -210,6 +231,60 @@ def test_a_third_derivative_by_the_kernels_is_refused():
         value = (gradient**2).sum()
     with pytest.raises(NotImplementedError, match="expected at most two derivatives of the kernels, got a third"):
         torch.autograd.grad(value, x)
+
+
+@cache
+def truth_of_both(size: tuple[int, int], settings: LossSettings) -> tuple[Tensor, Tensor, Tensor]:
+    """The specification's value and its gradients in both images."""
+    x, y = (picture.requires_grad_() for picture in image_and_target(size))
+    value = photometric_loss(x, y, settings)
+    in_x, in_y = torch.autograd.grad(value, (x, y))
+    return value.detach(), in_x, in_y
+
+
+@each_dtype
+@each_loss
+@each_size
+def test_the_consistency_of_two_images_has_the_specifications_value_and_gradients(size, settings, dtype):
+    value, *gradients = truth_of_both(size, settings)
+    x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target(size))
+    found = consistency_loss(x, y, settings)
+    assert found.item() == pytest.approx(value.item(), rel=IMAGE[dtype], abs=IMAGE[dtype])
+    assert consistency_loss(x.detach(), y.detach(), settings) == found
+    for got, expected in zip(torch.autograd.grad(found, (x, y)), gradients, strict=True):
+        assert got.dtype == dtype and relative_error(got, expected) < DERIVATIVE[dtype]
+
+
+@each_dtype
+@each_loss
+def test_consistency_is_symmetric_to_the_bit(settings, dtype):
+    x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target((37, 53)))
+    one, other = consistency_loss(x, y, settings), consistency_loss(y, x, settings)
+    assert one.item() == pytest.approx(other.item(), rel=IMAGE[dtype])
+    for first, second in zip(torch.autograd.grad(one, (x, y)), torch.autograd.grad(other, (x, y)), strict=True):
+        assert torch.equal(first, second) and first.any()
+
+
+@each_loss
+def test_an_image_that_depends_on_nothing_gets_no_gradient_of_consistency(settings):
+    x, y = image_and_target((17, 21))
+    x.requires_grad_()
+    both = torch.autograd.grad(consistency_loss(x, y.clone().requires_grad_(), settings), x)[0]
+    assert torch.equal(torch.autograd.grad(3 * consistency_loss(x, y, settings), x)[0], 3 * both)
+    assert torch.equal(torch.autograd.grad(3 * consistency_loss(y, x, settings), x)[0], 3 * both)
+
+
+def test_a_second_derivative_of_consistency_is_refused():
+    x, y = (picture.requires_grad_() for picture in image_and_target((9, 6)))
+    gradients = torch.autograd.grad(consistency_loss(x, y, LossSettings()), (x, y), create_graph=True)
+    for gradient in gradients:
+        with pytest.raises(NotImplementedError, match="expected one derivative of the consistency of two images"):
+            torch.autograd.grad((gradient**2).sum(), x, retain_graph=True)
+
+
+def test_consistency_of_images_of_two_sizes_is_refused():
+    with pytest.raises(ValueError, match="expected two images of one shape and dtype, got"):
+        consistency_loss(torch.rand(3, 8, 9), torch.rand(3, 9, 8), LossSettings())
 
 
 def test_l1_has_no_slope_at_its_kink():
