@@ -99,6 +99,11 @@ class ProbeSettings:
         if not 0 < self.kappa_full < inf:
             raise ValueError(f"expected a finite kappa_full above 0, got {self.kappa_full}")
 
+    @property
+    def on(self) -> tuple[Attribute, ...]:
+        """The attributes that are probed: those named that have a weight.  Only their traces are needed."""
+        return tuple(name for name in self.attributes if getattr(self.c, name) > 0)
+
 
 @dataclass(frozen=True)
 class Magnitude:
@@ -130,10 +135,8 @@ def magnitudes(
         raise ValueError(f"expected at least 1 active Gaussian and a finite extent above 0, got {active} and {extent}")
     each = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 3 * (sh_degree + 1) ** 2}
     result = {}
-    for name in settings.attributes:
+    for name in settings.on:
         c, cap = getattr(settings.c, name), getattr(settings.caps, name)
-        if c == 0:
-            continue
         trace = traces.get(name)
         if trace is None or not isfinite(trace):
             raise ValueError(f"expected a finite trace of {name}, got {trace}; lower the rates or leave {name} out")

@@ -109,6 +109,7 @@ def test_the_position_probe_scales_with_the_world():
 
 def test_attributes_left_out_or_without_a_weight_have_no_magnitude_and_need_no_trace():
     settings = ProbeSettings(attributes=("quats", "sh"), c=Constants(sh=0))
+    assert settings.on == ("quats",)
     assert list(magnitudes({"quats": 1.0}, 6, 1, EXTENT, settings)) == ["quats"]
 
 
