@@ -27,7 +27,7 @@ from math import inf, isfinite, isqrt, sqrt
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from splat.camera import Camera
@@ -204,14 +204,17 @@ def probe_attributes(
     return Perturbation(shift, exponential(omega))
 
 
-def depth_biased(gradient: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"], gamma: float) -> Float[Tensor, "n 3"]:
-    """The direction of gamma g_depth + (1 - gamma) g_lateral, in double precision; 0 where that is 0."""
-    gradient, v = gradient.double(), _unit(rays.double())
+def depth_biased(gradient: Float[Tensor, "n 3"], rays: Float64[Tensor, "n 3"], gamma: float) -> Float64[Tensor, "n 3"]:
+    """The direction of gamma g_depth + (1 - gamma) g_lateral, 0 where that is 0.
+
+    In double precision, where the square of no single-precision gradient underflows.
+    """
+    v = _unit(rays)
     depth = (gradient * v).sum(dim=1, keepdim=True) * v
     return _unit(gamma * depth + (1 - gamma) * (gradient - depth))
 
 
-def _unit(x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+def _unit(x: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3"]:
     length = x.norm(dim=1, keepdim=True)
     return torch.where(length > 0, x / length, 0)
 
