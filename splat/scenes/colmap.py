@@ -49,7 +49,7 @@ def read_colmap(root: Path, model: Path, images: str | None = None) -> tuple[lis
         rotation = torch.from_numpy(image.cam_from_world().rotation.matrix().copy())
         centre = torch.from_numpy(image.projection_center().copy())
         photos.append(Photo(image.name, path, reconstruction.cameras[image.camera_id], rotation, centre))
-    return photos, _points(reconstruction, posed)
+    return photos, points_of(reconstruction, posed)
 
 
 def _require_plausible_counts(model: Path) -> None:
@@ -81,7 +81,8 @@ def _paths(names: list[str], folder: Path) -> list[Path]:
     return [by_stem.get(Path(name).stem, folder / name) for name in names]
 
 
-def _points(reconstruction: pycolmap.Reconstruction, posed: list[pycolmap.Image]) -> Points | None:
+def points_of(reconstruction: pycolmap.Reconstruction, posed: list[pycolmap.Image]) -> Points | None:
+    """The model's points with the images among `posed` that see them; None where it has none."""
     points = list(reconstruction.points3D.values())
     if not points:
         return None

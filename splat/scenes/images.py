@@ -9,10 +9,12 @@ A `Photo` is what a reader of a scene format knows of an image: its file, its le
     downscale      area averaging: a pixel becomes the mean of the light that fell on its footprint, as on a sensor with
                    larger pixels; values stay in [0, 1], and at a fractional ratio nothing shifts (a box filter that
                    takes whole pixels only, as most libraries' does, moves edges by up to a quarter of a pixel)
+    beside it      masks and depth maps (`splat/scenes/layers.py`) are brought to the size of the file, then go the same
+                   way; a pixel is inside its mask where all of its footprint is
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,21 +23,27 @@ import numpy as np
 import pycolmap
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from splat.camera import Camera
+from splat.scenes.layers import read_depth, read_mask
 from splat.scenes.view import Frame, Picture, Subset
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 UNDISTORTED_HERE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+INSIDE = 1 - 1e-4  # share of a pixel's footprint that must be; below 1 by more than float32 sums can lose
+Warp = Callable[[Float[Tensor, "c h w"]], Float[Tensor, "c height width"]]
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """An image file with its lens and pose (rotation: world to camera; centre: world units), both float64."""
+    """An image file with its lens and pose (rotation: world to camera; centre: world units), both float64.
+
+    mask, depth: the files beside it.
+    """
 
     name: str
     path: Path
@@ -44,6 +52,8 @@ class Photo:
     centre: Float[Tensor, "3"]
     subset: Subset | None = None
     depth_range: tuple[float, float] | None = None
+    mask: Path | None = None
+    depth: Path | None = None
 
 
 def image_folder(root: Path, images: str | None = None) -> Path:
@@ -119,18 +129,24 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
     except ValueError as error:
         raise ValueError(f"the camera of image {photo.name!r} cannot be: {error}") from error
     camera = full.resized(width, height)
-    read = partial(_read, photo.path, lens, pinhole, (width, height), background)
-    return Frame(photo.name, camera, read, photo.subset, photo.depth_range)
+    warp = partial(_warp, lens, pinhole, (width, height))
+    return Frame(
+        photo.name,
+        camera,
+        partial(_read, photo.path, warp, background),
+        photo.subset,
+        photo.depth_range,
+        partial(_read_mask, photo.mask, size, warp) if photo.mask else None,
+        partial(_read_depth, photo.depth, size, warp) if photo.depth else None,
+    )
 
 
 def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> pycolmap.Camera:
-    """The lens at the file's size; the scale s must round s (w, h) to it, whichever way the tool rounded."""
+    """The lens at the file's size, which must be its own, scaled."""
     width, height = size
     if (lens.width, lens.height) == size:
         return lens
-    low = max((width - 1) / lens.width, (height - 1) / lens.height)
-    high = min((width + 1) / lens.width, (height + 1) / lens.height)
-    if not low < high:
+    if not _same_shape((lens.width, lens.height), size):
         raise ValueError(
             f"expected image {photo.name!r} at the {lens.width} x {lens.height} px of its camera or scaled from it, "
             f"got {width} x {height} px in {photo.path}; it was cropped, rotated or stretched: use the images that the "
@@ -139,6 +155,13 @@ def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> py
     scaled = pycolmap.Camera(lens.todict())
     scaled.rescale(width, height)
     return scaled
+
+
+def _same_shape(old: tuple[int, int], new: tuple[int, int]) -> bool:
+    """Whether some scale s, rounded either way, brings (w, h) to the new size."""
+    low = max((side - 1) / before for side, before in zip(new, old))
+    high = min((side + 1) / before for side, before in zip(new, old))
+    return low < high
 
 
 def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
@@ -155,9 +178,7 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
     return lens if lens.is_undistorted() else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
 
 
-def _read(
-    path: Path, lens: pycolmap.Camera, pinhole: pycolmap.Camera, size: tuple[int, int], background: Float[Tensor, "3"]
-) -> Picture:
+def _read(path: Path, warp: Warp, background: Float[Tensor, "3"]) -> Picture:
     """Composite over the background, undistort, downscale: in this order, no transparent colour bleeds in."""
     try:
         with Image.open(path) as file:
@@ -169,10 +190,39 @@ def _read(
     if has_alpha:
         rgb, alpha = layers[:3], layers[3:]
         layers = torch.cat([rgb * alpha + background[:, None, None] * (1 - alpha), alpha])
+    layers = warp(layers).clamp(0, 1)
+    return layers[:3], layers[3] if has_alpha else None
+
+
+def _read_mask(path: Path, size: tuple[int, int], warp: Warp) -> Bool[Tensor, "h w"]:
+    inside = warp(_at_size(read_mask(path), size, path))[0] >= INSIDE
+    if not inside.any():
+        raise ValueError(f"expected a mask with whole pixels inside, got none in {path} at this size; reduce less")
+    return inside
+
+
+def _read_depth(path: Path, size: tuple[int, int], warp: Warp) -> Float[Tensor, "h w"]:
+    return warp(_at_size(read_depth(path), size, path))[0]
+
+
+def _at_size(layers: Float[Tensor, "c h w"], size: tuple[int, int], path: Path) -> Tensor:
+    """A mask or depth map at the size of its photograph, whose shape it must have."""
+    height, width = layers.shape[1:]
+    if not _same_shape((width, height), size):
+        raise ValueError(
+            f"expected {path} to have the shape of its photograph, {size[0]} x {size[1]} px at any scale, got "
+            f"{width} x {height}; make it from that photograph"
+        )
+    return resize_by_area(layers, *size)
+
+
+def _warp(
+    lens: pycolmap.Camera, pinhole: pycolmap.Camera, size: tuple[int, int], layers: Float[Tensor, "c h w"]
+) -> Tensor:
+    """From the pixels of the file to those of the final camera: undistort, downscale."""
     if pinhole is not lens:
         layers = _undistort(layers, lens, pinhole)
-    layers = resize_by_area(layers, *size).clamp(0, 1)
-    return layers[:3], layers[3] if has_alpha else None
+    return resize_by_area(layers, *size)
 
 
 def _undistort(layers: Float[Tensor, "c h w"], lens: pycolmap.Camera, pinhole: pycolmap.Camera) -> Tensor:

@@ -4,13 +4,14 @@
     LLFF        poses_bounds.npy                                                                      `llff.py`
     Blender     transforms_train.json with transforms_test.json                                       `transforms.py`
     transforms  transforms.json of instant-ngp or nerfstudio                                          `transforms.py`
+    DTU         Rectified/scanN beside Calibration                                                    `dtu.py`
 
 in this order: a COLMAP model beside poses_bounds.npy wins, because it has points.  Every image file is looked up and
 its size compared with its camera's here, before any training; the pixels are read when a split asks for them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,14 +22,16 @@ from torch import Tensor
 from splat.camera import Camera
 from splat.scenes.capture import forward_facing
 from splat.scenes.colmap import MODEL_FOLDERS, find_model, read_colmap
+from splat.scenes.dtu import is_dtu, mask_folder, read_dtu
 from splat.scenes.images import Photo, frame, image_header, require_files
+from splat.scenes.layers import DEPTH_SUFFIXES, MASK_FOLDERS, MASK_SUFFIXES, find_layer
 from splat.scenes.llff import POSES, read_llff
 from splat.scenes.transforms import BLENDER_FILES, SINGLE_FILE, read_blender, read_transforms
 from splat.scenes.view import Frame, Points, View
 
 __all__ = ["Frame", "Points", "Scene", "View", "camera_extent", "load_scene"]
 
-Kind = Literal["colmap", "llff", "blender", "transforms", "synthetic"]
+Kind = Literal["colmap", "llff", "blender", "transforms", "dtu", "synthetic"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +94,8 @@ def load_scene(
     images: str | None = None,
     downscale: float = 1,
     background: Sequence[float] | None = None,
+    masks: Path | None = None,
+    depths: Path | None = None,
 ) -> Scene:
     """Recognise and load the scene in a folder; pixels are read later.
 
@@ -98,6 +103,8 @@ def load_scene(
     downscale: both sides of every picture are divided by this and rounded.
     background: RGB in [0, 1] that transparent pictures are composited over and renders are drawn on; by default white
         where the pictures have an alpha channel (as 3DGS does for Blender scenes), else black.
+    masks, depths: folders of `splat/scenes/layers.py`; an image that has no file there goes without.  Masks by default:
+        those that the scene's files name, else a folder mask or masks in the scene, else DTU's own.
 
     Raises FileNotFoundError for what is missing and ValueError for what cannot be used, in one sentence.
     """
@@ -109,7 +116,8 @@ def load_scene(
     if not 1 <= downscale < float("inf"):
         raise ValueError(f"expected downscale of at least 1, got {downscale}")
     kind, photos, points, own_background = _read(root, images)
-    require_files([photo.path for photo in photos])
+    photos = _with_layers(root, photos, masks, depths)
+    require_files([photo.path for photo in photos] + [photo.mask for photo in photos if photo.mask])
     _require_distinct(photos, root)
     if background is None:
         background = own_background
@@ -139,13 +147,38 @@ def _read(root: Path, images: str | None) -> tuple[Kind, list[Photo], Points | N
     for name in (SINGLE_FILE, BLENDER_FILES[0][1]):
         if (root / name).is_file():
             return "transforms", *read_transforms(root, root / name, images)
+    if is_dtu(root):
+        return "dtu", read_dtu(root), None, None
     found = sorted(path.name for path in root.iterdir())
     raise FileNotFoundError(
         f"expected a scene with camera poses in {root}: looked for a COLMAP model (cameras, images and points3D, .bin "
-        f"or .txt) in {', '.join(MODEL_FOLDERS)}, for {POSES}, {BLENDER_FILES[0][1]} and {SINGLE_FILE}; found "
+        f"or .txt) in {', '.join(MODEL_FOLDERS)}, for {POSES}, {BLENDER_FILES[0][1]}, {SINGLE_FILE} and DTU's images "
+        "(rect_001_3_r5000.png); found "
         f"{', '.join(found[:6]) + (' ...' if len(found) > 6 else '') if found else 'an empty folder'}; "
-        "run COLMAP on the photographs first"
+        "make a scene of the photographs with landscape sfm"
     )
+
+
+def _with_layers(root: Path, photos: list[Photo], masks: Path | None, depths: Path | None) -> list[Photo]:
+    """The photographs with the files beside them; a folder that was named must have some."""
+    usual = [root / name for name in MASK_FOLDERS] + ([mask_folder(root)] if is_dtu(root) else [])
+    folders = [
+        inner for folder in ([masks] if masks else usual) for inner in (folder, folder / "mask") if inner.is_dir()
+    ]
+    result = []
+    for photo in photos:
+        names = (photo.name, photo.path.name)
+        mask = next((path for folder in folders if (path := find_layer(folder, names, MASK_SUFFIXES))), None)
+        if photo.mask and not masks:
+            mask = photo.mask
+        result.append(replace(photo, mask=mask, depth=find_layer(depths, names, DEPTH_SUFFIXES) if depths else None))
+    for folder, files in ((masks, [photo.mask for photo in result]), (depths, [photo.depth for photo in result])):
+        if folder and not any(files):
+            raise FileNotFoundError(
+                f"expected files named after the {len(photos)} images, such as {Path(photos[0].name).stem}.png, in "
+                f"{folder}, {'found none' if folder.is_dir() else 'which is no folder'}; name their folder"
+            )
+    return result
 
 
 def _require_distinct(photos: Sequence[Photo], root: Path) -> None:

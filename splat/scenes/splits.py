@@ -1,7 +1,14 @@
 """Which views train and which test: the sparse-view protocols of the field.
 
-LLFF       names sorted; every 8th, from the first, is a test view; n training views at the rounded, evenly spaced
-           places of the rest, np.linspace(0, m - 1, n): RegNeRF, FreeNeRF, FSGS and their followers
+LLFF       3, 6 or 9 views.  Names sorted; every 8th, from the first, is a test view; n training views at the rounded,
+           evenly spaced places of the rest, np.linspace(0, m - 1, n): RegNeRF, FreeNeRF, FSGS and their followers.
+           Images of images_8, 504 x 378
+Mip-NeRF   360: 12 or 24 views by the same rule, images of images_8 (FSGS, CoR-GS, DropGaussian).  So is every scene
+           without a protocol of its own
+DTU        3, 6 or 9 views, the first of 25, 22, 28, 40, 44, 48, 0, 8, 13 (views counted from 0); the 25 test views are the
+           other ones of the first 49 but 3-7, 16-21 and 36-39, which are badly exposed: pixelNeRF, RegNeRF (`dtu_split_type`
+           pixelnerf), DNGaussian, CoR-GS.  Images reduced by 4; metrics inside the objects' masks.  A scene is DTU's by the
+           names of its images, whether COLMAP or DTU itself gave the cameras
 Blender    training views r_26, r_86, r_2, r_55, r_75, r_93, r_16, r_73, the first n of them; every 8th test view,
            25 of 200: DietNeRF, FreeNeRF.  A folder already reduced to these images gives the same split
 explicit   training (and test) views by name or by number
@@ -13,11 +20,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splat.scenes.layers import dtu_number
 from splat.scenes.scene import Scene
 from splat.scenes.view import Frame
 
 HOLD_OUT = 8
 BLENDER_TRAINING = (26, 86, 2, 55, 75, 93, 16, 73)
+DTU_TRAINING = (25, 22, 28, 40, 44, 48, 0, 8, 13)
+DTU_LEFT_OUT = (3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 36, 37, 38, 39)
+DTU_VIEWS = 49  # some scans have 64
 
 
 @dataclass(frozen=True)
@@ -44,7 +55,11 @@ def split_scene(
         return explicit_split(scene.names, train, test)
     if test is not None:
         raise ValueError("expected a list of training views beside the list of test views, got none; give both")
-    return blender_split(scene.frames, views) if scene.kind == "blender" else llff_split(scene.names, views)
+    if scene.kind == "blender":
+        return blender_split(scene.frames, views)
+    if all(dtu_number(name) is not None for name in scene.names):
+        return dtu_split(scene.names, views)
+    return llff_split(scene.names, views)
 
 
 def evenly_spaced(names: Sequence[str], n: int | None) -> tuple[str, ...]:
@@ -76,6 +91,23 @@ def blender_split(frames: Sequence[Frame], n: int | None = None) -> Split:
     if n is None or n > len(BLENDER_TRAINING) or n < 1 or None in chosen:
         return Split(evenly_spaced(train, n), _every_eighth(test), "blender, evenly spaced")
     return Split(tuple(name for name in chosen if name is not None), _every_eighth(test), "blender, 8 views")
+
+
+def dtu_split(names: Sequence[str], n: int | None = None) -> Split:
+    """The first n of the 9 training views (all by default), and the 25 test views, or those that the scene has."""
+    by_number = {dtu_number(name): name for name in names}
+    if n is not None and not 1 <= n <= len(DTU_TRAINING):
+        raise ValueError(f"expected 1 to {len(DTU_TRAINING)} training views, as DTU's protocol has, got {n}")
+    wanted = DTU_TRAINING[:n]
+    missing = [number for number in wanted if number not in by_number]
+    if missing:
+        raise ValueError(
+            f"expected the training views {', '.join(map(str, wanted))} of DTU's protocol, got a scene without view "
+            f"{missing[0]} (rect_{missing[0] + 1:03d}); restore its image"
+        )
+    not_tested = {*DTU_TRAINING, *DTU_LEFT_OUT}
+    test = [i for i in range(DTU_VIEWS) if i not in not_tested and i in by_number]
+    return Split(tuple(by_number[i] for i in wanted), tuple(by_number[i] for i in test), "dtu")
 
 
 def _every_eighth(names: Sequence[str]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ to camera rotation here is diag(1, -1, -1) R^T.  Intrinsics stand at the top or 
     fl_x fl_y cx cy w h          px, pixel centres at + 0.5; cx, cy default to the middle, fl_y to fl_x
     camera_angle_x               horizontal field of view, radians, where fl_x is not given
     k1 k2 k3 p1 p2               OpenCV's radial and tangential distortion (k4 ... of a rational model are refused)
+    mask_path                    the image's mask (`splat/scenes/layers.py`), from the folder of the file
     camera_model, is_fisheye     PINHOLE, SIMPLE_PINHOLE, OPENCV and the like; fisheye and panoramas are refused
     ply_file_path                points; an integer list property `views` of a vertex numbers the frames that see it
     background                   (this project) the colour that the pictures were composited over
@@ -91,7 +92,8 @@ def _photos(path: Path, data: dict[str, Any], paths: list[Path], subset: Subset 
         name = Path(frame["file_path"]).as_posix()
         rotation, centre = _pose(frame["transform_matrix"], name, path)
         lens = _lens({**shared, **frame}, image_header(image)[0], name, path)
-        photos.append(Photo(name, image, lens, rotation, centre, subset))
+        mask = path.parent / frame["mask_path"] if "mask_path" in frame else None
+        photos.append(Photo(name, image, lens, rotation, centre, subset, mask=mask))
     return photos
 
 

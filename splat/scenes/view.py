@@ -24,16 +24,23 @@ Picture = tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"] | None]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera and its picture.  alpha: coverage in [0, 1] where the file has an alpha channel."""
+    """A camera and its picture.
+
+    alpha: coverage in [0, 1] where the file has an alpha channel.  mask: the pixels that metrics count, where the scene
+    has masks.  depth: relative depth or disparity, in any unit, where a folder of depth maps was given.
+    """
 
     name: str
     camera: Camera
     image: Float[Tensor, "3 h w"]
     alpha: Float[Tensor, "h w"] | None = None
+    mask: Bool[Tensor, "h w"] | None = None
+    depth: Float[Tensor, "h w"] | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
-        if self.image.shape != (3, *size) or (self.alpha is not None and self.alpha.shape != size):
+        layers = [layer for layer in (self.alpha, self.mask, self.depth) if layer is not None]
+        if self.image.shape != (3, *size) or any(layer.shape != size for layer in layers):
             raise ValueError(
                 f"expected the picture of {self.name!r} to be (3, {size[0]}, {size[1]}) as its camera, got "
                 f"{tuple(self.image.shape)}; resize the picture, or the camera with Camera.resized"
@@ -45,7 +52,7 @@ class Frame:
     """A posed picture that is read on demand.
 
     subset: the part that the scene's own files assign it to; depth_range: nearest and farthest depth of the scene
-    content, world units.  Both None where the files do not say.
+    content, world units; read_mask, read_depth: of what `View` calls mask and depth.  None where there is no file.
     """
 
     name: str
@@ -53,10 +60,15 @@ class Frame:
     read: Callable[[], Picture]
     subset: Subset | None = None
     depth_range: tuple[float, float] | None = None
+    read_mask: Callable[[], Bool[Tensor, "h w"]] | None = None
+    read_depth: Callable[[], Float[Tensor, "h w"]] | None = None
 
     def view(self) -> View:
-        """Read the picture."""
-        return View(self.name, self.camera, *self.read())
+        """Read the picture, and what lies beside it."""
+        image, alpha = self.read()
+        mask = self.read_mask() if self.read_mask else None
+        depth = self.read_depth() if self.read_depth else None
+        return View(self.name, self.camera, image, alpha, mask, depth)
 
 
 @dataclass(frozen=True, eq=False)

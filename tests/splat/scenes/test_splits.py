@@ -1,5 +1,6 @@
 """The sparse-view protocols against their published lists."""
 
+from fractions import Fraction
 from pathlib import Path
 
 import folders
@@ -105,3 +106,13 @@ def test_the_protocols_fit_the_real_scenes(fern: Path, lego: Path) -> None:
     assert split_scene(load_scene(fern), 3).train == ("image001.png", "image010.png", "image019.png")
     split = split_scene(load_scene(lego), 8)
     assert len(split.train) == 8 and len(split.test) == 25
+
+
+@pytest.mark.parametrize("n", [12, 24])
+def test_mip_nerf_360_holds_out_every_eighth_and_spreads_n_over_the_rest(n: int) -> None:
+    garden = tuple(f"DSC{7956 + i:05d}.JPG" for i in range(185))
+    others = [name for i, name in enumerate(garden) if i % 8]
+    places = [round(Fraction(i * (len(others) - 1), n - 1)) for i in range(n)]  # exact, half to even
+    split = llff_split(garden, n)
+    assert split.train == tuple(others[place] for place in places) and len(set(split.train)) == n
+    assert split.test == garden[::8] and len(split.test) == 24

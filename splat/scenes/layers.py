@@ -1,0 +1,86 @@
+"""What lies beside a photograph, pixel for pixel: an object mask, a depth map.
+
+mask    an image file; inside is what has the file's largest value (white; 1 in a mask of 0 and 1) in every channel
+depth   NAME.npy, or NAME.png of 16 bits: relative monocular depth, in any unit.  The numbers are kept as they are; whether
+        larger means farther (depth) or nearer (disparity, what MiDaS and DPT give) is for the method that uses them
+
+A file is found by the photograph's name: NAME.SUFFIX or NAME without its own suffix, in the folder or below it as in the
+scene (`train/r_3` in `train/r_3.npy` or `r_3.npy`); the masks of DTU by the number of the view.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
+DEPTH_SUFFIXES = (".npy", ".png")
+MASK_FOLDERS = ("mask", "masks")
+SIXTEEN_BITS = ("I;16", "I;16B", "I")
+
+
+def dtu_number(name: str) -> int | None:
+    """The number of a DTU view from 0, by which the protocol and the masks know it; None for any other name.
+
+    >>> dtu_number("images/rect_026_3_r5000.png"), dtu_number("IMG_026.png")
+    (25, None)
+    """
+    match = re.fullmatch(r"(?:.*/)?rect_(\d{3})_(?:[0-6]_r\d+|max)\.\w+", name)
+    return int(match[1]) - 1 if match else None
+
+
+def find_layer(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> Path | None:
+    """The file in the folder that belongs to a photograph of one of these names."""
+    stems = []
+    for name in names:
+        path = PurePosixPath(name)
+        stems += [str(path), str(path.with_suffix("")), path.name, path.stem]
+        number = dtu_number(name)
+        if number is not None:
+            stems.append(f"{number:03d}")
+    candidates = (folder / f"{stem}{suffix}" for stem in stems for suffix in suffixes)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
+    """1 inside, 0 outside."""
+    try:
+        with Image.open(path) as file:
+            pixels = np.array(file if file.mode in ("1", "L") else file.convert("RGB"))
+    except (UnidentifiedImageError, OSError) as error:
+        raise ValueError(f"expected a mask, cannot read {path}: {error}; replace the file") from error
+    lowest = pixels.reshape(*pixels.shape[:2], -1).min(axis=2)
+    if not lowest.any():
+        raise ValueError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
+    return torch.from_numpy(lowest == lowest.max()).to(torch.float32)[None]
+
+
+def read_depth(path: Path) -> Float[Tensor, "1 h w"]:
+    """The numbers of the file, checked."""
+    try:
+        values = np.load(path, allow_pickle=False) if path.suffix == ".npy" else _read_png(path)
+    except (UnidentifiedImageError, OSError, ValueError, EOFError) as error:
+        raise ValueError(f"expected a depth map, cannot read {path}: {error}; write it again") from error
+    shape, values = values.shape, values.squeeze()
+    if values.ndim != 2 or values.dtype.kind not in "fiu":
+        raise ValueError(f"expected a depth map of shape (h, w), got {values.dtype} of shape {shape} in {path}")
+    values = values.astype(np.float32)
+    if not np.isfinite(values).all():
+        raise ValueError(
+            f"expected finite depths, got {(~np.isfinite(values)).sum()} that are not in {path}; fill them"
+        )
+    if values.min() == values.max():
+        raise ValueError(f"expected depths that vary, got {values.min()} everywhere in {path}; write it again")
+    return torch.from_numpy(values)[None]
+
+
+def _read_png(path: Path) -> np.ndarray:
+    with Image.open(path) as file:
+        if file.mode not in SIXTEEN_BITS:
+            raise ValueError(f"mode {file.mode} instead of 16 bits, too few levels for depth")
+        return np.array(file)

@@ -1,0 +1,182 @@
+"""Masks and depth maps beside the photographs."""
+
+import json
+from pathlib import Path
+
+import folders
+import numpy as np
+import pytest
+import torch
+from folders import NAMES, SIZE
+from PIL import Image
+
+from splat.scenes.layers import dtu_number, find_layer, read_depth, read_mask
+from splat.scenes.scene import load_scene
+from splat.scenes.view import View
+
+WIDTH, HEIGHT = SIZE
+
+
+def write_mask(path: Path, inside: np.ndarray, white: int = 255) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(inside.astype(np.uint8) * white).save(path)
+
+
+def blob(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """An ellipse, off the middle."""
+    row, column = np.mgrid[:height, :width]
+    return ((column / width - 0.4) / 0.3) ** 2 + ((row / height - 0.6) / 0.35) ** 2 < 1
+
+
+@pytest.mark.parametrize("file", ["masks/a.png", "masks/a.png.png", "mask/a.jpg", "masks/images/a.png"])
+def test_the_masks_of_a_scene_are_found_by_the_names_of_its_images(tmp_path: Path, file: str) -> None:
+    folders.write_transforms(tmp_path)
+    write_mask(tmp_path / file, np.ones((HEIGHT, WIDTH)))
+    views = load_scene(tmp_path).load()
+    assert views[0].mask is not None and bool(views[0].mask.all())
+    assert views[1].mask is None and views[2].mask is None
+
+
+def test_nerfstudios_mask_path_names_a_mask_and_a_folder_given_wins_over_it(tmp_path: Path) -> None:
+    content = folders.transforms()
+    content["frames"][0]["mask_path"] = "elsewhere/first.png"  # type: ignore[index]
+    folders.write_pictures(tmp_path / "images")
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(FileNotFoundError, match=r"1 are missing, the first is .*first\.png"):
+        load_scene(tmp_path)
+    write_mask(tmp_path / "elsewhere/first.png", blob(), white=1)  # nerfstudio counts what is not 0
+    mask = load_scene(tmp_path).load()[0].mask
+    assert mask is not None and np.array_equal(mask.numpy(), blob())
+    write_mask(tmp_path / "given/a.png", ~blob())
+    mask = load_scene(tmp_path, masks=tmp_path / "given").load()[0].mask
+    assert mask is not None and np.array_equal(mask.numpy(), ~blob())
+
+
+def test_the_masks_of_renamed_images_are_found_by_either_name(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path)
+    for name in NAMES:
+        (tmp_path / "images" / name).unlink()
+    folders.write_pictures(tmp_path / "images_2", ("image000.png", "image001.png", "image002.png"))
+    (tmp_path / "images").rmdir()
+    write_mask(tmp_path / "masks/image001.png", blob())
+    write_mask(tmp_path / "masks/c.png", blob())
+    assert [view.mask is not None for view in load_scene(tmp_path).load()] == [False, True, True]
+
+
+def test_a_pixel_is_inside_where_all_of_its_footprint_is(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    fine = blob(3 * WIDTH, 3 * HEIGHT)
+    write_mask(tmp_path / "masks/a.png", fine)
+    for downscale in (1, 2):
+        mask = load_scene(tmp_path, downscale=downscale).load()[0].mask
+        k = 3 * downscale
+        whole = fine.reshape(HEIGHT // downscale, k, WIDTH // downscale, k).all(axis=(1, 3))
+        assert mask is not None and np.array_equal(mask.numpy(), whole) and 0 < whole.sum() < whole.size
+
+
+def test_a_mask_is_undistorted_as_its_picture_is(tmp_path: Path) -> None:
+    size = (96, 72)
+    model = folders.reconstruction("OPENCV", (80.0, 79.0, 47.0, 37.0, -0.2, 0.05, 0.003, -0.002))
+    model.cameras[1].width, model.cameras[1].height = size
+    folders.write_colmap(tmp_path, model=model)
+    inside = blob(*size)
+    Image.fromarray(np.repeat(inside[..., None], 3, axis=2).astype(np.uint8) * 255).save(tmp_path / "images/a.png")
+    folders.write_pictures(tmp_path / "images", NAMES[1:], size)
+    write_mask(tmp_path / "masks/a.png", inside)
+    view = load_scene(tmp_path, downscale=2).load()[0]
+    assert view.mask is not None and torch.equal(view.mask, view.image[0] > 1 - 1e-4)
+    assert view.mask.float().mean() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("pixels", "message"),
+    [
+        (np.zeros((HEIGHT, WIDTH)), "black all over"),
+        (np.ones((HEIGHT, WIDTH // 2)), "to have the shape of its photograph, 24 x 18 px at any scale, got 12 x 18"),
+        (np.indices((HEIGHT, WIDTH)).sum(axis=0) % 2, "with whole pixels inside"),
+    ],
+)
+def test_masks_that_cannot_be_are_refused(tmp_path: Path, pixels: np.ndarray, message: str) -> None:
+    folders.write_transforms(tmp_path)
+    write_mask(tmp_path / "masks/a.png", pixels)
+    with pytest.raises(ValueError, match=message):
+        load_scene(tmp_path, downscale=2).load()
+
+
+def test_a_mask_of_colours_is_inside_where_every_channel_is_white(tmp_path: Path) -> None:
+    pixels = np.zeros((2, 3, 3), dtype=np.uint8)
+    pixels[0, 1], pixels[1, 2] = 255, (255, 255, 254)
+    Image.fromarray(pixels).save(tmp_path / "m.png")
+    assert read_mask(tmp_path / "m.png").tolist() == [[[0, 1, 0], [0, 0, 0]]]
+    (tmp_path / "m.png").write_text("no picture")
+    with pytest.raises(ValueError, match=r"cannot read .*m\.png"):
+        read_mask(tmp_path / "m.png")
+
+
+@pytest.mark.parametrize("option", ["masks", "depths"])
+def test_a_folder_without_a_file_for_any_image_is_refused(tmp_path: Path, option: str) -> None:
+    folders.write_transforms(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"named after the 3 images, such as a\.png, in .*which is no folder"):
+        load_scene(tmp_path, **{option: tmp_path / "nothing"})  # pyright: ignore[reportArgumentType]
+    write_mask(tmp_path / "others/z.png", blob())
+    with pytest.raises(FileNotFoundError, match="found none"):
+        load_scene(tmp_path, **{option: tmp_path / "others"})  # pyright: ignore[reportArgumentType]
+
+
+def test_depth_maps_keep_their_numbers_at_any_scale_of_the_picture(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    (tmp_path / "depth").mkdir()
+    values = np.random.default_rng(0).normal(size=(1, HEIGHT, WIDTH))
+    np.save(tmp_path / "depth/a.npy", values)
+    levels = np.arange(4 * HEIGHT * WIDTH, dtype=np.uint16).reshape(2 * HEIGHT, 2 * WIDTH) * 37
+    Image.fromarray(levels).save(tmp_path / "depth/b.png")
+    first, second, third = load_scene(tmp_path, depths=tmp_path / "depth").load()
+    assert first.depth is not None and torch.equal(first.depth, torch.from_numpy(values[0]).float())
+    mean = levels.reshape(HEIGHT, 2, WIDTH, 2).mean(axis=(1, 3))
+    assert second.depth is not None and third.depth is None
+    np.testing.assert_allclose(second.depth.numpy(), mean, rtol=1e-6)  # sums of four numbers in float32
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (np.full((4, 5), 2.0), "depths that vary, got 2.0 everywhere"),
+        (np.array([[1.0, np.nan], [np.inf, 2.0]]), "finite depths, got 2 that are not"),
+        (np.zeros((3, 4, 5)), r"of shape \(h, w\), got float64 of shape \(3, 4, 5\)"),
+        (np.array([["a", "b"], ["c", "d"]]), r"of shape \(h, w\), got <U1"),
+        (np.array([[None, 1], [2, 3]]), "cannot read"),
+    ],
+)
+def test_depth_maps_that_cannot_be_are_refused(tmp_path: Path, values: np.ndarray, message: str) -> None:
+    np.save(tmp_path / "d.npy", values)
+    with pytest.raises(ValueError, match=message):
+        read_depth(tmp_path / "d.npy")
+
+
+def test_depth_of_8_bits_is_refused(tmp_path: Path) -> None:
+    write_mask(tmp_path / "d.png", blob())
+    with pytest.raises(ValueError, match="mode L instead of 16 bits"):
+        read_depth(tmp_path / "d.png")
+
+
+def test_a_file_beside_a_photograph_has_its_name_with_the_folders_or_without(tmp_path: Path) -> None:
+    (tmp_path / "train").mkdir()
+    for file in ("train/r_3.npy", "r_4.npy", "025.png"):
+        (tmp_path / file).touch()
+    assert find_layer(tmp_path, ["train/r_3"], [".npy"]) == tmp_path / "train/r_3.npy"
+    assert find_layer(tmp_path, ["train/r_4"], [".npy"]) == tmp_path / "r_4.npy"
+    assert find_layer(tmp_path, ["train/r_4"], [".png"]) is None
+    assert find_layer(tmp_path, ["rect_026_max.png"], [".npy", ".png"]) == tmp_path / "025.png"
+    assert [dtu_number(name) for name in ("a/rect_001_6_r7000.jpg", "rect_001.png", "rect_1_3_r5000.png")] == [
+        0,
+        None,
+        None,
+    ]
+
+
+def test_a_mask_or_depth_of_another_size_than_its_camera_is_refused(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    view = load_scene(tmp_path).load()[0]
+    for layer in ({"mask": torch.ones(3, 3, dtype=torch.bool)}, {"depth": torch.ones(HEIGHT, WIDTH + 1)}):
+        with pytest.raises(ValueError, match="as its camera"):
+            View(view.name, view.camera, view.image, **layer)
