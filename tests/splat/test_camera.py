@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from splat.camera import Camera
+from splat.camera import Camera, look_at
 from splat.projection import project
 from tests.splat.random_scenes import random_camera, random_gaussians, relative_error
 
@@ -57,3 +57,18 @@ def test_a_camera_cannot_be_changed():
     camera: Camera = random_camera()
     with pytest.raises(AttributeError):
         camera.fx = 3.0  # pyright: ignore
+
+
+def test_a_camera_that_looks_at_a_target_sees_it_on_its_axis_and_is_held_level():
+    centre, target, down = torch.randn(3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    rotation = look_at(centre, target, down)
+    assert (rotation @ (target - centre)).tolist() == pytest.approx([0, 0, (target - centre).norm().item()], abs=1e-14)
+    assert float(rotation[0] @ down) == pytest.approx(0, abs=1e-14) and float(rotation[1] @ down) > 0
+    assert torch.linalg.det(rotation).item() == pytest.approx(1, rel=1e-14)
+
+
+@pytest.mark.parametrize("factor", [0.0, 2.0, -1.0])
+def test_nothing_is_level_that_looks_straight_up_or_down(factor: float):
+    centre, down = torch.tensor([[1.0, 2.0, 3.0], [0.2, 0.9, -0.1]], dtype=torch.float64)
+    with pytest.raises(ValueError, match="expected a target away from the centre"):
+        look_at(centre, centre + factor * down, down)
