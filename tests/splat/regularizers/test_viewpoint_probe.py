@@ -1,7 +1,7 @@
 """Viewpoint probes: each mode's pose by its frame, its handedness in the image, its distribution."""
 
-from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from math import cos, degrees, pi, radians, sin
 from typing import Literal
 
@@ -144,14 +144,17 @@ def depth_step(tilt: float) -> Gaussians:
     return Gaussians.pack(attributes)
 
 
-def image_shift(before: Tensor, after: Tensor) -> tuple[float, float]:
-    """Columns and rows by which the picture has moved: the peak of the phase correlation, to half a pixel."""
-    window = np.outer(np.hanning(before.shape[1]), np.hanning(before.shape[2]))
-    a, b = (np.fft.fft2((image.mean(dim=0).numpy() - 0.5) * window) for image in (before, after))
-    peak = np.fft.ifft2(b * a.conj() / np.abs(b * a.conj())).real
-    row, column = np.unravel_index(peak.argmax(), peak.shape)
-    wrap: Callable[[int, int], int] = lambda i, n: (i + n // 2) % n - n // 2  # noqa: E731
-    return wrap(int(column), peak.shape[1]), wrap(int(row), peak.shape[0])
+def image_shift(before: Tensor, after: Tensor, reach: int = 12) -> tuple[int, int]:
+    """Whole columns and rows by which the middle of the picture has moved: where it is found best afterwards."""
+    height, width = before.shape[1:]
+    middle = before[:, reach : height - reach, reach : width - reach]
+
+    def misfit(shift: tuple[int, int]) -> float:
+        column, row = reach + shift[0], reach + shift[1]
+        found = after[:, row : row + middle.shape[1], column : column + middle.shape[2]]
+        return float((found - middle).square().mean())
+
+    return min(product(range(-reach, reach + 1), repeat=2), key=misfit)
 
 
 @pytest.mark.parametrize("tilt", [0, 90, 35])
