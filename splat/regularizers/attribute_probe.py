@@ -59,13 +59,13 @@ class Constants:
 class Caps:
     """The largest rho of each attribute; inf for none.  Without them rho is 1e4 wherever a trace is not positive.
 
-    means: in units of the scene's extent (`splat/densify.py`); log_scales: 0.2 is a fifth in size; quats: radians;
-    opacity_logits: 0.5 is at most 0.125 in opacity; sh: 0.05 is 0.1 in colour at SH degree 3.
+    means: in units of the scene's extent (`splat/densify.py`): fern's 0.1 world units; log_scales: 0.2 is a fifth in size;
+    quats: radians; opacity_logits: 0.5 is at most 0.125 in opacity; sh: 0.05 is 0.1 in colour at SH degree 3.
     """
 
-    means: float = 0.05
+    means: float = 0.035
     log_scales: float = 0.2
-    quats: float = 0.2
+    quats: float = 0.05
     opacity_logits: float = 0.5
     sh: float = 0.05
 
