@@ -1,9 +1,11 @@
-"""The losses of `losses.py` on the CPU: value, gradient and Hessian-vector product of one view's image against its target.
+"""The losses of `losses.py` on the CPU: value, gradient and Hessian-vector product of one view's image against its target,
+and value and gradients of the consistency of two images.
 
 Planes are padded as in `raster/cpu.py`; only the first three are read, and the padding of an output is 0.  The formulas are in
-`losses_kernels.py`.
+`losses_kernels.py` and `consistency_kernels.py`.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splat.consistency_kernels import consistency_rows
 from splat.losses import LossSettings, window
 from splat.losses_kernels import CHARBONNIER, L1, L2, SECONDS, diagonal_rows, gradient_rows, product_rows, value_rows
 from splat.raster.compositing import TILE_ROWS
@@ -21,43 +24,57 @@ from splat.raster.threads import over_range
 from splat.window_kernels import moments_rows
 
 KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
+NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 
-class ViewLoss:
-    """The loss of images against one target; what depends on the target alone is computed once."""
+class ImageLoss:
+    """A loss of images of one size: their planes, and what its kernels are told."""
 
-    def __init__(self, target: Float[np.ndarray, "3 h w"], settings: LossSettings, dtype: type | np.dtype):
-        _, height, width = target.shape
+    def __init__(self, shape: Sequence[int], settings: LossSettings, dtype: type | np.dtype):
+        _, height, width = shape
         stride = -(-width // lanes_of(dtype)) * lanes_of(dtype)
         plane_rows = -(-height // TILE_ROWS) * TILE_ROWS
         self.shape, self.settings, self.dtype = (height, width, plane_rows, stride), settings, np.dtype(dtype)
         self.taps = window(torch.float64).numpy().astype(self.dtype)
-        self.target = self.planes(1)[0]
-        self.target[:] = 0
-        self.target[:, :height, :width] = target
         count = 3 * height * width
         self.pixel, self.structural = settings.pixel_weight / count, settings.ssim_weight / count
-        self._target_moments = self._moments_of_target() if settings.ssim_weight else np.empty(0, self.dtype)
 
     def planes(self, sets: int) -> np.ndarray:
         """Uninitialised plane sets, (sets, 3, padded height, padded width)."""
         return aligned((sets, 3, self.shape[2], self.shape[3]), self.dtype)
 
-    @classmethod
-    def of(cls, target: Float[Tensor, "3 h w"], settings: LossSettings, dtype: torch.dtype) -> "ViewLoss":
-        """The loss against a tensor, for images of dtype."""
-        return cls(target.numpy(), settings, np.float32 if dtype == torch.float32 else np.float64)
-
-    def padded(self, image: Tensor) -> np.ndarray:
+    def padded(self, image: Tensor | np.ndarray) -> np.ndarray:
         """Padded planes of an image, 0 outside it."""
         planes = self.planes(1)[0]
         planes[:] = 0
-        planes[:, : self.shape[0], : self.shape[1]] = image.detach().numpy()
+        planes[:, : self.shape[0], : self.shape[1]] = image.detach().numpy() if isinstance(image, Tensor) else image
         return planes
 
     def cropped(self, planes: np.ndarray) -> Tensor:
         """The first three planes without their padding, as a tensor."""
         return torch.from_numpy(np.ascontiguousarray(planes[:3, : self.shape[0], : self.shape[1]]))
+
+    def _pointwise(self) -> tuple:
+        scalar = self.dtype.type
+        eps, pixel, structural = scalar(self.settings.eps), scalar(self.pixel), scalar(self.structural)
+        return KINDS[self.settings.pixel], eps, pixel, structural
+
+    def _value(self, pixels: np.ndarray, distances: np.ndarray) -> float:
+        return float(self.pixel * pixels.sum() + self.structural * distances.sum())
+
+
+class ViewLoss(ImageLoss):
+    """The loss of images against one target; what depends on the target alone is computed once."""
+
+    def __init__(self, target: Float[np.ndarray, "3 h w"], settings: LossSettings, dtype: type | np.dtype):
+        super().__init__(target.shape, settings, dtype)
+        self.target = self.padded(target)
+        self._target_moments = self._moments_of_target() if settings.ssim_weight else np.empty(0, self.dtype)
+
+    @classmethod
+    def of(cls, target: Float[Tensor, "3 h w"], settings: LossSettings, dtype: torch.dtype) -> "ViewLoss":
+        """The loss against a tensor, for images of dtype."""
+        return cls(target.numpy(), settings, NUMPY[dtype])
 
     def _moments_of_target(self) -> np.ndarray:
         """mu and var."""
@@ -66,16 +83,8 @@ class ViewLoss:
         over_range(3 * self.shape[0], moments_rows, self.shape, self.taps, *flat)
         return moments
 
-    def _pointwise(self) -> tuple:
-        scalar = self.dtype.type
-        eps, pixel, structural = scalar(self.settings.eps), scalar(self.pixel), scalar(self.structural)
-        return KINDS[self.settings.pixel], eps, pixel, structural
-
     def _residual(self, image: np.ndarray) -> np.ndarray:
         return np.subtract(image[:3], self.target, out=self.planes(1)[0]).reshape(-1)
-
-    def _value(self, pixels: np.ndarray, distances: np.ndarray) -> float:
-        return float(self.pixel * pixels.sum() + self.structural * distances.sum())
 
     def value(self, image: np.ndarray) -> float:
         """The loss at padded planes: two blurs instead of the gradient's four."""
@@ -198,23 +207,31 @@ SECOND = "expected one derivative of the consistency of two images, got a second
 class _Consistency(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: Tensor, y: Tensor, settings: LossSettings) -> Tensor:
-        sides = []
-        for image, target in ((x, y), (y, x)):
-            loss = ViewLoss.of(target.detach(), settings, x.dtype)
-            linear = loss.linearize(loss.padded(image), second_order=False)
-            sides.append((linear.value, loss.cropped(linear.gradient)))
-        ctx.gradients = [gradient for _, gradient in sides]
+        loss = ImageLoss(x.shape, settings, NUMPY[x.dtype])
+        pair, gradients = (loss.padded(x).reshape(-1), loss.padded(y).reshape(-1)), loss.planes(2)
+        pixels, distances = np.zeros((2, 3 * loss.shape[0]))
+        over_range(
+            len(pixels), consistency_rows, loss.shape, loss.taps, *pair, *loss._pointwise(),
+            *gradients.reshape(2, -1), pixels, distances,
+        )  # fmt: skip
+        needed = zip(ctx.needs_input_grad, gradients, strict=False)
+        ctx.gradients = [loss.cropped(gradient) for need, gradient in needed if need]
         ctx.save_for_backward(x, y)
-        return x.new_tensor(sides[0][0])
+        return x.new_tensor(loss._value(pixels, distances))
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
         values = tuple(outputs[0].detach() * gradient for gradient in ctx.gradients)
-        return *last_derivative(values, *ctx.saved_tensors, outputs[0], refusal=SECOND), None
+        found = iter(last_derivative(values, *ctx.saved_tensors, outputs[0], refusal=SECOND))
+        return tuple(next(found) if needed else None for needed in ctx.needs_input_grad)
 
 
 def consistency_loss(x: Float[Tensor, "3 h w"], y: Float[Tensor, "3 h w"], settings: LossSettings) -> Float[Tensor, ""]:
-    """The loss between two images that both depend on the parameters, once differentiable in each; symmetric."""
+    """The loss between two images that both depend on the parameters: symmetric, once differentiable in each.
+
+    In float32 its gradients are within 1e-6 of their norms of those in float64 (renders of a trained scene and of the scene
+    with its parameters changed, images 0.002 to 0.14 apart: 2e-7 to 8e-7).
+    """
     if (x.shape, x.dtype) != (y.shape, y.dtype):
         kinds = " and ".join(f"{tuple(image.shape)} of {image.dtype}" for image in (x, y))
         raise ValueError(f"expected two images of one shape and dtype, got {kinds}; render both alike")
