@@ -126,7 +126,11 @@ def test_a_modes_draw_does_not_depend_on_the_other_modes() -> None:
 
 
 def depth_step(tilt: float) -> Gaussians:
-    """A near half plane (z = 4) before a far plane (z = 7), densely speckled; the edge's normal is `tilt` degrees from +x."""
+    """A near half plane (z = 4) before a far plane (z = 7), the edge's normal `tilt` degrees from +x.
+
+    The planes are a little rough, so that a turn does not change which of two neighbours is in front: shingles in the
+    order of their height would show their colours beside where they are.
+    """
     generator = torch.Generator().manual_seed(0)
     near, far = torch.rand(2, 4000, 2, generator=generator) - 0.5
     near, far = near * 6, far * 12
@@ -134,12 +138,15 @@ def depth_step(tilt: float) -> Gaussians:
     xy = torch.cat([near, far])
     z = torch.cat([torch.full((len(near), 1), 4.0), torch.full((len(far), 1), 7.0)])
     n = len(xy)
+    z = z + 0.2 * (torch.rand(n, 1, generator=generator) - 0.5)
+    waves, phases = 20 * torch.randn(2, 3, 4, generator=generator), 6 * torch.rand(3, 4, generator=generator)
+    pattern = torch.sin(torch.einsum("ni,icw->ncw", xy / z, waves) + phases).mean(dim=2)
     attributes = {
         "means": torch.cat([xy, z], dim=1),
         "log_scales": (z * 0.02).log().expand(n, 3),
         "quats": torch.tensor([1.0, 0, 0, 0]).expand(n, 4),
         "opacity_logits": torch.full((n,), 3.0),
-        "sh": (torch.rand(n, 1, 3, generator=generator) - 0.5) / Y00,
+        "sh": pattern[:, None] / 2 / Y00,
     }
     return Gaussians.pack(attributes)
 
@@ -149,12 +156,13 @@ def image_shift(before: Tensor, after: Tensor, reach: int = 12) -> tuple[int, in
     height, width = before.shape[1:]
     middle = before[:, reach : height - reach, reach : width - reach]
 
-    def misfit(shift: tuple[int, int]) -> float:
+    def misfit(shift: tuple[int, ...]) -> float:
         column, row = reach + shift[0], reach + shift[1]
         found = after[:, row : row + middle.shape[1], column : column + middle.shape[2]]
         return float((found - middle).square().mean())
 
-    return min(product(range(-reach, reach + 1), repeat=2), key=misfit)
+    column, row = min(product(range(-reach, reach + 1), repeat=2), key=misfit)
+    return column, row
 
 
 @pytest.mark.parametrize("tilt", [0, 90, 35])
