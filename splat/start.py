@@ -1,9 +1,12 @@
 """The Gaussians that a training starts from.
 
-points      from structure from motion, those seen by at least two of the training views; or random where the scene
-            has none: a random pixel of a random training view at a depth uniform between near and far, kept where at
-            least two views see it, in that pixel's colour.  near, far: the scene files' depth range, else half and
-            one and a half times the camera's distance to the place that all cameras look at
+points      points: the scene's, from structure from motion, those seen by at least two of the training views.  All of
+                the scene's photographs helped to place them, the test views too
+            triangulated: from the training views alone, their poses given (`splat/scenes/triangulation.py`)
+            random: a random pixel of a random training view at a depth uniform between near and far, kept where at
+                least two views see it, in that pixel's colour.  near, far: the scene files' depth range, else half and
+                one and a half times the camera's distance to the place that all cameras look at
+            scene: points where the scene has any, else random
 means       the points                          quats   the identity
 log_scales  isotropic: log of the root mean square distance to the three nearest neighbours (3DGS)
 opacity     0.1                                 sh      band 0 gives the point's colour, the others 0
@@ -11,6 +14,7 @@ opacity     0.1                                 sh      band 0 gives the point's
 
 from collections.abc import Sequence
 from math import log, sqrt
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,8 +27,10 @@ from splat.gaussians import Gaussians
 from splat.harmonics import Y00
 from splat.scenes.capture import common_target
 from splat.scenes.scene import Scene
+from splat.scenes.triangulation import triangulated_points
 from splat.scenes.view import Frame, Points, View, inside_image
 
+Source = Literal["scene", "points", "triangulated", "random"]
 OPACITY = 0.1
 NEIGHBOURS = 3
 SMALLEST_SCALE = sqrt(1e-7)  # of the median scale: for points that coincide with three others
@@ -40,9 +46,14 @@ def initial_gaussians(
     generator: torch.Generator,
     random_points: int = 10_000,
     min_views: int = 2,
+    source: Source = "scene",
 ) -> Gaussians:
-    """From the scene's points where it has any, else from random ones.  Same generator state, same Gaussians."""
-    if scene.points is not None:
+    """From the points of the source.  Same generator state, same Gaussians."""
+    if source == "points" and scene.points is None:
+        raise ValueError(f"expected a scene with points, {scene.root} has none; start from triangulated or random ones")
+    if source == "triangulated":
+        return gaussians_from_points(triangulated_points(views), views, sh_degree, min_views)
+    if source != "random" and scene.points is not None:
         return gaussians_from_points(scene.points, views, sh_degree, min_views)
     ranges = [frame.depth_range for frame in scene.select([view.name for view in views])]
     points = points_in_common_volume(views, random_points, generator, ranges, min_views)

@@ -1,11 +1,12 @@
 """Points from some views alone, whose poses are known: nothing of the views held out goes into the start of a training.
 
     features     SIFT with affine shapes and pooling over scales, in the pictures as the training sees them
-    matches      of every pair of views, guided by its epipolar geometry
+    matches      of every pair of views
     points       triangulated with COLMAP's thresholds (reprojection error 4 px, angle 1.5 degrees), poses and lenses held
 
 as FSGS and CoR-GS make them (their `tools/colmap_llff.py`, before dense stereo), except that points which only two
-views see are kept: of three views hardly any other is left.
+views see are kept, for of three views hardly any other is left; and that matching is not guided by epipolar geometry a
+second time, for where two views are all that see a point, nothing refutes the wrong matches which that adds.
 """
 
 import tempfile
@@ -43,7 +44,7 @@ def triangulated_points(views: Sequence[View]) -> Points:
         features.sift.estimate_affine_shape = True
         features.sift.domain_size_pooling = True
         pycolmap.extract_features(database, pictures, extraction_options=features)
-        pycolmap.match_exhaustive(database, matching_options=matching(guided=True), verification_options=verification())
+        pycolmap.match_exhaustive(database, matching_options=matching(), verification_options=verification())
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = SEED
         options.triangulation.ignore_two_view_tracks = False
@@ -57,11 +58,10 @@ def triangulated_points(views: Sequence[View]) -> Points:
     return Points(points.xyz, points.rgb, points.observations, tuple(view.name for view in views))
 
 
-def matching(guided: bool = False) -> pycolmap.FeatureMatchingOptions:
+def matching() -> pycolmap.FeatureMatchingOptions:
     """Matching on the processor, so that a machine with a GPU finds the same."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
-    options.guided_matching = guided
     return options
 
 

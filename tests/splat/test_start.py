@@ -15,7 +15,7 @@ from splat.render import render
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import split_scene
 from splat.scenes.view import Frame, Points, View, inside_image
-from splat.start import gaussians_from_points, initial_gaussians, points_in_common_volume
+from splat.start import Source, gaussians_from_points, initial_gaussians, points_in_common_volume
 
 NAMES = ("a", "b", "c")
 
@@ -186,3 +186,24 @@ def test_lego_starts_round_its_middle(lego: Path) -> None:
     gaussians = initial_gaussians(scene, chosen, 0, generator=torch.Generator().manual_seed(0), random_points=2000)
     assert len(gaussians) == 2000
     assert gaussians.means.mean(dim=0).norm() < 0.3 and 0.5 < float(gaussians.means.std(dim=0).mean()) < 1.5
+
+
+def test_the_source_of_the_points_can_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = tuple(Frame(v.name, v.camera, lambda v=v: (v.image, None), depth_range=(3.0, 5.0)) for v in views())
+    with_points = Scene("s", Path("s"), "synthetic", frames, some_points(), torch.zeros(3))
+    without = Scene("s", Path("s"), "synthetic", frames, None, torch.zeros(3))
+    elsewhere = Points(some_points().xyz + 5, some_points().rgb, some_points().observations, NAMES)
+    monkeypatch.setattr("splat.start.triangulated_points", lambda chosen: elsewhere if len(chosen) == 3 else None)
+
+    def start(scene: Scene, source: Source) -> Tensor:
+        generator = torch.Generator().manual_seed(0)
+        return initial_gaussians(scene, views(), generator=generator, random_points=40, source=source).flat
+
+    points = gaussians_from_points(some_points(), views()).flat
+    assert torch.equal(start(with_points, "points"), points) and torch.equal(start(with_points, "scene"), points)
+    assert torch.equal(start(with_points, "random"), start(without, "scene"))
+    triangulated = gaussians_from_points(elsewhere, views()).flat
+    for scene in (with_points, without):
+        assert torch.equal(start(scene, "triangulated"), triangulated)
+    with pytest.raises(ValueError, match="scene with points, s has none; start from triangulated or random ones"):
+        start(without, "points")
