@@ -3,13 +3,14 @@
 The file is a `torch.save` of tensors and plain types, loaded with `weights_only=True` (nothing in it can run code), and
 written whole or not at all.  The same training gives the same bytes.  Keys (p parameters, n Gaussians):
 
-    format, version     "splat-landscape checkpoint", 1
+    format, version     "splat-landscape checkpoint", 2; version 1 knew no methods: it is 3DGS, and has no regularizer
     torch               version of torch that wrote it
     step, extent        steps made; radius of the scene's cameras, world units
     sh_degree, flat     the Gaussians: bands in use, (p,) stored parameters
     adam                {"first": (p,), "second": (p,), "updates": int}
     screen_gradients    {"total": (n,), "renders": (n,)}
     generator, order    state of the random generator, uint8; views still to come in this epoch
+    regularizer         state of the method's regularizer, see `splat/regularizers/regularizer.py`
     config              `TrainConfig` as nested plain types
     scene               `SceneReference` as plain types
 """
@@ -30,11 +31,13 @@ from torch import Tensor
 from splat.adam import Adam
 from splat.densify import ScreenGradients
 from splat.gaussians import Gaussians
+from splat.regularizers.methods import ThreeDGS
+from splat.regularizers.regularizer import Regularizer
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split
 from splat.train import TrainConfig, Training
 
-FORMAT, VERSION = "splat-landscape checkpoint", 1
+FORMAT, VERSION = "splat-landscape checkpoint", 2
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,7 @@ def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> No
         },
         "generator": training.generator.get_state(),
         "order": training.order,
+        "regularizer": training.regularizer.state(),
         "config": asdict(training.config),
         "scene": asdict(scene),
     }
@@ -168,12 +172,17 @@ def load_checkpoint(path: Path) -> Checkpoint:
 def _checkpoint(content: Any) -> Checkpoint:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"it does not hold the format {FORMAT!r}")
-    if content.get("version") != VERSION:
-        raise ValueError(f"its format version is {content.get('version')!r}, this program reads {VERSION}")
+    version = content.get("version")
+    if version not in (1, VERSION):
+        raise ValueError(f"its format version is {version!r}, this program reads up to {VERSION}")
     flat = _get(content, "flat", Tensor)
     gaussians = Gaussians(_tensor(content, "flat", (flat.numel(),), flat.dtype), _get(content, "sh_degree", int))
     gaussians.require_finite()
-    config = _dataclass(TrainConfig, _get(content, "config", dict), "config")
+    older = {"method": asdict(ThreeDGS())} if version == 1 else {}
+    config = _dataclass(TrainConfig, {**_get(content, "config", dict), **older}, "config")
+    regularizer = config.method.regularizer(config.seed)
+    if version > 1:
+        _restore(regularizer, _get(content, "regularizer", dict))
     scene = _dataclass(SceneReference, _get(content, "scene", dict), "scene")
     adam, screen = _get(content, "adam", dict), _get(content, "screen_gradients", dict)
     training = Training(
@@ -190,6 +199,7 @@ def _checkpoint(content: Any) -> Checkpoint:
             _tensor(screen, "renders", (len(gaussians),), flat.dtype),
         ),
         generator=_generator(_get(content, "generator", Tensor)),
+        regularizer=regularizer,
         order=_get(content, "order", list),
         step=_get(content, "step", int),
     )
@@ -223,6 +233,13 @@ def _tensor(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype) -
     return value
 
 
+def _restore(regularizer: Regularizer, state: dict) -> None:
+    try:
+        regularizer.restore(state)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"'regularizer' is not the state of its method ({error})") from None
+
+
 def _generator(state: Tensor) -> torch.Generator:
     generator = torch.Generator()
     try:
@@ -240,12 +257,24 @@ def _dataclass(kind: type[T], content: dict, where: str) -> T:
     values = {}
     for key, hint in hints.items():
         value = content[key]
-        if isinstance(hint, type) and is_dataclass(hint):
-            value = _dataclass(hint, _get(content, key, dict), f"{where}.{key}")
+        if inner := _nested(hint, value, f"{where}.{key}"):
+            value = _dataclass(inner, _get(content, key, dict), f"{where}.{key}")
         elif not _fits(value, hint):
             raise ValueError(f"'{where}.{key}' is {value!r}, expected {getattr(hint, '__name__', hint)}")
         values[key] = value
     return kind(**values)
+
+
+def _nested(hint: Any, value: Any, where: str) -> type | None:
+    """The dataclass that a value is of, of several the one of its name; None where no dataclass is expected."""
+    kinds = [kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and is_dataclass(kind)]
+    if len(kinds) < 2:
+        return next(iter(kinds), None)
+    name = value.get("name") if isinstance(value, dict) else value
+    for kind in kinds:
+        if get_type_hints(kind)["name"] == Literal[name]:
+            return kind
+    raise ValueError(f"'{where}' has the unknown name {name!r}")
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -258,5 +287,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return type(value) is list and all(_fits(item, get_args(hint)[0]) for item in value)
     if get_origin(hint) is tuple:
         options = get_args(hint)
+        if options[1:] == (Ellipsis,):
+            return type(value) is tuple and all(_fits(item, options[0]) for item in value)
         return type(value) is tuple and len(value) == len(options) and all(map(_fits, value, options))
     return type(value) is hint or (hint is float and type(value) is int)

@@ -10,7 +10,7 @@ Plain torch, any float type, differentiable any number of times; the kernels of 
     colour max(0, 0.5 + sum_k Y_k(direction) sh_k)
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float
@@ -36,6 +36,10 @@ class Splats:
     colours: Float[Tensor, "n 3"]
     depths: Float[Tensor, " n"]
     drawn: Bool[Tensor, " n"]
+
+    def detach(self) -> "Splats":
+        """The same numbers, off the autograd graph."""
+        return Splats(*(getattr(self, each.name).detach() for each in fields(self)))
 
 
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:

@@ -38,11 +38,13 @@ def render(
     settings: RenderSettings = RenderSettings(),
     *,
     depth: bool = False,
+    opacity_gain: Float[Tensor, " n"] | None = None,
     backend: Backend = "cpu",
 ) -> Rendering:
     """Colour, accumulated alpha and, if asked for, expected depth of one view; twice differentiable.
 
-    background: black where None.  backend: "cpu" the kernels, "reference" plain torch (slow, any number of derivatives).
+    background: black where None.  opacity_gain: multiplies the opacities, may exceed 1, 0 hides a Gaussian; a constant.
+    backend: "cpu" the kernels, "reference" plain torch (slow, any number of derivatives).
     Raises ValueError where a parameter is not finite.
     """
     gaussians.require_finite()
@@ -50,13 +52,17 @@ def render(
         background = torch.zeros(3)
     background = background.to(gaussians.flat)
     if backend == "reference":
-        splats = project(gaussians, camera, settings)
+        splats = _gained(project(gaussians, camera, settings), opacity_gain)
         image, alpha, expected = rasterize_reference(splats, background, camera.width, camera.height, settings)
         return Rendering(image, alpha, expected if depth else None, splats)
-    splats = project_by_kernel(gaussians, camera, settings)
+    splats = _gained(project_by_kernel(gaussians, camera, settings), opacity_gain)
     image, alpha = rasterize_by_kernel(splats, background, camera.width, camera.height, settings)
     expected = _expected_depth(splats, gaussians, camera, settings) if depth else None
     return Rendering(image, alpha, expected, splats)
+
+
+def _gained(splats: Splats, opacity_gain: Float[Tensor, " n"] | None) -> Splats:
+    return splats if opacity_gain is None else replace(splats, opacities=splats.opacities * opacity_gain)
 
 
 def _expected_depth(

@@ -10,6 +10,7 @@ its own coefficient and the mean stays unbiased).  A sample costs one J u of as 
 not yet small enough, and no backward pass.  Where the loss is a sum over pixels, l'' = D and the traces are exact.
 """
 
+from collections.abc import Sequence
 from math import sqrt
 from time import monotonic
 
@@ -23,6 +24,7 @@ from landscape.hutchinson import WIDENING, Looks, TraceSettings
 from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, TraceEstimate
 from splat.curvature import SceneObjective
+from splat.gaussians import ATTRIBUTES
 
 ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
 COLUMNS = 5  # vectors in a pass over the pixels: one for each block
@@ -33,13 +35,14 @@ def exact_traces(
     generator: torch.Generator,
     settings: TraceSettings = ONE_PERCENT,
     progress: Progress | None = None,
+    names: Sequence[str] = ATTRIBUTES,
 ) -> dict[str, TraceEstimate]:
-    """The trace of every attribute's block of H, on the complement of the quaternions' radial directions.
+    """The trace of the named attributes' blocks of H, on the complement of the quaternions' radial directions.
 
     settings: rtol, atol, confidence, the numbers of samples and max_seconds count; the distribution is always random signs.
     """
     quats = objective.active.quats
-    known = objective.block_diagonal().traces(quats)
+    known = {name: value for name, value in objective.block_diagonal().traces(quats).items() if name in names}
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
     if not objective.couples_pixels:

@@ -1,7 +1,8 @@
 """Training of 3D Gaussian Splatting (Kerbl et al. 2023): settings, state, and the loop, which reads top to bottom.
 
-One step renders one view, takes the gradient of its photometric loss, updates every stored parameter with Adam, and,
-while density control is under way, clones, splits and prunes.  Steps are counted from 1.  Views come in epochs, each a
+One step renders one view, takes the gradient of its photometric loss, lets the method's regularizer change it
+(`splat/regularizers`), updates every stored parameter with Adam, and, while density control is under way, clones, splits
+and prunes.  Steps are counted from 1.  Views come in epochs, each a
 new random order.  All randomness is drawn from one generator, and `Training` holds all that the next step depends on: a
 training that is saved and loaded (`splat/checkpoint.py`) continues to the same bits.
 
@@ -14,17 +15,21 @@ is zero, and spares their cost.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from math import isfinite
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splat.adam import Adam
+from splat.camera import Camera
 from splat.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.gaussians import Gaussians
 from splat.losses import LossSettings
-from splat.losses_cpu import ViewLoss, view_loss
-from splat.render import render
+from splat.losses_cpu import ViewLoss
+from splat.photometric import Photometric, photometric
+from splat.regularizers.methods import MethodSettings, ThreeDGS
+from splat.regularizers.regularizer import Regularizer, Step
 from splat.scenes.view import View
 from splat.settings import RenderSettings
 
@@ -68,6 +73,7 @@ class TrainConfig:
     rates: LearningRates = field(default_factory=LearningRates)
     densify: DensifySettings = field(default_factory=DensifySettings)
     render: RenderSettings = field(default_factory=RenderSettings)
+    method: MethodSettings = field(default_factory=ThreeDGS)
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
@@ -102,6 +108,7 @@ class Training:
     adam: Adam
     screen_gradients: ScreenGradients
     generator: torch.Generator
+    regularizer: Regularizer
     order: list[int] = field(default_factory=list)
     step: int = 0
 
@@ -126,6 +133,7 @@ class Training:
             adam=Adam.zero(gaussians),
             screen_gradients=ScreenGradients.zero(len(gaussians), flat.dtype),
             generator=torch.Generator().manual_seed(config.seed),
+            regularizer=config.method.regularizer(config.seed),
         )
 
     def next_view(self, count: int) -> int:
@@ -134,11 +142,32 @@ class Training:
             self.order = torch.randperm(count, generator=self.generator).tolist()
         return self.order.pop()
 
+    def descend(self, gradient: Float[Tensor, " p"], step: int) -> None:
+        """Update every parameter with Adam, at the step's rates."""
+        position = position_rate(self.config.rates, self.extent, step, self.config.iterations)
+        rates = learning_rates(self.gaussians, self.config.rates, position)
+        self.adam.update(self.gaussians.flat, gradient, rates)
+
+    def control_density(self, step: int, camera: Camera, base: Photometric) -> None:
+        """Collect the screen-space gradient of a render; clone, split, prune and reset opacities when it is time."""
+        schedule, iterations = self.config.densify, self.config.iterations
+        if schedule.collects(step, iterations):
+            self.screen_gradients.add(base.screen_gradient, base.splats, camera)
+        if schedule.densifies(step, iterations):
+            gradients, large = self.screen_gradients.mean, schedule.prunes_large(step)
+            self.follow(densify(self.gaussians, gradients, self.extent, schedule, self.generator, prune_large=large))
+        if schedule.resets_opacity(step, iterations):
+            reset_opacities(self.gaussians, schedule.reset_opacity)
+            self.adam.forget("opacity_logits")
+
     def follow(self, change: Densified) -> None:
-        """Take over densified Gaussians: moments follow their Gaussian, new ones start from zero."""
+        """Take over other Gaussians: moments follow their Gaussian, new ones start from zero."""
+        if not len(change.gaussians):
+            raise ValueError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
         self.gaussians = change.gaussians
         self.adam.select(change.parents, change.fresh)
         self.screen_gradients = ScreenGradients.zero(len(change.gaussians), change.gaussians.flat.dtype)
+        self.regularizer.follow(change)
 
     def raise_sh_degree(self, degree: int) -> None:
         """Add bands of zeros up to this degree."""
@@ -179,49 +208,37 @@ def train(training: Training, views: Sequence[View]) -> Iterator[Progress]:
 
     Between two items `training` is whole, so that it can be saved, evaluated or left there.
     """
-    config, schedule = training.config, training.config.densify
+    config, regularizer = training.config, training.regularizer
     if not views:
         raise ValueError("expected at least one view to train on, got none")
     losses = [ViewLoss.of(view.image, config.loss, training.gaussians.flat.dtype) for view in views]
     while training.step < config.iterations:
-        step = training.step + 1
-        training.raise_sh_degree(min(config.sh_degree, (step - 1) // config.sh_degree_every))
-        chosen = training.next_view(len(views))
-        view, loss_of_view = views[chosen], losses[chosen]
-        gaussians = training.gaussians
-        background = torch.tensor(config.background, dtype=gaussians.flat.dtype)
-        if config.random_background:
-            drawn = torch.rand(3, generator=training.generator, dtype=background.dtype)
-            target = with_background(view, background, drawn)
-            background, loss_of_view = drawn, ViewLoss.of(target, config.loss, background.dtype)
-
-        flat = gaussians.flat.detach().requires_grad_()
-        rendering = render(gaussians.with_flat(flat), view.camera, background, config.render)
-        loss = view_loss(rendering.image, loss_of_view)
-        if not torch.isfinite(loss):
+        number = training.step + 1
+        training.raise_sh_degree(min(config.sh_degree, (number - 1) // config.sh_degree_every))
+        step = _next_step(training, number, views, losses)
+        camera, gaussians = step.camera, training.gaussians
+        gain = regularizer.opacity_gain(step)
+        base = photometric(gaussians, camera, step.loss, step.background, config.render, gain)
+        if not isfinite(base.loss):
             gaussians.require_finite()
+            name = views[step.chosen].name
             raise ValueError(
-                f"expected a finite loss, got {loss.item()} at step {step} on view {view.name}; lower the rates"
+                f"expected a finite loss, got {base.loss} at step {number} on view {name}; lower the rates"
             )
-        gradient, screen_gradient = torch.autograd.grad(loss, [flat, rendering.splats.means])
+        training.descend(regularizer.gradient(step, base), number)
+        training.control_density(number, camera, base)
+        regularizer.after(step)
+        training.step = number
+        yield Progress(number, base.loss, len(training.gaussians), views[step.chosen].name)
 
-        position = position_rate(config.rates, training.extent, step, config.iterations)
-        rates = learning_rates(gaussians, config.rates, position)
-        training.adam.update(gaussians.flat, gradient, rates)
 
-        if schedule.collects(step, config.iterations):
-            training.screen_gradients.add(screen_gradient, rendering.splats, view.camera)
-        if schedule.densifies(step, config.iterations):
-            gradients = training.screen_gradients.mean
-            large = schedule.prunes_large(step)
-            training.follow(
-                densify(gaussians, gradients, training.extent, schedule, training.generator, prune_large=large)
-            )
-            if not len(training.gaussians):
-                raise ValueError(f"every Gaussian became transparent or too large by step {step}; lower the rates")
-        if schedule.resets_opacity(step, config.iterations):
-            reset_opacities(training.gaussians, schedule.reset_opacity)
-            training.adam.forget("opacity_logits")
-
-        training.step = step
-        yield Progress(step, loss.item(), len(training.gaussians), view.name)
+def _next_step(training: Training, number: int, views: Sequence[View], losses: Sequence[ViewLoss]) -> Step:
+    """The view of a step and what it is compared with."""
+    config, gaussians = training.config, training.gaussians
+    chosen = training.next_view(len(views))
+    background, loss = torch.tensor(config.background, dtype=gaussians.flat.dtype), losses[chosen]
+    if config.random_background:
+        drawn = torch.rand(3, generator=training.generator, dtype=background.dtype)
+        target = with_background(views[chosen], background, drawn)
+        background, loss = drawn, ViewLoss.of(target, config.loss, background.dtype)
+    return Step(number, training, gaussians, views, chosen, background, loss)

@@ -81,7 +81,7 @@ class ProbeSettings:
     attributes: tuple[Attribute, ...] = ("means", "log_scales", "quats", "opacity_logits", "sh")
     c: Constants = field(default_factory=Constants)
     caps: Caps = field(default_factory=Caps)
-    dimension: Literal["active", "attribute"] = "active"
+    dimension: Literal["active", "attribute"] = "attribute"
     eps: float = 1e-6
     gamma: float = 0.7
     kappa_full: float = NEEDLE

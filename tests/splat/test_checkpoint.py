@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from splat.checkpoint import load_checkpoint, save_checkpoint, write_atomically
+from splat.regularizers.methods import ThreeDGS
 from splat.train import Training, train
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
@@ -118,6 +119,7 @@ CHANGES = {
     "screen_gradients": ([], "'screen_gradients' is list, expected dict"),
     "generator": (torch.zeros(5, dtype=torch.uint8), "not the state of a random generator"),
     "order": ([3], "does not index its 3 training views"),
+    "regularizer": ({}, "not the state of its method"),
     "config": ({"iterations": 5}, "'config' has missing or unknown keys: background"),
     "scene": ({}, "'scene' has missing or unknown keys"),
 }
@@ -142,6 +144,9 @@ def test_every_key_is_checked(path, key):
         ("background", (0.0, 1.0), "'config.background' is"),
         ("seed", -1, "expected a seed"),
         ("loss", {"pixel": "l1"}, "'config.loss' has missing or unknown keys"),
+        ("method", {"name": "magic"}, "'config.method' has the unknown name 'magic'"),
+        ("method", {"name": "stablegs"}, "'config.method' has missing or unknown keys"),
+        ("method", "3dgs", "'config.method' has the unknown name '3dgs'|is str, expected dict"),
     ],
 )
 def test_settings_in_a_checkpoint_are_checked_like_any_others(path, key, value, message):
@@ -178,3 +183,11 @@ def test_the_scene_is_found_from_the_checkpoint_else_where_it_was_else_not_at_al
     (moved / "scene").rmdir()
     with pytest.raises(FileNotFoundError, match="pass where it is now with --scene"):
         reference.find(run / "checkpoint.pt")
+
+
+def test_a_checkpoint_from_before_there_were_methods_is_3dgs(path):
+    content = torch.load(path, weights_only=True)
+    content["version"] = 1
+    del content["regularizer"], content["config"]["method"]
+    torch.save(content, path)
+    assert load_checkpoint(path).training.config.method == ThreeDGS()

@@ -211,11 +211,11 @@ def test_random_backgrounds_show_through_what_is_transparent_in_a_view_as_in_the
 def test_the_background_is_drawn_anew_each_step_where_it_is_random_and_is_the_settings_own_where_not(monkeypatch):
     colours = []
 
-    def recorded(gaussians, camera, background, settings):
+    def recorded(gaussians, camera, background, settings, **others):
         colours.append(tuple(background.tolist()))
-        return render(gaussians, camera, background, settings)
+        return render(gaussians, camera, background, settings, **others)
 
-    monkeypatch.setattr("splat.train.render", recorded)
+    monkeypatch.setattr("splat.photometric.render", recorded)
     run(TrainConfig(4, random_background=True))
     assert len(set(colours)) == 4
     colours.clear()

@@ -1,0 +1,99 @@
+"""What a method of training adds to plain 3DGS: the interface between the loop (`splat/train.py`) and its regularizers.
+
+At every step the loop asks, in this order:
+
+    opacity_gain    how the opacities are changed in this step's render (dropout), or None
+    gradient        what Adam descends, given the photometric gradient of the sampled view
+    follow          ... after density control, or any other change of the Gaussians: which old one each new one comes from
+    after           anything else, once the step is whole (unpooling, a second field's own density control)
+
+A regularizer draws from its own generator, so that the same seed shows every method the same views in the same order and
+splits the same Gaussians alike.  `state` and `restore` carry it through a checkpoint to the same bits.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splat.camera import Camera
+from splat.gaussians import Gaussians
+from splat.losses_cpu import ViewLoss
+from splat.photometric import Photometric
+from splat.scenes.view import View
+
+if TYPE_CHECKING:
+    from splat.densify import Densified
+    from splat.train import TrainConfig, Training
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One step of a training.  number: from 1; chosen: index of the sampled view.
+
+    gaussians: before the update.  background, loss: this step's (they change where the background is random).
+    """
+
+    number: int
+    training: "Training"
+    gaussians: Gaussians
+    views: Sequence[View]
+    chosen: int
+    background: Float[Tensor, "3"]
+    loss: ViewLoss
+
+    @property
+    def config(self) -> "TrainConfig":
+        return self.training.config
+
+    @property
+    def camera(self) -> Camera:
+        """The sampled view's."""
+        return self.views[self.chosen].camera
+
+
+class Regularizer:
+    """Plain 3DGS: nothing is added.  The base of the methods.
+
+    history: rows of what is worth a look afterwards, each with its "step"; part of the state.
+    """
+
+    def __init__(self, seed: int):
+        self.generator = torch.Generator().manual_seed(seed)
+        self.history: list[Row] = []
+
+    def opacity_gain(self, step: Step) -> Float[Tensor, " n"] | None:
+        """Factors on the opacities of this step's render, None for 1."""
+        return None
+
+    def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
+        """What the optimiser descends.  base: the sampled view's loss and gradient, in the parameters of step.gaussians."""
+        return base.gradient
+
+    def follow(self, change: "Densified") -> None:
+        """The Gaussians were replaced."""
+
+    def after(self, step: Step) -> None:
+        """The step is whole: update and density control are done."""
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain types, from which `restore` makes a new one of the same settings go on to the same bits."""
+        return {"generator": self.generator.get_state(), "history": self.history}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take over a state.  ValueError, KeyError or RuntimeError where it does not fit."""
+        self.generator.set_state(state["generator"])
+        self.history = list(state["history"])
+
+
+@dataclass(frozen=True)
+class Method:
+    """Settings of a method: a frozen dataclass with a `name`, from which its regularizer is made."""
+
+    def regularizer(self, seed: int) -> Regularizer:
+        return Regularizer(seed)

@@ -1,0 +1,191 @@
+"""StableGS (Algorithm 1): training on the images of probed Gaussians, and on their agreement from probed viewpoints.
+
+    L = L_recon(Theta) + asp_weight L_recon(Theta') + vsp_weight mean_k l(I_k(Theta), I_k(Theta'))      Eqs. (15), (21), (22)
+
+Theta' is one probed copy of all Gaussians in all attributes (`attribute_probe.py`), new at every step and constant to the
+derivative; k are probed viewpoints (`viewpoint_probe.py`), one for each training view or only for the sampled one; l is the
+loss of training, between two renders.  Of the gradient in Theta, what comes from an image of Theta' is pulled back through
+Eq. (14).  L_recon is the sampled view's, as Algorithm 1 has it.
+
+Probing starts after `warm_up` steps.  Every `every` steps the magnitudes rho are worked out anew from the traces of the
+Hessian's blocks over all training views, and with them the dominant occlusion edge of each view; both change slowly.  Density
+control sees the sampled view's own gradient alone.
+
+Left out because it cannot matter: the traces of attributes that are not probed; the probed copy where every rho is 0; each
+loss of weight 0; viewpoints that see nothing; the edges where nothing turns about them.
+"""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from landscape.hutchinson import TraceSettings
+from landscape.trace import PAPER, estimate_traces
+from splat.camera import Camera
+from splat.curvature import SceneHessian, SceneObjective
+from splat.densify import on_screen
+from splat.gaussians import Gaussians
+from splat.losses_cpu import consistency_loss
+from splat.photometric import Photometric, photometric
+from splat.regularizers.attribute_probe import (
+    Magnitude,
+    Perturbation,
+    ProbeSettings,
+    magnitudes,
+    probe_attributes,
+)
+from splat.regularizers.occlusion_edge import dominant_edge
+from splat.regularizers.regularizer import Method, Regularizer, Step
+from splat.regularizers.viewpoint_probe import ViewpointSettings, composite_pose
+from splat.render import render
+from splat.scenes.capture import capture_geometry
+from splat.traces import exact_traces
+
+TEN_PERCENT = TraceSettings(rtol=0.1, max_probes=16)  # rho goes with the root: 5%
+
+
+@dataclass(frozen=True)
+class StableGS(Method):
+    """The paper's settings.  traces: exact to 10%, or Eq. (6)'s ten Gaussian samples a block.
+
+    viewpoints: "all" is the paper's K = M probes a step, "one" K = 1, that of the sampled view.
+    """
+
+    name: Literal["stablegs"] = "stablegs"
+    warm_up: int = 1000
+    every: int = 100
+    asp_weight: float = 1.0
+    vsp_weight: float = 0.5
+    traces: Literal["exact", "paper"] = "exact"
+    viewpoints: Literal["all", "one"] = "all"
+    probe: ProbeSettings = field(default_factory=ProbeSettings)
+    viewpoint: ViewpointSettings = field(default_factory=ViewpointSettings)
+
+    def __post_init__(self) -> None:
+        if self.warm_up < 0 or self.every < 1:
+            raise ValueError(f"expected warm_up >= 0 and every >= 1, got {self.warm_up} and {self.every}")
+        if not (0 <= self.asp_weight < float("inf") and 0 <= self.vsp_weight < float("inf")):
+            raise ValueError(f"expected finite weights of at least 0, got {self.asp_weight} and {self.vsp_weight}")
+        if self.traces not in ("exact", "paper") or self.viewpoints not in ("all", "one"):
+            raise ValueError(
+                f"expected traces 'exact' or 'paper' and viewpoints 'all' or 'one', got {self.traces!r} and "
+                f"{self.viewpoints!r}"
+            )
+
+    def regularizer(self, seed: int) -> "StableRegularizer":
+        return StableRegularizer(self, seed)
+
+
+class StableRegularizer(Regularizer):
+    """magnitudes: of the attributes that are probed; normals: of each training view's edges, pixels, 0 where it has none."""
+
+    def __init__(self, settings: StableGS, seed: int):
+        super().__init__(seed)
+        self.settings = settings
+        self.magnitudes: dict[str, Magnitude] = {}
+        self.normals: list[Tensor] = []
+
+    def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
+        settings = self.settings
+        since = step.number - settings.warm_up - 1
+        if since < 0 or (settings.asp_weight == settings.vsp_weight == 0):
+            return base.gradient
+        if since % settings.every == 0:
+            self._diagnose(step)
+        probe = probe_attributes(
+            step.gaussians, base.gradient, step.camera, base.splats, self.magnitudes, settings.probe, self.generator
+        )
+        poses = self._poses(step)
+        if (
+            not self.magnitudes
+        ):  # the probed copy is the original: its gradient is known, and both agree from everywhere
+            return (1 + settings.asp_weight) * base.gradient
+        probed, total = probe.apply(step.gaussians), base.gradient.clone()
+        if settings.asp_weight:
+            again = photometric(probed, step.camera, step.loss, step.background, step.config.render)
+            total.add_(probe.pull(again.gradient), alpha=settings.asp_weight)
+        for pose in poses:
+            total.add_(_disagreement(step, probed, probe, pose), alpha=settings.vsp_weight / len(poses))
+        return total
+
+    def _diagnose(self, step: Step) -> None:
+        """Magnitudes from the traces, and the edges."""
+        settings, config, names = self.settings, step.config, self.settings.probe.on
+        background = torch.tensor(config.background, dtype=step.gaussians.flat.dtype)
+        objective = SceneObjective(step.gaussians, step.views, config.loss, background, config.render)
+        if not names:
+            estimates = {}
+        elif settings.traces == "exact":
+            estimates = exact_traces(objective, self.generator, TEN_PERCENT, names=names)
+        else:
+            estimates = estimate_traces(SceneHessian(objective), self.generator, PAPER, names)
+        self.magnitudes = magnitudes(
+            {name: estimate.value for name, estimate in estimates.items()},
+            len(objective.active),
+            step.gaussians.sh_degree,
+            step.training.extent,
+            settings.probe,
+        )
+        for name, magnitude in self.magnitudes.items():
+            self.history.append(
+                {
+                    "step": step.number,
+                    "attribute": name,
+                    **asdict(magnitude),
+                    "standard_error": estimates[name].standard_error,
+                    "capped": magnitude.capped,
+                    "negative": magnitude.negative,
+                }
+            )
+        if settings.vsp_weight and settings.viewpoint.edge_rotation:
+            self.normals = [_edge_normal(step, view.camera) for view in step.views]
+
+    def _poses(self, step: Step) -> list[Camera]:
+        """The viewpoints of this step."""
+        settings = self.settings
+        if not settings.vsp_weight:
+            return []
+        cameras = [view.camera for view in step.views]
+        geometry = capture_geometry(cameras)
+        which = range(len(cameras)) if settings.viewpoints == "all" else [step.chosen]
+        still = torch.zeros(2)
+        return [
+            composite_pose(
+                cameras, m, self.normals[m] if self.normals else still, geometry, settings.viewpoint,
+                generator=self.generator,
+            )
+            for m in which
+        ]  # fmt: skip
+
+    def state(self) -> dict[str, Any]:
+        magnitudes = {name: asdict(magnitude) for name, magnitude in self.magnitudes.items()}
+        return {**super().state(), "magnitudes": magnitudes, "normals": self.normals}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        super().restore(state)
+        self.magnitudes = {name: Magnitude(**values) for name, values in state["magnitudes"].items()}
+        self.normals = list(state["normals"])
+
+
+def _edge_normal(step: Step, camera: Camera) -> Float[Tensor, "2"]:
+    with torch.no_grad():
+        rendering = render(step.gaussians, camera, settings=step.config.render, depth=True)
+    assert rendering.depth is not None
+    return dominant_edge(rendering.depth, rendering.alpha)[0]
+
+
+def _disagreement(step: Step, probed: Gaussians, probe: Perturbation, pose: Camera) -> Float[Tensor, " p"]:
+    """The gradient of the loss between the images of the Gaussians and of their probed copy at a pose (Eq. (21))."""
+    flats = [gaussians.flat.detach().requires_grad_() for gaussians in (step.gaussians, probed)]
+    renders = [
+        render(probed.with_flat(flat), pose, step.background, step.config.render)
+        for flat in flats
+    ]  # fmt: skip
+    if not any(on_screen(each.splats.detach(), pose).any() for each in renders):
+        return torch.zeros_like(flats[0])
+    loss = consistency_loss(renders[0].image, renders[1].image, step.config.loss)
+    own, other = torch.autograd.grad(loss, flats)
+    return own + probe.pull(other)
