@@ -27,6 +27,14 @@ class TrainOptions:
     """Folder of images within the scene.  Default: images, else the largest images_K."""
     downscale: float = 1.0
     """Reduce the images further by this factor."""
+    start: Literal["scene", "points", "triangulated", "random"] = "scene"
+    """What the Gaussians start from.  points: the scene's, seen by two training views; triangulated: points of the training
+    views alone, with their poses; random: in their common volume; scene: points where there are any, else random."""
+    masks: Path | None = None
+    """Folder of object masks, named after the images, that the scores are taken inside.  Default: mask or masks in the
+    scene, or what its files name."""
+    depths: Path | None = None
+    """Folder of relative depth maps for the training views, NAME.npy or 16-bit NAME.png, for methods that use depth."""
     resume: FlagCreatePairsOff[bool] = False
     """Continue the run in OUT; the other options must be those that it was started with."""
     sh_degree: int = 3

@@ -4,7 +4,8 @@ RUN/checkpoint.pt   the latest checkpoint, see `splat/checkpoint.py`; written at
                     Ctrl-C and at the end
 RUN/test/NAME.png   the held-out views as rendered at the end
 RUN/metrics.json    {"step", "gaussians", "train": scores, "test": scores or null, "provenance"}, where scores are
-                    {"psnr", "ssim", "views": {NAME: {"psnr", "ssim"}}}, psnr in dB; "Infinity" for a perfect image
+                    {"psnr", "ssim", "lpips", "masked", "views": {NAME: {"psnr", "ssim", "lpips"}}}, psnr in dB;
+                    "Infinity" for a perfect image; lpips null where it cannot be computed; masked: inside masks only
 """
 
 import io
@@ -33,9 +34,11 @@ from analysis.options import TrainOptions
 from analysis.provenance import provenance
 from splat.checkpoint import SceneReference, load_checkpoint, save_checkpoint, write_atomically
 from splat.densify import DensifySettings
-from splat.evaluate import Evaluation, evaluate
+from splat.evaluate import Evaluation, ViewScore, evaluate, have_masks
 from splat.losses import LossSettings
+from splat.perceptual import MissingPerceptual, load_lpips
 from splat.scenes.images import IMAGE_SUFFIXES
+from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import split_scene
 from splat.scenes.view import View
@@ -54,15 +57,20 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
     colour = COLOURS.get(options.background)
-    scene = load_scene(options.scene, options.images, options.downscale, colour)
+    scene = load_scene(options.scene, options.images, options.downscale, colour, options.masks, options.depths)
     split = split_scene(scene, None if options.views == "all" else options.views)
     config = _config(options, scene)
     reference = SceneReference.to(scene, out / CHECKPOINT, split, options.images, options.downscale)
     views, held_out = scene.load(split.train), scene.load(split.test)
+    for together in (views, held_out):
+        have_masks(together)
+    if options.depths:
+        require_depths(views, options.depths)
     if options.resume:
         training = _resumed(out / CHECKPOINT, config, reference)
     else:
-        start = initial_gaussians(scene, views, 0, generator=torch.Generator().manual_seed(config.seed))
+        generator = torch.Generator().manual_seed(config.seed)
+        start = initial_gaussians(scene, views, 0, generator=generator, source=options.start)
         training = Training.start(start, scene.extent(split.train), config)
         _create_run(out, training, reference)
 
@@ -203,11 +211,17 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
     def keep(name: str, image: Tensor) -> None:
         write_atomically(renders / render_name(name), _png(image))
 
-    seen = evaluate(training.gaussians, views, background, config.render)
+    console = Console()
+    try:
+        lpips = load_lpips()
+    except MissingPerceptual as error:
+        lpips = None
+        console.print(str(error), soft_wrap=True, highlight=False, markup=False)
+    seen = evaluate(training.gaussians, views, background, config.render, lpips=lpips)
     tested = None
     if held_out:
         renders.mkdir(exist_ok=True)
-        tested = evaluate(training.gaussians, held_out, background, config.render, on_image=keep)
+        tested = evaluate(training.gaussians, held_out, background, config.render, lpips=lpips, on_image=keep)
     metrics = {
         "step": training.step,
         "gaussians": len(training.gaussians),
@@ -216,7 +230,6 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
         "provenance": provenance(config.seed, checkpoint=str(out / CHECKPOINT)),
     }
     write_atomically(out / METRICS, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
-    console = Console()
     console.print(_table(seen, tested))
     if tested is None:
         console.print("no view was held out, so nothing was tested")
@@ -240,18 +253,29 @@ def _scores(evaluation: Evaluation) -> dict[str, Any]:
     def number(value: float) -> float | str:
         return "Infinity" if value == math.inf else value
 
-    each = {view.name: {"psnr": number(view.psnr), "ssim": view.ssim} for view in evaluation.views}
-    return {"psnr": number(evaluation.psnr), "ssim": evaluation.ssim, "views": each}
+    def of(scores: ViewScore | Evaluation) -> dict[str, Any]:
+        return {"psnr": number(scores.psnr), "ssim": scores.ssim, "lpips": scores.lpips}
+
+    return {**of(evaluation), "masked": evaluation.masked, "views": {view.name: of(view) for view in evaluation.views}}
 
 
 def _table(seen: Evaluation, tested: Evaluation | None) -> Table:
-    table = Table("view", title="held-out views" if tested else "training views")
-    table.add_column("PSNR (dB)", justify="right")
-    table.add_column("SSIM", justify="right")
+    shown = tested or seen
+    title = "held-out views" if tested else "training views"
+    table = Table("view", title=f"{title}, inside their masks" if shown.masked else title)
+    columns = {"PSNR (dB)": "psnr", "SSIM": "ssim", **({} if shown.lpips is None else {"LPIPS": "lpips"})}
+    for column in columns:
+        table.add_column(column, justify="right")
+
+    def row(name: str, scores: ViewScore | Evaluation, style: str | None = None) -> None:
+        values = [getattr(scores, key) for key in columns.values()]
+        cells = ["" if v is None else f"{v:.{2 if key == 'psnr' else 4}f}" for v, key in zip(values, columns.values())]
+        table.add_row(name, *cells, style=style)
+
     if tested:
         for view in tested.views:
-            table.add_row(view.name, f"{view.psnr:.2f}", f"{view.ssim:.4f}")
+            row(view.name, view)
         table.add_section()
-        table.add_row("mean", f"{tested.psnr:.2f}", f"{tested.ssim:.4f}", style="bold")
-    table.add_row("mean of the training views", f"{seen.psnr:.2f}", f"{seen.ssim:.4f}")
+        row("mean", tested, "bold")
+    row("mean of the training views" + (", whole" if shown.masked and not seen.masked else ""), seen)
     return table

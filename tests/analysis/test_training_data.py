@@ -1,0 +1,131 @@
+"""What `landscape train` takes beside the photographs: masks, depth maps, where to start; and LPIPS."""
+
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from analysis.cli import main
+from splat.checkpoint import load_checkpoint
+from splat.scenes.scene import load_scene
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+
+SIZE = (24, 18)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "still"
+    settings = SyntheticSettings(gaussians=60, views=5, width=SIZE[0], height=SIZE[1])
+    write_transforms_scene(synthetic_scene(settings).scene, folder)
+    return folder
+
+
+def train(scene: Path, out: Path, *more: str) -> int:
+    return main(["train", str(scene), "--out", str(out), "--views", "3", "--iterations", "1", *more])
+
+
+def images(scene: Path) -> list[Path]:
+    return sorted((scene / "images").iterdir())
+
+
+def metrics(out: Path) -> dict:
+    return json.loads((out / "metrics.json").read_text())
+
+
+@pytest.fixture
+def lpips(monkeypatch) -> None:
+    """A stand-in for the package: the mean absolute difference."""
+
+    class Network(torch.nn.Module):
+        def __init__(self, **_: object) -> None:
+            super().__init__()
+
+        def forward(self, image: Tensor, target: Tensor) -> Tensor:
+            return (image - target).abs().mean()
+
+    module = ModuleType("lpips")
+    module.LPIPS = Network  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "lpips", module)
+
+
+def test_without_lpips_the_metric_is_left_out_in_one_sentence_and_null_in_the_record(
+    original, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    assert train(original, tmp_path / "run") == 0
+    said = capsys.readouterr().out
+    assert sum("LPIPS" in line for line in said.splitlines()) == 1 and "LPIPS is left out: " in said
+    for part in (metrics(tmp_path / "run")[key] for key in ("train", "test")):
+        assert part["lpips"] is None and all(view["lpips"] is None for view in part["views"].values())
+
+
+@pytest.mark.usefixtures("lpips")
+def test_with_lpips_it_stands_beside_psnr_and_ssim(original, tmp_path, capsys):
+    assert train(original, tmp_path / "run") == 0
+    said, scores = capsys.readouterr().out, metrics(tmp_path / "run")
+    assert "LPIPS" in said and "left out" not in said
+    with_lpips = scores["test"]["views"]
+    for view in load_scene(original).load(list(with_lpips)):
+        name = view.name.removeprefix("images/")
+        with Image.open(tmp_path / "run/test" / f"images_{name}") as file:
+            pixels = torch.from_numpy(np.array(file)).permute(2, 0, 1) / 255
+        wanted = float((pixels - view.image).abs().mean())
+        assert with_lpips[view.name]["lpips"] == pytest.approx(wanted, abs=0.5 / 255)
+        assert f"{with_lpips[view.name]['lpips']:.4f}" in said
+
+
+def test_scores_are_taken_inside_masks_where_there_are_any(original, tmp_path, capsys):
+    assert train(original, tmp_path / "whole") == 0
+    for path in images(original):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        inside = np.zeros((SIZE[1], SIZE[0]), dtype=np.uint8)
+        inside[4:12, 6:20] = 255
+        Image.fromarray(inside).save(tmp_path / "masks" / path.name)
+    capsys.readouterr()
+    assert train(original, tmp_path / "inside", "--masks", str(tmp_path / "masks")) == 0
+    assert "inside their masks" in capsys.readouterr().out
+    whole, inside = metrics(tmp_path / "whole"), metrics(tmp_path / "inside")
+    for part in ("train", "test"):
+        assert inside[part]["masked"] and not whole[part]["masked"] and inside[part]["psnr"] != whole[part]["psnr"]
+    kept = [(tmp_path / run / "checkpoint.pt").read_bytes() for run in ("whole", "inside")]
+    assert kept[0] == kept[1]  # masks are for the scores alone
+
+
+def test_masks_for_some_of_the_views_are_refused_before_the_training(original, tmp_path, capsys):
+    (tmp_path / "masks").mkdir()
+    Image.new("L", SIZE, 255).save(tmp_path / "masks" / images(original)[1].name)
+    assert train(original, tmp_path / "run", "--masks", str(tmp_path / "masks")) == 2
+    assert "expected a mask for each of 3 views" in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+def test_depth_maps_must_be_there_for_every_training_view(original, tmp_path, capsys):
+    (tmp_path / "depth").mkdir()
+    for i, path in enumerate(images(original)):
+        np.save(tmp_path / "depth" / f"{path.stem}.npy", np.arange(18 * 24).reshape(18, 24) + i)
+    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "depth")) == 0
+    chosen = load_checkpoint(tmp_path / "run/checkpoint.pt").scene.train[1]
+    missing = f"{Path(chosen).stem}.npy"
+    (tmp_path / "depth" / missing).unlink()
+    capsys.readouterr()
+    assert train(original, tmp_path / "again", "--depths", str(tmp_path / "depth")) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"got none for {chosen}; save it as {missing}" in said and not (tmp_path / "again").exists()
+
+
+def test_the_start_can_be_chosen(original, tmp_path, capsys, monkeypatch):
+    scene = load_scene(original)
+    assert scene.points is not None
+    monkeypatch.setattr("splat.start.triangulated_points", lambda views: scene.points)
+    runs = {}
+    for source in ("points", "triangulated", "random"):
+        assert train(original, tmp_path / source, "--start", source) == 0
+        runs[source] = len(load_checkpoint(tmp_path / source / "checkpoint.pt").training.gaussians)
+    assert runs["points"] == runs["triangulated"] < runs["random"] == 10_000
