@@ -23,7 +23,7 @@ from landscape.quadratic import FEWEST, PowerSums, column_dots, mean_interval, p
 from landscape.results import Progress, StopReason, TraceEstimate
 
 Reading = Literal["block", "full"]
-Method = Literal["hutchinson", "hutch++", "xtrace"]
+Method = Literal["auto", "hutchinson", "hutch++", "xtrace"]
 LEAST = 8  # probes: with fewer no interval can be trusted
 GROWTH = 1.5  # between two looks
 CONFIRMATION = 4  # probes between reaching the tolerance and believing it
@@ -35,7 +35,8 @@ GROUP = 32  # probes whose vectors are kept for the law of the mean
 class TraceSettings:
     """How many probe vectors of which kind.  rtol = atol = 0: max_probes of them, unless max_seconds end it.
 
-    method: see `landscape.trace`; for "hutch++" and "xtrace" the numbers of probes are numbers of matvecs.
+    method: see `landscape.trace`; but for "hutchinson" the numbers of probes are numbers of matvecs.  memory: GiB for the
+    vectors of XTrace, which stops where they are full.
     """
 
     distribution: Distribution = "rademacher"
@@ -47,26 +48,27 @@ class TraceSettings:
     max_probes: int = 100
     max_seconds: float = inf
     batch: int = 4
-    method: Method = "hutchinson"
+    method: Method = "auto"
+    memory: float = 2.0
 
     def __post_init__(self) -> None:
         if self.distribution not in ("rademacher", "gaussian"):
             raise ValueError(f"expected the distribution 'rademacher' or 'gaussian', got {self.distribution!r}")
         if self.reading not in ("block", "full"):
             raise ValueError(f"expected the reading 'block' or 'full', got {self.reading!r}")
-        if self.method not in ("hutchinson", "hutch++", "xtrace"):
-            raise ValueError(f"expected the method 'hutchinson', 'hutch++' or 'xtrace', got {self.method!r}")
-        if self.method != "hutchinson" and self.reading == "full":
+        if self.method not in ("auto", "hutchinson", "hutch++", "xtrace"):
+            raise ValueError(f"expected the method 'auto', 'hutchinson', 'hutch++' or 'xtrace', got {self.method!r}")
+        if self.method in ("hutch++", "xtrace") and self.reading == "full":
             raise ValueError(f"expected the reading 'block' with the method {self.method!r}, got 'full'")
         if not LEAST <= self.min_probes <= self.max_probes or self.max_probes < self.least:
             raise ValueError(
                 f"expected {LEAST} <= min_probes <= max_probes and max_probes >= {self.least} with the method {self.method!r}, "
                 f"got {self.min_probes} and {self.max_probes}"
             )
-        if self.rtol < 0 or self.atol < 0 or not 0 < self.confidence < 1 or self.batch < 1:
+        if self.rtol < 0 or self.atol < 0 or not 0 < self.confidence < 1 or self.batch < 1 or self.memory <= 0:
             raise ValueError(
-                f"expected rtol, atol >= 0, confidence in (0, 1) and batch >= 1, "
-                f"got {self.rtol}, {self.atol}, {self.confidence} and {self.batch}"
+                f"expected rtol, atol >= 0, confidence in (0, 1), batch >= 1 and memory > 0, "
+                f"got {self.rtol}, {self.atol}, {self.confidence}, {self.batch} and {self.memory}"
             )
 
     @classmethod
@@ -83,7 +85,7 @@ class TraceSettings:
     @property
     def least(self) -> int:
         """The fewest matvecs of the method: LEAST for each of its tasks."""
-        return LEAST * {"hutchinson": 1, "hutch++": 3, "xtrace": 2}[self.method]
+        return LEAST * {"auto": 1, "hutchinson": 1, "hutch++": 3, "xtrace": 2}[self.method]
 
     @property
     def adaptive(self) -> bool:
@@ -98,8 +100,8 @@ class TraceSettings:
 class Looks:
     """When an adaptive run looks at its error, and whether it may then stop.  next: the number of probes at the next look."""
 
-    def __init__(self, settings: TraceSettings) -> None:
-        self.next, self._most, self._confirming = settings.min_probes, settings.max_probes, False
+    def __init__(self, settings: TraceSettings, first: int | None = None) -> None:
+        self.next, self._most, self._confirming = first or settings.min_probes, settings.max_probes, False
 
     def end(self, probes: int, reached: bool) -> bool:
         """Whether the run ends with this look, at which the error asked for was reached or not."""
@@ -142,11 +144,11 @@ class Hutchinson:
         self, done_before: int = 0, most: int = 0, progress: Progress | None = None
     ) -> dict[str, TraceEstimate]:
         """Progress counts matvecs, from done_before to most."""
-        settings, probes, looks = self.settings, 0, Looks(self.settings)
+        settings, probes, looks = self.settings, 0, Looks(self.settings, self.first_look)
         if self.operator.dim == 0 or self.part is self.operator:
             return self._exact()
         while True:
-            self._draw(min(settings.batch, looks.next - probes, GROUP - probes % GROUP))
+            self.draw(min(settings.batch, looks.next - probes, GROUP - probes % GROUP))
             probes = self.samples.shape[2]
             if progress:
                 progress(done_before + probes, most, f"trace of {', '.join(self.rows)}: {probes} probes")
@@ -155,10 +157,19 @@ class Hutchinson:
                 continue
             estimates = self._estimates("time budget" if late else "matvec budget")
             reached = all(estimate.reason == "tolerance" for estimate in estimates.values())
-            if late or looks.end(probes, reached):
+            if late or looks.end(probes, reached) or (not reached and self.leaves(estimates)):
                 return estimates
 
-    def _draw(self, count: int) -> None:
+    @property
+    def first_look(self) -> int:
+        return self.settings.min_probes
+
+    def leaves(self, estimates: Mapping[str, TraceEstimate]) -> bool:
+        """Whether these estimates are where this method ends, because another one does better."""
+        return False
+
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
+        """Probes and their products with H, taken into account."""
         Z = draw_probes(self.operator.dim, count, self.generator, self.operator.dtype, self.settings.distribution)
         forms = [self.operator.apply(Z)] + ([] if self.part is None else [self.part.apply(Z)])
         sums = torch.stack([torch.stack([column_dots(Z[r], Y[r]) for r in self.rows.values()]) for Y in forms])
@@ -170,6 +181,7 @@ class Hutchinson:
             for name, group in self._open_groups().items():
                 self.groups[name].append(group)
             self.current = []
+        return Z, forms[0]
 
     def _open_groups(self) -> dict[str, PowerSums]:
         """The power sums of every block from the probes in no group yet; of H less what the known part explains."""
@@ -208,7 +220,7 @@ class Hutchinson:
                 matvecs=self.spent + probes,
                 reason="tolerance" if settings.reached(value, low, high) else reason,
                 samples=samples,
-                method=settings.method,
+                method="hutchinson",
             )
         return results
 

@@ -13,15 +13,26 @@ serves one task alone, because each omega_i in turn is the probe for the sketch 
 All t_i come from one QR: with Y = H Omega = Q R, Q_i spans Q less the unit vector Q s_i, s_i ~ R^-T e_i.  The squared
 length of u, replaced by the one it has on average, is random no more.
 
-The published error, the spread of the t_i over sqrt(s), takes them as independent.  They share their sketch, and it is
-0.6 to 0.9 of the true one: Student's interval from it covers 78 to 95%.  The jackknife, (s - 1) / sqrt(s) times the spread
-of the estimates without one test vector, also from the one QR, is too large (Efron and Stein 1981): 1.1 to 3.9 times, most
-where every vector counts.  The error given here is the geometric mean of the two, rather too long than too short: Student's
-interval from it covers 94 to 99.7% (700 seeds, n = 60 and 200, 16 to 48 matvecs, nominal 95%, the spectra of `quadratic`,
-exponential ones and ones with a step).
+**Its error.**  The published one, the spread of the t_i over sqrt(s), takes them as independent.  They share their sketch:
 
-Products are taken in the operator's dtype, the small matrices in float64.  A matrix of low rank makes R singular; the null
-directions are then those that s_i points to, and the result is exact to round-off.
+    Var(mean) = (V + (s - 1) C) / s,    V = Var t_i,  C = Cov(t_i, t_j);    the spread s_t^2 of the t_i is V - C on average
+
+C is known, too.  Let t_i^j be t_i with j left out of the sketch as well.  Given the other test vectors, t_i^j and t_j^i are
+independent and unbiased; so is t_j for any omega_i, of which alone t_i^j depends.  All products but one thus have the mean
+(tr H)^2, and
+
+    C = E (t_i - t_i^j) (t_j - t_j^i),      error^2 = s_t^2 / s + |C^|,    C^ the mean over all pairs
+
+without bias but for the modulus, which keeps a C^ that is below zero by chance from shortening the interval.  All t_i^j follow
+from the one QR.  Student's interval with s - 1 degrees of freedom covers (2,000 seeds, n = 60, 8 to 27 test vectors, nominal
+95%): 93.6 to 96.7% on power laws, clustered, indefinite and flat spectra, and with one dominant eigenvalue; up to 98% where the
+spectrum falls exponentially, and above where it has a step at the very size of the sketch.  The published error covers
+77 to 93%.
+
+Test vectors are signs where they were probes before (`choice`), and their squared lengths are left as they are.
+
+Products are taken in the operator's dtype, the small matrices in float64.  Directions of H Omega that are round-off alone
+are no part of Q and cost nothing: a matrix of low rank r is exact after s + r products.
 """
 
 from dataclasses import replace
@@ -29,17 +40,20 @@ from math import ceil, inf, isfinite, sqrt
 from time import monotonic
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from scipy.stats import t as student
 from torch import Tensor
 
-from landscape.hutchinson import GROWTH, WIDENING, Hutchinson, TraceSettings
+from landscape.hutchinson import GROWTH, LEAST, WIDENING, Hutchinson, TraceSettings
+from landscape.lanczos import is_dust
 from landscape.operator import ProjectedOperator, SymmetricOperator
 from landscape.probes import draw_probes
 from landscape.quadratic import column_dots, gram
 from landscape.results import StopReason, TraceEstimate
 
 EPS = torch.finfo(torch.float64).eps
+GIB = 2**30
+VECTORS = 4  # kept for each test vector of XTrace
 
 
 def hutch_plus_plus(
@@ -51,7 +65,7 @@ def hutch_plus_plus(
 ) -> TraceEstimate:
     """The trace of an operator; a third of max_probes goes into the sketch, an adaptive run saves probes on the rest."""
     if operator.dim <= settings.max_probes:
-        return _by_identity(operator, settings, name)
+        return by_identity(operator, settings, name)
     rank = settings.max_probes // 3
     sketch = draw_probes(operator.dim, rank, generator, operator.dtype, settings.distribution)
     Q = torch.linalg.qr(_products(operator, sketch, settings, name)).Q
@@ -69,63 +83,88 @@ def xtrace(
     settings: TraceSettings,
     deadline: float = inf,
     name: str = "all",
+    start: tuple[Float[Tensor, "n s"], Float[Tensor, "n s"]] | None = None,
 ) -> TraceEstimate:
-    """The trace of an operator.  The test vectors' directions are uniform, whatever settings.distribution says."""
-    n, most = operator.dim, settings.max_probes // 2
-    if n <= settings.max_probes:
-        return _by_identity(operator, settings, name)
+    """The trace of an operator.
+
+    start: test vectors of settings.distribution with their products, to go on from; else their directions are uniform.
+    """
+    n, most = operator.dim, most_test_vectors(operator, settings)
+    if start is None and n <= settings.max_probes:
+        return by_identity(operator, settings, name)
+    if most < LEAST:
+        raise ValueError(f"expected memory for {VECTORS * LEAST} vectors of {n} numbers, got {settings.memory:g} GiB")
+    kind = "gaussian" if start is None else settings.distribution
+    count = max(settings.min_probes, settings.least) // 2 if start is None else start[0].shape[1]
     Omega, Y, Q, HQ = (torch.empty(n, 0, dtype=operator.dtype) for _ in range(4))
-    count = max(settings.min_probes, settings.least) // 2
     while True:
-        fresh = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, "gaussian")
-        Omega, Y = torch.cat([Omega, fresh], dim=1), torch.cat([Y, _products(operator, fresh, settings, name)], dim=1)
-        new = torch.linalg.qr(torch.cat([Q, Y[:, Q.shape[1] :]], dim=1)).Q[:, Q.shape[1] :]
+        Z = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, kind) if start is None else start[0]
+        HZ = _products(operator, Z, settings, name) if start is None else start[1]
+        start, Omega, Y = None, torch.cat([Omega, Z], dim=1), torch.cat([Y, HZ], dim=1)
+        new = _added(Q, HZ)
         Q, HQ = torch.cat([Q, new], dim=1), torch.cat([HQ, _products(operator, new, settings, name)], dim=1)
-        samples, without = _leave_out(Omega, Y, Q, HQ)
-        value, error = float(samples.mean()), _error(samples, without)
-        half = (
-            float(student.ppf((1 + settings.confidence) / 2, count - 1))
-            * error
-            * (WIDENING if settings.adaptive else 1)
-        )
-        low, high = value - half, value + half
-        late = monotonic() > deadline
-        reached = settings.reached(value, low, high)
+        samples, without = _leave_out(Omega, Y, Q, HQ, kind == "gaussian")
+        value, error, spent = float(samples.mean()), _error(samples, without), count + Q.shape[1]
+        half = float(student.ppf((1 + settings.confidence) / 2, count - 1)) * error
+        half *= WIDENING if settings.adaptive else 1
+        late, reached = monotonic() > deadline, settings.reached(value, value - half, value + half)
         if reached or late or count == most:
             reason: StopReason = "tolerance" if reached else "time budget" if late else "matvec budget"
-            return TraceEstimate(
-                name, n, value, error, low, high, settings.confidence, count, 2 * count, reason, samples, "xtrace"
-            )
+            interval = value, error, value - half, value + half, settings.confidence
+            return TraceEstimate(name, n, *interval, count, spent, reason, samples, "xtrace")
         count = min(ceil(GROWTH * count), most)
+        if spent + n <= 2 * count:
+            return by_identity(operator, settings, name, spent)
+
+
+def most_test_vectors(operator: SymmetricOperator, settings: TraceSettings) -> int:
+    """How many XTrace may have: two products and VECTORS vectors each."""
+    size = max(operator.dim, 1) * torch.empty((), dtype=operator.dtype).element_size()
+    return min(settings.max_probes // 2, int(settings.memory * GIB / size) // VECTORS)
+
+
+def _added(Q: Float[Tensor, "n r"], Y: Float[Tensor, "n s"]) -> Float[Tensor, "n a"]:
+    """Orthonormal directions that Y adds to those of Q, round-off left out."""
+    rest = Y.clone(memory_format=torch.contiguous_format)
+    for _ in range(2):
+        rest -= Q @ (Q.T @ rest)
+    basis, R = torch.linalg.qr(rest)
+    U, sigma, _ = torch.linalg.svd(R.double())
+    scale = float(torch.linalg.vector_norm(Y, dim=0, dtype=torch.float64).max())
+    return basis @ U[:, [not is_dust(float(x), scale, Y.dtype) for x in sigma]].to(basis.dtype)
 
 
 def _error(samples: Tensor, without: Tensor) -> float:
-    """The geometric mean of the leave-one-out error and the jackknife's."""
+    """The root of the spread of the mean and the modulus of the covariance."""
     count = len(samples)
-    published = samples.std() / sqrt(count)
-    jackknife = without.std() * (count - 1) / sqrt(count)
-    return float((published * jackknife).sqrt())
+    changes = (samples - without).fill_diagonal_(0)
+    covariance = float((changes * changes.T).sum()) / (count * (count - 1))
+    return sqrt(float(samples.var()) / count + abs(covariance))
 
 
-def _leave_out(Omega: Tensor, Y: Tensor, Q: Tensor, HQ: Tensor) -> tuple[Float64[Tensor, " s"], Float64[Tensor, " s"]]:
-    """t_i of every test vector, and XTrace of all test vectors but the i-th.
+def _leave_out(
+    Omega: Tensor, Y: Tensor, Q: Tensor, HQ: Tensor, spherical: bool
+) -> tuple[Float64[Tensor, " s"], Float64[Tensor, "s s"]]:
+    """t_j of every test vector; and in row i, column j that without the i-th one.
 
-    Without the columns in P the sketch spans Q less Q S_P.  With g = S_P^T S_P, b = S_P^T w, y = g^-1 b and w = Q^T omega:
-    u = omega - Q (w - S_P y), whose square and whose u^T H u follow from products of small matrices.
+    Without the columns in P the sketch spans Q less Q S_P; all of Q where Y has a lower rank than columns, as any columns
+    but one span it then.  With g = S_P^T S_P, b = S_P^T w, y = g^-1 b and w = Q^T omega: u = omega - Q (w - S_P y), whose
+    square and whose u^T H u follow from products of small matrices.  spherical: lengths of u are replaced.
     """
-    (n, count) = Omega.shape
+    (n, count), rank = Omega.shape, Q.shape[1]
     R, W, core, T = gram(Q, Y), gram(Q, Omega), gram(Q, HQ), gram(HQ, Omega)
-    U, sigma, Vh = torch.linalg.svd(R)
-    if not sigma[0] > 0:
-        return torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
-    S = U @ (Vh / sigma.clamp_min(EPS * float(sigma[0]))[:, None])  # R^-T, the null directions of a singular R included
-    S = S / S.norm(dim=0)
+    S, less = torch.zeros(rank, count, dtype=torch.float64), 0
+    if rank == count:
+        U, sigma, Vh = torch.linalg.svd(R)
+        S, less = U @ (Vh / sigma.clamp_min(EPS * float(sigma[0]))[:, None]), 1  # R^-T
+        S = S / S.norm(dim=0)
     angles, b, pull, inner = S.T @ S, S.T @ W, S.T @ (T - core @ W), S.T @ core @ S
     squares = column_dots(Omega, Omega) - W.square().sum(dim=0)
     products = column_dots(Omega, Y) - 2 * (W * T).sum(dim=0) + (W * (core @ W)).sum(dim=0)
     own, b_own, pull_own = inner.diagonal(), b.diagonal(), pull.diagonal()
     quadratic = products + 2 * b_own * pull_own + b_own.square() * own
-    t = core.trace() - own + (n - count + 1) / (squares + b_own.square()) * quadratic
+    length = (n - rank + less) / (squares + b_own.square()) if spherical else 1.0
+    t = core.trace() - own + length * quadratic
     # row i is left out, column j tested
     det = (1 - angles.square()).fill_diagonal_(1)
     y, y_own = (b - angles * b_own) / det, (b_own - angles * b) / det
@@ -133,19 +172,21 @@ def _leave_out(Omega: Tensor, Y: Tensor, Q: Tensor, HQ: Tensor) -> tuple[Float64
     quadratic = products + 2 * (y * pull + y_own * pull_own)
     quadratic = quadratic + y.square() * own[:, None] + 2 * y * y_own * inner + y_own.square() * own
     left = core.trace() - (own[:, None] + own - 2 * angles * inner) / det
-    pairs = (left + (n - count + 2) / squares * quadratic).fill_diagonal_(0)
-    return t, pairs.sum(dim=1) / (count - 1)
+    length = (n - rank + 2 * less) / squares if spherical else 1.0
+    return t, left + length * quadratic
 
 
-def _by_identity(operator: SymmetricOperator, settings: TraceSettings, name: str) -> TraceEstimate:
-    """All of a small matrix costs no more than the estimate."""
+def by_identity(operator: SymmetricOperator, settings: TraceSettings, name: str, spent: int = 0) -> TraceEstimate:
+    """Where all of a small matrix costs no more than the estimate.  spent: matvecs that it took to know."""
     identity = torch.eye(operator.dim, dtype=operator.dtype)
     value = float(_products(operator, identity, settings, name).diagonal().double().sum()) if operator.dim else 0.0
-    return TraceEstimate.exact(name, operator.dim, value, settings.confidence, operator.dim)
+    return TraceEstimate.exact(name, operator.dim, value, settings.confidence, spent + operator.dim)
 
 
 def _products(operator: SymmetricOperator, V: Tensor, settings: TraceSettings, name: str) -> Tensor:
     """H V, `batch` vectors at a time."""
+    if V.shape[1] == 0:
+        return V
     result = torch.cat([operator.apply(some) for some in V.split(settings.batch, dim=1)], dim=1)
     if not isfinite(float(result.double().sum())):
         raise ValueError(f"expected finite products H v, got NaN or infinite entries in {name}")

@@ -6,6 +6,8 @@
         reading "full"   z lives on all rows and every block reads its part of z * (H z): a matvec per probe for all
                          blocks.  Unbiased, because the cross terms vanish in expectation; each adds |H_bc|_F^2 to the
                          variance.
+    method "auto"        the default: Hutchinson, until its own probes tell that one of the following does better (`choice`);
+                         with the reading "full" and where a part of the diagonal is known it stays Hutchinson
     method "hutch++"     exact on the range of a sketch H S, Hutchinson on the rest (`sketched`)
     method "xtrace"      every test vector in turn on the rest that the sketch of the others leaves (`sketched`)
 
@@ -21,7 +23,8 @@ from time import monotonic
 
 import torch
 
-from landscape.control import restrict
+from landscape.choice import chosen
+from landscape.control import PartlyKnown, restrict
 from landscape.hutchinson import Hutchinson, TraceSettings
 from landscape.operator import SymmetricOperator
 from landscape.probes import split
@@ -29,6 +32,7 @@ from landscape.results import Progress, TraceEstimate
 from landscape.sketched import hutch_plus_plus, xtrace
 
 PAPER = TraceSettings.fixed(10, "gaussian")
+ESTIMATORS = {"auto": chosen, "hutch++": hutch_plus_plus, "xtrace": xtrace}
 
 
 def estimate_traces(
@@ -62,11 +66,10 @@ def estimate_traces(
         block, own, before = restrict(operator, name), split(generator), index * settings.max_probes
         # what is left of the time is shared evenly among the blocks to come
         end = monotonic() + max(deadline - monotonic(), 0) / (len(names) - index)
-        if settings.method == "hutchinson":
+        if settings.method == "hutchinson" or (settings.method == "auto" and isinstance(block, PartlyKnown)):
             estimates |= Hutchinson(block, block.blocks, own, settings, end).estimate(before, most, progress)
         else:
-            estimator = hutch_plus_plus if settings.method == "hutch++" else xtrace
-            estimates[name] = estimator(block, own, settings, end, name)
+            estimates[name] = ESTIMATORS[settings.method](block, own, settings, end, name)
             if progress:
                 progress(before + settings.max_probes, most, f"trace of {name}: {estimates[name].matvecs} matvecs")
     return estimates

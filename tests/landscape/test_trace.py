@@ -51,7 +51,8 @@ def test_the_variance_is_the_one_of_theory(distribution, reading):
 
 
 def test_an_adaptive_run_reaches_its_tolerance_and_says_so():
-    estimates = estimate_traces(DenseOperator(POSITIVE, BLOCKS), generator(), TraceSettings(rtol=0.03, max_probes=5000))
+    settings = TraceSettings(rtol=0.03, max_probes=5000, method="hutchinson")
+    estimates = estimate_traces(DenseOperator(POSITIVE, BLOCKS), generator(), settings)
     for estimate in estimates.values():
         assert estimate.reason == "tolerance"
         assert estimate.half_width <= 0.03 * abs(estimate.value)
@@ -168,9 +169,11 @@ def test_bad_settings_are_refused():
         TraceSettings.fixed(7)
     with pytest.raises(ValueError, match=r"max_probes >= 24 with the method 'hutch[+][+]'"):
         TraceSettings.fixed(23, method="hutch++")
-    with pytest.raises(ValueError, match=r"'hutchinson', 'hutch[+][+]' or 'xtrace', got 'exact'"):
+    with pytest.raises(ValueError, match=r"'auto', 'hutchinson', 'hutch[+][+]' or 'xtrace', got 'exact'"):
         TraceSettings(method="exact")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="reading 'block' with the method 'xtrace'"):
         TraceSettings(method="xtrace", reading="full")
+    with pytest.raises(ValueError, match="memory > 0"):
+        TraceSettings(memory=0.0)
     with pytest.raises(ValueError, match="blocks out of a, b, c, got 'd'"):
         estimate_traces(DenseOperator(INDEFINITE, BLOCKS), generator(), blocks=["d"])
