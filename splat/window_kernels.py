@@ -7,7 +7,8 @@ The variance blur(y^2) - blur(y)^2 cancels.  That of the separable window is, by
 
     var = blur_down(var_along) + var_down(mean_along)       var_1d = sum w_k d_k^2 - (sum w_k d_k)^2,  d_k = y_k - y_0
 
-which loses next to nothing: the square taken away is at most 1 / w_0 = 3.8 times what is left, w_0 the middle weight.
+whose relative error is round-off times mean / std, that of rounding y itself, not the square of it: the square taken away
+is at most 1 / w_0 = 3.8 times what is left, w_0 the middle weight.
 
 Kernels take a range of `rows`, those of the three channels one after the other; fields are flat plane sets (3, plane_rows,
 stride) of `shape` = (height, width, plane_rows, stride).  What a range needs beyond its ends it works out for itself.
