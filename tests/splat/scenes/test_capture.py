@@ -90,7 +90,7 @@ def test_the_radius_is_about_the_centroid_and_the_orbit_about_the_target() -> No
     # at azimuths 0 and 180: centroid the target; a third at 90 moves it by a third of 4
     pair, three = capture_geometry(orbit((0, 180, 90))[:2]), capture_geometry(orbit((0, 90, 180)))
     assert pair.radius == pytest.approx(4, rel=1e-12) and pair.orbit is None  # opposite axes are parallel
-    assert three.orbit == pytest.approx(4, rel=1e-12)
+    assert capture_geometry(orbit((0, 90)) + orbit((200,), radius=1.0)).orbit == pytest.approx(3, rel=1e-12)
     assert three.radius == pytest.approx((4 * 2 / 3 + 2 * (16 + (4 / 3) ** 2) ** 0.5) / 3, rel=1e-12)
 
 
