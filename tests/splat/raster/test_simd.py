@@ -176,14 +176,25 @@ def test_a_width_that_does_not_exist_is_refused():
 
 
 def test_a_changed_source_or_width_gets_kernels_of_its_own(tmp_path, monkeypatch) -> None:
-    for name in ("kernels.py", "formulas.py"):
-        (tmp_path / name).write_text("x = 1\n")
+    (tmp_path / "inner").mkdir()
+    sources = {
+        "kernels.py": "from splat.inner import (\n    blurs,\n)\n\n@kernel\ndef f(): pass\n",
+        "inner/blurs.py": "from splat.constants import x\n",
+        "constants.py": "x = 1\n",
+        "training.py": "from splat.kernels import f\n",
+    }
+    for name, text in sources.items():
+        (tmp_path / name).write_text(text)
     monkeypatch.setattr(kernel_cache, "PACKAGE", tmp_path)
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     before = kernel_cache.kernel_folder(256)
     assert kernel_cache.kernel_folder(256) == before != kernel_cache.kernel_folder(512)
-    (tmp_path / "formulas.py").write_text("x = 2\n")
-    assert kernel_cache.kernel_folder(256) != before
+    (tmp_path / "training.py").write_text("no kernel's business")
+    assert kernel_cache.kernel_folder(256) == before
+    for name in ("constants.py", "inner/blurs.py", "kernels.py"):
+        (tmp_path / name).write_text(sources[name] + "# changed")
+        assert kernel_cache.kernel_folder(256) != before
+        (tmp_path / name).write_text(sources[name])
     assert before.is_relative_to(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "elsewhere"))
     assert kernel_cache.kernel_folder(256).parent == tmp_path / "elsewhere"
