@@ -144,9 +144,12 @@ class Training:
 
     def descend(self, gradient: Float[Tensor, " p"], step: int) -> None:
         """Update every parameter with Adam, at the step's rates."""
+        self.adam.update(self.gaussians.flat, gradient, self.rates(step))
+
+    def rates(self, step: int) -> Float[Tensor, " p"]:
+        """The learning rate of every parameter at a step."""
         position = position_rate(self.config.rates, self.extent, step, self.config.iterations)
-        rates = learning_rates(self.gaussians, self.config.rates, position)
-        self.adam.update(self.gaussians.flat, gradient, rates)
+        return learning_rates(self.gaussians, self.config.rates, position)
 
     def control_density(self, step: int, camera: Camera, base: Photometric) -> None:
         """Collect the screen-space gradient of a render; clone, split, prune and reset opacities when it is time."""

@@ -1,9 +1,17 @@
-"""The methods of training by name."""
+"""The methods of training by name.
+
+3dgs            nothing is added
+stablegs        images of probed Gaussians, and their agreement from probed viewpoints
+sam             the gradient at the worst place near by in the space of parameters
+dropgaussian    a growing random share of the Gaussians is left out of each training render
+"""
 
 from dataclasses import dataclass
 from typing import Literal
 
+from splat.regularizers.dropgaussian import DropGaussian
 from splat.regularizers.regularizer import Method
+from splat.regularizers.sam import SAM
 from splat.regularizers.stablegs import StableGS
 
 
@@ -14,6 +22,6 @@ class ThreeDGS(Method):
     name: Literal["3dgs"] = "3dgs"
 
 
-MethodSettings = ThreeDGS | StableGS
+MethodSettings = ThreeDGS | StableGS | SAM | DropGaussian
 
-METHODS: dict[str, type[MethodSettings]] = {method.name: method for method in (ThreeDGS, StableGS)}
+METHODS: dict[str, type[MethodSettings]] = {method.name: method for method in (ThreeDGS, StableGS, SAM, DropGaussian)}
