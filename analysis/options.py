@@ -35,6 +35,10 @@ class TrainOptions:
     scene, or what its files name."""
     depths: Path | None = None
     """Folder of relative depth maps for the training views, NAME.npy or 16-bit NAME.png, for methods that use depth."""
+    method: str = "3dgs"
+    """What is trained: 3dgs, stablegs or another of `splat/regularizers/methods.py`, at its published settings."""
+    set: UseAppendAction[tuple[str, ...]] = ()
+    """KEY=VALUE changes a setting of the method or of the training, as in vsp_weight=0; may be repeated."""
     resume: FlagCreatePairsOff[bool] = False
     """Continue the run in OUT; the other options must be those that it was started with."""
     sh_degree: int = 3
@@ -49,6 +53,16 @@ class TrainOptions:
     """Weight of 1 - SSIM; the pixel loss has the rest."""
     checkpoint_every: int = 500
     """Steps between checkpoints: what a killed run loses at most."""
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """Make a scene from a folder of photographs: find where each was taken, with pycolmap."""
+
+    photos: Positional[Path]
+    """Folder of the photographs: at least 3 of one scene that does not move, from different places."""
+    out: Path | None = None
+    """Folder of the scene, which must not exist yet.  Default: PHOTOS-scene, beside the photographs."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,10 @@
 
 RUN/checkpoint.pt   the latest checkpoint, see `splat/checkpoint.py`; written at the start, every so many steps, on
                     Ctrl-C and at the end
+RUN/seconds.json    how long that took, see `analysis/spent.py`
+RUN/history.csv     what the method noted along the way, a row each with its "step"; where there is any
 RUN/test/NAME.png   the held-out views as rendered at the end
-RUN/metrics.json    {"step", "gaussians", "train": scores, "test": scores or null, "provenance"}, where scores are
+RUN/metrics.json    {"step", "gaussians", "train": scores, "test": scores or null, "seconds", "provenance"}, where scores are
                     {"psnr", "ssim", "lpips", "masked", "views": {NAME: {"psnr", "ssim", "lpips"}}}, psnr in dB;
                     "Infinity" for a perfect image; lpips null where it cannot be computed; masked: inside masks only
 """
@@ -14,14 +16,12 @@ import math
 import os
 import shlex
 import shutil
-import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from threading import Event
 from typing import Any
 
+import pandas as pd
 import torch
 from PIL import Image
 from rich.console import Console
@@ -30,22 +30,26 @@ from rich.table import Table
 from rich.text import Text
 from torch import Tensor
 
+from analysis.interruption import interruption
 from analysis.options import TrainOptions
+from analysis.overrides import assignments, overridden
 from analysis.provenance import provenance
+from analysis.spent import Spent
 from splat.checkpoint import SceneReference, load_checkpoint, save_checkpoint, write_atomically
 from splat.densify import DensifySettings
 from splat.evaluate import Evaluation, ViewScore, evaluate, have_masks
 from splat.losses import LossSettings
 from splat.perceptual import MissingPerceptual, load_lpips
+from splat.regularizers.methods import METHODS
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
-from splat.scenes.splits import split_scene
+from splat.scenes.splits import Split, split_scene
 from splat.scenes.view import View
 from splat.start import initial_gaussians
 from splat.train import TrainConfig, Training, train
 
-CHECKPOINT, METRICS, RENDERS = "checkpoint.pt", "metrics.json", "test"
+CHECKPOINT, METRICS, HISTORY, RENDERS = "checkpoint.pt", "metrics.json", "history.csv", "test"
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
 
@@ -56,18 +60,14 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         raise ValueError(f"expected checkpoint_every of at least 1, got {options.checkpoint_every}")
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
-    colour = COLOURS.get(options.background)
-    scene = load_scene(options.scene, options.images, options.downscale, colour, options.masks, options.depths)
-    split = split_scene(scene, None if options.views == "all" else options.views)
-    config = _config(options, scene)
-    reference = SceneReference.to(scene, out / CHECKPOINT, split, options.images, options.downscale)
+    scene, split, config, reference = planned(options, out)
     views, held_out = scene.load(split.train), scene.load(split.test)
     for together in (views, held_out):
         have_masks(together)
     if options.depths:
         require_depths(views, options.depths)
     if options.resume:
-        training = _resumed(out / CHECKPOINT, config, reference)
+        training = resumed(out / CHECKPOINT, config, reference)
     else:
         generator = torch.Generator().manual_seed(config.seed)
         start = initial_gaussians(scene, views, 0, generator=generator, source=options.start)
@@ -88,9 +88,20 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     return 0
 
 
+def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig, SceneReference]:
+    """What the options stand for, before any image is read.  ValueError or FileNotFoundError where they are wrong."""
+    colour = COLOURS.get(options.background)
+    scene = load_scene(options.scene, options.images, options.downscale, colour, options.masks, options.depths)
+    split = split_scene(scene, None if options.views == "all" else options.views)
+    reference = SceneReference.to(scene, out / CHECKPOINT, split, options.images, options.downscale)
+    return scene, split, _config(options, scene), reference
+
+
 def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
     red, green, blue = scene.background.tolist()
-    return TrainConfig(
+    if options.method not in METHODS:
+        raise ValueError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}")
+    config = TrainConfig(
         iterations=options.iterations,
         seed=options.seed,
         sh_degree=options.sh_degree,
@@ -98,7 +109,9 @@ def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
         random_background=options.background == "random",
         loss=LossSettings(pixel=options.pixel_loss, ssim_weight=options.ssim_weight),
         densify=DensifySettings(enabled=options.densify),
+        method=METHODS[options.method](),
     )
+    return overridden(config, assignments(options.set))
 
 
 def _require_run(out: Path, resume: bool) -> None:
@@ -124,7 +137,7 @@ def _create_run(out: Path, training: Training, reference: SceneReference) -> Non
         raise
 
 
-def _resumed(path: Path, config: TrainConfig, reference: SceneReference) -> Training:
+def resumed(path: Path, config: TrainConfig, reference: SceneReference) -> Training:
     """The training of a checkpoint, which must have been started with the same settings on the same views."""
     loaded = load_checkpoint(path)
     asked = {**_flat(asdict(config)), **_flat(asdict(replace(reference, absolute="", relative="")))}
@@ -151,19 +164,26 @@ def _follow(
     training: Training, views: list[View], path: Path, reference: SceneReference, every: int, console: Console
 ) -> bool:
     """Train to the end with a progress bar and checkpoints; False where Ctrl-C ended it, after a checkpoint."""
-    total = training.config.iterations
-    with _interrupt() as interrupted, _progress(console) as progress:
+    total, spent = training.config.iterations, Spent.read(path.parent)
+    with interruption() as interrupted, _progress(console) as progress:
         bar = progress.add_task("training", total=total, completed=training.step, loss=math.nan, gaussians=0)
         loss = math.nan
-        for done in train(training, views):
+        for done in spent.timed(train(training, views)):
             loss = done.loss if math.isnan(loss) else loss + SMOOTHING * (done.loss - loss)
             progress.update(bar, completed=done.step, loss=loss, gaussians=done.gaussians)
             stop = interrupted.is_set()
             if stop or done.step % every == 0 or done.step == total:
                 save_checkpoint(path, training, reference)
+                spent.write(path.parent)
+                _write_history(training, path.with_name(HISTORY))
             if stop:
                 return done.step == total
     return True
+
+
+def _write_history(training: Training, path: Path) -> None:
+    if training.regularizer.history:
+        write_atomically(path, pd.DataFrame(training.regularizer.history).to_csv(index=False).encode())
 
 
 class _Rate(ProgressColumn):
@@ -183,23 +203,6 @@ def _progress(console: Console) -> Progress:
         console=console,
         refresh_per_second=4,
     )
-
-
-@contextmanager
-def _interrupt() -> Iterator[Event]:
-    """The first Ctrl-C only sets the event, so that the step under way ends; a second one interrupts at once."""
-    event = Event()
-    before = signal.getsignal(signal.SIGINT)
-
-    def first(*_: object) -> None:
-        event.set()
-        signal.signal(signal.SIGINT, before)
-
-    signal.signal(signal.SIGINT, first)
-    try:
-        yield event
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _report(training: Training, views: list[View], held_out: list[View], out: Path) -> None:
@@ -227,6 +230,7 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
         "gaussians": len(training.gaussians),
         "train": _scores(seen),
         "test": _scores(tested) if tested else None,
+        "seconds": asdict(Spent.read(out)),
         "provenance": provenance(config.seed, checkpoint=str(out / CHECKPOINT)),
     }
     write_atomically(out / METRICS, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from PIL import Image
@@ -17,7 +18,9 @@ from PIL import Image
 from analysis.cli import main
 from analysis.training import render_name
 from splat.checkpoint import load_checkpoint
+from splat.gaussians import ATTRIBUTES
 from splat.losses import psnr
+from splat.regularizers.stablegs import StableGS
 from splat.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -72,7 +75,7 @@ def refuse(capsys, arguments: list[str], *expected: str) -> None:
 
 
 def test_a_run_leaves_a_checkpoint_renders_and_metrics_that_agree(finished, original):
-    assert sorted(p.name for p in finished.iterdir()) == ["checkpoint.pt", "metrics.json", "test"]
+    assert sorted(p.name for p in finished.iterdir()) == ["checkpoint.pt", "metrics.json", "seconds.json", "test"]
     loaded = load_checkpoint(finished / "checkpoint.pt")
     assert loaded.training.step == ITERATIONS
     assert loaded.scene.find(finished / "checkpoint.pt") == original.resolve()
@@ -135,15 +138,15 @@ def test_ctrl_c_saves_a_checkpoint_and_says_how_to_continue(finished, original, 
     out = finished.with_name("stopped")
     command = arguments(original, out, "--checkpoint-every", "1000")
 
-    def press(gaussians, camera, background, settings, presses=[]):  # noqa: B006
+    def press(gaussians, camera, background, settings, *, presses=[], **others):  # noqa: B006
         presses.append(1)
         if len(presses) == 4:
             os.kill(os.getpid(), signal.SIGINT)
-        return render(gaussians, camera, background, settings)
+        return render(gaussians, camera, background, settings, **others)
 
     before = signal.getsignal(signal.SIGINT)
     with monkeypatch.context() as patch:
-        patch.setattr("splat.train.render", press)
+        patch.setattr("splat.photometric.render", press)
         assert main(command) == 130
     assert signal.getsignal(signal.SIGINT) is before
     said = " ".join(capsys.readouterr().err.split())
@@ -297,3 +300,17 @@ def test_random_backgrounds_and_other_losses_train(original, tmp_path):
     config = load_checkpoint(out / "checkpoint.pt").training.config
     assert config.random_background and config.loss.pixel == "charbonnier" and not config.densify.enabled
     assert config.sh_degree == 0
+
+
+def test_a_method_and_its_settings_are_named_on_the_command_line(original, tmp_path, capsys):
+    out = tmp_path / "stable"
+    settings = ["--set", "warm_up=2", "--set", "every=2", "--set", "viewpoints=one"]
+    assert main(arguments(original, out, "--method", "stablegs", *settings)) == 0
+    method = load_checkpoint(out / "checkpoint.pt").training.config.method
+    assert method == StableGS(warm_up=2, every=2, viewpoints="one")
+    history = pd.read_csv(out / "history.csv")
+    assert set(history["attribute"]) == set(ATTRIBUTES) and min(history["step"].tolist()) == 3
+    capsys.readouterr()
+    assert main(arguments(original, tmp_path / "other", "--method", "magic")) == 2
+    assert "expected a method among 3dgs, stablegs" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
