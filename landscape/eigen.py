@@ -5,19 +5,27 @@ T = Q^T H Q is kept whole, so that nothing is assumed of its shape after a resta
 vectors is full, the Ritz vectors next to both ends are kept and the recurrence goes on from them.
 
 A run ends when every wanted pair has an estimated residual |B s| under max(rtol |lambda|, atol), or under the round-off
-of the matvec, or at its budget.  The residuals reported are measured afterwards with the operator itself:
-|H v - lambda v|.
+of the matvec, or at its budget.  The residuals reported are measured with the operator itself.  The recurrence knows
+r_i = H v_i - lambda_i v_i up to round-off: its next vectors times B s_i.  One product with all the k pairs, signs at random,
+
+    f = H x - sum_i +-(lambda_i v_i + r_i),  x = sum_i +-v_i
+
+shows what it does not know, |f|^2 = k times the mean square of one pair's on average, and |r_i +- f| is the residual.  Where
+that is more than was asked for, as at the end of a budget, each pair has a product of its own.
+
+The noise of a product is measured once before, with one vector more, when an estimate that is still above its goal has come
+under NEAR times the largest value: from there on steps might be made in vain.
 """
 
 from dataclasses import dataclass
-from math import inf, log, sqrt
+from math import inf, isnan, log, nan, sqrt
 from time import monotonic
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.checks import matvec_noise
+from landscape.checks import SCALE
 from landscape.lanczos import is_dust, norm, orthogonalise
 from landscape.operator import SymmetricOperator
 from landscape.probes import draw_probes
@@ -25,6 +33,7 @@ from landscape.results import EigenEnds, Eigenpairs, Progress, StopReason
 
 KEEP = 0.6  # share of the basis that a restart keeps
 CHUNK = 1 << 16  # rows of vectors that a restart recombines at a time
+NEAR = 3e-4  # root of the eps of float32, which a product's rounding stays below in either precision
 WARM_NOISE = 0.01  # share of a random vector in a warm start: an end that the old vectors miss is still found
 
 
@@ -86,19 +95,20 @@ def extreme_eigenpairs(
         raise ValueError(f"expected at most {n} eigenpairs of an operator with {n} rows, got {settings.wanted}")
     krylov = _Krylov(operator, generator, settings, start)
     deadline = monotonic() + settings.max_seconds
-    strictness = 1.0
+    strictness, near = 1.0, False
     while True:
-        krylov.expand()
+        krylov.expand(near)
         if krylov.size < settings.wanted:
             continue
         ritz = krylov.ritz()
         if progress:
             progress(krylov.matvecs, settings.max_matvecs, ritz.state())
-        spent = krylov.matvecs + settings.block + settings.wanted > settings.max_matvecs
+        spent = krylov.matvecs + settings.block + settings.wanted + 2 > settings.max_matvecs
         late = monotonic() > deadline
         goal = strictness * settings.rtol, max(strictness * settings.atol, krylov.floor(ritz))
-        if ritz.converged(*goal) or spent or late:
-            ends, more = krylov.measured(ritz, "time budget" if late else "matvec budget")
+        near, converged = ritz.near(NEAR, *goal), ritz.converged(*goal)
+        if converged or spent or late:
+            ends, more = krylov.measured(ritz, "time budget" if late else "matvec budget", converged)
             if not more or spent or late:
                 return ends
             strictness /= 2
@@ -121,8 +131,16 @@ class _Ritz:
         return self.largest + self.smallest
 
     def converged(self, rtol: float, floor: float) -> bool:
-        goal = (rtol * self.values[self.wanted].abs()).clamp_min(floor)
-        return bool((self.residuals[self.wanted] <= goal).all())
+        return not self._open(rtol, floor).numel()
+
+    def near(self, share: float, rtol: float, floor: float) -> bool:
+        """Whether an open residual is under this share of the largest value."""
+        return bool((self._open(rtol, floor) < share * self.values.abs().max()).any())
+
+    def _open(self, rtol: float, floor: float) -> Float64[Tensor, " k"]:
+        """The residuals above their goals."""
+        residuals = self.residuals[self.wanted]
+        return residuals[residuals > (rtol * self.values[self.wanted].abs()).clamp_min(floor)]
 
     def gaps(self) -> Float64[Tensor, " k"]:
         """Distance of each wanted value to the nearest other one."""
@@ -155,19 +173,22 @@ class _Krylov:
         if start is not None:
             first[:, 0] = _mixed(start, first[:, 0])
         self._append(first.T.contiguous())
-        self.noise = matvec_noise(operator, self.basis[0][:, None])
-        self.matvecs = 2
-        self._restarted = False
+        self.noise, self.matvecs, self._restarted = nan, 0, False
 
     @property
     def full(self) -> bool:
         return self.size + self.width > self.capacity
 
-    def expand(self) -> None:
-        """Apply H to the next rows, project, and find the rows after them."""
+    def expand(self, near_noise: bool) -> None:
+        """Apply H to the next rows, project, and find the rows after them; the first time near the noise, measure it."""
         old, new = self.size, self.size + self.width
-        W = self.operator.apply(self.basis[old:new].T.contiguous()).T.clone(memory_format=torch.contiguous_format)
-        self.matvecs += self.width
+        V = self.basis[old:new].T
+        if near_noise and isnan(self.noise):
+            V = torch.cat([V, SCALE * V[:, :1]], dim=1)
+        W = self.operator.apply(V.contiguous()).T.clone(memory_format=torch.contiguous_format)
+        self.matvecs += len(W)
+        if len(W) > self.width:
+            self.noise, W = norm(W[-1].double() / SCALE - W[0].double()), W[:-1]
         if not torch.isfinite(W).all():
             raise ValueError(
                 "expected finite products H v, got NaN or infinity; check the parameters with check_operator"
@@ -217,7 +238,8 @@ class _Krylov:
 
     def floor(self, ritz: _Ritz) -> float:
         """The residual that the matvec's round-off leaves at least."""
-        return max(self.noise, torch.finfo(self.basis.dtype).eps * float(ritz.values.abs().max()))
+        rounding = torch.finfo(self.basis.dtype).eps * float(ritz.values.abs().max())
+        return rounding if isnan(self.noise) else max(self.noise, rounding)
 
     def restart(self, ritz: _Ritz) -> None:
         """Keep the share KEEP of the memory in Ritz vectors, and the rows that come next.
@@ -238,13 +260,16 @@ class _Krylov:
         self.T[:keep, :keep] = torch.diag(ritz.values[kept])
         self.size, self._restarted = keep, True
 
-    def measured(self, ritz: _Ritz, budget: StopReason) -> tuple[EigenEnds, bool]:
+    def measured(self, ritz: _Ritz, budget: StopReason, converged: bool) -> tuple[EigenEnds, bool]:
         """The wanted pairs with residuals by the operator itself, and whether more steps would make them better."""
         s = self.settings
         vectors = self.basis[: self.size].T @ ritz.coordinates[:, ritz.wanted].to(self.basis.dtype)
         vectors /= torch.linalg.vector_norm(vectors, dim=0)  # restarts leave a little of their round-off
-        values, residuals = rayleigh(self.operator, vectors)
-        self.matvecs += s.wanted
+        values = ritz.values[ritz.wanted]
+        residuals = self._together(ritz, vectors) if converged else torch.full_like(values, inf)
+        if not (residuals <= (s.rtol * values.abs()).clamp_min(s.atol)).all():
+            values, residuals = rayleigh(self.operator, vectors)
+            self.matvecs += s.wanted
         estimated = ritz.residuals[ritz.wanted]
         # a residual far above the recurrence's estimate is the matvec's round-off: more steps cannot lower it
         stuck = (estimated <= residuals / 4) | (estimated <= self.floor(ritz))
@@ -266,6 +291,19 @@ class _Krylov:
         spectrum = torch.stack([ritz.values, ritz.residuals])
         ends = EigenEnds(largest, smallest, "lanczos", self.matvecs, beyond, self.noise, spectrum)
         return ends, not bool((reached | stuck).all())
+
+    def _together(self, ritz: _Ritz, vectors: Float[Tensor, "n k"]) -> Float64[Tensor, " k"]:
+        """Residuals of all pairs from one product; measures the noise."""
+        signs = draw_probes(len(ritz.wanted), 1, self.generator, torch.float64, "rademacher")[:, 0]
+        last = ritz.coordinates[self.size - self.coupling.shape[1] : self.size, ritz.wanted]
+        unknown = self.operator.apply((vectors @ signs.to(vectors.dtype))[:, None])[:, 0].double()
+        self.matvecs += 1
+        following = self.basis[self.size : self.size + self.width]
+        known = following.T @ (self.coupling @ last).to(vectors.dtype)
+        for i, value in enumerate(ritz.values[ritz.wanted]):
+            unknown -= signs[i] * (value * vectors[:, i] + known[:, i])
+        self.noise = norm(unknown) / len(signs) ** 0.5
+        return torch.tensor([norm(signs[i] * known[:, i] + unknown) for i in range(len(signs))], dtype=torch.float64)
 
 
 def rayleigh(
