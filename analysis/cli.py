@@ -1,7 +1,7 @@
 """The `landscape` command: subcommands, and how errors become exit codes.
 
     0    done
-    1    a self-check failed under --strict
+    1    a self-check failed under --strict, or a cell of a sweep failed
     2    bad input: one sentence on stderr that says what was expected, what came and what to do
     130  interrupted with Ctrl-C
 
@@ -14,10 +14,20 @@ from typing import Annotated
 
 import tyro
 
-from analysis.options import BenchOptions, DemoOptions, ProbeOptions, SliceOptions, TrainOptions
+from analysis.options import (
+    BenchOptions,
+    DemoOptions,
+    ProbeOptions,
+    SfmOptions,
+    SliceOptions,
+    SweepOptions,
+    TrainOptions,
+)
 
 Options = (
-    Annotated[TrainOptions, tyro.conf.subcommand("train")]
+    Annotated[SfmOptions, tyro.conf.subcommand("sfm")]
+    | Annotated[TrainOptions, tyro.conf.subcommand("train")]
+    | Annotated[SweepOptions, tyro.conf.subcommand("sweep")]
     | Annotated[ProbeOptions, tyro.conf.subcommand("probe")]
     | Annotated[SliceOptions, tyro.conf.subcommand("slice")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
@@ -48,10 +58,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(options: Options, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand."""
     match options:
+        case SfmOptions():
+            from analysis.sfm import run_sfm
+
+            return run_sfm(options)
         case TrainOptions():
             from analysis.training import run_training
 
             return run_training(options, ["landscape", *arguments])
+        case SweepOptions():
+            from analysis.sweep import run_sweep
+
+            return run_sweep(options)
         case ProbeOptions():
             from analysis.probe import run_probe
 

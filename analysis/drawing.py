@@ -14,10 +14,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def draw(module: str, target: Path) -> list[str]:
     """Run `python -m figures.MODULE TARGET`; returns what it warned of.  Raises RuntimeError with its words if it failed."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
     command = [sys.executable, "-m", f"figures.{module}", str(target)]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, env=module_environment())
     said = [line for line in done.stderr.splitlines() if line.strip()]
     if done.returncode:
         raise RuntimeError(f"drawing failed; draw again with: {' '.join(command)}\n" + "\n".join(said))
     return [line.split("Warning: ", 1)[1] for line in said if "Warning: " in line]
+
+
+def module_environment() -> dict[str, str]:
+    """In which `python -m` finds the modules of this repository, and all that this process finds."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}

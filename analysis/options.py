@@ -66,6 +66,23 @@ class SfmOptions:
 
 
 @dataclass(frozen=True)
+class SweepOptions:
+    """Train methods x seeds x scenes, and give mean and standard deviation.
+
+    What is done already is kept: a sweep that was stopped or killed continues when it is run again.
+    """
+
+    file: Annotated[Positional[Path], arg(metavar="SWEEP.toml")]
+    """The methods, seeds, scenes and settings; an example is in the README."""
+    out: Path | None = None
+    """Folder of the runs and tables.  Default: the file's."""
+    jobs: int = 1
+    """Cells at once, each on its share of the processors."""
+    probe: FlagCreatePairsOff[bool] = False
+    """Also probe every cell after its training; the file's split_control adds the control."""
+
+
+@dataclass(frozen=True)
 class ProbeOptions:
     """Measure the loss landscape at a checkpoint: traces, extreme eigenvalues, anisotropy, a slice."""
 

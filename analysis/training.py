@@ -51,6 +51,7 @@ from splat.train import TrainConfig, Training, train
 
 CHECKPOINT, METRICS, HISTORY, RENDERS = "checkpoint.pt", "metrics.json", "history.csv", "test"
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+AGAIN = "repeat its command with --resume, or choose another --out"
 SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
 
 
@@ -137,8 +138,9 @@ def _create_run(out: Path, training: Training, reference: SceneReference) -> Non
         raise
 
 
-def resumed(path: Path, config: TrainConfig, reference: SceneReference) -> Training:
-    """The training of a checkpoint, which must have been started with the same settings on the same views."""
+def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: str = AGAIN) -> Training:
+    """The training of a checkpoint, which must have been started with the same settings on the same views.  remedy: what a
+    refusal advises."""
     loaded = load_checkpoint(path)
     asked = {**_flat(asdict(config)), **_flat(asdict(replace(reference, absolute="", relative="")))}
     saved = {**_flat(asdict(loaded.training.config)), **_flat(asdict(replace(loaded.scene, absolute="", relative="")))}
@@ -146,7 +148,7 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference) -> Train
         if asked[key] != value:
             raise ValueError(
                 f"expected the settings that the run in {path.parent} was started with, {key} = {value}, got "
-                f"{asked[key]}; repeat its command with --resume, or choose another --out"
+                f"{asked[key]}; {remedy}"
             )
     return loaded.training
 
