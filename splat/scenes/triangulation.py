@@ -74,9 +74,9 @@ def verification() -> pycolmap.TwoViewGeometryOptions:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """COLMAP's own log is kept to its errors."""
+    """Without COLMAP's own log, but for what ends the process."""
     before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     try:
         yield
     finally:

@@ -19,7 +19,7 @@ SHARP = 1.0  # px within which nearly all features lie
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    return textured.views(3)
+    return textured.views(3, off_centre=(3, -2))
 
 
 @pytest.fixture(scope="module")

@@ -20,16 +20,17 @@ def texture() -> np.ndarray:
     return 1 / (1 + np.exp(-8 * sum(grains)))
 
 
-def cameras(n: int, arc: float = 40.0) -> list[Camera]:
-    """On an arc in degrees before the edge, at changing heights, looking at its middle."""
+def cameras(n: int, off_centre: tuple[float, float] = (0, 0)) -> list[Camera]:
+    """On an arc before the edge, at changing heights, looking at its middle; off_centre: of the principal point, px."""
     target = torch.tensor([0.0, 0.0, 0.25], dtype=torch.float64)
     down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     result = []
-    for i, angle in enumerate(np.deg2rad(np.linspace(-arc / 2, arc / 2, n))):
+    for i, angle in enumerate(np.deg2rad(np.linspace(-20, 20, n))):
         offset = torch.tensor([np.sin(angle), 0.15 * (-1) ** i, -np.cos(angle)], dtype=torch.float64)
         centre = target + DISTANCE * offset
         rotation = look_at(centre, target, down)
-        result.append(Camera(rotation, centre, FOCAL, FOCAL, WIDTH / 2 + 3, HEIGHT / 2 - 2, WIDTH, HEIGHT))
+        cx, cy = WIDTH / 2 + off_centre[0], HEIGHT / 2 + off_centre[1]
+        result.append(Camera(rotation, centre, FOCAL, FOCAL, cx, cy, WIDTH, HEIGHT))
     return result
 
 
@@ -47,7 +48,7 @@ def picture(camera: Camera, colours: np.ndarray) -> np.ndarray:
     return np.stack([map_coordinates(layer, places, order=1, mode="grid-wrap") for layer in colours], axis=-1)
 
 
-def views(n: int) -> list[View]:
-    colours = texture()
-    images = [torch.from_numpy(picture(camera, colours)).permute(2, 0, 1).float() for camera in cameras(n)]
-    return [View(f"place/{i}", camera, image) for i, (camera, image) in enumerate(zip(cameras(n), images))]
+def views(n: int, off_centre: tuple[float, float] = (0, 0)) -> list[View]:
+    colours, posed = texture(), cameras(n, off_centre)
+    images = [torch.from_numpy(picture(camera, colours)).permute(2, 0, 1).float() for camera in posed]
+    return [View(f"place/{i}", camera, image) for i, (camera, image) in enumerate(zip(posed, images))]
