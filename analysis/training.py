@@ -94,7 +94,9 @@ def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig
     colour = COLOURS.get(options.background)
     scene = load_scene(options.scene, options.images, options.downscale, colour, options.masks, options.depths)
     split = split_scene(scene, None if options.views == "all" else options.views)
-    reference = SceneReference.to(scene, out / CHECKPOINT, split, options.images, options.downscale)
+    reference = SceneReference.to(
+        scene, out / CHECKPOINT, split, options.images, options.downscale, options.start, options.depths
+    )
     return scene, split, _config(options, scene), reference
 
 

@@ -35,6 +35,7 @@ from splat.regularizers.methods import ThreeDGS
 from splat.regularizers.regularizer import Regularizer
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split
+from splat.start import Source
 from splat.train import TrainConfig, Training
 
 FORMAT, VERSION = "splat-landscape checkpoint", 2
@@ -46,7 +47,8 @@ class SceneReference:
 
     absolute, relative: the scene's folder, and the same from the checkpoint's folder.  images: the folder of images in
     it, where one was named; downscale: by which its images were reduced further.  train, test: names of the views;
-    sizes: (width, height) of the training views, px.
+    sizes: (width, height) of the training views, px.  start: what the Gaussians started from (`splat/start.py`); depths:
+    the folder of depth maps, where one was named.  Older checkpoints have neither.
     """
 
     absolute: str
@@ -56,10 +58,21 @@ class SceneReference:
     train: list[str]
     test: list[str]
     sizes: list[list[int]]
+    start: Source = "scene"
+    depths: str | None = None
 
     @classmethod
-    def to(cls, scene: Scene, checkpoint: Path, split: Split, images: str | None, downscale: float) -> "SceneReference":
-        """The scene, loaded with these images and downscale, as seen from where the checkpoint will lie."""
+    def to(
+        cls,
+        scene: Scene,
+        checkpoint: Path,
+        split: Split,
+        images: str | None,
+        downscale: float,
+        start: Source = "scene",
+        depths: Path | None = None,
+    ) -> "SceneReference":
+        """The scene, loaded with these images, downscale and depths, as seen from where the checkpoint will lie."""
         return cls(
             absolute=str(scene.root),
             relative=os.path.relpath(scene.root, checkpoint.parent.resolve()),
@@ -68,6 +81,8 @@ class SceneReference:
             train=list(split.train),
             test=list(split.test),
             sizes=[[frame.camera.width, frame.camera.height] for frame in scene.select(split.train)],
+            start=start,
+            depths=None if depths is None else str(depths.resolve()),
         )
 
     def find(self, checkpoint: Path) -> Path:
@@ -183,7 +198,7 @@ def _checkpoint(content: Any) -> Checkpoint:
     regularizer = config.method.regularizer(config.seed)
     if version > 1:
         _restore(regularizer, _get(content, "regularizer", dict))
-    scene = _dataclass(SceneReference, _get(content, "scene", dict), "scene")
+    scene = _dataclass(SceneReference, {"start": "scene", "depths": None, **_get(content, "scene", dict)}, "scene")
     adam, screen = _get(content, "adam", dict), _get(content, "screen_gradients", dict)
     training = Training(
         config=config,

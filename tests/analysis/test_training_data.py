@@ -128,4 +128,18 @@ def test_the_start_can_be_chosen(original, tmp_path, capsys, monkeypatch):
     for source in ("points", "triangulated", "random"):
         assert train(original, tmp_path / source, "--start", source) == 0
         runs[source] = len(load_checkpoint(tmp_path / source / "checkpoint.pt").training.gaussians)
+        assert load_checkpoint(tmp_path / source / "checkpoint.pt").scene.start == source
     assert runs["points"] == runs["triangulated"] < runs["random"] == 10_000
+    assert train(original, tmp_path / "random", "--start", "points", "--resume") == 2
+    assert "start = random, got points" in capsys.readouterr().err
+
+
+def test_a_run_resumes_with_the_depth_maps_that_it_was_started_with(original, tmp_path, capsys):
+    for folder in ("depth", "other"):
+        (tmp_path / folder).mkdir()
+        for path in images(original):
+            np.save(tmp_path / folder / f"{path.stem}.npy", np.arange(18 * 24).reshape(18, 24))
+    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "depth")) == 0
+    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "depth"), "--resume") == 0
+    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "other"), "--resume") == 2
+    assert f"depths = {tmp_path / 'depth'}, got {tmp_path / 'other'}" in capsys.readouterr().err

@@ -191,3 +191,11 @@ def test_a_checkpoint_from_before_there_were_methods_is_3dgs(path):
     del content["regularizer"], content["config"]["method"]
     torch.save(content, path)
     assert load_checkpoint(path).training.config.method == ThreeDGS()
+
+
+def test_checkpoints_from_before_the_start_was_recorded_are_read(tmp_path):
+    save_checkpoint(tmp_path / "new.pt", Training.start(tiny_gaussians(), EXTENT, tiny_config()), REFERENCE)
+    content = torch.load(tmp_path / "new.pt", weights_only=True)
+    del content["scene"]["start"], content["scene"]["depths"]
+    torch.save(content, tmp_path / "old.pt")
+    assert load_checkpoint(tmp_path / "old.pt").scene == REFERENCE
