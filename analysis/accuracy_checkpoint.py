@@ -30,7 +30,15 @@ from splat.traces import exact_traces
 
 # a scene's products cost too much for more, and for what the matrices have shown to be the same as another, or no rival
 BUDGETS = (12, 36)  # matvecs a block
-LEFT_OUT = ("Hutchinson, Gaussian", "Hutchinson, adaptive", "PyHessian", "lobpcg", "power iteration", "in blocks")
+LEFT_OUT = (
+    "Hutchinson, Gaussian",
+    "Hutchinson, adaptive",
+    "chosen by",
+    "PyHessian",
+    "lobpcg",
+    "power iteration",
+    "in blocks",
+)
 SAMPLES, FINE, MOST = 128, 1e-6, 250
 STARTS, STEPS = 6, 24
 TRUTH = "truth.json"

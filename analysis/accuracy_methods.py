@@ -14,6 +14,7 @@ share of a product's arithmetic; there is no backward pass).
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from math import inf, nan
 from typing import Literal
 
@@ -26,6 +27,7 @@ from analysis.accuracy_cases import Case, Meter
 from analysis.bench_scene import OPERATIONS
 from landscape.anisotropy import effective_rank, mass_quantile
 from landscape.density import absolute_sum, spectral_density
+from landscape.diagonal import Method as DiagonalMethod
 from landscape.diagonal import estimate_diagonal
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.power import PowerSettings, power_ends
@@ -85,9 +87,11 @@ def own_methods(budgets: tuple[int, ...] = BUDGETS) -> Iterator[Method]:
 
 
 def trace_methods(budgets: tuple[int, ...]) -> Iterator[Method]:
-    yield _traces("Hutchinson, adaptive", "rtol 0.05", TraceSettings(), "default", lambda case: case.objective is None)
+    yield _traces("chosen by its probes", "rtol 0.05", TraceSettings(), "default", lambda case: case.objective is None)
     for rtol in (0.2, 0.1):
-        yield _traces("Hutchinson, adaptive", f"rtol {rtol:g}", TraceSettings(rtol=rtol))
+        yield _traces("chosen by its probes", f"rtol {rtol:g}", TraceSettings(rtol=rtol))
+    for rtol in (0.2, 0.1, 0.05):
+        yield _traces("Hutchinson, adaptive", f"rtol {rtol:g}", TraceSettings(rtol=rtol, method="hutchinson"))
     yield _traces("StableGS", "10 probes", PAPER)
     for budget in budgets:
         fixed = TraceSettings.fixed(budget)
@@ -194,14 +198,19 @@ def _bracketed(part: str, bracket: Bracket) -> Answer:
 
 
 def diagonal_methods() -> Iterator[Method]:
-    for probes, origin in {32: "default", **dict.fromkeys(PROBES, "own")}.items():
+    names: dict[DiagonalMethod, str] = {"auto": "chosen by its probes", "signs": "random signs"}
+    for probes, (method, name) in product((32, *PROBES), names.items()):
 
-        def run(_: Case, operator: Meter, seed: int, probes: int = probes) -> list[Answer]:
-            found = estimate_diagonal(operator, generator(seed), probes)
-            half = float(student.ppf((1 + CONFIDENCE) / 2, probes - 1)) * found.standard_errors
+        def run(
+            _: Case, operator: Meter, seed: int, probes: int = probes, method: DiagonalMethod = method
+        ) -> list[Answer]:
+            found = estimate_diagonal(operator, generator(seed), probes, method=method)
+            freedom = found.samples.shape[1] - 1
+            half = float(student.ppf((1 + CONFIDENCE) / 2, freedom)) * found.standard_errors
             return [Answer("all", found.values, found.standard_errors, found.values - half, found.values + half)]
 
-        yield Method("diagonal", "random signs", f"{probes} probes", run, origin)  # pyright: ignore[reportArgumentType]
+        origin: Origin = "default" if (probes, method) == (32, "auto") else "own"
+        yield Method("diagonal", name, f"{probes} probes", run, origin)
 
     def own_blocks(case: Case, operator: Meter, _: int) -> list[Answer]:
         assert case.objective is not None

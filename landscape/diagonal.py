@@ -1,10 +1,15 @@
-"""The diagonal of H by random signs (Bekas, Kokiopoulou and Saad 2007), and how much of it lies on groups of rows.
+"""The diagonal of H, and how much of it lies on groups of rows.
+
+    method "signs"   random signs (Bekas, Kokiopoulou and Saad 2007)
+    method "auto"    the default: half of the probes are signs; where their products tell that it pays, by the rule of
+                     `choice`, they become a sketch and the other half its products (`sketched_diagonal`), else signs too
 
     a_i = z_i * (H z_i),   diag H ~ mean of a_i,   variance of an entry: the other entries of its row, squared, over k
 
 Where the operator knows the diagonal d of a part K of itself (`control.PartlyKnown`), z * (K z) - d has the mean zero and is
 taken off with the slope that the other probes have in all rows together: unbiased, as no probe has a part in its own slope.
-An operator that knows all of its diagonal is not probed.
+An operator that knows all of its diagonal is not probed.  A sketch pays where 4 r is below the sum of the entries' variances
+with one probe, r what the sketch leaves.
 
 The sensitivity of a group of rows (a Gaussian, say) is the sum of |H_rr| over them.  The modulus of an estimate is too large on
 average: for a normal error s by at most s sqrt(2 / pi), where the entry is zero.  `GroupSums.bias` is that expected excess
@@ -13,18 +18,25 @@ group's rows go together.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi, sqrt
+from typing import Literal
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from landscape.choice import WORSE, sketch_leaves
 from landscape.control import PartlyKnown
 from landscape.operator import SymmetricOperator
 from landscape.probes import draw_probes
 from landscape.quadratic import gram
 from landscape.results import Progress
+from landscape.sketched import added_directions
+from landscape.sketched_diagonal import sketched_samples
+
+Method = Literal["auto", "signs"]
+FEWEST = 4  # test vectors of a sketch
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,19 +50,26 @@ class GroupSums:
 
 @dataclass(frozen=True, eq=False)
 class DiagonalEstimate:
-    """diag H.  samples: one column a probe, with the mean `values`; no column where it is exact."""
+    """diag H.  samples: one column a test vector, with the mean `values`; no column where it is exact."""
 
     values: Float64[Tensor, " n"]
     standard_errors: Float64[Tensor, " n"]
     samples: Float64[Tensor, "n probes"]
     blocks: Mapping[str, slice]
     matvecs: int
+    method: str = "signs"
 
     def block(self, name: str) -> "DiagonalEstimate":
         """The rows of one block."""
         rows = self.blocks[name]
         own = {name: slice(0, rows.stop - rows.start)}
-        return DiagonalEstimate(self.values[rows], self.standard_errors[rows], self.samples[rows], own, self.matvecs)
+        return replace(
+            self,
+            values=self.values[rows],
+            standard_errors=self.standard_errors[rows],
+            samples=self.samples[rows],
+            blocks=own,
+        )
 
     def sensitivity(self, groups: Int64[Tensor, " n"], count: int) -> GroupSums:
         """sum |H_rr| over the rows of each of `count` groups; groups: the group of every row."""
@@ -75,8 +94,9 @@ def estimate_diagonal(
     probes: int = 32,
     batch: int = 4,
     progress: Progress | None = None,
+    method: Method = "auto",
 ) -> DiagonalEstimate:
-    """diag H with a standard error for every entry, from `probes` matvecs.  Keeps n x probes numbers in float64.
+    """diag H with a standard error for every entry, from `probes` matvecs at most.  Keeps n x probes numbers in float64.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([1.0, -2.0])))
@@ -85,24 +105,68 @@ def estimate_diagonal(
     """
     if probes < 3:
         raise ValueError(f"expected at least 3 probes, got {probes}")
+    if method not in ("auto", "signs"):
+        raise ValueError(f"expected the method 'auto' or 'signs', got {method!r}")
     if isinstance(operator, PartlyKnown) and operator.known is operator:
         exact = operator.known_diagonal().double()
         return DiagonalEstimate(exact, torch.zeros_like(exact), exact.new_zeros(len(exact), 0), operator.blocks, 0)
-    parts, controls = [], []
-    for start in range(0, probes, batch):
-        Z = draw_probes(operator.dim, min(batch, probes - start), generator, operator.dtype, "rademacher")
-        parts.append((Z * operator.apply(Z)).double())
-        if not torch.isfinite(parts[-1]).all():
-            raise ValueError("expected finite products H z, got NaN or infinite entries")
+    half = probes // 2
+    choosing = method == "auto" and half >= FEWEST and operator.dim > probes and not isinstance(operator, PartlyKnown)
+    samples, controls = torch.zeros(2, operator.dim, 0, dtype=torch.float64)
+    kept: list[tuple[Tensor, Tensor]] = []
+    while (done := samples.shape[1]) < probes:
+        Z = draw_probes(operator.dim, min(batch, probes - done), generator, operator.dtype, "rademacher")
+        Z = Z[:, : half - done] if choosing and done < half else Z
+        Y = _finite(operator.apply(Z))
+        samples = torch.cat([samples, Z.double() * Y.double()], dim=1)
         if isinstance(operator, PartlyKnown):
-            controls.append((Z * operator.known.apply(Z)).double() - operator.known_diagonal().double()[:, None])
+            control = (Z * operator.known.apply(Z)).double() - operator.known_diagonal().double()[:, None]
+            controls = torch.cat([controls, control], dim=1)
         if progress:
-            progress(start + Z.shape[1], probes, f"diagonal: {start + Z.shape[1]} probes")
-    samples = torch.cat(parts, dim=1)
-    if controls:
-        samples = _controlled(samples, torch.cat(controls, dim=1))
-    errors = samples.std(dim=1) / sqrt(probes)
-    return DiagonalEstimate(samples.mean(dim=1), errors, samples, operator.blocks, probes)
+            progress(samples.shape[1], probes, f"diagonal: {samples.shape[1]} probes")
+        if choosing and samples.shape[1] <= half:
+            kept.append((Z, Y))
+        if choosing and samples.shape[1] == half and _pays(samples, kept):
+            return _sketched(operator, kept, batch, probes, progress)
+    if controls.numel():
+        samples = _controlled(samples, controls)
+    return _mean(samples, operator, probes, "signs")
+
+
+def _mean(samples: Float64[Tensor, "n k"], operator: SymmetricOperator, matvecs: int, method: str) -> DiagonalEstimate:
+    errors = samples.std(dim=1) / sqrt(samples.shape[1])
+    return DiagonalEstimate(samples.mean(dim=1), errors, samples, operator.blocks, matvecs, method)
+
+
+def _finite(Y: Tensor) -> Tensor:
+    if not torch.isfinite(Y).all():
+        raise ValueError("expected finite products H z, got NaN or infinite entries")
+    return Y
+
+
+def _pays(samples: Float64[Tensor, "n k"], kept: list[tuple[Tensor, Tensor]]) -> bool:
+    """Whether a sketch leaves so much less to chance that half as many test vectors do better."""
+    leaves = sketch_leaves(torch.cat([Y for _, Y in kept], dim=1))
+    return WORSE * leaves < float(samples.var(dim=1).sum())
+
+
+def _sketched(
+    operator: SymmetricOperator,
+    kept: list[tuple[Tensor, Tensor]],
+    batch: int,
+    most: int,
+    progress: Progress | None,
+) -> DiagonalEstimate:
+    """With the products of the sketch's own directions."""
+    Z, Y = (torch.cat(parts, dim=1) for parts in zip(*kept, strict=True))
+    Q = added_directions(Y[:, :0], Y)
+    HQ, done = torch.empty_like(Q), Z.shape[1]
+    for columns in torch.arange(Q.shape[1]).split(batch):
+        HQ[:, columns] = _finite(operator.apply(Q[:, columns].contiguous()))
+        done += len(columns)
+        if progress:
+            progress(done, most, f"diagonal: a sketch of {Q.shape[1]} directions")
+    return _mean(sketched_samples(Z, Y, Q, HQ), operator, done, "sketch")
 
 
 def _controlled(A: Float64[Tensor, "n k"], B: Float64[Tensor, "n k"]) -> Float64[Tensor, "n k"]:

@@ -101,7 +101,7 @@ def xtrace(
         Z = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, kind) if start is None else start[0]
         HZ = _products(operator, Z, settings, name) if start is None else start[1]
         start, Omega, Y = None, torch.cat([Omega, Z], dim=1), torch.cat([Y, HZ], dim=1)
-        new = _added(Q, HZ)
+        new = added_directions(Q, HZ)
         Q, HQ = torch.cat([Q, new], dim=1), torch.cat([HQ, _products(operator, new, settings, name)], dim=1)
         samples, without = _leave_out(Omega, Y, Q, HQ, kind == "gaussian")
         value, error, spent = float(samples.mean()), _error(samples, without), count + Q.shape[1]
@@ -123,7 +123,7 @@ def most_test_vectors(operator: SymmetricOperator, settings: TraceSettings) -> i
     return min(settings.max_probes // 2, int(settings.memory * GIB / size) // VECTORS)
 
 
-def _added(Q: Float[Tensor, "n r"], Y: Float[Tensor, "n s"]) -> Float[Tensor, "n a"]:
+def added_directions(Q: Float[Tensor, "n r"], Y: Float[Tensor, "n s"]) -> Float[Tensor, "n a"]:
     """Orthonormal directions that Y adds to those of Q, round-off left out."""
     rest = Y.clone(memory_format=torch.contiguous_format)
     for _ in range(2):

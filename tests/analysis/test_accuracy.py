@@ -144,7 +144,7 @@ def test_sampled_coupling_is_charged_by_its_jacobian_products(with_ssim):
 
 
 def test_intervals_of_the_defaults_cover(matrix):
-    (default,) = by_name("traces", "Hutchinson, adaptive", "default")
+    (default,) = by_name("traces", "chosen by its probes", "default")
     covered = [run.covered for seed in range(10) for run in measure(matrix, default, seed)]
     # 20 at 95%: 12 or fewer have a probability of 1e-6, were they independent
     assert sum(covered) > 12
@@ -305,7 +305,7 @@ def test_errors_only_count_downwards():
 @pytest.fixture
 def small(monkeypatch, matrix):
     monkeypatch.setattr(accuracy, "_cases", lambda options: [matrix])
-    chosen = {"Hutchinson, adaptive", "Hutch++", "Lanczos, both ends"}
+    chosen = {"chosen by its probes", "Hutch++", "Lanczos, both ends"}
     monkeypatch.setattr(accuracy, "own_methods", lambda budgets: (m for m in own_methods(budgets) if m.name in chosen))
     monkeypatch.setattr(
         accuracy, "peer_methods", lambda budgets: (list(scipy_methods()), ["curvlinops is left out (why)"])
@@ -316,7 +316,7 @@ def test_the_command_prints_writes_and_draws(small, tmp_path, capsys):
     assert run_bench(BenchOptions(subject="accuracy", out=tmp_path, repetitions=2)) == 0
     runs = pd.read_csv(tmp_path / "accuracy.csv")
     assert list(runs.columns) == list(Run.__annotations__)
-    assert set(runs["quantity"]) == {"traces", "ends", "precision"}
+    assert set(runs["quantity"]) == {"traces", "ends", "diagonal", "precision"}
     shown = capsys.readouterr().out
     assert "curvlinops is left out (why)" in shown and "at equal true error" in shown and "asked for" in shown
     for name in ("traces", "ends", "precision"):
