@@ -18,6 +18,7 @@ written whole or not at all.  The same training gives the same bytes.  Keys (p p
 import io
 import os
 import pickle
+import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, is_dataclass
@@ -149,8 +150,17 @@ def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> No
         "scene": asdict(scene),
     }
     buffer = io.BytesIO()  # a file's own name would be among the bytes
-    torch.save(content, buffer)
+    torch.save(_interned(content), buffer)
     write_atomically(path, buffer.getvalue())
+
+
+def _interned(content: Any) -> Any:
+    """The same content with one object for equal strings: pickle writes a string that it has met as a reference to it."""
+    if isinstance(content, dict):
+        return {_interned(key): _interned(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return type(content)(map(_interned, content))
+    return sys.intern(content) if type(content) is str else content
 
 
 def write_atomically(path: Path, content: bytes) -> None:
