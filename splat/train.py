@@ -13,7 +13,7 @@ The Gaussians hold only the SH bands in use; a band joins as zeros.  That is the
 is zero, and spares their cost.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 
@@ -100,7 +100,10 @@ class Progress:
 
 @dataclass(eq=False)
 class Training:
-    """A training under way: all that its next step depends on.  order: the epoch's views still to come, last first."""
+    """A training under way: all that its next step depends on.  order: the epoch's views still to come, last first.
+
+    watchers: called with every change of the set of Gaussians; no part of what is saved.
+    """
 
     config: TrainConfig
     extent: float
@@ -111,6 +114,7 @@ class Training:
     regularizer: Regularizer
     order: list[int] = field(default_factory=list)
     step: int = 0
+    watchers: list[Callable[[Densified], None]] = field(default_factory=list)
 
     @classmethod
     def start(cls, gaussians: Gaussians, extent: float, config: TrainConfig) -> "Training":
@@ -171,6 +175,8 @@ class Training:
         self.adam.select(change.parents, change.fresh)
         self.screen_gradients = ScreenGradients.zero(len(change.gaussians), change.gaussians.flat.dtype)
         self.regularizer.follow(change)
+        for watch in self.watchers:
+            watch(change)
 
     def raise_sh_degree(self, degree: int) -> None:
         """Add bands of zeros up to this degree."""
@@ -214,6 +220,7 @@ def train(training: Training, views: Sequence[View]) -> Iterator[Progress]:
     config, regularizer = training.config, training.regularizer
     if not views:
         raise ValueError("expected at least one view to train on, got none")
+    regularizer.begin(training, views)
     losses = [ViewLoss.of(view.image, config.loss, training.gaussians.flat.dtype) for view in views]
     while training.step < config.iterations:
         number = training.step + 1

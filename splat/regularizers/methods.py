@@ -4,12 +4,18 @@
 stablegs        images of probed Gaussians, and their agreement from probed viewpoints
 sam             the gradient at the worst place near by in the space of parameters
 dropgaussian    a growing random share of the Gaussians is left out of each training render
+dropoutgs       the image without a random share of the Gaussians agrees with that of all
+fsgs            new Gaussians between distant neighbours; depth correlates with the user's depth maps
+dngaussian      depth has the shape of the user's depth maps, globally and in small patches
 """
 
 from dataclasses import dataclass
 from typing import Literal
 
+from splat.regularizers.dngaussian import DNGaussian
 from splat.regularizers.dropgaussian import DropGaussian
+from splat.regularizers.dropoutgs import DropoutGS
+from splat.regularizers.fsgs import FSGS
 from splat.regularizers.regularizer import Method
 from splat.regularizers.sam import SAM
 from splat.regularizers.stablegs import StableGS
@@ -22,6 +28,8 @@ class ThreeDGS(Method):
     name: Literal["3dgs"] = "3dgs"
 
 
-MethodSettings = ThreeDGS | StableGS | SAM | DropGaussian
+MethodSettings = ThreeDGS | StableGS | SAM | DropGaussian | DropoutGS | FSGS | DNGaussian
 
-METHODS: dict[str, type[MethodSettings]] = {method.name: method for method in (ThreeDGS, StableGS, SAM, DropGaussian)}
+METHODS: dict[str, type[MethodSettings]] = {
+    method.name: method for method in (ThreeDGS, StableGS, SAM, DropGaussian, DropoutGS, FSGS, DNGaussian)
+}

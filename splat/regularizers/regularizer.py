@@ -1,6 +1,6 @@
 """What a method of training adds to plain 3DGS: the interface between the loop (`splat/train.py`) and its regularizers.
 
-At every step the loop asks, in this order:
+The loop asks, in this order, `begin` before the first step and after a resume, and at every step:
 
     opacity_gain    how the opacities are changed in this step's render (dropout), or None
     gradient        what Adam descends, given the photometric gradient of the sampled view
@@ -66,6 +66,9 @@ class Regularizer:
     def __init__(self, seed: int):
         self.generator = torch.Generator().manual_seed(seed)
         self.history: list[Row] = []
+
+    def begin(self, training: "Training", views: Sequence[View]) -> None:
+        """Steps are about to be made on these views.  ValueError where they lack what the method needs."""
 
     def opacity_gain(self, step: Step) -> Float[Tensor, " n"] | None:
         """Factors on the opacities of this step's render, None for 1."""
