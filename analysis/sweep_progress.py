@@ -58,8 +58,9 @@ class SweepProgress:
             self.probes.append(seconds)
 
     def ended(self, cell: Cell, statuses: Mapping[str, str]) -> None:
-        """Say how it ended and how much is left."""
-        self.active.pop(cell.name, None)
+        """Say how it ended, where it began at all, and how much is left."""
+        if self.active.pop(cell.name, None) is None:
+            return
         count = sum(status == "done" for status in statuses.values())
         line = f"{cell.name}: {statuses[cell.name]}; {count} of {len(statuses)} cells, {self.left()} left"
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)

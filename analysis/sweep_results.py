@@ -35,6 +35,7 @@ SCORES = {
     "wall_ratio": "time ×",
     "cpu_ratio": "CPU time ×",
 }
+PLACES = {"psnr": 2, "ssim": 4, "lpips": 4, "gaussians": 0, "wall_ratio": 2, "cpu_ratio": 2}
 SPLIT = "split_"
 
 
@@ -136,11 +137,13 @@ def tables(summary: pd.DataFrame) -> list[Table]:
     traces = {name: attribute_name(name.removeprefix("trace_")) for name in _columns(summary, "trace_")}
     ends = {"lambda_max": "λ max", "lambda_min": "λ min"}
     indices = {name: name.replace("_", " ") for name in INDICES}
-    split = {f"{SPLIT}{name}": f"{title}, split" for name, title in indices.items()}
+    split = {f"{SPLIT}{name}": title for name, title in indices.items()}
     parts = {
         "mean ± standard deviation over the seeds": SCORES,
-        "traces, and ends of the spectrum": traces | ends,
-        "anisotropy; split: what an index is multiplied by where every Gaussian is split in two": indices | split,
+        "traces": traces,
+        "ends of the spectrum": ends,
+        "anisotropy": indices,
+        "what splitting every Gaussian in two multiplies the anisotropy by": split,
     }
     return [_table(summary, title, columns) for title, columns in parts.items() if _known(summary, columns)]
 
@@ -161,7 +164,7 @@ def _table(summary: pd.DataFrame, title: str, columns: Mapping[str, str]) -> Tab
     table.add_column("n", justify="right")
     known = _known(summary, columns)
     for name in known:
-        table.add_column(columns[name], justify="right", no_wrap=True)
+        table.add_column(columns[name], justify="right")
     for row in summary.to_dict("records"):
         most = max(int(row[f"{name}_n"]) for name in known)
         table.add_row(row["scene"], row["method"], str(most), *(_cell(row, name, most) for name in known))
@@ -173,5 +176,6 @@ def _cell(row: Mapping[Any, Any], name: str, most: int) -> str:
     mean, deviation, n = (row[f"{name}_{what}"] for what in ("mean", "std", "n"))
     if not n:
         return quantity(None)
-    text = quantity(mean, None if n < 2 or math.isnan(deviation) else deviation)
+    parts = [mean] if n < 2 or math.isnan(deviation) else [mean, deviation]
+    text = " ± ".join(f"{part:.{PLACES[name]}f}" for part in parts) if name in PLACES else quantity(*parts)
     return text if n == most else f"{text} (n = {n})"
