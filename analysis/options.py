@@ -53,6 +53,10 @@ class TrainOptions:
     """Weight of 1 - SSIM; the pixel loss has the rest."""
     checkpoint_every: int = 500
     """Steps between checkpoints: what a killed run loses at most."""
+    probe_every: Annotated[int | None, arg(help_behavior_hint="")] = None
+    """Steps between records of traces, both ends of the spectrum and anisotropy in OUT/trajectory.csv.  Default: none."""
+    probe_share: float = 0.1
+    """Time that these records may take, as a share of that of the steps; one that would not fit is skipped.  inf: no limit."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ RUN/checkpoint.pt   the latest checkpoint, see `splat/checkpoint.py`; written at
                     Ctrl-C and at the end
 RUN/seconds.json    how long that took, see `analysis/spent.py`
 RUN/history.csv     what the method noted along the way, a row each with its "step"; where there is any
+RUN/trajectory.csv, RUN/start/checkpoint.pt     with --probe-every: the landscape along the way, see `analysis/trajectory.py`
 RUN/test/NAME.png   the held-out views as rendered at the end
 RUN/metrics.json    {"step", "gaussians", "train": scores, "test": scores or null, "seconds", "provenance"}, where scores are
                     {"psnr", "ssim", "lpips", "masked", "views": {NAME: {"psnr", "ssim", "lpips"}}}, psnr in dB;
@@ -35,6 +36,7 @@ from analysis.options import TrainOptions
 from analysis.overrides import assignments, overridden
 from analysis.provenance import provenance
 from analysis.spent import Spent
+from analysis.trajectory import START, Trajectory, TrajectorySettings
 from splat.checkpoint import SceneReference, load_checkpoint, save_checkpoint, write_atomically
 from splat.densify import DensifySettings
 from splat.evaluate import Evaluation, ViewScore, evaluate, have_masks
@@ -59,6 +61,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     """Train, or continue, a run; returns the exit code.  command: as typed, for the message on how to resume."""
     if options.checkpoint_every < 1:
         raise ValueError(f"expected checkpoint_every of at least 1, got {options.checkpoint_every}")
+    along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_share)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
     scene, split, config, reference = planned(options, out)
@@ -73,7 +76,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         generator = torch.Generator().manual_seed(config.seed)
         start = initial_gaussians(scene, views, 0, generator=generator, source=options.start)
         training = Training.start(start, scene.extent(split.train), config)
-        _create_run(out, training, reference)
+        _create_run(out, training, reference, keep_start=along is not None)
 
     console = Console(stderr=True)
     camera = views[0].camera
@@ -81,7 +84,8 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         f"{scene.name}: {len(views)} views to train on, {len(held_out)} held out, {camera.width} x {camera.height} px, "
         f"{len(training.gaussians)} Gaussians"
     )
-    if not _follow(training, views, out / CHECKPOINT, reference, options.checkpoint_every, console):
+    trajectory = None if along is None else Trajectory(out, training, views, along)
+    if not _follow(training, views, out / CHECKPOINT, reference, options.checkpoint_every, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])
         console.print(f"stopped after step {training.step}; to continue: {again}", soft_wrap=True, highlight=False)
         return 130
@@ -127,13 +131,17 @@ def _require_run(out: Path, resume: bool) -> None:
         )
 
 
-def _create_run(out: Path, training: Training, reference: SceneReference) -> None:
-    """Make the folder with its first checkpoint appear at once."""
+def _create_run(out: Path, training: Training, reference: SceneReference, *, keep_start: bool) -> None:
+    """Make the folder with its first checkpoint appear at once.  keep_start: with a copy that stays."""
     partial = out.absolute().with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
         save_checkpoint(partial / CHECKPOINT, training, reference)
+        if keep_start:
+            (partial / START).mkdir()
+            deeper = replace(reference, relative=os.path.join(os.pardir, reference.relative))
+            save_checkpoint(partial / START / CHECKPOINT, training, deeper)
         os.rename(partial, out)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
@@ -165,7 +173,13 @@ def _flat(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _follow(
-    training: Training, views: list[View], path: Path, reference: SceneReference, every: int, console: Console
+    training: Training,
+    views: list[View],
+    path: Path,
+    reference: SceneReference,
+    every: int,
+    trajectory: Trajectory | None,
+    console: Console,
 ) -> bool:
     """Train to the end with a progress bar and checkpoints; False where Ctrl-C ended it, after a checkpoint."""
     total, spent = training.config.iterations, Spent.read(path.parent)
@@ -175,10 +189,16 @@ def _follow(
         for done in spent.timed(train(training, views)):
             loss = done.loss if math.isnan(loss) else loss + SMOOTHING * (done.loss - loss)
             progress.update(bar, completed=done.step, loss=loss, gaussians=done.gaussians)
+            if trajectory:
+                trajectory.after_step(spent.wall)
             stop = interrupted.is_set()
             if stop or done.step % every == 0 or done.step == total:
+                if trajectory:
+                    trajectory.keep()
                 save_checkpoint(path, training, reference)
                 spent.write(path.parent)
+                if trajectory:
+                    trajectory.forget()
                 _write_history(training, path.with_name(HISTORY))
             if stop:
                 return done.step == total

@@ -1,0 +1,294 @@
+"""The landscape along a training: at every so many steps the traces, both ends of the spectrum, and the anisotropy indices.
+
+RUN/trajectory.csv            a row for each record, rewritten whole after it (below)
+RUN/trajectory-STEP.npz       the vectors that the next record starts from, as of the checkpoint of that step; one file
+RUN/start/checkpoint.pt       where the training began, so that its landscape can be looked at too
+
+The operator is the exact Hessian of the training loss over all training views (`splat.curvature`).  Lanczos begins at the last
+record's eigenvectors: a Gaussian's rows follow it through density control, those of new Gaussians begin at zero.  Records draw
+from generators of their own, seeded by the run's seed and the step: they change no bit of the training, and do not depend on
+each other but through the start.
+
+Time.  The records together may take `share` of the seconds that the steps have taken so far.  What is not used is left to later
+ones.  A record that is expected not to fit (by what the last one's least work took, before the first by the time of a step) is
+skipped.  The numbers depend on the seed alone where no time ran out, and with share = inf it never does.
+
+Columns:
+
+step, gaussians        steps made, and the Gaussians after them
+state, note            "whole"; "cut": time ended it early, the note says where; "skipped": nothing measured, the note says why
+seconds, time_share    that the record took; all records so far over the training's steps so far
+visible_gaussians, parameters    Gaussians in sight, and active parameters
+start, matvecs         of Lanczos: "warm" or "random"; products H v of the record
+trace_A                of each attribute's block, with _error (standard error), _low, _high (95%), _dim and _reason
+lambda_max, lambda_min with _error (residual) and _reason (why it ended)
+literal, saddle, share, effective_rank, mass_quantile    the indices (`landscape.anisotropy`), with _low and _high; the last
+                       three where there was time for the spectral density
+"""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from math import inf, isinf
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from landscape import (
+    CountingOperator,
+    EigenSettings,
+    SpectralDensity,
+    TraceSettings,
+    anisotropy,
+    extreme_eigenpairs,
+    spectral_density,
+)
+from landscape.density import ActiveSpace
+from landscape.probes import split
+from landscape.results import Anisotropy, EigenEnds, TraceEstimate
+from splat.checkpoint import write_atomically
+from splat.curvature import SceneHessian, SceneObjective
+from splat.densify import Densified
+from splat.gaussians import ATTRIBUTES, Gaussians
+from splat.scenes.view import View
+from splat.traces import exact_traces
+from splat.train import TrainConfig, Training
+
+FILE, START = "trajectory.csv", "start"
+Row = dict[str, Any]
+LEAST = 32  # renders with their gradients, for each view, that the least record takes (measured on 8,000 Gaussians)
+FEWEST_MATVECS = 20  # from a warm start, for the largest eigenvalue
+FEWEST_STEPS = 8  # of a density that is worth its time
+INDICES = ("literal", "saddle", "share", "effective_rank", "mass_quantile")
+COLUMNS = (
+    "step", "gaussians", "state", "note", "seconds", "time_share", "visible_gaussians", "parameters", "start", "matvecs",
+    *(f"trace_{name}{key}" for name in ATTRIBUTES for key in ("", "_error", "_low", "_high", "_dim", "_reason")),
+    *(f"lambda_{end}{key}" for end in ("max", "min") for key in ("", "_error", "_reason")),
+    *(f"{index}{key}" for index in INDICES for key in ("", "_low", "_high")),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrajectorySettings:
+    """every: steps between records; share: of the time of the steps that the records may take, inf for no limit."""
+
+    every: int
+    share: float = 0.1
+    traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=8))
+    eigen: EigenSettings = field(default_factory=lambda: EigenSettings(rtol=1e-2, max_matvecs=150))
+    density_starts: int = 2
+    density_steps: int = 16
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise ValueError(f"expected probe_every of at least 1 step, got {self.every}")
+        if not self.share > 0:
+            raise ValueError(f"expected probe_share above 0 (0.1: a tenth of the time of the steps), got {self.share}")
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """One record.  least: seconds of what every record does; short: what time ended early."""
+
+    traces: dict[str, TraceEstimate]
+    ends: EigenEnds
+    density: SpectralDensity | None
+    matvecs: int
+    least: float
+    short: tuple[str, ...]
+
+    @property
+    def indices(self) -> Anisotropy:
+        return anisotropy(self.ends, self.density)
+
+
+class Trajectory:
+    """The records of one run, beside its training.  Reads those that an interrupted run has left, up to the training's step."""
+
+    def __init__(self, run: Path, training: Training, views: Sequence[View], settings: TrajectorySettings) -> None:
+        self.run, self.training, self.views, self.settings = run, training, views, settings
+        self.rows = _read_rows(run / FILE, training.step)
+        self.vectors = _read_vectors(run, training)
+        self.least: tuple[float, int] | None = None  # seconds of the last record's least work, with how many Gaussians
+        training.watchers.append(self.follow)
+        _compile(training, views)
+
+    def follow(self, change: Densified) -> None:
+        """The Gaussians were replaced: rows of those that are kept go along, new ones are zero."""
+        self.vectors = [vector.select(change.parents) for vector in self.vectors]
+        for vector in self.vectors:
+            for values in vector.attributes.values():
+                values[change.fresh] = 0
+
+    def after_step(self, trained: float) -> None:
+        """Record where it is time to.  trained: seconds that the steps so far took."""
+        step, last = self.training.step, self.training.config.iterations
+        if step % self.settings.every and step != last:
+            return
+        spent = sum(row["seconds"] for row in self.rows)
+        allowed = self.settings.share * trained - spent
+        row: Row = {"step": step, "gaussians": len(self.training.gaussians), "state": "skipped", "seconds": 0.0}
+        least = self._expected(trained / step)
+        if allowed < least:
+            row["note"] = f"no time: {least:.2g} s were needed at least, {max(allowed, 0.0):.2g} s were allowed"
+        else:
+            start = perf_counter()
+            try:
+                row |= self._recorded(allowed)
+            except ValueError as error:  # nothing in sight, say: the training may still find its way
+                row["note"] = str(error)
+            row["seconds"] = perf_counter() - start
+        row["time_share"] = (spent + row["seconds"]) / trained
+        self.rows.append(row)
+        write_atomically(self.run / FILE, pd.DataFrame(self.rows, columns=COLUMNS).to_csv(index=False).encode())
+
+    def _expected(self, step: float) -> float:
+        """Seconds that the next record takes at least, where a step takes so many."""
+        if isinf(self.settings.share):
+            return 0.0
+        if self.least is None:
+            return LEAST * len(self.views) * step
+        seconds, gaussians = self.least
+        return seconds * len(self.training.gaussians) / gaussians
+
+    def _recorded(self, seconds: float) -> Row:
+        objective = _objective(self.training.gaussians, self.views, self.training.config)
+        start = self._start(objective)
+        found = measure(objective, self._generator(), self.settings, seconds, start)
+        self.least = found.least, len(self.training.gaussians)
+        pairs = torch.cat([found.ends.largest.vectors, found.ends.smallest.vectors], dim=1)
+        self.vectors = [_lifted(vector, objective, self.training.gaussians) for vector in pairs.T]
+        counts = objective.counts
+        return {
+            "state": "cut" if found.short else "whole",
+            "note": f"out of time: {', '.join(found.short)}" if found.short else "",
+            "visible_gaussians": counts.active_gaussians,
+            "parameters": counts.active_parameters,
+            "start": "random" if start is None else "warm",
+            "matvecs": found.matvecs,
+            **_columns(found),
+        }
+
+    def _generator(self) -> torch.Generator:
+        sequence = np.random.SeedSequence([self.training.config.seed, self.training.step])
+        return torch.Generator().manual_seed(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))
+
+    def _start(self, objective: SceneObjective) -> Tensor | None:
+        """The last record's eigenvectors on the Gaussians that are now in sight; None where nothing of them is left."""
+        degree = self.training.gaussians.sh_degree
+        columns = [vector.select(objective.mask, degree).flat for vector in self.vectors]
+        left = [column for column in columns if column.norm() > 0]
+        return torch.stack(left, dim=1) if left else None
+
+    def keep(self) -> None:
+        """Write the vectors for the checkpoint that is about to be saved."""
+        step, vectors = self.training.step, [vector.flat.numpy() for vector in self.vectors]
+        degree = self.vectors[0].sh_degree if vectors else 0
+        partial = self.run / f".trajectory-{step}.partial.npz"
+        np.savez(partial, vectors=np.stack(vectors) if vectors else np.empty((0, 0)), sh_degree=degree)
+        partial.replace(self.run / f"trajectory-{step}.npz")
+
+    def forget(self) -> None:
+        """That checkpoint is saved: remove the vectors of earlier ones."""
+        for path in self.run.glob("trajectory-*.npz"):
+            if path.name != f"trajectory-{self.training.step}.npz":
+                path.unlink()
+
+
+def measure(
+    objective: SceneObjective,
+    generator: torch.Generator,
+    settings: TrajectorySettings,
+    seconds: float = inf,
+    start: Tensor | None = None,
+) -> Found:
+    """One record, in about so many seconds, counted from the call.  start: vectors that Lanczos begins from."""
+    began, streams = perf_counter(), [split(generator) for _ in range(3)]
+
+    def left() -> float:
+        return seconds - (perf_counter() - began)
+
+    hessian = SceneHessian(objective)
+    operator = CountingOperator(hessian)
+    traces = exact_traces(objective, streams[0], replace(settings.traces, max_seconds=max(left() / 2, 0.0)))
+    fixed = perf_counter() - began
+    ends = extreme_eigenpairs(operator, streams[1], replace(settings.eigen, max_seconds=max(left(), 0.0)), start)
+    least = fixed + FEWEST_MATVECS * operator.seconds / operator.matvecs
+    short = [f"trace of {name}" for name, trace in traces.items() if trace.reason == "time budget"]
+    pairs = {"lambda_max": ends.largest, "lambda_min": ends.smallest}
+    short += [name for name, end in pairs.items() if end.reason == "time budget"]
+    possible = left() / (settings.density_starts * operator.seconds / operator.matvecs)
+    steps = int(min(settings.density_steps, possible))
+    density = None
+    if steps < min(FEWEST_STEPS, hessian.rank):
+        short.append("spectral density")
+    else:
+        active = ActiveSpace(hessian.project, hessian.rank)
+        density = spectral_density(operator, streams[2], settings.density_starts, steps, active=active)
+    return Found(traces, ends, density, operator.matvecs, least, tuple(short))
+
+
+def _objective(gaussians: Gaussians, views: Sequence[View], config: TrainConfig) -> SceneObjective:
+    background = torch.tensor(config.background, dtype=gaussians.flat.dtype)
+    return SceneObjective(gaussians, views, config.loss, background, config.render)
+
+
+def _columns(found: Found) -> Row:
+    row: Row = {}
+    for name, trace in found.traces.items():
+        numbers = {"": trace.value, "_error": trace.standard_error, "_low": trace.low, "_high": trace.high}
+        row |= {f"trace_{name}{key}": value for key, value in numbers.items()}
+        row |= {f"trace_{name}_dim": trace.dim, f"trace_{name}_reason": trace.reason}
+    for name, pairs in {"lambda_max": found.ends.largest, "lambda_min": found.ends.smallest}.items():
+        row |= {
+            name: float(pairs.values[0]),
+            f"{name}_error": float(pairs.residuals[0]),
+            f"{name}_reason": pairs.reason,
+        }
+    for name, bracket in found.indices.record().items():
+        assert isinstance(bracket, dict)
+        row |= {name: bracket["value"], f"{name}_low": bracket["low"], f"{name}_high": bracket["high"]}
+    return row
+
+
+def _lifted(vector: Tensor, objective: SceneObjective, gaussians: Gaussians) -> Gaussians:
+    """A vector over the Gaussians in sight as one over all, laid out like them; zero where nothing is seen."""
+    result = gaussians.with_flat(torch.zeros_like(gaussians.flat))
+    active = objective.active.with_flat(vector).attributes
+    for name, values in result.attributes.items():
+        values[objective.mask] = active[name]
+    return result
+
+
+def _read_rows(path: Path, step: int) -> list[Row]:
+    """Those up to a step."""
+    if not path.is_file():
+        return []
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows: list[Row] = [
+            dict(row) for row in csv.DictReader(stream)
+        ]  # as text, which is written back to the same bits
+    return [row | {"seconds": float(row["seconds"])} for row in rows if int(row["step"]) <= step]
+
+
+def _read_vectors(run: Path, training: Training) -> list[Gaussians]:
+    """As of the training's step; none where they do not fit."""
+    path = run / f"trajectory-{training.step}.npz"
+    if not path.is_file():
+        return []
+    with np.load(path, allow_pickle=False) as kept:
+        vectors = [Gaussians(torch.from_numpy(flat), int(kept["sh_degree"])) for flat in kept["vectors"]]
+    return [vector for vector in vectors if len(vector) == len(training.gaussians)]
+
+
+def _compile(training: Training, views: Sequence[View]) -> None:
+    """Compile the kernels of a record, which would count as its time, on a few Gaussians."""
+    seen = _objective(training.gaussians, views, training.config).mask.nonzero()[:8, 0]
+    objective = _objective(training.gaussians.select(seen), views, training.config)
+    least = TrajectorySettings(1, eigen=EigenSettings(max_matvecs=10), density_steps=FEWEST_STEPS)
+    measure(objective, torch.Generator().manual_seed(0), least)

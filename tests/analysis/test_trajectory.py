@@ -1,0 +1,203 @@
+"""The landscape along a training: what is recorded, what it costs, and that the training does not notice."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+
+from analysis import training as command
+from analysis.cli import main
+from analysis.trajectory import COLUMNS, Trajectory, TrajectorySettings, measure
+from splat.checkpoint import load_checkpoint, save_checkpoint
+from splat.curvature import SceneHessian, SceneObjective
+from splat.densify import Densified
+from splat.gaussians import ATTRIBUTES, Gaussians
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+
+STEPS, EVERY = 40, 10
+TIMES = ["seconds", "time_share"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("trajectory") / "still"
+    settings = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
+    write_transforms_scene(synthetic_scene(settings).scene, folder)
+    return folder
+
+
+def arguments(scene: Path, out: str, *more: str) -> list[str]:
+    run = ["--views", "3", "--iterations", str(STEPS), "--checkpoint-every", "10", "--sh-degree", "0"]
+    return ["train", str(scene), "--out", str(scene.parent / out), *run, *more]
+
+
+def probed(scene: Path, out: str, *more: str) -> list[str]:
+    return arguments(scene, out, "--probe-every", str(EVERY), "--probe-share", "inf", *more)
+
+
+def rows(run: Path) -> pd.DataFrame:
+    return pd.read_csv(run / "trajectory.csv")
+
+
+@pytest.fixture(scope="module")
+def run(scene) -> Path:
+    assert main(probed(scene, "run")) == 0
+    return scene.parent / "run"
+
+
+@pytest.fixture(scope="module")
+def at_the_end(run) -> tuple:
+    """(training, views, objective) of the finished run."""
+    path = run / "checkpoint.pt"
+    loaded = load_checkpoint(path)
+    views = loaded.load_scene(path).load(loaded.scene.train)
+    config = loaded.training.config
+    objective = SceneObjective(loaded.training.gaussians, views, config.loss, torch.zeros(3), config.render)
+    return loaded.training, views, objective
+
+
+def test_probing_changes_no_bit_of_the_training(scene, run):
+    assert main(arguments(scene, "plain")) == 0
+    assert (run / "checkpoint.pt").read_bytes() == (scene.parent / "plain" / "checkpoint.pt").read_bytes()
+    assert not (scene.parent / "plain" / "trajectory.csv").exists()
+
+
+def test_a_row_is_written_every_so_many_steps_with_every_column(run):
+    table = rows(run)
+    assert tuple(table) == COLUMNS
+    assert list(table["step"]) == list(range(EVERY, STEPS + 1, EVERY))
+    assert set(table["state"]) == {"whole"}
+    assert table["gaussians"].iloc[-1] == len(load_checkpoint(run / "checkpoint.pt").training.gaussians)
+    assert sorted(path.name for path in run.glob("*trajectory*")) == ["trajectory-40.npz", "trajectory.csv"]
+
+
+def test_the_last_row_is_that_of_the_checkpoint(run, at_the_end, tmp_path):
+    training, views, _ = at_the_end
+    trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY, float("inf")))
+    trajectory.after_step(1.0)
+    written, (again,) = rows(run).iloc[-1], trajectory.rows
+    for name in ATTRIBUTES:
+        assert again[f"trace_{name}"] == written[f"trace_{name}"]
+    assert (again["start"], written["start"]) == ("random", "warm")
+    for end in ("lambda_max", "lambda_min"):
+        assert abs(again[end] - written[end]) <= again[f"{end}_error"] + written[f"{end}_error"]
+
+
+def test_a_row_is_the_landscape_within_its_errors(at_the_end, tmp_path):
+    training, views, objective = at_the_end
+    few = replace(training, gaussians=training.gaussians.select(objective.mask.nonzero()[:15, 0]))
+    trajectory = Trajectory(tmp_path, few, views, TrajectorySettings(EVERY, float("inf")))
+    trajectory.after_step(1.0)
+    (row,) = trajectory.rows
+    config = training.config
+    objective = SceneObjective(few.gaussians, views, config.loss, torch.zeros(3), config.render)
+    hessian = SceneHessian(objective)
+    H = hessian.apply(torch.eye(hessian.dim)).double()
+    values = torch.linalg.eigvalsh((H + H.T) / 2)
+    rounding = hessian.dim * torch.finfo(torch.float32).eps * float(values.abs().max())
+    for name, value in {"lambda_max": values[-1], "lambda_min": values[0]}.items():
+        assert abs(row[name] - float(value)) <= row[f"{name}_error"] + rounding
+    for name in ATTRIBUTES:
+        block = objective.blocks[name]
+        exact = float(H[block, block].trace())
+        assert abs(row[f"trace_{name}"] - exact) <= 4 * row[f"trace_{name}_error"] + rounding
+    known = {"literal": values[-1] / values[0], "saddle": -values[-1] / values[0]}
+    known |= {"share": values[-1] / values.abs().sum()}
+    for index, value in known.items():
+        assert row[f"{index}_low"] - 1e-6 <= float(value) <= row[f"{index}_high"] + 1e-6, index
+
+
+def test_the_start_is_kept_and_finds_its_scene(run):
+    path = run / "start" / "checkpoint.pt"
+    loaded = load_checkpoint(path)
+    assert loaded.training.step == 0
+    assert (path.parent / loaded.scene.relative).resolve() == loaded.load_scene(path).root.resolve()
+
+
+def test_a_run_killed_beside_a_checkpoint_and_resumed_gives_the_same_rows(scene, run, monkeypatch):
+    def killed(path, training, reference):
+        if training.step == 30:
+            raise RuntimeError("killed")
+        save_checkpoint(path, training, reference)
+
+    out = scene.parent / "killed"
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "save_checkpoint", killed)
+        with pytest.raises(RuntimeError, match="killed"):
+            main(probed(scene, "killed"))
+    assert list(rows(out)["step"]) == [10, 20, 30]  # the last of them is after the checkpoint, of step 20
+    assert main(probed(scene, "killed", "--resume")) == 0
+    pd.testing.assert_frame_equal(rows(out).drop(columns=TIMES), rows(run).drop(columns=TIMES), check_exact=True)
+    assert (out / "checkpoint.pt").read_bytes() == (run / "checkpoint.pt").read_bytes()
+
+
+def test_what_does_not_fit_is_skipped_and_time_that_ends_a_record_is_said(run, at_the_end, tmp_path):
+    training, views, _ = at_the_end
+    trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY, 0.1))
+    trajectory.after_step(1e-3)
+    (row,) = trajectory.rows
+    assert (
+        row["state"] == "skipped"
+        and row["seconds"] == row["time_share"] == 0
+        and "0.0001 s were allowed" in row["note"]
+    )
+    trajectory.least = 0.0, 1
+    trajectory.after_step(1e-3)
+    row = trajectory.rows[-1]
+    assert row["state"] == "cut" and row["note"].startswith("out of time: ") and "lambda_min" in row["note"]
+    assert row["lambda_min_reason"] == "time budget" and row["time_share"] == row["seconds"] / 1e-3
+    trajectory.after_step(1e-3)  # the budget is overdrawn now, whatever a record takes
+    assert trajectory.rows[-1]["state"] == "skipped"
+    trajectory.after_step(1e6)
+    assert trajectory.rows[-1]["state"] == "whole"
+    assert list(rows(tmp_path)["state"]) == ["skipped", "cut", "skipped", "whole"]
+
+
+def test_vectors_follow_their_gaussians_and_new_ones_begin_at_zero(at_the_end, tmp_path):
+    training, views, _ = at_the_end
+    training = replace(training, watchers=[])
+    trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY))
+    n = len(training.gaussians)
+    numbered = training.gaussians.with_flat(torch.zeros_like(training.gaussians.flat))
+    for values in numbered.attributes.values():
+        values += torch.arange(1.0, n + 1).view(n, *[1] * (values.ndim - 1))
+    trajectory.vectors = [numbered]
+    parents, fresh = torch.tensor([3, 1, 1]), torch.tensor([False, False, True])
+    for watch in training.watchers:
+        watch(Densified(training.gaussians.select(parents), parents, fresh, 1, 0, 0))
+    for name, values in trajectory.vectors[0].attributes.items():
+        assert values.reshape(3, -1).unique(dim=1)[:, 0].tolist() == [4.0, 2.0, 0.0], name
+
+
+def test_a_record_that_starts_from_the_last_one_needs_fewer_products(at_the_end):
+    _, _, objective = at_the_end
+    settings = TrajectorySettings(EVERY)
+    cold = measure(objective, torch.Generator().manual_seed(1), settings)
+    start = torch.cat([cold.ends.largest.vectors, cold.ends.smallest.vectors], dim=1)
+    warm = measure(objective, torch.Generator().manual_seed(2), settings, start=start)
+    assert warm.ends.matvecs < cold.ends.matvecs
+    assert float(warm.ends.largest.values) == pytest.approx(float(cold.ends.largest.values), rel=2e-2)  # rtol of each
+
+
+def test_what_is_not_in_sight_is_lifted_as_zeros(at_the_end, tmp_path):
+    training, views, _ = at_the_end
+    hidden = training.gaussians.select(torch.arange(len(training.gaussians)))
+    hidden.means[0] = torch.tensor([0.0, 0.0, -100.0])  # behind every camera
+    trajectory = Trajectory(
+        tmp_path, replace(training, gaussians=hidden), views, TrajectorySettings(EVERY, float("inf"))
+    )
+    trajectory.after_step(1.0)
+    assert trajectory.rows[-1]["visible_gaussians"] < len(hidden)
+    for vector in trajectory.vectors:
+        assert isinstance(vector, Gaussians) and not any(values[0].any() for values in vector.attributes.values())
+        assert float(vector.flat.norm()) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize(("option", "value"), [("--probe-every", "0"), ("--probe-share", "0")])
+def test_options_out_of_range_are_refused(scene, tmp_path, capsys, option, value):
+    assert main([*arguments(scene, "refused", "--probe-every", "5"), option, value]) == 2
+    assert f"expected {option[2:].replace('-', '_')}" in capsys.readouterr().err
+    assert not (scene.parent / "refused").exists()
