@@ -45,6 +45,7 @@ def test_nerfstudios_mask_path_names_a_mask_and_a_folder_given_wins_over_it(tmp_
     with pytest.raises(FileNotFoundError, match=r"1 are missing, the first is .*first\.png"):
         load_scene(tmp_path)
     write_mask(tmp_path / "elsewhere/first.png", blob(), white=1)  # nerfstudio counts what is not 0
+    write_mask(tmp_path / "masks/a.png", ~blob())
     mask = load_scene(tmp_path).load()[0].mask
     assert mask is not None and np.array_equal(mask.numpy(), blob())
     write_mask(tmp_path / "given/a.png", ~blob())
@@ -165,6 +166,7 @@ def test_a_file_beside_a_photograph_has_its_name_with_the_folders_or_without(tmp
         (tmp_path / file).touch()
     assert find_layer(tmp_path, ["train/r_3"], [".npy"]) == tmp_path / "train/r_3.npy"
     assert find_layer(tmp_path, ["train/r_4"], [".npy"]) == tmp_path / "r_4.npy"
+    assert find_layer(tmp_path, ["other/r_4.jpg"], [".npy"]) == tmp_path / "r_4.npy"
     assert find_layer(tmp_path, ["train/r_4"], [".png"]) is None
     assert find_layer(tmp_path, ["rect_026_max.png"], [".npy", ".png"]) == tmp_path / "025.png"
     assert [dtu_number(name) for name in ("a/rect_001_6_r7000.jpg", "rect_001.png", "rect_1_3_r5000.png")] == [
