@@ -27,6 +27,7 @@ from splat.curvature import SceneObjective
 from splat.gaussians import ATTRIBUTES
 
 ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
+LEAST_SAMPLES = 4  # a mean, a slope, and a spread of two degrees of freedom
 COLUMNS = 5  # vectors in a pass over the pixels: one for each block
 
 
@@ -36,11 +37,15 @@ def exact_traces(
     settings: TraceSettings = ONE_PERCENT,
     progress: Progress | None = None,
     names: Sequence[str] = ATTRIBUTES,
+    samples: int | None = None,
 ) -> dict[str, TraceEstimate]:
     """The trace of the named attributes' blocks of H, on the complement of the quaternions' radial directions.
 
     settings: rtol, atol, confidence, the numbers of samples and max_seconds count; the distribution is always random signs.
+    samples: just so many, at least LEAST_SAMPLES, whatever the settings say: for rough values, as a training needs them.
     """
+    if samples is not None and samples < LEAST_SAMPLES:
+        raise ValueError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
     quats = objective.active.quats
     known = {name: value for name, value in objective.block_diagonal().traces(quats).items() if name in names}
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
@@ -50,10 +55,10 @@ def exact_traces(
             name: TraceEstimate.exact(name, sizes[name], value, settings.confidence) for name, value in known.items()
         }
     pixelwise = objective.block_diagonal(gauss_newton=True).traces(quats)
-    blocks = [_Block(name, sizes[name], known[name], pixelwise[name], settings) for name in known]
+    blocks = [_Block(name, sizes[name], known[name], pixelwise[name], settings, samples) for name in known]
     deadline = monotonic() + settings.max_seconds
     while still := [block for block in blocks if block.open]:
-        count, next_look = still[0].count, min(block.looks.next for block in still)
+        count, next_look = still[0].count, min(block.next_look for block in still)
         # few blocks leave room for several samples in the pass over the pixels
         together = min(max(COLUMNS // len(still), 1), next_look - count)
         sampled = _sample(objective, generator, [block.name for block in still], together)
@@ -62,15 +67,17 @@ def exact_traces(
             block.add(x, y, late)
         if progress:
             state = f"traces: {count + together} samples of the coupling between pixels"
-            progress(count + together, settings.max_probes, state)
+            progress(count + together, samples or settings.max_probes, state)
     return {block.name: block.estimate() for block in blocks}
 
 
 class _Block:
     """The samples of one block, and whether it needs more."""
 
-    def __init__(self, name: str, dim: int, known: float, pixelwise: float, settings: TraceSettings):
-        self.name, self.dim, self.settings = name, dim, settings
+    def __init__(
+        self, name: str, dim: int, known: float, pixelwise: float, settings: TraceSettings, samples: int | None
+    ):
+        self.name, self.dim, self.settings, self.samples = name, dim, settings, samples
         self.exact, self.mean = known - pixelwise, pixelwise
         self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
         self.looks, self.open, self.late = Looks(settings), True, False
@@ -79,12 +86,16 @@ class _Block:
     def count(self) -> int:
         return len(self.full)
 
+    @property
+    def next_look(self) -> int:
+        return self.samples or self.looks.next
+
     def add(self, x: Float64[Tensor, " s"], y: Float64[Tensor, " s"], late: bool) -> None:
         self.full, self.diagonal = torch.cat([self.full, x]), torch.cat([self.diagonal, y])
         self.late = late and self.count >= self.settings.min_probes
-        if self.late:
+        if self.late or self.count == self.samples:
             self.open = False
-        elif self.count == self.looks.next:
+        elif self.count == self.looks.next and not self.samples:
             self.open = not self.looks.end(self.count, self.estimate().reason == "tolerance")
 
     def estimate(self) -> TraceEstimate:
@@ -94,7 +105,7 @@ class _Block:
         error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.mean))
         # the slope of the control variate is one more number that the samples had to give
         quantile = float(student.ppf((1 + settings.confidence) / 2, self.count - 2))
-        half = quantile * error * (WIDENING if settings.adaptive else 1.0)
+        half = quantile * error * (WIDENING if settings.adaptive and not self.samples else 1.0)
         reason: StopReason = "time budget" if self.late else "matvec budget"
         if settings.reached(value, value - half, value + half):
             reason = "tolerance"

@@ -15,7 +15,7 @@ from splat.losses import LossSettings
 from splat.losses_cpu import ViewLoss
 from splat.render import render
 from splat.scenes.view import View
-from splat.traces import _Block, _sample, exact_traces
+from splat.traces import LEAST_SAMPLES, _Block, _sample, exact_traces
 from tests.splat.random_scenes import random_camera, random_gaussians
 
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")
@@ -138,17 +138,26 @@ def test_intervals_of_fixed_and_adaptive_budgets_cover_over_two_hundred_runs(noi
     quats, generator = objective.active.quats, torch.Generator().manual_seed(0)
     known, pixelwise = (objective.block_diagonal(gauss_newton=part).traces(quats) for part in (False, True))
     pool = torch.stack([torch.stack(_sample(objective, generator, names, 100)) for _ in range(40)], dim=2).flatten(2)
-    for settings in (TraceSettings.fixed(8), TraceSettings(rtol=0.05, max_probes=64)):
+    fixed, adaptive = TraceSettings.fixed(8), TraceSettings(rtol=0.05, max_probes=64)
+    for settings, samples in ((fixed, None), (adaptive, None), (adaptive, LEAST_SAMPLES)):
         for i, name in enumerate(names):
             covered, at = 0, 0
             for _ in range(200):
-                block = _Block(name, 0, known[name], pixelwise[name], settings)
+                block = _Block(name, 0, known[name], pixelwise[name], settings, samples)
                 while block.open:
                     block.add(*pool[:, i, [at % pool.shape[2]], None].squeeze(2), late=False)
                     at += 1
                 estimate = block.estimate()
                 covered += estimate.low <= truth[name] <= estimate.high
-            assert 0.895 <= covered / 200 <= 0.99, (name, settings, covered)
+            assert 0.895 <= covered / 200 <= 0.99, (name, settings, samples, covered)
+
+
+def test_a_number_of_samples_that_is_asked_for_is_the_number_taken() -> None:
+    objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise=0.1)
+    rough = exact_traces(objective, torch.Generator().manual_seed(0), samples=5, names=["means", "sh"])
+    assert {name: estimate.probes for name, estimate in rough.items()} == {"means": 5, "sh": 5}
+    with pytest.raises(ValueError, match="at least 4 samples, got 3"):
+        exact_traces(objective, torch.Generator(), samples=3)
 
 
 def test_a_block_whose_error_is_small_enough_is_sampled_no_further_and_the_others_as_if_it_were() -> None:
