@@ -124,12 +124,9 @@ class Checkpoint:
         return found
 
 
-def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> None:
-    """Write the checkpoint, replacing one that is there only once the new one is complete on disk."""
-    content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "torch": str(torch.__version__),
+def training_state(training: Training) -> dict[str, Any]:
+    """All that a training depends on, as tensors and plain types: the keys from `step` to `config`."""
+    return {
         "step": training.step,
         "extent": training.extent,
         "sh_degree": training.gaussians.sh_degree,
@@ -147,6 +144,16 @@ def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> No
         "order": training.order,
         "regularizer": training.regularizer.state(),
         "config": asdict(training.config),
+    }
+
+
+def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> None:
+    """Write the checkpoint, replacing one that is there only once the new one is complete on disk."""
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "torch": str(torch.__version__),
+        **training_state(training),
         "scene": asdict(scene),
     }
     buffer = io.BytesIO()  # a file's own name would be among the bytes
@@ -200,15 +207,26 @@ def _checkpoint(content: Any) -> Checkpoint:
     version = content.get("version")
     if version not in (1, VERSION):
         raise ValueError(f"its format version is {version!r}, this program reads up to {VERSION}")
+    if version == 1:
+        config = {**_get(content, "config", dict), "method": asdict(ThreeDGS())}
+        content = {**content, "config": config, "regularizer": Regularizer(0).state()}
+    training = restored_training(content)
+    scene = _dataclass(SceneReference, {"start": "scene", "depths": None, **_get(content, "scene", dict)}, "scene")
+    if len(scene.sizes) != len(scene.train):
+        raise ValueError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
+    if not all(type(index) is int and 0 <= index < len(scene.train) for index in training.order):
+        raise ValueError(f"its order does not index its {len(scene.train)} training views")
+    return Checkpoint(training, scene, _get(content, "torch", str))
+
+
+def restored_training(content: dict[str, Any]) -> Training:
+    """The training of a state.  ValueError that says what is wrong with it."""
     flat = _get(content, "flat", Tensor)
     gaussians = Gaussians(_tensor(content, "flat", (flat.numel(),), flat.dtype), _get(content, "sh_degree", int))
     gaussians.require_finite()
-    older = {"method": asdict(ThreeDGS())} if version == 1 else {}
-    config = _dataclass(TrainConfig, {**_get(content, "config", dict), **older}, "config")
+    config = _dataclass(TrainConfig, _get(content, "config", dict), "config")
     regularizer = config.method.regularizer(config.seed)
-    if version > 1:
-        _restore(regularizer, _get(content, "regularizer", dict))
-    scene = _dataclass(SceneReference, {"start": "scene", "depths": None, **_get(content, "scene", dict)}, "scene")
+    _restore(regularizer, _get(content, "regularizer", dict))
     adam, screen = _get(content, "adam", dict), _get(content, "screen_gradients", dict)
     training = Training(
         config=config,
@@ -232,11 +250,7 @@ def _checkpoint(content: Any) -> Checkpoint:
         raise ValueError(f"its step {training.step} is not among its {config.iterations} iterations")
     if not 0 < training.extent < float("inf"):
         raise ValueError(f"its extent is {training.extent}")
-    if len(scene.sizes) != len(scene.train):
-        raise ValueError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
-    if not all(type(index) is int and 0 <= index < len(scene.train) for index in training.order):
-        raise ValueError(f"its order does not index its {len(scene.train)} training views")
-    return Checkpoint(training, scene, _get(content, "torch", str))
+    return training
 
 
 T = TypeVar("T")

@@ -7,29 +7,20 @@ dropgaussian    a growing random share of the Gaussians is left out of each trai
 dropoutgs       the image without a random share of the Gaussians agrees with that of all
 fsgs            new Gaussians between distant neighbours; depth correlates with the user's depth maps
 dngaussian      depth has the shape of the user's depth maps, globally and in small patches
+cor-gs          two fields: each keeps the Gaussians that the other confirms, and agrees with it between the views
 """
 
-from dataclasses import dataclass
-from typing import Literal
-
+from splat.regularizers.corgs import CoRGS
 from splat.regularizers.dngaussian import DNGaussian
 from splat.regularizers.dropgaussian import DropGaussian
 from splat.regularizers.dropoutgs import DropoutGS
 from splat.regularizers.fsgs import FSGS
-from splat.regularizers.regularizer import Method
+from splat.regularizers.regularizer import ThreeDGS
 from splat.regularizers.sam import SAM
 from splat.regularizers.stablegs import StableGS
 
-
-@dataclass(frozen=True)
-class ThreeDGS(Method):
-    """3D Gaussian Splatting as it is (Kerbl et al. 2023)."""
-
-    name: Literal["3dgs"] = "3dgs"
-
-
-MethodSettings = ThreeDGS | StableGS | SAM | DropGaussian | DropoutGS | FSGS | DNGaussian
+MethodSettings = ThreeDGS | StableGS | SAM | DropGaussian | DropoutGS | FSGS | DNGaussian | CoRGS
 
 METHODS: dict[str, type[MethodSettings]] = {
-    method.name: method for method in (ThreeDGS, StableGS, SAM, DropGaussian, DropoutGS, FSGS, DNGaussian)
+    method.name: method for method in (ThreeDGS, StableGS, SAM, DropGaussian, DropoutGS, FSGS, DNGaussian, CoRGS)
 }

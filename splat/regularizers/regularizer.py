@@ -13,7 +13,7 @@ splits the same Gaussians alike.  `state` and `restore` carry it through a check
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -100,3 +100,10 @@ class Method:
 
     def regularizer(self, seed: int) -> Regularizer:
         return Regularizer(seed)
+
+
+@dataclass(frozen=True)
+class ThreeDGS(Method):
+    """3D Gaussian Splatting as it is (Kerbl et al. 2023)."""
+
+    name: Literal["3dgs"] = "3dgs"

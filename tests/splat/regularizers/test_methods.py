@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from splat.checkpoint import load_checkpoint, save_checkpoint
+from splat.regularizers.corgs import CoRGS
 from splat.regularizers.dngaussian import DNGaussian
 from splat.regularizers.dropgaussian import DropGaussian
 from splat.regularizers.dropoutgs import DropoutGS
@@ -27,6 +28,7 @@ SHORT: dict[str, MethodSettings] = {
     "dropoutgs": DropoutGS(),
     "fsgs": FSGS(threshold=0.1, large=0.01),
     "dngaussian": DNGaussian(soft_start=3),
+    "cor-gs": CoRGS(prune_every=4, prune_start=3, distance=0.3, pseudo_start=5),
 }  # schedules that fit into a dozen steps
 
 
