@@ -266,8 +266,9 @@ class _Krylov:
         vectors = self.basis[: self.size].T @ ritz.coordinates[:, ritz.wanted].to(self.basis.dtype)
         vectors /= torch.linalg.vector_norm(vectors, dim=0)  # restarts leave a little of their round-off
         values = ritz.values[ritz.wanted]
+        enough = (s.rtol * values.abs()).clamp_min(max(s.atol, self.floor(ritz)))
         residuals = self._together(ritz, vectors) if converged else torch.full_like(values, inf)
-        if not (residuals <= (s.rtol * values.abs()).clamp_min(s.atol)).all():
+        if not (residuals <= enough).all():
             values, residuals = rayleigh(self.operator, vectors)
             self.matvecs += s.wanted
         estimated = ritz.residuals[ritz.wanted]

@@ -49,6 +49,7 @@ CROSS = DEGREE4  # after the moments of s + v: those of w g_c + w h_c D_c, and t
 COLOUR = DEGREE4 + 3 * DEGREE2
 BLOCK_SUMS = COLOUR + 3
 SPLAT = 9
+TINY = np.finfo(np.float64).tiny  # an opacity below has no weight, and no inverse
 
 
 def _moment_index() -> np.ndarray:
@@ -189,7 +190,7 @@ def splat_block(splat, moments, S, Sx, Sy, block):
     dq: a dx + b dy, b dx + c dy in the mean; -dx^2 / 2, -dx dy, -dy^2 / 2 in the conic; 1 / o in the opacity.
     """
     rows = ((splat[2], splat[3]), (splat[3], splat[4]))
-    inverse = 1.0 / splat[5]
+    inverse = 1.0 / max(splat[5], TINY)
     powers = ((2, 0, -0.5), (1, 1, -1.0), (0, 2, -0.5))
     for p in range(2):
         for q in range(p + 1):
@@ -204,7 +205,7 @@ def splat_block(splat, moments, S, Sx, Sy, block):
         for q in range(p + 1):
             j2, k2, factor2 = powers[q]
             block[2 + p, 2 + q] = factor * factor2 * moments[MOMENT[j + j2, k + k2]]
-    block[5, 5] = inverse * inverse * (moments[0] - S)
+    block[5, 5] = inverse * (inverse * (moments[0] - S))  # 1 / o^2 alone may overflow
     for c in range(3):
         at = CROSS + DEGREE2 * c
         for p in range(2):
