@@ -16,12 +16,14 @@ import tyro
 
 from analysis.options import (
     BenchOptions,
+    CompareOptions,
     DemoOptions,
     ProbeOptions,
     SfmOptions,
     SliceOptions,
     SweepOptions,
     TrainOptions,
+    TrajectoryOptions,
 )
 
 Options = (
@@ -30,7 +32,9 @@ Options = (
     | Annotated[SweepOptions, tyro.conf.subcommand("sweep")]
     | Annotated[ProbeOptions, tyro.conf.subcommand("probe")]
     | Annotated[SliceOptions, tyro.conf.subcommand("slice")]
+    | Annotated[CompareOptions, tyro.conf.subcommand("compare")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
+    | Annotated[TrajectoryOptions, tyro.conf.subcommand("trajectory")]
     | Annotated[BenchOptions, tyro.conf.subcommand("bench")]
 )
 
@@ -78,6 +82,14 @@ def run(options: Options, arguments: Sequence[str]) -> int:
             from analysis.slicing import run_slice
 
             return run_slice(options, ["landscape", *arguments])
+        case TrajectoryOptions():
+            from analysis.trajectories import run_trajectory
+
+            return run_trajectory(options)
+        case CompareOptions():
+            from analysis.compare import run_compare
+
+            return run_compare(options)
         case DemoOptions():
             from analysis.demo import run_demo
 

@@ -166,6 +166,28 @@ class SliceOptions:
 
 
 @dataclass(frozen=True)
+class TrajectoryOptions:
+    """Plot the landscape along trainings that were made with --probe-every, several in one picture."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Folders that landscape train wrote."""
+    out: Path | None = None
+    """Folder of the table and the picture.  Default: trajectory, in the folder that holds all runs."""
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Compare probed runs in one table and on one page: scores, traces, spectra, anisotropy, slices."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
+    """Folders that landscape train wrote, of the same views and loss, each probed."""
+    out: Annotated[Path | None, arg(help_behavior_hint="")] = None
+    """Folder of the page, the table and the pictures.  Default: compare, in the folder that holds all runs."""
+    probe: FlagCreatePairsOff[bool] = False
+    """Probe the runs that have no record of their checkpoint yet."""
+
+
+@dataclass(frozen=True)
 class DemoOptions:
     """Train and probe an embedded synthetic scene, and say which pictures to open."""
 

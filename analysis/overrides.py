@@ -26,6 +26,18 @@ def assignments(texts: Sequence[str]) -> dict[str, str]:
     return {key.strip(): value.strip() for key, _, value in pairs}
 
 
+def leaves(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings as one level, by their dotted names.
+
+    >>> leaves({"probe": {"gamma": 0.5}, "viewpoint.parallax": False})
+    {'probe.gamma': 0.5, 'viewpoint.parallax': False}
+    """
+    result = {}
+    for key, value in settings.items():
+        result |= {f"{key}.{name}": v for name, v in leaves(value).items()} if isinstance(value, dict) else {key: value}
+    return result
+
+
 def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     """The settings with some of them changed.
 
@@ -101,6 +113,11 @@ def _words(hint: Any) -> str:
         return f"a list of {_words(options[0])}"
     if kind in (Union, UnionType):
         return " or ".join(_words(option) for option in options)
-    return {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path", NoneType: "none"}.get(
-        hint, str(hint)
-    )
+    return {
+        int: "a whole number",
+        float: "a number",
+        bool: "true or false",
+        str: "text",
+        Path: "a path",
+        NoneType: "none",
+    }.get(hint, str(hint))

@@ -5,6 +5,7 @@ to a network.  Text from the record is escaped.
 """
 
 import base64
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def render_report(record: Record) -> str:
     return environment.get_template("report.html.jinja").render(
         data=record.data,
         verdict=verdict(record.data),
-        pictures=_pictures(record.folder),
+        pictures=pictures_in(record.folder, PICTURES),
         families=family_lines(record.data),
         indices=INDICES,
         surface="" if surface is None else _embedded(surface),
@@ -106,9 +107,9 @@ def _plain(text: str) -> str:
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
-def _pictures(folder: Path) -> list[dict[str, str]]:
+def pictures_in(folder: Path, captions: Mapping[str, str]) -> list[dict[str, str]]:
     """The pictures that were drawn, as data URIs with their captions."""
-    drawn = [(name, caption, folder / f"{name}.png") for name, caption in PICTURES.items()]
+    drawn = [(name, caption, folder / f"{name}.png") for name, caption in captions.items()]
     return [
         {
             "name": name,

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from analysis.options import ProbeOptions, TrainOptions
-from analysis.overrides import read_value
+from analysis.overrides import leaves, read_value
 
 FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
@@ -163,7 +163,7 @@ def _method(table: Mapping[str, Any], name: str, file: Path) -> dict[str, Any]:
         raise ValueError(f"expected a table {where}set of settings, as in set = {{ gamma = 0.5 }}, got {changes!r}")
     rest = {key: value for key, value in table.items() if key != "set"}
     values = _values(rest, METHOD | TRAINING, where, file.parent)
-    texts = tuple(f"{key}={_text(value)}" for key, value in _leaves(changes).items())
+    texts = tuple(f"{key}={_text(value)}" for key, value in leaves(changes).items())
     return {"method": name, **values, "set": texts}
 
 
@@ -176,18 +176,6 @@ def _values(table: Mapping[str, Any], hints: Mapping[str, Any], where: str, fold
         read = read_value(value, hints[key], where + key)
         values[key] = folder / read if isinstance(read, Path) else read
     return values
-
-
-def _leaves(table: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    >>> _leaves({"probe": {"gamma": 0.5}, "viewpoint.parallax": False})
-    {'probe.gamma': 0.5, 'viewpoint.parallax': False}
-    """
-    result = {}
-    for key, value in table.items():
-        inner = {f"{key}.{name}": v for name, v in _leaves(value).items()} if isinstance(value, dict) else {key: value}
-        result.update(inner)
-    return result
 
 
 def _text(value: Any) -> str:

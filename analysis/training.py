@@ -33,7 +33,7 @@ from torch import Tensor
 
 from analysis.interruption import interruption
 from analysis.options import TrainOptions
-from analysis.overrides import assignments, overridden
+from analysis.overrides import assignments, leaves, overridden
 from analysis.provenance import provenance
 from analysis.spent import Spent
 from analysis.trajectory import START, Trajectory, TrajectorySettings
@@ -152,8 +152,11 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: 
     """The training of a checkpoint, which must have been started with the same settings on the same views.  remedy: what a
     refusal advises."""
     loaded = load_checkpoint(path)
-    asked = {**_flat(asdict(config)), **_flat(asdict(replace(reference, absolute="", relative="")))}
-    saved = {**_flat(asdict(loaded.training.config)), **_flat(asdict(replace(loaded.scene, absolute="", relative="")))}
+    asked = {**leaves(asdict(config)), **leaves(asdict(replace(reference, absolute="", relative="")))}
+    saved = {
+        **leaves(asdict(loaded.training.config)),
+        **leaves(asdict(replace(loaded.scene, absolute="", relative=""))),
+    }
     for key, value in saved.items():
         if asked[key] != value:
             raise ValueError(
@@ -161,15 +164,6 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: 
                 f"{asked[key]}; {remedy}"
             )
     return loaded.training
-
-
-def _flat(settings: dict[str, Any]) -> dict[str, Any]:
-    """Nested settings as one level, by the names of the leaves joined with dots."""
-    result = {}
-    for key, value in settings.items():
-        inner = {f"{key}.{name}": v for name, v in _flat(value).items()} if isinstance(value, dict) else {key: value}
-        result.update(inner)
-    return result
 
 
 def _follow(

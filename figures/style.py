@@ -71,9 +71,9 @@ def style() -> Iterator[None]:
         yield
 
 
-def new_figure(height: float) -> Figure:
-    """A figure of column width that lays itself out without overlaps."""
-    return Figure(figsize=(COLUMN, height), layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.05))
+def new_figure(height: float, width: float = COLUMN) -> Figure:
+    """A figure, of column width by default, that lays itself out without overlaps."""
+    return Figure(figsize=(width, height), layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.05))
 
 
 def save(figure: Figure, path: str | Path) -> Path:

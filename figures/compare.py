@@ -1,0 +1,238 @@
+"""Figures: several probed runs beside each other, a colour a run: `python -m figures.compare OUT`, after `landscape compare`.
+
+compare_traces      |trace| of every attribute with its interval; filled: positive, open: negative, crossed: not decided
+compare_densities   the share of directions whose curvature is at most -x (left) or at least x (right), both axes logarithmic;
+                    means over the start vectors of the quadrature; dashed: the ends of the spectrum
+compare_slices      the planes of the two steepest directions, cut to the steps that all slices reach, with the same levels
+compare_sections    the loss along each of these directions, as far as each slice goes
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from analysis.records import Record, read_record
+from analysis.verdict import attribute_name
+from figures.plane import Plane, plane
+from figures.style import (
+    BLACK,
+    BLUE,
+    COLUMN,
+    FIELD_MAP,
+    GREEN,
+    MISSING,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    exponent_of,
+    literal,
+    new_figure,
+    save,
+    style,
+    unit_suffix,
+)
+
+Records = Mapping[str, Record]
+COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)
+LINES = ("-", "--", ":")  # once the colours are used up
+LEVELS = 12
+ACROSS = 3  # panels in a row
+
+
+def draw_traces(records: Records) -> Figure:
+    """A row an attribute, in it one below the other the runs."""
+    names = list(dict.fromkeys(name for record in records.values() for name in record.data["traces"]))
+    with style():
+        figure = new_figure(0.7 + 0.13 * len(names) * (len(records) + 1), 2 * COLUMN)
+        axes = figure.subplots()
+        for i, (look, record) in enumerate(zip(_looks(records), records.values(), strict=True)):
+            for row, name in enumerate(names):
+                y = row + (i + 0.5) / (len(records) + 1) - 0.4
+                _draw_trace(axes, record.data["traces"].get(name), y, look["color"])
+        axes.set_xscale("log")
+        axes.set_yticks(range(len(names)), [literal(attribute_name(name)) for name in names])
+        axes.set_ylim(len(names) - 0.4, -0.6)
+        axes.tick_params(axis="y", length=0)
+        axes.grid(True, axis="x")
+        axes.set_xlabel("|trace| (loss per squared parameter unit)")
+        axes.set_title("Trace by attribute", loc="left")
+        _legend(figure, records)
+    return figure
+
+
+def _draw_trace(axes: Axes, entry: Mapping | None, y: float, colour: str) -> None:
+    if entry is None or entry["value"] is None or not np.isfinite(entry["value"]) or entry["value"] == 0:
+        return
+    ends = [entry["value"] if entry.get(key) is None else entry[key] for key in ("low", "high")]
+    decided = ends[0] * ends[1] > 0
+    low, high = sorted(np.abs(ends))
+    smallest = abs(entry["value"]) / 10  # an interval that reaches 0 has no end on a logarithmic axis
+    axes.plot([low if decided else smallest, max(high, abs(entry["value"]))], [y, y], color=colour, linewidth=1.2)
+    face = colour if entry["value"] > 0 else "white"
+    axes.plot([abs(entry["value"])], [y], "o" if decided else "X", color=colour, markerfacecolor=face)
+
+
+def draw_densities(records: Records) -> Figure:
+    """Both sides of 0 on the same axes."""
+    if not any("nodes" in record.arrays.get("spectrum", {}) for record in records.values()):
+        raise ValueError("expected a spectral density in at least one record, got none")
+    with style():
+        figure = new_figure(2.6, 2 * COLUMN)
+        panels = figure.subplots(1, 2, sharey=True)
+        for look, record in zip(_looks(records), records.values(), strict=True):
+            spectrum, ends = record.arrays.get("spectrum", {}), record.data["eigenvalues"]
+            for axes, sign, end in zip(panels, (-1, 1), ("min", "max"), strict=True):
+                if "nodes" in spectrum:
+                    axes.step(*beyond(sign * spectrum["nodes"], spectrum["weights"]), where="pre", **look)
+                if sign * (ends[end]["value"] or 0) > 0:
+                    axes.axvline(sign * ends[end]["value"], color=look["color"], linestyle=(0, (2, 2)), linewidth=0.6)
+        for axes, words in zip(panels, ("down", "up"), strict=True):
+            axes.set(xscale="log", yscale="log", xlabel="|curvature| (loss per squared parameter unit)")
+            axes.set_title(f"Directions that curve {words}", loc="left")
+            axes.grid(True)
+        limits = np.array([axes.get_xlim() for axes in panels])
+        top = limits[:, 1].max()
+        for axes in panels:
+            axes.set_xlim(max(limits[:, 0].min(), top * 1e-8), top)
+        panels[0].invert_xaxis()
+        most = max(record.data["counts"]["active_parameters"] for record in records.values())
+        panels[0].set_ylim(0.5 / most, 2)  # one direction is a share of 1 / parameters
+        panels[0].set_ylabel("share of directions\nat least so curved")
+        _legend(figure, records)
+    return figure
+
+
+def beyond(nodes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positive nodes in rising order, and the mean over the start vectors of the weight at or above each.
+
+    >>> values, shares = beyond(np.array([[3.0, -1.0], [1.0, 2.0]]), np.array([[0.2, 0.8], [0.6, 0.4]]))
+    >>> values.tolist(), shares.round(12).tolist()
+    ([1.0, 2.0, 3.0], [0.6, 0.3, 0.1])
+    """
+    flat, masses = nodes.ravel(), weights.ravel() / len(nodes)
+    kept = flat > 0
+    order = np.argsort(flat[kept])
+    return flat[kept][order], np.cumsum(masses[kept][order][::-1])[::-1]
+
+
+def draw_slices(records: Records) -> Figure:
+    """The planes in the window that all of them have."""
+    planes = {label: plane(record) for label, record in records.items() if "slice" in record.arrays}
+    reach = [min(float(np.abs(getattr(field, axis).steps).max()) for field in planes.values()) for axis in "xy"]
+    exponent = exponent_of(*reach)
+    windows = {label: _window(field, *reach) for label, field in planes.items()}
+    high = max(float(change[mask].max()) for _, _, change, mask in windows.values())
+    low = min(float(change[mask].min()) for _, _, change, mask in windows.values())
+    power = exponent_of(high, low)
+    levels = MaxNLocator(LEVELS).tick_values(low / 10.0**power, high / 10.0**power)
+    rows, columns = -(-len(planes) // ACROSS), min(len(planes), ACROSS)
+    with style():
+        figure = new_figure(0.4 + 2.1 * rows, 2 * COLUMN)
+        panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+        filled = None
+        for axes, (label, (x, y, change, _)) in zip(panels.ravel(), windows.items(), strict=False):
+            values, steps = change.T / 10.0**power, (x / 10.0**exponent, y / 10.0**exponent)
+            axes.set_facecolor(MISSING)
+            filled = axes.contourf(*steps, values, levels=levels, cmap=FIELD_MAP, extend="both")
+            axes.contour(*steps, values, levels=levels, colors=BLACK, linewidths=0.4)
+            axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
+            axes.set_title(literal(label), loc="left")
+            axes.set(
+                xlim=np.array([-1, 1]) * reach[0] / 10.0**exponent, ylim=np.array([-1, 1]) * reach[1] / 10.0**exponent
+            )
+        for axes in panels.ravel()[len(planes) :]:
+            axes.set_axis_off()
+        figure.supxlabel(f"step along the steepest direction, param. units{unit_suffix(exponent)}", fontsize=7)
+        figure.supylabel(f"step along the second{unit_suffix(exponent)}", fontsize=7)
+        figure.colorbar(filled, ax=panels, label=f"change of loss{unit_suffix(power)}")  # pyright: ignore[reportArgumentType]
+    return figure
+
+
+def _window(field: Plane, x: float, y: float) -> tuple[np.ndarray, np.ndarray, np.ma.MaskedArray, np.ndarray]:
+    """Steps, the change of loss, and which of its points lie within the window (and are finite)."""
+    inside = np.outer(np.abs(field.x.steps) <= x * (1 + 1e-9), np.abs(field.y.steps) <= y * (1 + 1e-9))
+    change = field.change * 10.0**field.exponent
+    return field.x.steps, field.y.steps, change, inside & ~np.ma.getmaskarray(change)
+
+
+def draw_sections(records: Records) -> Figure:
+    """The lines through the centres of the planes, as far as each goes."""
+    planes = {label: plane(record) if "slice" in record.arrays else None for label, record in records.items()}
+    changes = [field.change * 10.0**field.exponent for field in planes.values() if field is not None]
+    power = exponent_of(*(change.compressed() for change in changes))
+    steps = exponent_of(*(axis.steps for field in planes.values() if field is not None for axis in (field.x, field.y)))
+    with style():
+        figure = new_figure(2.6, 2 * COLUMN)
+        panels = figure.subplots(1, 2, sharey=True)
+        for look, field in zip(_looks(records), planes.values(), strict=True):
+            if field is None:
+                continue
+            for number, (axes, along) in enumerate(zip(panels, (field.x, field.y), strict=True)):
+                other = field.y if number == 0 else field.x
+                line = field.change.take(other.centre, axis=1 - number) * 10.0 ** (field.exponent - power)
+                axes.plot(along.steps / 10.0**steps, line, **look)
+        for axes, which in zip(panels, ("steepest", "second"), strict=True):
+            axes.set_xlabel(f"step, param. units{unit_suffix(steps)}")
+            axes.set_title(f"Along the {which} direction", loc="left")
+            axes.grid(True)
+        panels[0].set_ylabel(f"change of loss{unit_suffix(power)}")
+        _legend(figure, records)
+    return figure
+
+
+def _looks(records: Records) -> list[dict[str, str]]:
+    """Colour and line of each run."""
+    return [
+        {"color": COLOURS[i % len(COLOURS)], "linestyle": LINES[i // len(COLOURS) % len(LINES)]}
+        for i in range(len(records))
+    ]
+
+
+def _legend(figure: Figure, records: Records) -> None:
+    handles = [Line2D([], [], label=literal(label), **look) for label, look in zip(records, _looks(records))]  # pyright: ignore[reportArgumentType]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(records)))
+
+
+FIGURES: dict[str, Callable[[Records], Figure]] = {
+    "compare_traces": draw_traces,
+    "compare_densities": draw_densities,
+    "compare_slices": draw_slices,
+    "compare_sections": draw_sections,
+}
+
+
+def draw_comparison(folder: Path, suffix: str = "png") -> list[Path]:
+    """Draw what the records of the comparison in the folder have the numbers for; returns the files."""
+    named = json.loads((folder / "compare.json").read_text(encoding="utf-8"))["runs"]
+    records = {label: read_record(path) for label, path in named.items()}
+    arrays = [record.arrays for record in records.values()]
+    known = {"compare_densities": any("nodes" in each.get("spectrum", {}) for each in arrays)}
+    known |= dict.fromkeys(("compare_slices", "compare_sections"), any("slice" in each for each in arrays))
+    return [save(draw(records), folder / f"{name}.{suffix}") for name, draw in FIGURES.items() if known.get(name, True)]
+
+
+def main() -> None:
+    """`python -m figures.compare OUT [--format pdf]`"""
+    parser = argparse.ArgumentParser(description="Draw the figures of a comparison into its folder.")
+    parser.add_argument("folder", type=Path, help="a folder written by `landscape compare`")
+    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
+    arguments = parser.parse_args()
+    try:
+        paths = draw_comparison(arguments.folder, arguments.format)
+    except (FileNotFoundError, ValueError) as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+    print(*paths, sep="\n")
+
+
+if __name__ == "__main__":
+    main()
