@@ -12,8 +12,9 @@
     method "xtrace"      every test vector in turn on the rest that the sketch of the others leaves (`sketched`)
 
 The last two pay where a few eigenvalues dominate, with errors that fall like 1 / matvecs and faster; Hutchinson's fall like
-1 / sqrt(matvecs), and are the smaller ones on a flat spectrum.  Where the operator knows the diagonal of a part of itself
-(`control.PartlyKnown`), Hutchinson uses it as a control variate, and an operator that knows all of it is not probed.
+1 / sqrt(matvecs), and are the smaller ones on a flat spectrum.  The default keeps up to max_probes / 2 probes with their
+products and, as XTrace, twice as many vectors more, within `TraceSettings.memory`.  Where the operator knows the diagonal of a
+part of itself (`control.PartlyKnown`), Hutchinson uses it as a control variate, and one that knows all of it is not probed.
 
 `PAPER` is StableGS's estimator, Eq. (6): Gaussian z, one block at a time, ten probes.
 """
