@@ -39,6 +39,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from analysis.trajectories import RECORDS
 from landscape import (
     CountingOperator,
     EigenSettings,
@@ -59,7 +60,7 @@ from splat.scenes.view import View
 from splat.traces import exact_traces
 from splat.train import TrainConfig, Training
 
-FILE, START = "trajectory.csv", "start"
+START = "start"
 Row = dict[str, Any]
 LEAST = 32  # renders with their gradients, for each view, that the least record takes (measured on 8,000 Gaussians)
 FEWEST_MATVECS = 20  # from a warm start, for the largest eigenvalue
@@ -112,7 +113,7 @@ class Trajectory:
 
     def __init__(self, run: Path, training: Training, views: Sequence[View], settings: TrajectorySettings) -> None:
         self.run, self.training, self.views, self.settings = run, training, views, settings
-        self.rows = _read_rows(run / FILE, training.step)
+        self.rows = _read_rows(run / RECORDS, training.step)
         self.vectors = _read_vectors(run, training)
         self.least: tuple[float, int] | None = None  # seconds of the last record's least work, with how many Gaussians
         training.watchers.append(self.follow)
@@ -145,7 +146,7 @@ class Trajectory:
             row["seconds"] = perf_counter() - start
         row["time_share"] = (spent + row["seconds"]) / trained
         self.rows.append(row)
-        write_atomically(self.run / FILE, pd.DataFrame(self.rows, columns=COLUMNS).to_csv(index=False).encode())
+        write_atomically(self.run / RECORDS, pd.DataFrame(self.rows, columns=COLUMNS).to_csv(index=False).encode())
 
     def _expected(self, step: float) -> float:
         """Seconds that the next record takes at least, where a step takes so many."""

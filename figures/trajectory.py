@@ -1,0 +1,169 @@
+"""Figure: the landscape along one or several trainings, from the table that `landscape trajectory` wrote.
+
+`python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Bands: 95% intervals of the traces, residuals of
+the eigenvalues; bars: brackets of the indices, with an arrow where there is no upper bound.  An axis is logarithmic where all of
+its values are positive and span more than a decade.  |lambda_max / lambda_min| has open markers where it is negative.
+"""
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from analysis.quantities import power_of_ten
+from analysis.verdict import ATTRIBUTES, attribute_name
+from figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    exponent_of,
+    literal,
+    new_figure,
+    save,
+    style,
+    unit_suffix,
+)  # fmt: skip
+
+COLOURS = (VERMILION, GREEN, BLUE, ORANGE, PURPLE, SKY, BLACK)
+ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
+INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
+PANEL = 1.05  # inches of height
+LEGEND_LINE = 0.14
+
+
+def draw(table: pd.DataFrame) -> Figure:
+    """table: rows of `analysis/trajectory.py`, with the name of the run that each belongs to as "run".
+
+    Raises ValueError where nothing was measured.
+    """
+    measured = pd.DataFrame(table[table["state"] != "skipped"])
+    if measured["lambda_max"].dropna().empty:
+        raise ValueError(
+            "expected at least one record that was not skipped, got none; train with a larger --probe-share"
+        )
+    runs = {str(name): COLOURS[i % len(COLOURS)] for i, name in enumerate(table["run"].unique())}
+    with style():
+        figure = new_figure(PANEL * 5 + LEGEND_LINE * (len(runs) + 2))
+        panels = figure.subplots(5, 2)
+        for axes, name in zip(panels.flat, ATTRIBUTES, strict=False):
+            columns = f"trace_{name}", f"trace_{name}_low", f"trace_{name}_high"
+            _bands(axes, measured, runs, columns, f"trace of {attribute_name(name)}")
+        _gaussians(panels[2, 1], table, runs)
+        for axes, (name, title) in zip(panels[3], ENDS.items(), strict=True):
+            error = measured[f"{name}_error"]
+            known = measured.assign(low=measured[name] - error, high=measured[name] + error)
+            _bands(axes, known, runs, (name, "low", "high"), title)
+        for axes, (name, title) in zip(panels[4], INDICES.items(), strict=True):
+            axes.set_title(title)
+            index_over_steps(axes, measured, runs, name)
+            axes.set_xlabel("step")
+        for axes in panels.flat:
+            axes.grid(True)
+            axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        handles = [Line2D([], [], color=colour, label=literal(name)) for name, colour in runs.items()]
+        figure.legend(handles=handles, loc="outside lower center", ncols=1)
+    return figure
+
+
+def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], name: str) -> None:
+    """An index of every run over the steps, its magnitude on a logarithmic axis, with its bracket.  runs: name -> colour."""
+    axes.set_yscale("log")
+    for run, colour in runs.items():
+        part = pd.DataFrame(measured[(measured["run"] == run) & measured[name].notna()])
+        steps, values = part["step"].to_numpy(float), part[name].to_numpy(float)
+        magnitudes = np.abs(values)
+        ends = np.stack([np.abs(part[f"{name}_low"].to_numpy(float)), np.abs(part[f"{name}_high"].to_numpy(float))])
+        unbounded = ~np.isfinite(ends).all(axis=0)
+        low = np.fmin(np.nanmin(ends, axis=0, initial=np.inf), magnitudes)
+        high = np.where(unbounded, magnitudes, np.fmax(ends.max(axis=0), magnitudes))
+        axes.errorbar(
+            steps, magnitudes, yerr=np.stack([magnitudes - low, high - magnitudes]), lolims=unbounded, color=colour,
+            linewidth=1.0, elinewidth=0.6, capsize=1.2, markersize=2, capthick=0.6,
+        )  # fmt: skip
+        for sign, face in ((values >= 0, colour), (values < 0, "white")):
+            axes.plot(
+                steps[sign], magnitudes[sign], "o", color=colour, markerfacecolor=face, markersize=3, linestyle="none"
+            )
+    _few_decades(axes)
+
+
+def _bands(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], columns: tuple[str, str, str], title: str) -> None:
+    """columns: of the values and of both ends of their bands."""
+    lowest = float(np.nanmin(measured[columns[1]].to_numpy(float)))
+    highest = float(np.nanmax(measured[columns[2]].to_numpy(float)))
+    logarithmic = lowest > 0 and highest > 10 * lowest
+    exponent = 0 if logarithmic else exponent_of(measured[columns[0]].to_numpy(float))
+    axes.set_title(literal(title) + unit_suffix(exponent))
+    for run, colour in runs.items():
+        part = pd.DataFrame(measured[measured["run"] == run])
+        value, low, high = (part[name].to_numpy(float) / 10.0**exponent for name in columns)
+        axes.fill_between(part["step"], low, high, color=colour, alpha=0.25, linewidth=0)
+        axes.plot(part["step"], value, "-o", color=colour, markersize=2)
+    if logarithmic:
+        axes.set_yscale("log")
+        _few_decades(axes)
+    else:
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+
+
+def _gaussians(axes: Axes, table: pd.DataFrame, runs: dict[str, str]) -> None:
+    axes.set_title("Gaussians")
+    for run, colour in runs.items():
+        part = table[table["run"] == run]
+        axes.plot(part["step"], part["gaussians"], "-o", color=colour, markersize=2)
+    axes.set_ylim(bottom=0)
+    axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+
+
+def _few_decades(axes: Axes) -> None:
+    """Ticks of a logarithmic axis: decades, or where it spans less than two of them, also 2 and 5."""
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100 * low else (1.0,), numticks=6))
+    axes.yaxis.set_major_formatter(FuncFormatter(_tick))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _tick(value: float, _: int | None) -> str:
+    """
+    >>> _tick(20.0, None), _tick(1e-5, None), _tick(5e-5, None)
+    ('20', '10⁻⁵', '5×10⁻⁵')
+    """
+    exponent = math.floor(math.log10(value) + 1e-9)
+    if -3 <= exponent <= 3:
+        return f"{value:g}"
+    leading = round(value / 10.0**exponent)
+    return power_of_ten(exponent) if leading == 1 else f"{leading}×{power_of_ten(exponent)}"
+
+
+def main() -> None:
+    """`python -m figures.trajectory OUT/trajectories.csv`"""
+    parser = argparse.ArgumentParser(
+        description="Draw the landscape along trainings, as written by `landscape trajectory`."
+    )
+    parser.add_argument("table", type=Path, help="trajectories.csv, as written by `landscape trajectory`")
+    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
+    arguments = parser.parse_args()
+    try:
+        figure = draw(pd.read_csv(arguments.table))
+        print(save(figure, arguments.table.with_suffix(f".{arguments.format}")))
+    except KeyError as error:
+        print(f"expected trajectories.csv as written by landscape trajectory, got none of its {error}", file=sys.stderr)
+        sys.exit(2)
+    except (FileNotFoundError, ValueError) as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

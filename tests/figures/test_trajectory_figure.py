@@ -1,0 +1,102 @@
+"""The landscape along trainings: gathered, drawn as recorded, and legible; what is missing is named."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_hex
+
+from analysis.cli import main
+from analysis.trajectories import gathered
+from analysis.trajectory import COLUMNS
+from figures import trajectory
+from figures.style import COLUMN
+from figures.trajectory import COLOURS
+from tests.figures.test_figures import POINT, laid_out, words
+from tests.recorded import ATTRIBUTES
+
+
+def rows(scale: float = 1.0, steps: int = 4) -> pd.DataFrame:
+    """A run's records, the first one skipped; the literal index is negative, the effective rank unbounded above."""
+    found = []
+    for i in range(1, steps + 1):
+        row = {"step": 500 * i, "gaussians": 1000 * i, "state": "whole", "note": "", "seconds": 1.0, "time_share": 0.1}
+        for j, name in enumerate(ATTRIBUTES):
+            value = scale * (10.0 ** (i + j) if j % 2 else i - 2.5)
+            row |= {f"trace_{name}": value, f"trace_{name}_error": 0.1 * abs(value)}
+            row |= {f"trace_{name}_low": value - 0.2 * abs(value), f"trace_{name}_high": value + 0.2 * abs(value)}
+        row |= {
+            "lambda_max": scale * i,
+            "lambda_max_error": 0.1 * scale,
+            "lambda_min": -scale / i,
+            "lambda_min_error": 0.0,
+        }
+        row |= {"literal": -float(i * i), "literal_low": -1.1 * i * i, "literal_high": -0.9 * i * i}
+        row |= {"effective_rank": 10.0 * i, "effective_rank_low": 5.0 * i, "effective_rank_high": math.nan}
+        found.append(row)
+    found[0] = {key: value for key, value in found[0].items() if key in COLUMNS[:6]} | {"state": "skipped"}
+    return pd.DataFrame(found, columns=list(COLUMNS))
+
+
+def run(folder: Path, scale: float = 1.0) -> Path:
+    folder.mkdir(parents=True)
+    rows(scale).to_csv(folder / "trajectory.csv", index=False)
+    return folder
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e9])
+def test_labels_stay_inside_the_column_and_apart_whatever_the_records(tmp_path, scale):
+    figure = trajectory.draw(gathered([run(tmp_path / "3dgs", scale), run(tmp_path / "stablegs", 3 * scale)]))
+    renderer = laid_out(figure)
+    drawn = figure.get_tightbbox(renderer)
+    assert figure.get_figwidth() == COLUMN
+    assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
+    assert drawn.x1 <= COLUMN + POINT and drawn.y1 <= figure.get_figheight() + POINT
+    boxes = words(figure, renderer)
+    assert not [
+        (a, b) for i, (a, box) in enumerate(boxes) for b, other in boxes[:i] if box.shrunk(0.9, 0.9).overlaps(other)
+    ]
+
+
+def test_what_is_drawn_is_what_was_recorded(tmp_path):
+    table = gathered([run(tmp_path / "a"), run(tmp_path / "b", 3.0)])
+    figure = trajectory.draw(table)
+    panels = {axes.get_title(): axes for axes in figure.axes}
+    for name, colour, scale in (("a", COLOURS[0], 1.0), ("b", COLOURS[1], 3.0)):
+        (line,) = [x for x in panels["trace of position"].lines if to_hex(x.get_color()).upper() == colour]
+        assert list(np.asarray(line.get_xdata())) == [1000, 1500, 2000], name  # the skipped record is left out
+        assert np.asarray(line.get_ydata()) == pytest.approx([scale * (i - 2.5) for i in (2, 3, 4)])
+    literal = panels["|λmax / λmin|"]
+    hollow = [x for x in literal.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) == "#ffffff"]
+    assert [float(y) for x in hollow for y in np.asarray(x.get_ydata())] == [4.0, 9.0, 16.0] * 2
+    assert literal.get_yscale() == "log" and panels["trace of log scale"].get_yscale() == "log"
+    gaussians = panels["Gaussians"].lines[0]
+    assert list(np.asarray(gaussians.get_ydata())) == [1000, 2000, 3000, 4000]
+
+
+def test_the_command_prints_the_first_and_last_values_and_writes_table_and_picture(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    runs = [run(tmp_path / "runs" / "3dgs" / "0"), run(tmp_path / "runs" / "stablegs" / "0", 3.0)]
+    assert main(["trajectory", *map(str, runs)]) == 0
+    said = capsys.readouterr().out
+    out = tmp_path / "runs" / "trajectory"
+    assert (out / "trajectories.png").is_file()
+    assert list(pd.read_csv(out / "trajectories.csv")["run"].unique()) == ["3dgs/0", "stablegs/0"]
+    lines = [line.split() for line in said.splitlines()]
+    assert ["3dgs/0", "(1", "skipped)", "step", "1,000", "(whole)", "step", "2,000", "(whole)"] in lines
+    assert ["largest", "eigenvalue", "2.00", "±", "0.10", "4.00", "±", "0.10"] in lines
+    assert ["literal", "−4.00", "(−4.40", "to", "−3.60)", "−16.0", "(−17.6", "to", "−14.4)"] in lines
+
+
+def test_a_run_without_records_or_named_twice_is_refused_with_what_to_do(tmp_path, capsys):
+    kept = run(tmp_path / "kept")
+    (tmp_path / "bare").mkdir()
+    for runs, told in (([kept, tmp_path / "bare"], "train with --probe-every"), ([kept, kept], "every run once")):
+        assert main(["trajectory", *map(str, runs)]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("landscape: expected") and told in said
+    table = gathered([kept])
+    with pytest.raises(ValueError, match="larger --probe-share"):
+        trajectory.draw(pd.DataFrame(table[table["state"] == "skipped"]))
