@@ -1,0 +1,77 @@
+"""The figures of a comparison: common limits, signs, and runs of which something was not recorded."""
+
+import json
+
+import numpy as np
+import pytest
+
+from analysis.records import Record
+from figures.compare import COLOURS, beyond, draw_comparison, draw_densities, draw_sections, draw_slices, draw_traces
+from tests.recorded import synthetic
+
+
+def records(tmp_path, *scales: float) -> dict[str, Record]:
+    return {f"run {scale:g} $x_1$": Record(tmp_path, *synthetic(scale)) for scale in scales}
+
+
+def test_slices_share_the_smallest_window_and_the_levels(tmp_path):
+    pair = records(tmp_path, 1.0, 0.25)
+    figure = draw_slices(pair)
+    steep = next(iter(pair.values())).arrays["slice"]
+    panels = [axes for axes in figure.axes if axes.get_title(loc="left")]
+    assert [axes.get_title(loc="left") for axes in panels] == [r"run 1 \$x_1\$", r"run 0.25 \$x_1\$"]
+    for axes in panels:
+        for limits, steps in ((axes.get_xlim(), steep["x"]), (axes.get_ylim(), steep["y"])):
+            exponent = round(np.log10(limits[1] / np.abs(steps).max()))
+            assert limits == pytest.approx(np.array([steps[0], steps[-1]]) * 10.0**exponent)
+    levels = [axes.collections[0].levels for axes in panels]  # pyright: ignore[reportAttributeAccessIssue]
+    assert (levels[0] == levels[1]).all()
+
+
+def test_a_trace_shows_its_sign_and_whether_its_interval_decides_it(tmp_path):
+    (record,) = records(tmp_path, 1.0).values()
+    record.data["traces"]["sh"] |= {"value": 12.0, "low": -1.0, "high": 25.0, "sign": "undetermined"}
+    record.data["traces"]["means"] |= {"value": None}
+    marked = [line for line in draw_traces({"one": record}).axes[0].lines if line.get_marker() not in ("None", None)]
+    looks = [(float(line.get_xdata()[0]), line.get_marker(), line.get_markerfacecolor()) for line in marked]  # pyright: ignore[reportIndexIssue, reportArgumentType]
+    by_value = {round(value): (marker, face) for value, marker, face in looks}
+    traces = record.data["traces"]
+    assert len(looks) == 4 and by_value[12] == ("X", COLOURS[0])
+    assert by_value[round(-traces["opacity_logits"]["value"])] == ("o", "white")
+    assert by_value[round(traces["quats"]["value"])] == ("o", COLOURS[0])
+
+
+def test_a_density_is_shared_out_among_the_directions_on_both_sides_of_zero(tmp_path):
+    (record,) = records(tmp_path, 1.0).values()
+    nodes, weights = record.arrays["spectrum"]["nodes"], record.arrays["spectrum"]["weights"]
+    (values, up), (_, down) = beyond(nodes, weights), beyond(-nodes, weights)
+    assert up[0] + down[0] == pytest.approx(1, rel=1e-12) and (np.diff(values) > 0).all() and (np.diff(up) < 0).all()
+    middle = values[len(values) // 2]
+    assert up[len(values) // 2] == pytest.approx(np.where(nodes >= middle, weights, 0).sum(axis=1).mean(), rel=1e-12)
+    left, right = draw_densities({"one": record, "two": record}).axes
+    assert left.get_xlim()[::-1] == right.get_xlim()
+
+
+def test_a_run_without_slice_or_density_is_left_out_of_those_pictures_alone(tmp_path):
+    both = records(tmp_path, 1.0, 2.0)
+    poor = list(both.values())[1]
+    del poor.arrays["slice"], poor.arrays["spectrum"]
+    poor.data["slice"] = None
+    assert len([axes for axes in draw_slices(both).axes if axes.get_title(loc="left")]) == 1
+    for draw in (draw_sections, draw_densities, draw_traces):
+        figure = draw(both)
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+            label.replace("$", r"\$") for label in both
+        ]
+    colours = {line.get_color() for line in draw_sections(both).axes[0].lines}
+    assert colours == {COLOURS[0]}
+
+
+def test_what_no_run_has_is_not_drawn(tmp_path, monkeypatch):
+    poor = records(tmp_path, 1.0, 2.0)
+    for record in poor.values():
+        record.arrays.clear()
+        record.data["slice"] = None
+    (tmp_path / "compare.json").write_text(json.dumps({"runs": {label: label for label in poor}}))
+    monkeypatch.setattr("figures.compare.read_record", lambda folder: poor[folder])
+    assert [path.name for path in draw_comparison(tmp_path)] == ["compare_traces.png"]
