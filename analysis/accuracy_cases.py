@@ -2,7 +2,7 @@
 
     splats      the Hessian of a small synthetic scene, made dense in float64: the truth is its eigendecomposition.  Methods see
                 the same matrix in float32, and every product costs what the scene's own product with as many vectors took.
-                Only `exact_traces`, which needs more than products, runs on the scene itself.
+                Only `exact_traces`, which needs more than products, and the comparison of precisions run on the scene itself.
     matrices    random eigenvectors, prescribed eigenvalues
     checkpoint  a trained scene, with a converged long run as truth (`accuracy_checkpoint`)
 
@@ -79,6 +79,7 @@ class Case:
     """An operator with what is true of it.
 
     price: seconds of a product with k vectors; None where the operator's own time counts.  objective: the scene, if it is one.
+    products: its kernels' products by precision, for matrices those of the dense one.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Case:
     price: Callable[[int], float] | None = None
     objective: SceneObjective | None = None
     active: ActiveSpace | None = None
+    products: Mapping[torch.dtype, SymmetricOperator] | None = None
 
     @property
     def round_off(self) -> float:
@@ -98,13 +100,6 @@ class Case:
     def ends(self) -> EigenEnds:
         """Both ends, by the library's defaults."""
         return extreme_eigenpairs(self.operator, torch.Generator().manual_seed(0))
-
-    @cached_property
-    def matrix(self) -> Tensor:
-        """The operator made dense."""
-        if isinstance(self.operator, DenseOperator):
-            return self.operator.matrix
-        return self.operator.apply(torch.eye(self.operator.dim, dtype=self.operator.dtype))
 
 
 class Meter:
@@ -195,7 +190,8 @@ def splat_case(name: str, noise: float, loss: LossSettings, seed: int, settings:
     rough = SceneHessian(single)
     operator = DenseOperator(matrix.float(), dict(H.blocks))
     active = ActiveSpace(rough.project, rough.rank)
-    return Case(name, "splats", operator, Truth.of(matrix, H.blocks), price_of(rough), single, active)
+    products = {torch.float32: rough, torch.float64: H}
+    return Case(name, "splats", operator, Truth.of(matrix, H.blocks), price_of(rough), single, active, products)
 
 
 def price_of(operator: SymmetricOperator) -> Callable[[int], float]:
