@@ -51,7 +51,8 @@ def own_stages(p: Problem) -> Stages:
     by_entries = raster.lists
     planes = raster.pad(np.concatenate([p.cotangents, np.zeros_like(p.cotangents[:, :1])], axis=1))
     adjoint = raster.backward(planes[0])
-    slot_start, n = raster.slot_start, len(p.splats)
+    slot_start, splats = raster.slot_start, raster.splats
+    n = len(splats)
     entries, scalars = int(slot_start[-1]), (raster.params, raster.lists, raster.frame, raster.pixels)
     sums = aligned((entries * compositing.SUMS,), p.splats.dtype)
     cut = np.log2(settings.alpha_min)
@@ -62,11 +63,11 @@ def own_stages(p: Problem) -> Stages:
 
     def backward():
         over_tiles(compositing.backward, *scalars, adjoint.cotangent, sums)
-        over_range(n, packing.reduce_gradient, p.splats, slot_start, sums, adjoint.moments, adjoint.gradient)
+        over_range(n, packing.reduce_gradient, splats, slot_start, sums, adjoint.moments, adjoint.gradient)
 
     calls: dict[str, Callable[[], object]] = {
-        "binning": lambda: binning.bin_splats(p.splats, p.depths, drawn, size.width, size.height, settings),
-        "packing": lambda: over_range(n, packing.pack_splats, p.splats, cut, np.inf, raster.params),
+        "binning": lambda: binning.bin_splats(splats, p.depths, drawn, size.width, size.height, settings),
+        "packing": lambda: over_range(n, packing.pack_splats, splats, cut, np.inf, raster.params),
         "forward": lambda: over_tiles(compositing.forward, raster.params, by_entries, raster.frame, raster.pixels),
         "slots": slots,
         "backward + reduce": backward,
@@ -84,8 +85,8 @@ def own_stages(p: Problem) -> Stages:
 def _own_tangent_stages(
     p: Problem, raster: Raster, adjoint: Adjoint, cotangents: np.ndarray, K: int, results: dict[str, np.ndarray]
 ) -> dict[str, Callable[[], object]]:
-    n, dtype, size, slot_start = len(p.splats), p.splats.dtype, raster.frame.size, raster.slot_start
-    directions = np.ascontiguousarray(p.directions[:, :K])
+    splats, dtype, size, slot_start = raster.splats, raster.dtype, raster.frame.size, raster.slot_start
+    n, directions = len(splats), np.ascontiguousarray(p.directions[:, :K], np.float64)
     packed = aligned((n * K * compositing.TANGENTS,), dtype)
     planes, transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
     sums = aligned((int(slot_start[-1]) * K * compositing.SUMS,), dtype)
@@ -94,7 +95,7 @@ def _own_tangent_stages(
     results[f"J u {K}"] = raster.crop(planes.reshape(K, 4, *raster.plane)[:, :3])
     results[f"reduce {K}"] = product
     return {
-        f"tangents {K}": lambda: over_range(n, packing.pack_tangents, p.splats, directions, packed),
+        f"tangents {K}": lambda: over_range(n, packing.pack_tangents, splats, directions, packed),
         f"J u {K}": lambda: over_tiles(
             compositing.tangent, raster.params, packed, *primal, planes, transmittances
         ),
@@ -102,7 +103,7 @@ def _own_tangent_stages(
             compositing.curvature, raster.params, packed, *primal, adjoint.cotangent, transmittances, cotangents, sums
         ),
         f"reduce {K}": lambda: over_range(
-            n, packing.reduce_curvature, p.splats, directions, slot_start, sums, adjoint.moments, product
+            n, packing.reduce_curvature, splats, directions, slot_start, sums, adjoint.moments, product
         ),
     }  # fmt: skip
 

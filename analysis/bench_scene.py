@@ -91,7 +91,7 @@ class ViewBench:
         """The parts of a gradient and of a product with one vector, and compositing alone."""
         w, camera, raster = self.workload, self.view.camera, self.raster
         n, drawing = len(w.gaussians), (raster.params, raster.lists, raster.frame, raster.pixels)
-        sums = aligned((int(raster.slot_start[-1]) * compositing.SUMS,), self.splats.dtype)
+        sums = aligned((int(raster.slot_start[-1]) * compositing.SUMS,), raster.dtype)
         bins = (self.splats, self.depths, self.drawn, camera.width, camera.height, w.settings)
         adjoint = self.adjoint
 

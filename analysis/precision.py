@@ -6,8 +6,8 @@ transmittance_min are NOTHING, so that either way of deciding gives the same to 
 clamp differs between the two are taken out and counted; the target keeps a distance of CLEAR from the image.  `as trained` is
 the same comparison with the training's thresholds and target, flips of decisions included.
 
-What is left is due to needles: a conic stored in float32 moves the exponent by its rounding times the squared ratio of the
-splat's axes.
+Whitened coordinates (`splat/raster/whitening.py`) keep needles as precise as round splats: what is left is the round-off of
+the passes over the pixels, the same for both.
 """
 
 from collections.abc import Iterator

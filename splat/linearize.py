@@ -144,9 +144,9 @@ class LinearizedView:
 
     def workspace(self, vectors: int) -> int:
         """Bytes that `hvp` of so many vectors takes beside its argument, its result and the loss's few rows a thread."""
-        item, planes, n = self._raster.splats.itemsize, self._raster.frame.size, len(self.gaussians)
-        each = 5 * planes + SUMS * self.entries + (TANGENTS + 2 * 9) * n
-        return item * (vectors * each + 3 * planes)
+        item, planes, n = self._raster.dtype.itemsize, self._raster.frame.size, len(self.gaussians)
+        each = item * (5 * planes + SUMS * self.entries + TANGENTS * n) + 8 * 2 * 9 * n
+        return vectors * each + item * 3 * planes
 
     def concerns(self, U: Float[Tensor, "p k"]) -> bool:
         """Whether a vector moves any Gaussian that the view draws: where none does, all products are 0."""
@@ -184,7 +184,8 @@ class LinearizedView:
         """
         own = self._raster.own_blocks(self._adjoint, self._loss.diagonal, self._index, gauss_newton)
         n, bands = len(self.gaussians), self.gaussians.sh.shape[1]
-        geometry, sh = np.zeros((n, 11, 11), own.dtype), np.zeros((n, bands, 3), own.dtype)
+        dtype = self._raster.dtype
+        geometry, sh = np.zeros((n, 11, 11), dtype), np.zeros((n, bands, 3), dtype)
         self._projection.add_blocks(own, not gauss_newton, geometry, sh)
         return OwnBlocks(torch.from_numpy(geometry), torch.from_numpy(sh))
 
@@ -198,14 +199,14 @@ class LinearizedView:
         return torch.from_numpy(full), torch.from_numpy(pixelwise)
 
     def _pulled(self, cotangents: np.ndarray, block: np.ndarray | None) -> Tensor:
-        out = np.zeros((self.gaussians.flat.numel(), cotangents.shape[1]), cotangents.dtype)
+        out = np.zeros((self.gaussians.flat.numel(), cotangents.shape[1]), self._raster.dtype)
         self._projection.pull(cotangents, block, out)
         return torch.from_numpy(out)
 
 
 def touches(raster: Raster) -> Bool[np.ndarray, " n"]:
     """Which splats have any weight in any pixel of the image: the exact support of the view's derivatives."""
-    ones = raster.pad(np.ones((4, raster.height, raster.width), raster.splats.dtype))
+    ones = raster.pad(np.ones((4, raster.height, raster.width), raster.dtype))
     return raster.backward(ones).gradient[:, 6] != 0
 
 

@@ -74,7 +74,7 @@ def seen_parameters(views: Sequence[Held], n: int, bands: int, stacked: Stacked 
 
 
 def _dtype(views: Sequence[Held]) -> torch.dtype:
-    return torch.from_numpy(views[0].splats[:0]).dtype
+    return torch.from_numpy(views[0].jacobian[:0]).dtype
 
 
 def _jacobian_rows(views: Sequence[Held], start: int, stop: int, bands: int) -> Float[Tensor, "n r d"]:

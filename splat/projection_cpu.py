@@ -121,10 +121,10 @@ def project_adjoint(
 
 
 def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Splats (n, 9), depths (n,) and which are drawn (n,)."""
+    """Splats (n, 9) in double precision, depths (n,) and which are drawn (n,)."""
     arrays = attribute_arrays(gaussians)
     n, dtype = len(gaussians), arrays[0].dtype
-    splats, depths, drawn = np.empty((n, 9), dtype), np.empty(n, dtype), np.empty(n, np.bool_)
+    splats, depths, drawn = np.empty((n, 9)), np.empty(n, dtype), np.empty(n, np.bool_)
     over_range(n, project_splats, lens, *arrays, splats, depths, drawn)
     require_sizes(lens, arrays[1], depths, drawn)
     return splats, depths, drawn

@@ -19,17 +19,19 @@ from splat.projection_formulas import Lens, basis, colour_adjoint, direction_of,
 from splat.raster.compositing import formula, kernel
 from splat.raster.simd import store
 from splat.raster.threads import over_range
+from splat.raster.whitening import cancellation, plain, put, whitened, whitened_adjoint, whitening
 
 GEOMETRY = 10  # mean 3, log-scales 3, quaternion 4
 SYMMETRIC = GEOMETRY * (GEOMETRY + 1) // 2
+LEAST_CANCELLATION = 4.0  # from which on tangents take double precision
 
 
 class Held(NamedTuple):
     """What stands still.  index: (m,) the Gaussians that matter; splats (n, 9); opacity_bar (n,); the rest one row each.
 
-    jacobian (5, 10): mean x, y and conic in mean, log-scales, quaternion; curvature (55,): lower triangle of the geometry's
-    (10, 10); harmonic (16,) and slope (16, 3) in the mean; colour_bar (3,): adjoint of the colour before its clamp at 0;
-    visible (3,): 1 where that clamp does not hold; colour_slope (3, 3): dcolour/dmean.
+    jacobian (5, 10): mean x, y and conic, whitened (`raster/whitening.py`), in mean, log-scales, quaternion; curvature (55,):
+    lower triangle of the geometry's (10, 10); harmonic (16,) and slope (16, 3) in the mean; colour_bar (3,): adjoint of the
+    colour before its clamp at 0; visible (3,): 1 where that clamp does not hold; colour_slope (3, 3): dcolour/dmean.
     """
 
     index: np.ndarray
@@ -54,48 +56,71 @@ def split(block: np.ndarray, n: int, sh_degree: int) -> tuple[np.ndarray, ...]:
     return tuple(views)
 
 
-@kernel
-def linearize_gaussian(lens, mean, log_scales, quat, colour_weight, bands, bar, jacobian, curvature, harmonic, slope):
-    """One Gaussian's Jacobian (5, 10), packed curvature (55,), harmonics (16,) and their derivative in the mean (16, 3).
+@formula
+def variables(like, mean, log_scales, quat):
+    """The ten numbers of a Gaussian's geometry as variables; like: an array of the tangents' dtype."""
+    x = (variable(like, mean[0], 0), variable(like, mean[1], 1), variable(like, mean[2], 2))
+    s = (variable(like, log_scales[0], 3), variable(like, log_scales[1], 4), variable(like, log_scales[2], 5))
+    q = (variable(like, quat[0], 6), variable(like, quat[1], 7), variable(like, quat[2], 8), variable(like, quat[3], 9))
+    return x, s, q
 
-    colour_weight: (16,) the adjoint of the direction's harmonics, sum_c sh[k, c] colour_bar[c]; bar: five geometric adjoints.
-    """
-    x = (variable(jacobian, mean[0], 0), variable(jacobian, mean[1], 1), variable(jacobian, mean[2], 2))
-    s = (
-        variable(jacobian, log_scales[0], 3),
-        variable(jacobian, log_scales[1], 4),
-        variable(jacobian, log_scales[2], 5),
-    )
-    q = (
-        variable(jacobian, quat[0], 6),
-        variable(jacobian, quat[1], 7),
-        variable(jacobian, quat[2], 8),
-        variable(jacobian, quat[3], 9),
-    )
-    lanes = np.empty(DIRECTIONS, jacobian.dtype)
+
+@kernel
+def linearize_geometry(lens, W, like, mean, log_scales, quat, bar, jacobian, curvature):
+    """One Gaussian's whitened Jacobian (5, 10) and the packed curvature (55,) of its geometry; like: of the tangents' dtype."""
+    x, s, q = variables(like, mean, log_scales, quat)
+    tangents = np.empty((5, DIRECTIONS), like.dtype)
     values = geometry(lens, x, s, q)
     for j in range(5):
-        store(lanes, 0, tangent_of(values[j]))
-        for k in range(GEOMETRY):
-            jacobian[j, k] = lanes[k]
+        store(tangents.reshape(-1), j * DIRECTIONS, tangent_of(values[j]))
+    for k in range(GEOMETRY):
+        put(jacobian[:, k], whitened(W, tangents[:, k]))
     m, t, r = geometry_adjoint(lens, x, s, q, bar)
-    along = colour_adjoint(lens, x, colour_weight, bands)
-    rows = (
-        m[0] + along[0], m[1] + along[1], m[2] + along[2], t[0], t[1], t[2], r[0], r[1], r[2], r[3],
-    )  # fmt: skip
+    rows = (m[0], m[1], m[2], t[0], t[1], t[2], r[0], r[1], r[2], r[3])
     place = 0
     for j in range(GEOMETRY):
-        store(lanes, 0, tangent_of(rows[j]))
+        store(tangents.reshape(-1), 0, tangent_of(rows[j]))
         for k in range(j + 1):
-            curvature[place + k] = lanes[k]
+            curvature[place + k] = tangents[0, k]
         place += j + 1
-    harmonics = basis(direction_of(lens, x)[0])
-    plain = basis(direction_of(lens, mean)[0])
+
+
+@formula
+def linearize_colour(lens, mean, x, colour_weight, bands, curvature, harmonic, slope):
+    """One Gaussian's harmonics (16,), their derivative in the mean (16, 3), and what the colours add to its curvature.
+
+    colour_weight: (16,) the adjoint of the direction's harmonics, sum_c sh[k, c] colour_bar[c].
+    """
+    tangents = np.empty(DIRECTIONS, slope.dtype)
+    along = colour_adjoint(lens, x, colour_weight, bands)
+    for j in range(3):
+        store(tangents, 0, tangent_of(along[j]))
+        for k in range(j + 1):
+            curvature[j * (j + 1) // 2 + k] += tangents[k]
+    values, harmonics = basis(direction_of(lens, mean)[0]), basis(direction_of(lens, x)[0])
     for k in range(16):
-        harmonic[k] = plain[k]
-        store(lanes, 0, tangent_of(harmonics[k]))
+        harmonic[k] = values[k]
+        store(tangents, 0, tangent_of(harmonics[k]))
         for j in range(3):
-            slope[k, j] = lanes[j]
+            slope[k, j] = tangents[j]
+
+
+@kernel
+def linearize_gaussian(
+    lens, mean, log_scales, quat, splat, colour_weight, bands, bar, jacobian, curvature, harmonic, slope
+):
+    """One Gaussian's rows of `Held`; bar: five geometric adjoints.
+
+    The geometry of a slanted needle has tangents in double precision: they cancel by a c / (a c - b^2), in whitening as well as
+    in `geometry_adjoint`.
+    """
+    W = whitening(splat)
+    if cancellation(W) > LEAST_CANCELLATION:
+        linearize_geometry(lens, W, np.empty(0), mean, log_scales, quat, bar, jacobian, curvature)
+    else:
+        linearize_geometry(lens, W, slope, mean, log_scales, quat, bar, jacobian, curvature)
+    x, _s, _q = variables(slope, mean, log_scales, quat)
+    linearize_colour(lens, mean, x, colour_weight, bands, curvature, harmonic, slope)
 
 
 @kernel
@@ -115,7 +140,7 @@ def linearize_all(start, stop, held, lens, means, log_scales, quats, sh, bar):
             np.float64(bar[i, 3]), np.float64(bar[i, 4]),
         )  # fmt: skip
         linearize_gaussian(
-            lens, point(means, i), point(log_scales, i), quaternion(quats, i), weight, bands, bars,
+            lens, point(means, i), point(log_scales, i), quaternion(quats, i), held.splats[i], weight, bands, bars,
             held.jacobian[e], held.curvature[e], held.harmonic[e], held.slope[e],
         )  # fmt: skip
         for c in range(3):
@@ -130,9 +155,10 @@ def linearize_all(start, stop, held, lens, means, log_scales, quats, sh, bar):
 def push_forward(start, stop, held, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
     """P' u: out (n, K, 9), which starts at 0."""
     K, bands = out.shape[1], d_sh.shape[1]
+    y = np.empty(5, d_means.dtype)
     for e in range(start, stop):
         i = held.index[e]
-        opacity = held.splats[i, 5]
+        W, opacity = whitening(held.splats[i]), held.splats[i, 5]
         for k in range(K):
             for r in range(5):
                 J = held.jacobian[e, r]
@@ -140,10 +166,11 @@ def push_forward(start, stop, held, d_means, d_log_scales, d_quats, d_logits, d_
                 total += J[7] * d_quats[i, 1, k] + J[8] * d_quats[i, 2, k]
                 for j in range(3):
                     total += J[j] * d_means[i, j, k] + J[3 + j] * d_log_scales[i, j, k]
-                out[i, k, r] = total
+                y[r] = total
+            put(out[i, k], plain(W, y))
             out[i, k, 5] = opacity * (1 - opacity) * d_logits[i, k]
             for c in range(3):
-                total = out.dtype.type(0)
+                total = d_means.dtype.type(0)
                 for j in range(3):
                     total += held.colour_slope[e, c, j] * d_means[i, j, k]
                 for b in range(bands):
@@ -158,13 +185,16 @@ def pull_back(
 ):  # fmt: skip
     """P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order; added to the outputs."""
     K, bands = cotangents.shape[1], out_sh.shape[1]
+    y = np.empty(9, out_means.dtype)
     for e in range(start, stop):
         i = held.index[e]
-        opacity = held.splats[i, 5]
+        W, opacity = whitening(held.splats[i]), held.splats[i, 5]
         slope_of_opacity = opacity * (1 - opacity)
         u, h = np.empty(GEOMETRY, out_means.dtype), np.empty(GEOMETRY, out_means.dtype)
         for k in range(K):
-            y = cotangents[i, k]
+            put(y, whitened_adjoint(W, cotangents[i, k]))
+            for c in range(5, 9):
+                y[c] = cotangents[i, k, c]
             for j in range(GEOMETRY):
                 h[j] = 0
                 for r in range(5):
@@ -202,21 +232,21 @@ def pull_back(
 
 @kernel
 def chain_blocks(start, stop, held, own, curved, geometry_out, sh_out):
-    """Own blocks of splats, (m, 9, 9) as lower triangles, in stored parameters: P'^T own P', plus (a . P'') where curved.
+    """Own blocks of splats, (m, 9, 9), in stored parameters: P'^T own P', plus (a . P'') where curved.
 
     geometry_out: (n, 11, 11) over mean, log-scales, quaternion and opacity logit; sh_out: (n, k, 3), the diagonal of SH's.
     Both are added to.
     """
     bands = sh_out.shape[1]
-    J, column, product = np.zeros((9, GEOMETRY + 1)), np.zeros(9), np.zeros(9)
+    J, product = np.zeros((9, GEOMETRY + 1)), np.zeros(9)
     for e in range(start, stop):
         i = held.index[e]
         opacity = np.float64(held.splats[i, 5])
         slope = opacity * (1 - opacity)
         J[5, GEOMETRY] = slope
-        for r in range(5):
-            for j in range(GEOMETRY):
-                J[r, j] = held.jacobian[e, r, j]
+        W = whitening(held.splats[i])
+        for j in range(GEOMETRY):
+            put(J[:, j], plain(W, held.jacobian[e, :, j]))
         for c in range(3):
             for j in range(3):
                 J[6 + c, j] = held.visible[e, c] * held.colour_slope[e, c, j]
@@ -224,13 +254,9 @@ def chain_blocks(start, stop, held, own, curved, geometry_out, sh_out):
                 sh_out[i, b, c] += held.visible[e, c] * held.harmonic[e, b] * held.harmonic[e, b] * own[e, 6 + c, 6 + c]
         for j in range(GEOMETRY + 1):
             for r in range(9):
-                column[r] = J[r, j]
                 product[r] = 0
-            for r in range(9):
-                for s in range(r):
-                    product[r] += own[e, r, s] * column[s]
-                    product[s] += own[e, r, s] * column[r]
-                product[r] += own[e, r, r] * column[r]
+                for s in range(9):
+                    product[r] += own[e, r, s] * J[s, j]
             for k in range(j + 1):
                 total = 0.0
                 for r in range(9):
@@ -267,7 +293,7 @@ class Projection:
         self.n, self.sh_degree, m = len(gaussians), gaussians.sh_degree, index.size
 
         def empty(*shape: int) -> np.ndarray:
-            return np.empty((m, *shape), splats.dtype)
+            return np.empty((m, *shape), means.dtype)
 
         self.held = Held(
             index, splats, np.ascontiguousarray(bar[:, 5]), empty(5, GEOMETRY), empty(SYMMETRIC), empty(16), empty(16, 3),
@@ -282,7 +308,7 @@ class Projection:
 
     def jvp(self, block: np.ndarray) -> np.ndarray:
         """P' U: (n, K, 9) from a block (p, K) of tangents of the stored parameters."""
-        out = np.zeros((self.n, block.shape[1], 9), self.held.splats.dtype)
+        out = np.zeros((self.n, block.shape[1], 9))
         over_range(self.held.index.size, push_forward, self.held, *split(block, self.n, self.sh_degree), out)
         return out
 

@@ -164,7 +164,7 @@ def bin_splats(
     splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, settings: RenderSettings
 ) -> Lists:
     """The tile lists of a view; the tiles are ordered heaviest first.  Slots come with `reached_lists`."""
-    tile = lanes_of(splats.dtype)
+    tile = lanes_of(depths.dtype)
     columns = -(-width // tile)
     tile_count = columns * -(-height // TILE_ROWS)
     order = depth_order(depths, drawn)

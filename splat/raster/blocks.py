@@ -7,12 +7,12 @@ g = dl/dI and h_c = d2l/dI_c2 (the pixel-diagonal of l''), the block of one pixe
     q q     s + v, s = sum_c g_c D_c, v = sum_c h_c D_c^2        q c     w g_c + w h_c D_c        c c     w^2 h_c
 
 where s and w g_c come from the curvature of the compositing (R''), the others from Gauss-Newton (J^T diag(h) J): with g = 0
-the pass gives that part alone.  q is quadratic in the pixel's offset (dx, dy) from the mean, so the sums over pixels are
-moments of offsets:
+the pass gives that part alone.  q is quadratic in the pixel's offset from the mean, in whitened coordinates (u, v)
+(`whitening.py`), so the sums over pixels are moments of offsets:
 
     s + v to degree 4 (15), w g_c + w h_c D_c to degree 2 (6 each, three channels), w^2 h_c (three): 36 a splat
 
-and d2q itself needs the moments S, Sx, Sy of s, which the first-order adjoint has.
+and d2q itself needs the moments S, Su, Sv of s, which the first-order adjoint has.
 
 Where the cap holds, q is constant: only c c is left.
 """
@@ -21,7 +21,6 @@ import numpy as np
 
 from splat.raster.compositing import (
     CAPPED,
-    MY,
     PARAMS,
     RED,
     TILE_ROWS,
@@ -38,10 +37,12 @@ from splat.raster.compositing import (
     prefetch,
     reached,
     row_range,
+    row_v,
     scratch,
     store3,
 )
 from splat.raster.simd import broadcast, lanes, load, select, store, store_sums
+from splat.raster.whitening import ROUND, plain_adjoint, put, whitening
 
 AHEAD = 4
 DEGREE4, DEGREE2 = 15, 6
@@ -53,7 +54,7 @@ TINY = np.finfo(np.float64).tiny  # an opacity below has no weight, and no inver
 
 
 def _moment_index() -> np.ndarray:
-    """Where the moment of x^j y^k lies among the fifteen, by [j, k]: powers of y outermost, as `store_powers` leaves them."""
+    """Where the moment of u^j v^k lies among the fifteen, by [j, k]: powers of v outermost, as `store_powers` leaves them."""
     index = np.full((5, 5), -1, np.int64)
     place = 0
     for k in range(5):
@@ -63,7 +64,8 @@ def _moment_index() -> np.ndarray:
     return index
 
 
-MOMENT = _moment_index()  # the six of degree 2 are stored alike: 1, x, x^2, y, x y, y^2
+MOMENT = _moment_index()
+MOMENT2 = np.array([[0, 3, 5], [1, 4, -1], [2, -1, -1]])  # of the six of degree 2, stored alike: 1, u, u^2, v, u v, v^2
 
 
 @kernel
@@ -102,18 +104,17 @@ def block_moments(counter, params, lists, frame, pixels, gradient, curvature, su
 def block_entry(params, lists, e, k, x0, y0, frame, state, shared, sums):
     L = lanes(params)
     o = np.int64(lists.splat[e]) * PARAMS
-    dx, terms = alpha_terms(params, o, x0)
+    u, terms = alpha_terms(params, o, x0, y0)
     colour = broadcast3(params, o + RED)
     capped = lists.rows[e] & CAPPED
-    dy0 = broadcast(params, y0 - params[o + MY])
     index = broadcast(params, k)
     zero = broadcast(params, 0.0)
     m0, m1, m2, m3, m4 = zero, zero, zero, zero, zero
     top, bottom = row_range(lists.rows[e])
     for y in range(top, bottom):
         b = 11 * L * y
-        dy = dy0 + load(frame.row_offsets, L * y)
-        alpha, uncapped = alpha_row(dy, terms, index < load(state, b + 10 * L), frame.cap)
+        v = row_v(frame, L, y, terms)
+        alpha, uncapped = alpha_row(v, terms, index < load(state, b + 10 * L), frame.cap)
         r = 1.0 / (1.0 - alpha)
         T = load(state, b) * r
         w, beta = alpha * T, alpha * r
@@ -128,109 +129,83 @@ def block_entry(params, lists, e, k, x0, y0, frame, state, shared, sums):
         store(shared, 5 * L * y + L, free)
         store3(shared, 5 * L * y + 2 * L, L, D)
         weight = D[0] * (g[0] + h[0] * D[0]) + D[1] * (g[1] + h[1] * D[1]) + D[2] * (g[2] + h[2] * D[2])
-        yy = dy * dy
-        m0, m1, m2 = m0 + weight, m1 + weight * dy, m2 + weight * yy
-        m3, m4 = m3 + weight * (yy * dy), m4 + weight * (yy * yy)
+        vv = v * v
+        m0, m1, m2 = m0 + weight, m1 + weight * v, m2 + weight * vv
+        m3, m4 = m3 + weight * (vv * v), m4 + weight * (vv * vv)
     slot = np.int64(lists.slots[e]) * BLOCK_SUMS
-    store_powers(sums, slot, dx, m0, m1, m2, m3, m4)
+    store_powers(sums, slot, u, m0, m1, m2, m3, m4)
     for c in range(3):
-        channel_entry(lists, e, c, dx, dy0, frame, state, shared, sums, slot, L, zero)
+        channel_entry(lists, e, c, u, terms, frame, state, shared, sums, slot, L, zero)
 
 
 @formula
-def channel_entry(lists, e, c, dx, dy0, frame, state, shared, sums, slot, L, zero):
+def channel_entry(lists, e, c, u, terms, frame, state, shared, sums, slot, L, zero):
     m0, m1, m2, squared = zero, zero, zero, zero
     top, bottom = row_range(lists.rows[e])
     for y in range(top, bottom):
-        dy = dy0 + load(frame.row_offsets, L * y)
+        v = row_v(frame, L, y, terms)
         g, h = load(state, (11 * y + 4 + c) * L), load(state, (11 * y + 7 + c) * L)
         w, free, D = load(shared, 5 * L * y), load(shared, 5 * L * y + L), load(shared, (5 * y + 2 + c) * L)
         cross = free * g + w * h * D
         squared += w * w * h
-        m0, m1, m2 = m0 + cross, m1 + cross * dy, m2 + cross * (dy * dy)
-    xx = dx * dx
-    store_sums(sums, slot + CROSS + DEGREE2 * c, (m0, m0 * dx, m0 * xx, m1, m1 * dx, m2))
+        m0, m1, m2 = m0 + cross, m1 + cross * v, m2 + cross * (v * v)
+    store_sums(sums, slot + CROSS + DEGREE2 * c, (m0, m0 * u, m0 * (u * u), m1, m1 * u, m2))
     store_sums(sums, slot + COLOUR + c, (squared,))
 
 
 @formula
-def store_powers(sums, at, dx, m0, m1, m2, m3, m4):
-    """The fifteen moments from the sums over rows of a weight times dy^k."""
-    xx = dx * dx
-    xxx = xx * dx
-    store_sums(sums, at, (m0, m0 * dx, m0 * xx, m0 * xxx, m0 * (xx * xx), m1, m1 * dx, m1 * xx, m1 * xxx))
-    store_sums(sums, at + 9, (m2, m2 * dx, m2 * xx, m3, m3 * dx, m4))
+def store_powers(sums, at, u, m0, m1, m2, m3, m4):
+    """The fifteen moments from the sums over rows of a weight times v^k."""
+    uu = u * u
+    uuu = uu * u
+    store_sums(sums, at, (m0, m0 * u, m0 * uu, m0 * uuu, m0 * (uu * uu), m1, m1 * u, m1 * uu, m1 * uuu))
+    store_sums(sums, at + 9, (m2, m2 * u, m2 * uu, m3, m3 * u, m4))
 
 
 # --- from moments to blocks -------------------------------------------------------------------------------------------
 
 
-@formula
-def quadratic_form(moments, x, y, j, k):
-    """The moment of (x . (dx, dy)) (y . (dx, dy)) dx^j dy^k."""
-    return (
-        x[0] * y[0] * moments[MOMENT[j + 2, k]]
-        + (x[0] * y[1] + x[1] * y[0]) * moments[MOMENT[j + 1, k + 1]]
-        + x[1] * y[1] * moments[MOMENT[j, k + 2]]
-    )
-
-
-@formula
-def linear_form(moments, at, x, j, k):
-    """The moment of (x . (dx, dy)) dx^j dy^k: of s + v, or, at > 0, of a channel's cross weight with j = k = 0."""
-    if at > 0:
-        return x[0] * moments[at + 1] + x[1] * moments[at + 3]
-    return x[0] * moments[MOMENT[j + 1, k]] + x[1] * moments[MOMENT[j, k + 1]]
-
-
 @kernel
-def splat_block(splat, moments, S, Sx, Sy, block):
-    """A splat's own block (9, 9), its lower triangle, in mean x, y, conic a, b, c, opacity, colour; S, Sx, Sy: for d2q.
+def splat_block(splat, moments, S, Su, Sv, block):
+    """A splat's own block (9, 9), symmetric, in mean, conic (both whitened), opacity, colour; S, Su, Sv: for d2q.
 
-    dq: a dx + b dy, b dx + c dy in the mean; -dx^2 / 2, -dx dy, -dy^2 / 2 in the conic; 1 / o in the opacity.
+    dq: ROUND u, ROUND v in the mean; -u^2 / 2, -u v, -v^2 / 2 in the conic; 1 / o in the opacity.
     """
-    rows = ((splat[2], splat[3]), (splat[3], splat[4]))
     inverse = 1.0 / max(splat[5], TINY)
-    powers = ((2, 0, -0.5), (1, 1, -1.0), (0, 2, -0.5))
-    for p in range(2):
+    first = ((1, 0, ROUND), (0, 1, ROUND), (2, 0, -0.5), (1, 1, -1.0), (0, 2, -0.5), (0, 0, inverse))
+    for p in range(6):
+        j, k, factor = first[p]
         for q in range(p + 1):
-            block[p, q] = quadratic_form(moments, rows[p], rows[q], 0, 0)
-        block[5, p] = inverse * linear_form(moments, 0, rows[p], 0, 0)
-        for q in range(3):
-            j, k, factor = powers[q]
-            block[2 + q, p] = factor * linear_form(moments, 0, rows[p], j, k)
-    for p in range(3):
-        j, k, factor = powers[p]
-        block[5, 2 + p] = factor * inverse * moments[MOMENT[j, k]]
-        for q in range(p + 1):
-            j2, k2, factor2 = powers[q]
-            block[2 + p, 2 + q] = factor * factor2 * moments[MOMENT[j + j2, k + k2]]
-    block[5, 5] = inverse * (inverse * (moments[0] - S))  # 1 / o^2 alone may overflow
+            j2, k2, factor2 = first[q]
+            block[p, q] = factor * (factor2 * moments[MOMENT[j + j2, k + k2]])
+        for c in range(3):
+            block[6 + c, p] = factor * moments[CROSS + DEGREE2 * c + MOMENT2[j, k]]
     for c in range(3):
-        at = CROSS + DEGREE2 * c
-        for p in range(2):
-            block[6 + c, p] = linear_form(moments, at, rows[p], 0, 0)
-        block[6 + c, 2], block[6 + c, 3], block[6 + c, 4] = (
-            -0.5 * moments[at + 2],
-            -moments[at + 4],
-            -0.5 * moments[at + 5],
-        )
-        block[6 + c, 5] = inverse * moments[at]
         block[6 + c, 6 + c] = moments[COLOUR + c]
     # sum s d2q
-    block[0, 0] -= S * splat[2]
-    block[1, 0] -= S * splat[3]
-    block[1, 1] -= S * splat[4]
-    block[2, 0] += Sx
-    block[3, 0] += Sy
-    block[3, 1] += Sx
-    block[4, 1] += Sy
+    block[0, 0] -= S * ROUND
+    block[1, 1] -= S * ROUND
+    block[2, 0] += Su
+    block[3, 0] += Sv
+    block[3, 1] += Su
+    block[4, 1] += Sv
+    block[5, 5] = inverse * (inverse * (moments[0] - S))  # 1 / o^2 alone may overflow
+    for p in range(SPLAT):
+        for q in range(p):
+            block[q, p] = block[p, q]
+
+
+@formula
+def make_plain(W, rows):
+    """The adjoints in a splat's numbers (9, ...), column by column, in plain coordinates."""
+    for j in range(SPLAT):
+        put(rows[:, j], plain_adjoint(W, rows[:, j]))
 
 
 @kernel
 def reduce_blocks(start, stop, index, splats, slot_start, sums, moments, curved, blocks):
-    """The own blocks (m, 9, 9), lower triangles, of the splats at index; moments: (n, 3) S, Sx, Sy."""
-    total, splat, own = np.zeros(BLOCK_SUMS), np.zeros(SPLAT), np.zeros((SPLAT, SPLAT))
+    """The own blocks (m, 9, 9) of the splats at index; moments: (n, 3) S, Su, Sv."""
+    total, own = np.zeros(BLOCK_SUMS), np.zeros((SPLAT, SPLAT))
     for e in range(start, stop):
         i = index[e]
         for j in range(BLOCK_SUMS):
@@ -238,12 +213,11 @@ def reduce_blocks(start, stop, index, splats, slot_start, sums, moments, curved,
         for slot in range(slot_start[i], slot_start[i + 1]):
             for j in range(BLOCK_SUMS):
                 total[j] += sums[slot * BLOCK_SUMS + j]
-        for j in range(SPLAT):
-            splat[j] = splats[i, j]
-        S, Sx, Sy = np.float64(moments[i, 0]), np.float64(moments[i, 1]), np.float64(moments[i, 2])
+        S, Su, Sv = np.float64(moments[i, 0]), np.float64(moments[i, 1]), np.float64(moments[i, 2])
         if not curved:
-            S, Sx, Sy = 0.0, 0.0, 0.0
-        splat_block(splat, total, S, Sx, Sy, own)
-        for p in range(SPLAT):
-            for q in range(p + 1):
-                blocks[e, p, q] = own[p, q]
+            S, Su, Sv = 0.0, 0.0, 0.0
+        splat_block(splats[i], total, S, Su, Sv, own)
+        W = whitening(splats[i])
+        make_plain(W, own)
+        make_plain(W, own.T)
+        blocks[e] = own

@@ -1,9 +1,9 @@
 """The compositing kernels: one view's pixels, front to back and back to front, at first and second order.
 
-A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  Per pixel, splats in order of depth, offset
-d = p - mean, conic (a, b, c), opacity o, colour c:
+A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  Per pixel, splats in order of depth, with the
+pixel's offset from the mean in the splat's whitened coordinates (u, v) (`whitening.py`), opacity o, colour c:
 
-    l = log2 alpha = log2 o - log2(e) (a dx^2 / 2 + b dx dy + c dy^2 / 2)      alpha = min(cap, 2^l)
+    l = log2 alpha = log2 o - u^2 - v^2      alpha = min(cap, 2^l)
     active where l >= cut and the pixel has not stopped; elsewhere alpha = 0 and every update below is a no-op
 
 `forward`     w = alpha T;  image += w c;  T <- T - w;  at the end image += T background, alpha plane = 1 - T.
@@ -12,7 +12,7 @@ d = p - mean, conic (a, b, c), opacity o, colour c:
               sum over the splats behind of w_j (g . c_j) plus the background's part, at T (g . background - g_A):
               r = 1 / (1 - alpha);  T <- T r;  w = alpha T;  beta = alpha r;  e = g . c
               s = w e - beta R, the derivative in q = ln alpha, 0 where the cap holds;  R <- R + w e
-              per splat: moments S, Sx, Sy, Sxx, Sxy, Syy of s over the offsets, and G = sum w g.
+              per splat: moments S, Su, Sv, Suu, Suv, Svv of s over the offsets, and G = sum w g.
 
 `tangent`     (J u) given tangents of the splats; q' is one quadratic in the offset, 0 where the cap holds:
               w' = w q' + alpha T';  image' += w' c + w c';  T' <- T' - w';  at the end image' += T' background.
@@ -55,14 +55,12 @@ TILE_ROWS = 16
 NEVER = 1e30  # the stop index of a pixel that does not stop
 AHEAD = 6  # entries between a prefetch and its use
 
-PARAMS = (
-    16  # one cache line in float32: mean x, y (pixel index units); log2 alpha = LO + LXX dx^2 + LXY dx dy + LYY dy^2
-)
-MX, MY, LXX, LXY, LYY, LO, RED, GREEN, BLUE, CUT = range(10)
+PARAMS = 16  # one cache line in float32: mean x, y (pixel index units), the whitening, LO = log2 o; _REST: of a rounded number
+MX, MX_REST, MY, MY_REST, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT = range(13)
 CAPPED = 1 << 16  # in an entry's rows: its splat's alpha can reach the cap
-TANGENTS = 12  # q' = Q0 + QX dx + QY dy + QXX dx^2 + QXY dx dy + QYY dy^2, colour'
-Q0, QX, QY, QXX, QXY, QYY, DRED, DGREEN, DBLUE = range(9)
-SUMS = 9  # S, Sx, Sy, Sxx, Sxy, Syy, G (3)
+TANGENTS = 12  # q' = Q0 + QU u + QV v + QUU u^2 + QUV u v + QVV v^2, colour'
+Q0, QU, QV, QUU, QUV, QVV, DRED, DGREEN, DBLUE = range(9)
+SUMS = 9  # S, Su, Sv, Suu, Suv, Svv, G (3)
 
 
 class Lists(NamedTuple):
@@ -138,35 +136,48 @@ def row_range(packed):
 
 
 @formula
-def alpha_terms(params, o, x0):
-    """dx of a tile's columns, and log2 alpha = A + dy (B + dy C) as (A, B, C, cut)."""
-    dx = iota(params) + (x0 - params[o + MX])
-    constant = fma(dx * dx, broadcast(params, params[o + LXX]), broadcast(params, params[o + LO]))
-    terms = (constant, dx * params[o + LXY], broadcast(params, params[o + LYY]), broadcast(params, params[o + CUT]))
-    return dx, terms
+def alpha_terms(params, o, x0, y0):
+    """u of a tile's columns, and what gives v and log2 alpha of its rows: v of row 0, its step, log2 o - u^2, cut.
+
+    The offset of the tile's corner is in double precision: far from the mean, v of a needle is a small difference.
+    """
+    along, across = params[o + ALONG], params[o + ACROSS]
+    shear = np.float64(params[o + SHEAR]) + params[o + SHEAR_REST]
+    dx = x0 - np.float64(params[o + MX]) - params[o + MX_REST]
+    dy = y0 - np.float64(params[o + MY]) - params[o + MY_REST]
+    u = fma(iota(params), along, along * dx)
+    v = fma(iota(params), across * shear, across * (shear * dx + dy))
+    terms = (v, broadcast(params, across), fma(-u, u, params[o + LO]), broadcast(params, params[o + CUT]))
+    return u, terms
 
 
 @formula
-def alpha_row(dy, terms, running, cap):
+def row_v(frame, L, y, terms):
+    """v of a tile's row y."""
+    return fma(load(frame.row_offsets, L * y), terms[1], terms[0])
+
+
+@formula
+def alpha_row(v, terms, running, cap):
     """alpha of a row and 2^l before the cap; running: the mask of the pixels that have not stopped.
 
     l decides, so it is rounded alike in every kernel: fma.
     """
-    l = fma(dy, fma(dy, terms[2], terms[1]), terms[0])
+    l = fma(-v, v, terms[2])
     uncapped = exp2(l)
     return select((l >= terms[3]) & running, minimum(uncapped, cap), 0.0), uncapped
 
 
 @formula
-def tangent_terms(tangents, j, dx):
-    """q' = A + dy (B + dy C) as (A, B, C)."""
-    constant = dx * (dx * tangents[j + QXX] + tangents[j + QX]) + tangents[j + Q0]
-    return constant, dx * tangents[j + QXY] + tangents[j + QY], broadcast(tangents, tangents[j + QYY])
+def tangent_terms(tangents, j, u):
+    """q' = A + v (B + v C) as (A, B, C)."""
+    constant = u * (u * tangents[j + QUU] + tangents[j + QU]) + tangents[j + Q0]
+    return constant, u * tangents[j + QUV] + tangents[j + QV], broadcast(tangents, tangents[j + QVV])
 
 
 @formula
-def quadratic(dy, terms):
-    return terms[0] + dy * (terms[1] + dy * terms[2])
+def quadratic(v, terms):
+    return terms[0] + v * (terms[1] + v * terms[2])
 
 
 @formula
@@ -249,13 +260,13 @@ def no_moments(params):
 
 
 @formula
-def add_row(moments, dy, s, w, h):
-    """Add a row to the sums over rows (s, s dy, s dy^2, w h)."""
-    sy = s * dy
+def add_row(moments, v, s, w, h):
+    """Add a row to the sums over rows (s, s v, s v^2, w h)."""
+    sv = s * v
     return (
         moments[0] + s,
-        moments[1] + sy,
-        moments[2] + sy * dy,
+        moments[1] + sv,
+        moments[2] + sv * v,
         moments[3] + w * h[0],
         moments[4] + w * h[1],
         moments[5] + w * h[2],
@@ -263,10 +274,10 @@ def add_row(moments, dy, s, w, h):
 
 
 @formula
-def store_moments(sums, slot, moments, dx):
-    S, Sy, Syy, G0, G1, G2 = moments
-    Sx = S * dx
-    store_sums(sums, slot * SUMS, (S, Sx, Sy, Sx * dx, Sy * dx, Syy, G0, G1, G2))
+def store_moments(sums, slot, moments, u):
+    S, Sv, Svv, G0, G1, G2 = moments
+    Su = S * u
+    store_sums(sums, slot * SUMS, (S, Su, Sv, Su * u, Sv * u, Svv, G0, G1, G2))
 
 
 # --- forward ----------------------------------------------------------------------------------------------------------
@@ -312,15 +323,14 @@ def forward_entry(params, lists, e, k, x0, y0, frame, state):
     """Composite one entry; True if it stopped a pixel."""
     L = lanes(params)
     o = np.int64(lists.splat[e]) * PARAMS
-    _dx, terms = alpha_terms(params, o, x0)
+    _u, terms = alpha_terms(params, o, x0, y0)
     colour = broadcast3(params, o + RED)
-    dy0 = broadcast(params, y0 - params[o + MY])
     top, bottom = row_range(lists.rows[e])
     stopped = False
     for y in range(top, bottom):
         b = 5 * L * y
         T = load(state, b)
-        alpha, _uncapped = alpha_row(dy0 + load(frame.row_offsets, L * y), terms, T > 0.0, frame.cap)
+        alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, T > 0.0, frame.cap)
         w = alpha * T
         after = fma(-alpha, T, T)  # T - w, to the last bit even where alpha is near 1
         ends = (after < frame.floor) & (T > 0.0)
@@ -380,17 +390,16 @@ def begin_backward_row(state, b, L, frame, pixels, cotangent, p):
 def backward_entry(params, lists, e, k, x0, y0, frame, state, sums):
     L = lanes(params)
     o = np.int64(lists.splat[e]) * PARAMS
-    dx, terms = alpha_terms(params, o, x0)
+    u, terms = alpha_terms(params, o, x0, y0)
     colour = broadcast3(params, o + RED)
     capped = lists.rows[e] & CAPPED
-    dy0 = broadcast(params, y0 - params[o + MY])
     index = broadcast(params, k)
     moments = no_moments(params)
     top, bottom = row_range(lists.rows[e])
     for y in range(top, bottom):
         b = 6 * L * y
-        dy = dy0 + load(frame.row_offsets, L * y)
-        alpha, uncapped = alpha_row(dy, terms, index < load(state, b + 5 * L), frame.cap)
+        v = row_v(frame, L, y, terms)
+        alpha, uncapped = alpha_row(v, terms, index < load(state, b + 5 * L), frame.cap)
         r = 1.0 / (1.0 - alpha)
         T = load(state, b) * r
         R = load(state, b + L)
@@ -402,8 +411,8 @@ def backward_entry(params, lists, e, k, x0, y0, frame, state, sums):
             s = select(uncapped <= frame.cap, s, 0.0)
         store(state, b, T)
         store(state, b + L, R + we)
-        moments = add_row(moments, dy, s, w, g)
-    store_moments(sums, np.int64(lists.slots[e]), moments, dx)
+        moments = add_row(moments, v, s, w, g)
+    store_moments(sums, np.int64(lists.slots[e]), moments, u)
 
 
 # --- tangent: J u -----------------------------------------------------------------------------------------------------
@@ -466,21 +475,20 @@ def tangent_entry_single(params, tangents, lists, e, k, x0, y0, frame, state):
     L = lanes(params)
     splat = np.int64(lists.splat[e])
     o = splat * PARAMS
-    dx, terms = alpha_terms(params, o, x0)
+    u, terms = alpha_terms(params, o, x0, y0)
     colour, dcolour = broadcast3(params, o + RED), broadcast3(tangents, splat * TANGENTS + DRED)
-    dterms = tangent_terms(tangents, splat * TANGENTS, dx)
+    dterms = tangent_terms(tangents, splat * TANGENTS, u)
     capped = lists.rows[e] & CAPPED
-    dy0 = broadcast(params, y0 - params[o + MY])
     index = broadcast(params, k)
     top, bottom = row_range(lists.rows[e])
     for y in range(top, bottom):
         b = 6 * L * y
-        dy = dy0 + load(frame.row_offsets, L * y)
-        alpha, uncapped = alpha_row(dy, terms, index < load(state, b + L), frame.cap)
+        v = row_v(frame, L, y, terms)
+        alpha, uncapped = alpha_row(v, terms, index < load(state, b + L), frame.cap)
         T = load(state, b)
         w = alpha * T
         store(state, b, fma(-alpha, T, T))
-        dq = quadratic(dy, dterms)
+        dq = quadratic(v, dterms)
         if capped:
             dq = select(uncapped <= frame.cap, dq, 0.0)
         tangent_row(state, b + 2 * L, L, alpha, w, w * dq, colour, dcolour)
@@ -492,14 +500,13 @@ def tangent_entry_block(params, tangents, K, lists, e, k, x0, y0, frame, state, 
     width = (2 + 4 * K) * L
     splat = np.int64(lists.splat[e])
     o = splat * PARAMS
-    dx, terms = alpha_terms(params, o, x0)
+    u, terms = alpha_terms(params, o, x0, y0)
     colour = broadcast3(params, o + RED)
-    dy0 = broadcast(params, y0 - params[o + MY])
     index = broadcast(params, k)
     top, bottom = row_range(lists.rows[e])
     for y in range(top, bottom):
         b = width * y
-        alpha, uncapped = alpha_row(dy0 + load(frame.row_offsets, L * y), terms, index < load(state, b + L), frame.cap)
+        alpha, uncapped = alpha_row(row_v(frame, L, y, terms), terms, index < load(state, b + L), frame.cap)
         T = load(state, b)
         w = alpha * T
         store(state, b, fma(-alpha, T, T))
@@ -507,9 +514,9 @@ def tangent_entry_block(params, tangents, K, lists, e, k, x0, y0, frame, state, 
         store3(shared, 3 * L * y, L, (alpha, w, free))
     for i in range(K):
         j = (splat * K + i) * TANGENTS
-        dterms, dcolour = tangent_terms(tangents, j, dx), broadcast3(tangents, j + DRED)
+        dterms, dcolour = tangent_terms(tangents, j, u), broadcast3(tangents, j + DRED)
         for y in range(top, bottom):
-            dq = quadratic(dy0 + load(frame.row_offsets, L * y), dterms)
+            dq = quadratic(row_v(frame, L, y, terms), dterms)
             alpha, w, free = load3(shared, 3 * L * y, L)
             tangent_row(state, width * y + (2 + 4 * i) * L, L, alpha, w, free * dq, colour, dcolour)
 
@@ -595,28 +602,27 @@ def curvature_entry_single(params, tangents, lists, e, k, x0, y0, frame, state, 
     L = lanes(params)
     splat = np.int64(lists.splat[e])
     o = splat * PARAMS
-    dx, terms = alpha_terms(params, o, x0)
+    u, terms = alpha_terms(params, o, x0, y0)
     colour, dcolour = broadcast3(params, o + RED), broadcast3(tangents, splat * TANGENTS + DRED)
-    dterms = tangent_terms(tangents, splat * TANGENTS, dx)
+    dterms = tangent_terms(tangents, splat * TANGENTS, u)
     capped = lists.rows[e] & CAPPED
-    dy0 = broadcast(params, y0 - params[o + MY])
     index = broadcast(params, k)
     moments = no_moments(params)
     top, bottom = row_range(lists.rows[e])
     for y in range(top, bottom):
         b = 11 * L * y
-        dy = dy0 + load(frame.row_offsets, L * y)
-        alpha, uncapped = alpha_row(dy, terms, index < load(state, b + 5 * L), frame.cap)
+        v = row_v(frame, L, y, terms)
+        alpha, uncapped = alpha_row(v, terms, index < load(state, b + 5 * L), frame.cap)
         g = load3(state, b + 2 * L, L)
         w, beta, rR = backward_row(state, b, L, alpha, g, colour)
-        dq = quadratic(dy, dterms)
+        dq = quadratic(v, dterms)
         if capped:
             dq = select(uncapped <= frame.cap, dq, 0.0)
         ds, h = curvature_row(state, b + 6 * L, L, w, beta, rR, dq, g, colour, dcolour)
         if capped:
             ds = select(uncapped <= frame.cap, ds, 0.0)
-        moments = add_row(moments, dy, ds, w, h)
-    store_moments(sums, np.int64(lists.slots[e]), moments, dx)
+        moments = add_row(moments, v, ds, w, h)
+    store_moments(sums, np.int64(lists.slots[e]), moments, u)
 
 
 @formula
@@ -625,35 +631,32 @@ def curvature_entry_block(params, tangents, K, lists, e, k, x0, y0, frame, state
     width = (6 + 5 * K) * L
     splat = np.int64(lists.splat[e])
     o = splat * PARAMS
-    dx, terms = alpha_terms(params, o, x0)
+    u, terms = alpha_terms(params, o, x0, y0)
     colour = broadcast3(params, o + RED)
     capped = lists.rows[e] & CAPPED
-    dy0 = broadcast(params, y0 - params[o + MY])
     index = broadcast(params, k)
     top, bottom = row_range(lists.rows[e])
     for y in range(top, bottom):
         b, x = width * y, 4 * L * y
-        alpha, uncapped = alpha_row(
-            dy0 + load(frame.row_offsets, L * y), terms, index < load(state, b + 5 * L), frame.cap
-        )
+        alpha, uncapped = alpha_row(row_v(frame, L, y, terms), terms, index < load(state, b + 5 * L), frame.cap)
         g = load3(state, b + 2 * L, L)
         store3(shared, x, L, backward_row(state, b, L, alpha, g, colour))
         if capped:
             store(shared, x + 3 * L, select(uncapped <= frame.cap, broadcast(params, 1.0), 0.0))
     for i in range(K):
         j = (splat * K + i) * TANGENTS
-        dterms, dcolour = tangent_terms(tangents, j, dx), broadcast3(tangents, j + DRED)
+        dterms, dcolour = tangent_terms(tangents, j, u), broadcast3(tangents, j + DRED)
         moments = no_moments(params)
         for y in range(top, bottom):
             b, x = width * y, 4 * L * y
-            dy = dy0 + load(frame.row_offsets, L * y)
+            v = row_v(frame, L, y, terms)
             w, beta, rR = load3(shared, x, L)
             g = load3(state, b + 2 * L, L)
-            dq = quadratic(dy, dterms)
+            dq = quadratic(v, dterms)
             if capped:
                 dq *= load(shared, x + 3 * L)
             ds, h = curvature_row(state, b + (6 + 5 * i) * L, L, w, beta, rR, dq, g, colour, dcolour)
             if capped:
                 ds *= load(shared, x + 3 * L)
-            moments = add_row(moments, dy, ds, w, h)
-        store_moments(sums, np.int64(lists.slots[e]) * K + i, moments, dx)
+            moments = add_row(moments, v, ds, w, h)
+        store_moments(sums, np.int64(lists.slots[e]) * K + i, moments, u)

@@ -29,7 +29,8 @@ def aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
 class Raster:
     """One view of one set of splats, composited and held still.
 
-    splats: (n, 9), finite; depths: (n,) positive where drawn; background: (3,).  With transmittance_min = 0 a pixel still
+    splats: (n, 9), finite, kept in double precision; depths: (n,) positive where drawn, in the precision of the pixels;
+    background: (3,).  With transmittance_min = 0 a pixel still
     stops at LEAST_TRANSMITTANCE, an error of the image far beneath round-off.  listed: how many entries the tile lists had
     before those that no pixel reaches were dropped.
     """
@@ -44,8 +45,9 @@ class Raster:
         height: int,
         settings: RenderSettings,
     ):
-        self.splats, self.width, self.height = splats, width, height
-        dtype, n = splats.dtype, len(splats)
+        splats = np.ascontiguousarray(splats, np.float64)
+        self.splats, self.dtype, self.width, self.height = splats, depths.dtype, width, height
+        dtype, n = self.dtype, len(splats)
         lanes = lanes_of(dtype)
         self.lists = binning.bin_splats(splats, depths, drawn, width, height, settings)
         self.listed = self.lists.splat.size
@@ -81,7 +83,7 @@ class Raster:
 
     def pad(self, planes: np.ndarray) -> np.ndarray:
         """Padded copies of planes, 0 outside the image, so that pixels outside it have no weight in any derivative."""
-        padded = aligned((*planes.shape[:-2], *self.plane), self.splats.dtype)
+        padded = aligned((*planes.shape[:-2], *self.plane), self.dtype)
         padded[..., : self.height, : self.width] = planes
         padded[..., self.height :, :] = 0
         padded[..., self.width :] = 0
@@ -111,18 +113,18 @@ class Raster:
     def own_blocks(
         self, adjoint: "Adjoint", curvature: np.ndarray, index: np.ndarray, gauss_newton: bool
     ) -> np.ndarray:
-        """Own blocks (m, 9, 9), lower triangles, of the splats at index: of the Hessian or of its Gauss-Newton part.
+        """Own blocks (m, 9, 9) of the splats at index: of the Hessian or of its Gauss-Newton part.
 
         adjoint: that of the loss's gradient; curvature: the pixel-diagonal of l'', padded planes (3, ...).
         """
-        dtype, slot_start = self.splats.dtype, self.slot_start
+        dtype, slot_start = self.dtype, self.slot_start
         sums = aligned((slot_start[-1] * blocks.BLOCK_SUMS,), dtype)
         gradient = np.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent
         over_tiles(
             blocks.block_moments, self.params, self.lists, self.frame, self.pixels, gradient,
             np.ascontiguousarray(curvature, dtype).reshape(-1), sums,
         )  # fmt: skip
-        own = np.empty((index.size, 9, 9), dtype)
+        own = np.empty((index.size, 9, 9))
         over_range(
             index.size,
             blocks.reduce_blocks,
@@ -145,7 +147,7 @@ class Adjoint:
     """The first-order adjoint of the splats: `gradient` (n, 9), its moments, and the cotangent it came from."""
 
     def __init__(self, raster: Raster, cotangent: np.ndarray):
-        dtype, n, slot_start = raster.splats.dtype, len(raster.splats), raster.slot_start
+        dtype, n, slot_start = raster.dtype, len(raster.splats), raster.slot_start
         self.cotangent = np.ascontiguousarray(cotangent, dtype).reshape(-1)
         sums = aligned((slot_start[-1] * compositing.SUMS,), dtype)
         over_tiles(compositing.backward, raster.params, raster.lists, raster.frame, raster.pixels, self.cotangent, sums)
@@ -157,8 +159,8 @@ class Tangent:
     """J u of K directions: `planes` (K, 4, padded height, padded width), and what the second-order pass needs of it."""
 
     def __init__(self, raster: Raster, directions: np.ndarray):
-        self.raster, self.directions = raster, np.ascontiguousarray(directions, raster.splats.dtype)
-        K, dtype, size = directions.shape[1], raster.splats.dtype, raster.frame.size
+        self.raster, self.directions = raster, np.ascontiguousarray(directions, np.float64)
+        K, dtype, size = directions.shape[1], raster.dtype, raster.frame.size
         self._packed = aligned((len(directions) * K * compositing.TANGENTS,), dtype)
         over_range(len(directions), packing.pack_tangents, raster.splats, self.directions, self._packed)
         _ = raster.slot_start  # drops the entries that no pixel reaches
@@ -176,10 +178,10 @@ class Tangent:
         """
         raster, K = self.raster, self.directions.shape[1]
         slot_start = raster.slot_start
-        sums = aligned((slot_start[-1] * K * compositing.SUMS,), raster.splats.dtype)
+        sums = aligned((slot_start[-1] * K * compositing.SUMS,), raster.dtype)
         over_tiles(
             compositing.curvature, raster.params, self._packed, raster.lists, raster.frame, raster.pixels,
-            adjoint.cotangent, self._transmittances, np.ascontiguousarray(cotangents, raster.splats.dtype).reshape(-1), sums,
+            adjoint.cotangent, self._transmittances, np.ascontiguousarray(cotangents, raster.dtype).reshape(-1), sums,
         )  # fmt: skip
         product = np.empty_like(self.directions)
         over_range(

@@ -21,9 +21,9 @@ from splat.settings import RenderSettings
 PARTS = (2, 3, 1, 3)  # mean, conic, opacity, colour in a splat of nine numbers
 
 
-def _parts(splats: np.ndarray) -> tuple[Tensor, ...]:
-    """The four attributes of splats (n, 9) as tensors; opacity (n,)."""
-    means, conics, opacities, colours = torch.from_numpy(splats).split(PARTS, dim=1)
+def _parts(splats: np.ndarray, like: Tensor) -> tuple[Tensor, ...]:
+    """The four attributes of splats (n, 9) as tensors in the precision of another; opacity (n,)."""
+    means, conics, opacities, colours = torch.from_numpy(splats).to(like.dtype).split(PARTS, dim=1)
     return means.contiguous(), conics.contiguous(), opacities.reshape(-1), colours.contiguous()
 
 
@@ -59,7 +59,7 @@ class _Project(torch.autograd.Function):
         splats, depths, drawn = project_arrays(gaussians, lens)
         ctx.held = (sh_degree, lens, splats, drawn)
         ctx.save_for_backward(flat)
-        outputs = (*_parts(splats), torch.from_numpy(depths), torch.from_numpy(drawn))
+        outputs = (*_parts(splats, flat), torch.from_numpy(depths), torch.from_numpy(drawn))
         ctx.mark_non_differentiable(*outputs[4:])
         return outputs
 
@@ -92,7 +92,7 @@ class _ProjectAdjoint(torch.autograd.Function):
         direction = outputs[0].detach().numpy()[:, None]
         tangents, product = projection.jvp(direction), torch.zeros_like(flat)
         projection.pull(np.zeros_like(tangents), direction, product.numpy()[:, None])
-        product, *parts = last_derivative((product, *_parts(tangents[:, 0])), flat, *outputs)
+        product, *parts = last_derivative((product, *_parts(tangents[:, 0], flat)), flat, *outputs)
         return product, None, *parts
 
 
@@ -114,14 +114,14 @@ class _RasterizeAdjoint(torch.autograd.Function):
         ctx.raster = raster
         ctx.adjoint = raster.backward(raster.pad(cotangent.detach().numpy()))
         ctx.save_for_backward(cotangent, *splats)
-        return _parts(ctx.adjoint.gradient)
+        return _parts(ctx.adjoint.gradient, cotangent)
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
         raster = ctx.raster
         tangent = raster.jvp(_joined(outputs)[:, None])
         product = tangent.curvature(ctx.adjoint, np.zeros_like(tangent.planes))
-        values = (torch.from_numpy(raster.crop(tangent.planes[0]).copy()), *_parts(product[:, 0]))
+        values = (torch.from_numpy(raster.crop(tangent.planes[0]).copy()), *_parts(product[:, 0], outputs[0]))
         return None, *last_derivative(values, *ctx.saved_tensors, *outputs)
 
 

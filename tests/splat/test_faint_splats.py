@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from splat.raster.blocks import BLOCK_SUMS, SPLAT, splat_block
+from splat.raster.whitening import ROUND
 
 
 @pytest.mark.parametrize("opacity", [1e-160, 1e-304, 5e-324])  # logits of -368, -700, -744
@@ -15,4 +16,4 @@ def test_the_own_block_of_a_splat_that_nobody_sees_is_finite(opacity: float) -> 
     splat_block(splat, moments, opacity, opacity, opacity, block)
     assert np.isfinite(block).all()
     assert block[5, 5] == 0
-    assert block[5, 0] == pytest.approx(0.6 * min(1.0, opacity / np.finfo(np.float64).tiny))  # (0.5 + 0.1) o / o
+    assert block[5, 0] == pytest.approx(ROUND * min(1.0, opacity / np.finfo(np.float64).tiny))  # ROUND o / o
