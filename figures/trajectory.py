@@ -1,8 +1,8 @@
 """Figure: the landscape along one or several trainings, from the table that `landscape trajectory` wrote.
 
 `python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Bands: 95% intervals of the traces, residuals of
-the eigenvalues; bars: brackets of the indices, with an arrow where there is no upper bound.  An axis is logarithmic where all of
-its values are positive and span more than a decade.  |lambda_max / lambda_min| has open markers where it is negative.
+the eigenvalues; bars: brackets of the indices, with an arrow where there is no upper bound.  An axis is logarithmic where all
+of its values are positive and span more than a decade.  |lambda_max / lambda_min| has open markers where it is negative.
 """
 
 import argparse

@@ -1,0 +1,75 @@
+"""Figure after the paper's Fig. 1: two landscapes side by side, and what the two scenes look like from a view held out.
+
+`python -m figures.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint along the two
+steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1; dashed: e_2); below, the first
+view that both have rendered.  Both share their axes (`figures.manifold`).
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.lines import Line2D
+
+from figures.fig7 import COLOURS, command_line, names_of
+from figures.manifold import Scale, contours, landscape_of, section, surface
+from figures.style import BLACK, literal, new_figure, style
+
+RENDERS = "test"
+WIDTH = 4.8  # inches
+
+
+def draw(runs: Sequence[Path]) -> Figure:
+    """Of two runs.  FileNotFoundError or ValueError name the record that is missing and the command that makes it."""
+    names, landscapes, view = names_of(runs), [landscape_of(run) for run in runs], common_view(runs)
+    scale = Scale.of(*landscapes)
+    with style():
+        figure = new_figure(7.4)
+        figure.set_figwidth(WIDTH)
+        for i, (run, name, landscape) in enumerate(zip(runs, names, landscapes, strict=True)):
+            surface(figure, (4, 2, 1 + i), landscape, scale, name)
+            filled = contours(figure.add_subplot(4, 2, 3 + i), landscape, scale)
+            across = figure.add_subplot(4, 2, 5 + i)
+            section(across, landscape, scale, 0, color=COLOURS[i])
+            section(across, landscape, scale, 1, color=COLOURS[i], linestyle="--")
+            across.set(
+                xlabel=scale.step_label("e₁, e₂"), ylim=[end / 10.0**scale.loss for end in (scale.low, scale.high)]
+            )
+            picture = figure.add_subplot(4, 2, 7 + i)
+            picture.imshow(imread(run / RENDERS / view))
+            picture.axis("off")
+            picture.set_title(literal(view))
+            if i == 0:
+                across.set_ylabel(scale.loss_label)
+            else:
+                figure.colorbar(filled, ax=figure.axes[1], label=scale.loss_label, shrink=0.9)
+        handles = [Line2D([], [], color=BLACK, label="along e₁")]
+        handles.append(Line2D([], [], color=BLACK, linestyle="--", label="along e₂"))
+        figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    return figure
+
+
+def common_view(runs: Sequence[Path]) -> str:
+    """The file name of the first held-out view that every run has rendered."""
+    found = [{path.name for path in (run / RENDERS).glob("*.png")} for run in runs]
+    for run, views in zip(runs, found, strict=True):
+        if not views:
+            raise FileNotFoundError(
+                f"expected renders of held-out views in {run / RENDERS}, found none; run landscape train to its end, with "
+                "fewer --views than the scene has"
+            )
+    if not (common := set.intersection(*found)):
+        raise ValueError(
+            f"expected a view that both {runs[0]} and {runs[1]} have rendered, found none; train on one scene"
+        )
+    return min(common)
+
+
+def main() -> None:
+    """`python -m figures.fig1 RUN_3DGS RUN_STABLEGS`"""
+    command_line(draw, "fig1")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""Figure after the paper's Fig. 7: the anisotropy index over two trainings, where they ended, and where they began.
+
+`python -m figures.fig7 RUN_3DGS RUN_STABLEGS --out fig7.png`.  Above: |lambda_max / lambda_min| (Eq. (3); open: negative) with
+its bracket, and the loss around both checkpoints along the two steepest eigenvectors.  Below: the same around the start of the
+first run, and sections through all three along e_1 and e_2.  All landscapes share their axes (`figures.manifold`).
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from figures.manifold import Scale, landscape_of, section, start_of, surface
+from figures.style import BLUE, GREEN, VERMILION, literal, new_figure, save, style
+from figures.trajectory import index_over_steps
+
+RECORDS = "trajectory.csv"
+PAGE = 6.9  # inches
+COLOURS = (VERMILION, GREEN)
+BEGINNING = "start"
+
+
+def draw(runs: Sequence[Path]) -> Figure:
+    """Of two runs.  FileNotFoundError or ValueError name the record that is missing and the command that makes it."""
+    names = names_of(runs)
+    measured = _measured(runs, names)
+    ends, start = [landscape_of(run) for run in runs], start_of(runs[0])
+    scale = Scale.of(*ends, start)
+    with style():
+        figure = new_figure(4.4)
+        figure.set_figwidth(PAGE)
+        index = figure.add_subplot(2, 3, 1)
+        index_over_steps(index, measured, dict(zip(names, COLOURS, strict=True)), "literal")
+        index.set(xlabel="step", ylabel="|λmax / λmin|", title="Anisotropy index")
+        index.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        index.grid(True)
+        for i, (end, name) in enumerate(zip(ends, names, strict=True)):
+            surface(figure, (2, 3, 2 + i), end, scale, f"{name}, end")
+        surface(figure, (2, 3, 4), start, scale, BEGINNING)
+        for axis, direction in enumerate(("e₁", "e₂")):
+            axes = figure.add_subplot(2, 3, 5 + axis)
+            section(axes, start, scale, axis, color=BLUE, linestyle="--")
+            for end, colour in zip(ends, COLOURS, strict=True):
+                section(axes, end, scale, axis, color=colour)
+            axes.set(xlabel=scale.step_label(direction), ylabel=scale.loss_label, title=f"Section along {direction}")
+        handles = [figure.axes[-1].lines[i] for i in (1, 2, 0)]
+        labels = [literal(name) for name in (*names, BEGINNING)]
+        figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    return figure
+
+
+def names_of(runs: Sequence[Path]) -> list[str]:
+    """Of the folders; the parents' where the folders' own are the same, as with a sweep's METHOD/SEED."""
+    if len(runs) != 2:
+        raise ValueError(f"expected two runs, of 3DGS and of StableGS, got {len(runs)}")
+    first, second = (run.resolve() for run in runs)
+    if first == second:
+        raise ValueError(f"expected two different runs, got {runs[0]} twice")
+    while first.name == second.name:
+        first, second = first.parent, second.parent
+    return [first.name, second.name]
+
+
+def _measured(runs: Sequence[Path], names: Sequence[str]) -> pd.DataFrame:
+    tables = []
+    for run, name in zip(runs, names, strict=True):
+        if not (run / RECORDS).is_file():
+            raise FileNotFoundError(f"expected {RECORDS} in the run {run}, found none; train anew with --probe-every")
+        table = pd.read_csv(run / RECORDS)
+        table = pd.DataFrame(table[table["state"] != "skipped"]).assign(run=name)
+        if table.empty:
+            raise ValueError(
+                f"expected records in {run / RECORDS}, all were skipped; train with a larger --probe-share"
+            )
+        tables.append(table)
+    return pd.concat(tables, ignore_index=True)
+
+
+def main() -> None:
+    """`python -m figures.fig7 RUN_3DGS RUN_STABLEGS`"""
+    command_line(draw, "fig7")
+
+
+def command_line(figure, name: str) -> None:
+    """Draw a figure of two runs, named on the command line, into a file."""
+    parser = argparse.ArgumentParser(description=f"Draw {name} from the records of two runs.")
+    parser.add_argument(
+        "runs", type=Path, nargs=2, metavar="RUN", help="folders of landscape train: 3DGS, then StableGS"
+    )
+    parser.add_argument("--out", type=Path, default=Path(f"{name}.png"), help="PNG, PDF or SVG, by its suffix")
+    arguments = parser.parse_args()
+    try:
+        print(save(figure(arguments.runs), arguments.out))
+    except (FileNotFoundError, ValueError) as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""Recorded slices of several landscapes to one scale, for the figures that compare them.
+
+Every slice is drawn along its own two steepest eigenvectors, but all share their axes: steps in stored parameter units, as far
+as the widest of them reaches, and the change of the loss from its own centre.  So a valley that is narrower looks narrower.
+Where a slice was not recorded that far there is nothing.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.contour import QuadContourSet
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D
+
+from analysis.records import PROBE, SLICE, read_record
+from figures.plane import Plane, plane
+from figures.style import BLACK, FIELD_MAP, MISSING, exponent_of, literal, unit_suffix
+
+CHECKPOINT, START = "checkpoint.pt", "start"
+SLICES = (("slice-eigenvectors-2d", SLICE), ("probe", PROBE))  # beside a checkpoint, the first that is there
+LEVELS = 10
+NAMES = ("e₁", "e₂")
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What landscapes have in common: steps to +-reach, changes of the loss from low to high."""
+
+    reach: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, *landscapes: Plane) -> "Scale":
+        changes = [change_of(each) for each in landscapes]
+        reach = max(float(np.abs(d.steps).max()) for each in landscapes for d in (each.x, each.y))
+        low, high = min(float(c.min()) for c in changes), max(float(c.max()) for c in changes)
+        return cls(reach, low, high if high > low else low + 1.0)
+
+    @property
+    def steps(self) -> int:
+        return exponent_of(self.reach)
+
+    @property
+    def loss(self) -> int:
+        return exponent_of(np.array([self.low, self.high]))
+
+    @property
+    def loss_label(self) -> str:
+        return f"change of loss{unit_suffix(self.loss)}"
+
+    def step_label(self, name: str) -> str:
+        return f"step along {name}{unit_suffix(self.steps)}"
+
+
+def change_of(landscape: Plane) -> np.ma.MaskedArray:
+    """The loss minus that at the centre."""
+    return landscape.change * 10.0**landscape.exponent
+
+
+def landscape_of(run: Path) -> Plane:
+    """The recorded slice around a run's checkpoint, along its two steepest eigenvectors.
+
+    FileNotFoundError or ValueError name the record that is missing and the command that makes it.
+    """
+    if not (run / CHECKPOINT).is_file():
+        raise FileNotFoundError(f"expected a run of `landscape train` in {run}, found no {CHECKPOINT} there")
+    for name, kind in SLICES:
+        if (run / name / kind.file).is_file():
+            found = plane(read_record(run / name))
+            if (found.x.name, found.y.name) != NAMES:
+                raise ValueError(
+                    f"expected a slice along {' and '.join(NAMES)} in {run / name}, got others; {_slice(run)}"
+                )
+            return found
+    raise FileNotFoundError(
+        f"expected a slice of {run} in {' or '.join(str(run / name) for name, _ in SLICES)}, found none; {_slice(run)}"
+    )
+
+
+def start_of(run: Path) -> Plane:
+    """The same of where a run began."""
+    if not (run / START / CHECKPOINT).is_file():
+        raise FileNotFoundError(
+            f"expected the start of the run in {run / START / CHECKPOINT}, found none; train anew with --probe-every, "
+            f"which keeps it, then {_slice(run / START)}"
+        )
+    return landscape_of(run / START)
+
+
+def _slice(run: Path) -> str:
+    return f"run: landscape slice {run / CHECKPOINT}"
+
+
+def surface(figure: Figure, place: tuple[int, int, int], landscape: Plane, scale: Scale, title: str) -> None:
+    """The loss as a surface over both steps."""
+    axes: Axes3D = figure.add_subplot(*place, projection="3d")  # pyright: ignore[reportAssignmentType]
+    steps, loss = 10.0**scale.steps, 10.0**scale.loss
+    x, y = np.meshgrid(landscape.x.steps / steps, landscape.y.steps / steps, indexing="ij")
+    height = change_of(landscape).filled(np.nan) / loss
+    low, high = scale.low / loss, scale.high / loss
+    axes.plot_surface(x, y, height, cmap=FIELD_MAP, rcount=60, ccount=60, linewidth=0.1, vmin=low, vmax=high)
+    reach = scale.reach / steps
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(low, high))
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(3))
+    axes.tick_params(labelsize=5, pad=-3)
+    axes.set_xlabel(scale.step_label("e₁"), fontsize=6, labelpad=-8)
+    axes.set_ylabel(scale.step_label("e₂"), fontsize=6, labelpad=-8)
+    axes.set_title(f"{literal(title)}\n{scale.loss_label}", y=0.95)
+    axes.view_init(elev=32, azim=-58)
+    # the layout does not count the labels of such axes
+    axes.set_box_aspect(None, zoom=0.8)  # pyright: ignore[reportArgumentType]
+
+
+def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
+    """The same from above, at levels that all landscapes have in common."""
+    steps, loss = 10.0**scale.steps, 10.0**scale.loss
+    levels = np.asarray(MaxNLocator(LEVELS).tick_values(scale.low / loss, scale.high / loss))
+    x, y, change = landscape.x.steps / steps, landscape.y.steps / steps, change_of(landscape).T / loss
+    axes.set_facecolor(MISSING)
+    filled = axes.contourf(x, y, change, levels=levels, cmap=FIELD_MAP)
+    axes.contour(x, y, change, levels=levels, colors=BLACK, linewidths=0.4)
+    reach = scale.reach / steps
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    axes.set_xlabel(scale.step_label("e₁"))
+    axes.set_ylabel(scale.step_label("e₂"))
+    return filled
+
+
+def section(axes: Axes, landscape: Plane, scale: Scale, axis: int, **look: object) -> None:
+    """The grid's line through the centre along the first (axis 0) or the second direction."""
+    along, other = (landscape.x, landscape.y) if axis == 0 else (landscape.y, landscape.x)
+    line = change_of(landscape).take(other.centre, axis=1 - axis) / 10.0**scale.loss
+    axes.plot(along.steps / 10.0**scale.steps, line, **look)  # pyright: ignore[reportArgumentType]
+    axes.set(xlim=(-scale.reach / 10.0**scale.steps, scale.reach / 10.0**scale.steps))
+    axes.grid(True)

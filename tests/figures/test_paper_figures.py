@@ -1,0 +1,98 @@
+"""The figures after the paper's Figs. 1 and 7: drawn from records, all landscapes to one scale; what is missing is named."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_hex
+from PIL import Image
+
+from analysis.records import SLICE, record_folder, write_record
+from figures import fig1, fig7
+from figures.manifold import Scale, landscape_of, start_of
+from tests.figures.test_figures import POINT, laid_out
+from tests.figures.test_trajectory_figure import rows
+from tests.recorded import synthetic
+
+
+def slice_at(run: Path, scale: float) -> None:
+    """A checkpoint in a run, and a slice of its landscape."""
+    run.mkdir(parents=True, exist_ok=True)
+    (run / "checkpoint.pt").touch()
+    data, arrays = synthetic(scale)
+    with record_folder(run / "slice-eigenvectors-2d", SLICE) as folder:
+        write_record(folder, data, {"slice": arrays["slice"]}, SLICE)
+
+
+@pytest.fixture
+def runs(tmp_path) -> list[Path]:
+    """Two runs with all records: the second's curvatures are a ninth of the first's, the start's are nine times as large."""
+    found = [tmp_path / "3dgs" / "0", tmp_path / "stablegs" / "0"]
+    for run, scale in zip(found, (1.0, 1 / 9), strict=True):
+        slice_at(run, scale)
+        rows().to_csv(run / "trajectory.csv", index=False)
+        (run / "test").mkdir()
+        Image.new("RGB", (12, 9), "white").save(run / "test" / "view_3.png")
+    slice_at(found[0] / "start", 9.0)
+    return found
+
+
+@pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
+def test_everything_stays_inside_the_page(runs, module):
+    figure = module.draw(runs)
+    drawn = figure.get_tightbbox(laid_out(figure))
+    assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
+    assert drawn.x1 <= figure.get_figwidth() + POINT and drawn.y1 <= figure.get_figheight() + POINT
+
+
+def test_all_landscapes_of_a_figure_share_their_axes(runs):
+    figure = fig7.draw(runs)
+    surfaces = [axes for axes in figure.axes if hasattr(axes, "get_zlim")]
+    assert len(surfaces) == 3
+    widest = landscape_of(runs[1])
+    reach = float(np.abs(widest.y.steps).max())  # of the flattest direction of the flattest landscape
+    assert Scale.of(widest, start_of(runs[0])).reach == reach
+    limits = {(axes.get_xlim(), axes.get_ylim(), axes.get_zlim()) for axes in surfaces}  # pyright: ignore[reportAttributeAccessIssue]
+    assert len(limits) == 1
+    across, along = figure.axes[-2:]
+    assert across.get_xlim() == along.get_xlim()
+    start, first, second = (np.ptp(np.asarray(line.get_xdata())) for line in across.lines)
+    assert first / start == pytest.approx(3) and second / first == pytest.approx(
+        3
+    )  # a curvature unit is 1 / sqrt(lambda)
+
+
+def test_the_index_is_the_recorded_one_of_each_run(runs):
+    index = fig7.draw(runs).axes[0]
+    dots = [line for line in index.lines if line.get_marker() == "o" and len(np.asarray(line.get_xdata()))]
+    assert {to_hex(line.get_color()).upper() for line in dots} == set(fig7.COLOURS)
+    assert [float(y) for line in dots for y in np.asarray(line.get_ydata())] == [4.0, 9.0, 16.0] * 2
+    assert fig7.names_of(runs) == ["3dgs", "stablegs"]
+
+
+def test_a_missing_record_is_named_with_the_command_that_makes_it(runs, tmp_path, capsys, monkeypatch):
+    def refused(module, words: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["figure", *map(str, runs), "--out", str(tmp_path / "out.png")])
+        with pytest.raises(SystemExit) as stopped:
+            module.main()
+        said = capsys.readouterr().err
+        assert stopped.value.code == 2 and words in said and said.count("\n") == 1, said
+        assert not (tmp_path / "out.png").exists()
+
+    (runs[0] / "start" / "slice-eigenvectors-2d" / "slice.json").unlink()
+    refused(fig7, f"run: landscape slice {runs[0] / 'start' / 'checkpoint.pt'}")
+    (runs[0] / "start" / "checkpoint.pt").unlink()
+    refused(fig7, "train anew with --probe-every, which keeps it")
+    table = pd.read_csv(runs[1] / "trajectory.csv")
+    table.assign(state="skipped").to_csv(runs[1] / "trajectory.csv", index=False)
+    refused(fig7, "train with a larger --probe-share")
+    (runs[1] / "trajectory.csv").unlink()
+    refused(fig7, "found none; train anew with --probe-every")
+    (runs[1] / "test" / "view_3.png").unlink()
+    shutil.rmtree(runs[1] / "slice-eigenvectors-2d")
+    refused(fig1, f"run: landscape slice {runs[1] / 'checkpoint.pt'}")
+    slice_at(runs[1], 1.0)
+    refused(fig1, "run landscape train to its end")
