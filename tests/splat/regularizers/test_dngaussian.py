@@ -9,6 +9,7 @@ import torch
 from splat.gaussians import Gaussians
 from splat.losses_cpu import ViewLoss
 from splat.photometric import photometric
+from splat.regularizers import dngaussian
 from splat.regularizers.dngaussian import DNGaussian, normalised
 from splat.regularizers.regularizer import Step
 from splat.render import render
@@ -115,10 +116,14 @@ def test_a_loss_of_weight_0_adds_nothing_but_the_draws_stay_the_same():
     assert (sum(alone) - both).norm() < 1e-10 * both.norm()
 
 
-def test_where_nothing_is_seen_and_in_images_smaller_than_a_patch_there_is_no_error():
+def test_where_nothing_is_seen_depth_adds_nothing_and_is_not_normalised(monkeypatch):
+    monkeypatch.setattr(dngaussian, "normalised", None)
     step = a_step(DNGaussian(soft_start=0))
     step.gaussians.means[:, 2] = -3.0
     assert not added(step).flat.any()
+
+
+def test_in_an_image_smaller_than_a_patch_the_patch_is_as_large_as_the_image():
     wide = added(a_step(DNGaussian(soft_start=0, smallest_patch=16, largest_patch=17))).flat
     assert wide.any() and wide.isfinite().all()
 
