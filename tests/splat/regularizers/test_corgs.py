@@ -60,6 +60,7 @@ def test_the_fields_are_the_same_until_each_draws_its_own_splits():
     assert torch.equal(regularizer.partner.gaussians.flat, training.gaussians.flat)
     training, regularizer, _ = trained(replace(tiny_config(), method=APART))
     assert regularizer.partner is not None
+    assert len(regularizer.partner.gaussians) != 12  # it is densified too
     assert len(regularizer.partner.gaussians) != len(training.gaussians) or not torch.equal(
         regularizer.partner.gaussians.flat, training.gaussians.flat
     )
