@@ -7,9 +7,7 @@ compare_slices      the planes of the two steepest directions, cut to the steps 
 compare_sections    the loss along each of these directions, as far as each slice goes
 """
 
-import argparse
 import json
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -34,6 +32,7 @@ from figures.style import (
     SKY,
     VERMILION,
     exponent_of,
+    folder_script,
     literal,
     new_figure,
     save,
@@ -212,7 +211,10 @@ FIGURES: dict[str, Callable[[Records], Figure]] = {
 
 def draw_comparison(folder: Path, suffix: str = "png") -> list[Path]:
     """Draw what the records of the comparison in the folder have the numbers for; returns the files."""
-    named = json.loads((folder / "compare.json").read_text(encoding="utf-8"))["runs"]
+    index = folder / "compare.json"
+    if not index.is_file():
+        raise FileNotFoundError(f"expected a folder written by `landscape compare` (with compare.json), got {folder}")
+    named = json.loads(index.read_text(encoding="utf-8"))["runs"]
     records = {label: read_record(path) for label, path in named.items()}
     arrays = [record.arrays for record in records.values()]
     known = {"compare_densities": any("nodes" in each.get("spectrum", {}) for each in arrays)}
@@ -222,16 +224,7 @@ def draw_comparison(folder: Path, suffix: str = "png") -> list[Path]:
 
 def main() -> None:
     """`python -m figures.compare OUT [--format pdf]`"""
-    parser = argparse.ArgumentParser(description="Draw the figures of a comparison into its folder.")
-    parser.add_argument("folder", type=Path, help="a folder written by `landscape compare`")
-    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
-    arguments = parser.parse_args()
-    try:
-        paths = draw_comparison(arguments.folder, arguments.format)
-    except (FileNotFoundError, ValueError) as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
-    print(*paths, sep="\n")
+    folder_script(draw_comparison, "the figures of a comparison", "compare")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,10 @@
 """All figures of a recorded probe or slice: `python -m figures.make_all RUN/probe` or `draw_probe(folder)`."""
 
-import argparse
-import sys
 from pathlib import Path
 
 from analysis.records import Record, read_record
 from figures import slice1d, slice2d, spectrum, surface, traces
-from figures.style import save
+from figures.style import folder_script, save
 
 FIGURES = {
     "traces": traces.draw,
@@ -38,16 +36,7 @@ def draw_probe(folder: str | Path, suffix: str = "png") -> list[Path]:
 
 def main() -> None:
     """`python -m figures.make_all RUN/probe`"""
-    parser = argparse.ArgumentParser(description="Draw all figures of a recorded probe into its folder.")
-    parser.add_argument("folder", type=Path, help="a folder written by `landscape probe`, e.g. runs/fern/probe")
-    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
-    arguments = parser.parse_args()
-    try:
-        paths = draw_probe(arguments.folder, arguments.format)
-    except (FileNotFoundError, ValueError) as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
-    print(*paths, sep="\n")
+    folder_script(draw_probe, "all figures of a recorded probe", "probe")
 
 
 if __name__ == "__main__":

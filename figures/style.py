@@ -116,14 +116,23 @@ def literal(text: str) -> str:
 
 def script(draw: Callable[[Record], Figure], name: str) -> None:
     """The command line of one figure: `python -m figures.NAME RUN/probe [--format pdf]`."""
-    parser = argparse.ArgumentParser(description=f"Draw the figure {name} of a recorded probe into its folder.")
-    parser.add_argument("folder", type=Path, help="a folder written by `landscape probe`, e.g. runs/fern/probe")
+
+    def drawn(folder: Path, suffix: str) -> list[Path]:
+        record = read_record(folder)
+        return [save(draw(record), record.folder / f"{name}.{suffix}")]
+
+    folder_script(drawn, f"the figure {name} of a recorded probe", "probe")
+
+
+def folder_script(draw: Callable[[Path, str], list[Path]], what: str, command: str) -> None:
+    """A command line that draws into a folder of `landscape COMMAND` and prints the files."""
+    parser = argparse.ArgumentParser(description=f"Draw {what} into its folder.")
+    parser.add_argument("folder", type=Path, help=f"a folder written by `landscape {command}`")
     parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
     arguments = parser.parse_args()
     try:
-        record = read_record(arguments.folder)
-        path = save(draw(record), record.folder / f"{name}.{arguments.format}")
+        paths = draw(arguments.folder, arguments.format)
     except (FileNotFoundError, ValueError) as error:
         print(error, file=sys.stderr)
         sys.exit(2)
-    print(path)
+    print(*paths, sep="\n")
