@@ -1,5 +1,7 @@
 """Per attribute: what is exactly flat is left out and counted, and the indices are those of the dense blocks."""
 
+from collections import Counter
+
 import pytest
 import torch
 
@@ -48,16 +50,19 @@ def test_the_indices_of_every_attribute_are_those_of_its_dense_block(
 ) -> None:
     hessian = SceneHessian(objective, gauss_newton=gauss_newton)
     H = hessian.apply(torch.eye(hessian.dim, dtype=torch.float64))
-    found = scene_families(hessian, torch.Generator().manual_seed(0))
-    for name, part in found.items():
-        rows = hessian.blocks.get(name, slice(0, hessian.dim))
-        true = torch.linalg.eigvalsh((H[rows, rows] + H[rows, rows].T) / 2)
-        total = float(true.abs().sum())
-        share, rank = part.indices.share, part.indices.effective_rank
-        assert share is not None and rank is not None
-        assert share.low <= float(true[-1]) / total * (1 + 1e-9) and float(true[-1]) / total <= share.high * (1 + 1e-9)
-        assert rank.low <= total**2 / float(true.square().sum()) <= rank.high
-        assert rank.high <= part.rank
+    runs, misses = 6, Counter()
+    for seed in range(runs):
+        for name, part in scene_families(hessian, torch.Generator().manual_seed(seed)).items():
+            rows = hessian.blocks.get(name, slice(0, hessian.dim))
+            true = torch.linalg.eigvalsh((H[rows, rows] + H[rows, rows].T) / 2)
+            total = float(true.abs().sum())
+            share, rank = part.indices.share, part.indices.effective_rank
+            assert share is not None and rank is not None and rank.high <= part.rank
+            largest, spread = float(true[-1]) / total, total**2 / float(true.square().sum())
+            misses[name, "share"] += not share.low <= largest * (1 + 1e-9) <= share.high * (1 + 2e-9)
+            misses[name, "rank"] += not rank.low <= spread <= rank.high
+    # 95% brackets: four misses of six have a probability of 9e-5
+    assert max(misses.values()) < 4, misses
 
 
 def test_with_the_null_space_kept_nothing_is_left_out(objective: SceneObjective) -> None:
