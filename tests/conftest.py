@@ -4,6 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
+
+if not torch.cuda.is_available():  # before the first import of triton, which reads it
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 
 def _real_scene(name: str) -> Path:
@@ -25,3 +29,10 @@ def fern() -> Path:
 def lego() -> Path:
     """Blender lego, reduced to the 8-view protocol."""
     return _real_scene("lego")
+
+
+@pytest.fixture
+def device() -> torch.device:
+    """Where the kernels for GPUs run: a GPU, or else the CPU with Triton's interpreter."""
+    pytest.importorskip("triton", reason="the kernels for GPUs need triton; install splat-landscape[gpu]")
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")

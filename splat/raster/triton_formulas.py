@@ -1,0 +1,134 @@
+"""The CPU's formulas, compiled a second time: by Triton, for the GPU.
+
+A formula that is plain arithmetic on numbers (`compositing.formula`) is written once.  Numba compiles it for vectors of
+float; `twin` gives the same source to Triton, where a number is a tensor and every other name of it means the functions of
+this module.  Formulas therefore take and give numbers and tuples of numbers, index tuples by constants, and choose by
+`select(condition, x, y)`, which is elementwise there.
+
+    quadratic, dot = twins(compositing.quadratic, compositing.dot)
+
+`jit` marks kernels and `device` what they call: `triton.jit` too, or with Triton's interpreter (TRITON_INTERPRET=1) the plain function, since
+the interpreter patches its language anew at every call of a jitted one.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from types import FunctionType
+from typing import Any
+
+import triton
+import triton.language as tl
+from triton import knobs
+
+INTERPRETED = knobs.runtime.interpret
+
+
+def jit(function: Callable) -> Any:
+    """A kernel, launched by `function[grid](arguments)`: `triton.jit`."""
+    return triton.jit(function)
+
+
+def device(function: Callable) -> Any:
+    """A function that kernels call."""
+    return function if INTERPRETED else jit(function)
+
+
+def twin(formula: Callable) -> Any:
+    """A formula of the CPU as a function that kernels call."""
+    return _twin(getattr(formula, "py_func", formula))
+
+
+def twins(*formulas: Callable) -> tuple[Any, ...]:
+    return tuple(twin(formula) for formula in formulas)
+
+
+@cache
+def _twin(function: FunctionType) -> Any:
+    meaning = {name: _meaning(name, function.__globals__) for name in _names(function)}
+    copied = FunctionType(function.__code__, {"__name__": function.__module__, "tl": tl, **meaning}, function.__name__)
+    copied.__module__, copied.__qualname__ = function.__module__, function.__qualname__
+    return device(copied)
+
+
+def _names(function: FunctionType) -> list[str]:
+    return [name for name in function.__code__.co_names if name in MEANING or name in function.__globals__]
+
+
+def _meaning(name: str, names: dict[str, Any]) -> Any:
+    if name in MEANING:
+        return MEANING[name]
+    value = names[name]
+    if isinstance(value, bool | int | float):
+        return value if INTERPRETED else tl.constexpr(value)
+    return twin(value)
+
+
+# --- what the names of the formulas mean ------------------------------------------------------------------------------
+
+
+@device
+def fma(x, y, z):
+    return tl.fma(x, y, z)
+
+
+@device
+def select(condition, x, y):
+    return tl.where(condition, x, y)
+
+
+@device
+def minimum(x, y):
+    return tl.minimum(x, y)
+
+
+@device
+def maximum(x, y):
+    return tl.maximum(x, y)
+
+
+@device
+def reciprocal(x):
+    """1 / x to the last bit or the one before: the hardware's quotient and a step of Newton's."""
+    r = 1.0 / x
+    return tl.fma(r, tl.fma(-x, r, 1.0), r)
+
+
+@device
+def sqrt(x):
+    return tl.sqrt(x)
+
+
+@device
+def exp(x):
+    return tl.exp(x)
+
+
+@device
+def log(x):
+    return tl.log(x)
+
+
+@device
+def exp2(x):
+    return tl.exp2(x)
+
+
+@device
+def log2(x):
+    return tl.log2(x)
+
+
+MEANING: dict[str, Any] = {
+    "fma": fma,
+    "select": select,
+    "minimum": minimum,
+    "maximum": maximum,
+    "min": minimum,
+    "max": maximum,
+    "reciprocal": reciprocal,
+    "sqrt": sqrt,
+    "exp": exp,
+    "log": log,
+    "exp2": exp2,
+    "log2": log2,
+}

@@ -1,0 +1,41 @@
+"""A formula of the CPU gives Triton the numbers that it gives Python."""
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="the kernels for GPUs need triton; install splat-landscape[gpu]")
+
+import triton.language as tl
+
+from splat.raster import compositing, whitening
+from splat.raster.triton_formulas import jit, twin, twins
+
+quadratic, dot = twins(compositing.quadratic, compositing.dot)
+plain, plain_adjoint = twins(whitening.plain, whitening.plain_adjoint)
+
+
+@jit
+def evaluate(x, out, n, BLOCK: tl.constexpr):
+    i = tl.arange(0, BLOCK)
+    v = tl.load(x + i, i < n)
+    W = (v + 1, 0.5 * v, v)
+    five = plain_adjoint(W, plain(W, (v, 2.0, v * v, v, 0.3 * v)))
+    tl.store(out + i, quadratic(v, five) + dot(five, W), i < n)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_twin_computes_what_its_formula_computes(device, dtype):
+    x = torch.linspace(0.5, 2.0, 10, dtype=dtype, device=device)
+    out = torch.empty_like(x)
+    evaluate[(1,)](x, out, 10, BLOCK=16)
+    expected = []
+    for v in x.tolist():
+        W = (v + 1, 0.5 * v, v)
+        five = whitening.plain_adjoint.py_func(W, whitening.plain.py_func(W, (v, 2.0, v * v, v, 0.3 * v)))
+        expected.append(compositing.quadratic.py_func(v, five) + compositing.dot.py_func(five, W))
+    np.testing.assert_allclose(out.cpu(), expected, rtol=16 * torch.finfo(dtype).eps)
+
+
+def test_a_formula_has_one_twin():
+    assert twin(compositing.dot) is dot
