@@ -34,8 +34,10 @@ from splat.raster.compositing import (
     kernel,
     load3,
     next_tile,
+    plus,
     prefetch,
     reached,
+    reciprocal,
     row_range,
     row_v,
     scratch,
@@ -101,6 +103,21 @@ def block_moments(counter, params, lists, frame, pixels, gradient, curvature, su
 
 
 @formula
+def step_block(w, free, beta, R, g, h, colour):
+    """D, R in front of the splat, and s + v.  free: w where the cap does not hold, else 0; beta likewise."""
+    D = (free * colour[0] - beta * R[0], free * colour[1] - beta * R[1], free * colour[2] - beta * R[2])
+    weight = D[0] * (g[0] + h[0] * D[0]) + D[1] * (g[1] + h[1] * D[1]) + D[2] * (g[2] + h[2] * D[2])
+    return D, plus(R, w, colour), weight
+
+
+@formula
+def cross_terms(w, free, D, g, h):
+    """w g_c + w h_c D_c and w^2 h_c of a channel."""
+    wh = w * h
+    return free * g + wh * D, w * wh
+
+
+@formula
 def block_entry(params, lists, e, k, x0, y0, frame, state, shared, sums):
     L = lanes(params)
     o = np.int64(lists.splat[e]) * PARAMS
@@ -115,20 +132,19 @@ def block_entry(params, lists, e, k, x0, y0, frame, state, shared, sums):
         b = 11 * L * y
         v = row_v(frame, L, y, terms)
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + 10 * L), frame.cap)
-        r = 1.0 / (1.0 - alpha)
+        r = reciprocal(1.0 - alpha)
         T = load(state, b) * r
         w, beta = alpha * T, alpha * r
         free = w
         if capped:
             free, beta = select(uncapped <= frame.cap, w, 0.0), select(uncapped <= frame.cap, beta, 0.0)
         R, g, h = load3(state, b + L, L), load3(state, b + 4 * L, L), load3(state, b + 7 * L, L)
-        D = (free * colour[0] - beta * R[0], free * colour[1] - beta * R[1], free * colour[2] - beta * R[2])
+        D, after, weight = step_block(w, free, beta, R, g, h, colour)
         store(state, b, T)
-        store3(state, b + L, L, (R[0] + w * colour[0], R[1] + w * colour[1], R[2] + w * colour[2]))
+        store3(state, b + L, L, after)
         store(shared, 5 * L * y, w)
         store(shared, 5 * L * y + L, free)
         store3(shared, 5 * L * y + 2 * L, L, D)
-        weight = D[0] * (g[0] + h[0] * D[0]) + D[1] * (g[1] + h[1] * D[1]) + D[2] * (g[2] + h[2] * D[2])
         vv = v * v
         m0, m1, m2 = m0 + weight, m1 + weight * v, m2 + weight * vv
         m3, m4 = m3 + weight * (vv * v), m4 + weight * (vv * vv)
@@ -146,8 +162,8 @@ def channel_entry(lists, e, c, u, terms, frame, state, shared, sums, slot, L, ze
         v = row_v(frame, L, y, terms)
         g, h = load(state, (11 * y + 4 + c) * L), load(state, (11 * y + 7 + c) * L)
         w, free, D = load(shared, 5 * L * y), load(shared, 5 * L * y + L), load(shared, (5 * y + 2 + c) * L)
-        cross = free * g + w * h * D
-        squared += w * w * h
+        cross, square = cross_terms(w, free, D, g, h)
+        squared += square
         m0, m1, m2 = m0 + cross, m1 + cross * v, m2 + cross * (v * v)
     store_sums(sums, slot + CROSS + DEGREE2 * c, (m0, m0 * u, m0 * (u * u), m1, m1 * u, m2))
     store_sums(sums, slot + COLOUR + c, (squared,))

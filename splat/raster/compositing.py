@@ -158,6 +158,11 @@ def row_v(frame, L, y, terms):
 
 
 @formula
+def reciprocal(x):
+    return 1.0 / x
+
+
+@formula
 def alpha_row(v, terms, running, cap):
     """alpha of a row and 2^l before the cap; running: the mask of the pixels that have not stopped.
 
@@ -169,10 +174,17 @@ def alpha_row(v, terms, running, cap):
 
 
 @formula
+def along_row(q, u):
+    """q' = A + v (B + v C) as (A, B, C), from its six coefficients."""
+    return u * (u * q[QUU] + q[QU]) + q[Q0], u * q[QUV] + q[QV], q[QVV]
+
+
+@formula
 def tangent_terms(tangents, j, u):
-    """q' = A + v (B + v C) as (A, B, C)."""
-    constant = u * (u * tangents[j + QUU] + tangents[j + QU]) + tangents[j + Q0]
-    return constant, u * tangents[j + QUV] + tangents[j + QV], broadcast(tangents, tangents[j + QVV])
+    A, B, C = along_row(
+        (tangents[j], tangents[j + 1], tangents[j + 2], tangents[j + 3], tangents[j + 4], tangents[j + 5]), u
+    )
+    return A, B, broadcast(tangents, C)
 
 
 @formula
@@ -215,10 +227,42 @@ def plus(x, y, c):
 
 
 @formula
-def behind_all(planes, p, size, background):
+def behind_all(g, background):
     """What the final transmittance is multiplied by in the loss: g . background - g_A."""
+    return g[0] * background[0] + g[1] * background[1] + g[2] * background[2] - g[3]
+
+
+@formula
+def load_cotangent(planes, p, size):
+    """(g, g_A) of a row."""
     g = load3(planes, p, size)
-    return g[0] * background[0] + g[1] * background[1] + g[2] * background[2] - load(planes, p + 3 * size)
+    return g[0], g[1], g[2], load(planes, p + 3 * size)
+
+
+@formula
+def step_back(alpha, T, R, g, colour):
+    """A splat undone: T, R in front of it, and its w, beta, r, w e."""
+    r = reciprocal(1.0 - alpha)
+    T = T * r
+    w = alpha * T
+    we = w * dot(g, colour)
+    return T, R + we, w, alpha * r, r, we
+
+
+@formula
+def step_tangent(dT, dimage, alpha, w, w_dq, colour, dcolour):
+    """w' = w q' + alpha T';  T' <- T' - w';  image' += w c' + w' c."""
+    dw = w_dq + alpha * dT
+    return dT - dw, plus(plus(dimage, w, dcolour), dw, colour)
+
+
+@formula
+def step_curvature(tau, dR, dg, w, beta, rR, dq, g, colour, dcolour):
+    """tau and R' after a splat, its s' where the cap does not hold, and h."""
+    tau = tau + beta * dq
+    h = plus(dg, dq + tau, g)
+    z = w * dot_plus(h, colour, dot(g, dcolour))
+    return tau, dR + z, z - beta * (rR * dq + dR), h
 
 
 @formula
@@ -260,24 +304,36 @@ def no_moments(params):
 
 
 @formula
-def add_row(moments, v, s, w, h):
-    """Add a row to the sums over rows (s, s v, s v^2, w h)."""
+def row_terms(v, s, w, h):
+    """What a row adds to its columns' sums."""
     sv = s * v
+    return s, sv, sv * v, w * h[0], w * h[1], w * h[2]
+
+
+@formula
+def add_row(moments, v, s, w, h):
+    t = row_terms(v, s, w, h)
     return (
-        moments[0] + s,
-        moments[1] + sv,
-        moments[2] + sv * v,
-        moments[3] + w * h[0],
-        moments[4] + w * h[1],
-        moments[5] + w * h[2],
+        moments[0] + t[0],
+        moments[1] + t[1],
+        moments[2] + t[2],
+        moments[3] + t[3],
+        moments[4] + t[4],
+        moments[5] + t[5],
     )
 
 
 @formula
-def store_moments(sums, slot, moments, u):
-    S, Sv, Svv, G0, G1, G2 = moments
+def column_terms(columns, u):
+    """The nine sums' parts of each column, from its sums over rows."""
+    S, Sv, Svv, G0, G1, G2 = columns
     Su = S * u
-    store_sums(sums, slot * SUMS, (S, Su, Sv, Su * u, Sv * u, Svv, G0, G1, G2))
+    return S, Su, Sv, Su * u, Sv * u, Svv, G0, G1, G2
+
+
+@formula
+def store_moments(sums, slot, moments, u):
+    store_sums(sums, slot * SUMS, column_terms(moments, u))
 
 
 # --- forward ----------------------------------------------------------------------------------------------------------
@@ -379,10 +435,10 @@ def backward(counter, params, lists, frame, pixels, cotangent, sums):
 
 @formula
 def begin_backward_row(state, b, L, frame, pixels, cotangent, p):
-    T = load(pixels.transmittance, p)
+    T, g = load(pixels.transmittance, p), load_cotangent(cotangent, p, frame.size)
     store(state, b, T)
-    store(state, b + L, T * behind_all(cotangent, p, frame.size, frame.background))
-    store3(state, b + 2 * L, L, load3(cotangent, p, frame.size))
+    store(state, b + L, T * behind_all(g, frame.background))
+    store3(state, b + 2 * L, L, g)
     store(state, b + 5 * L, load(pixels.stop, p))
 
 
@@ -400,17 +456,13 @@ def backward_entry(params, lists, e, k, x0, y0, frame, state, sums):
         b = 6 * L * y
         v = row_v(frame, L, y, terms)
         alpha, uncapped = alpha_row(v, terms, index < load(state, b + 5 * L), frame.cap)
-        r = 1.0 / (1.0 - alpha)
-        T = load(state, b) * r
-        R = load(state, b + L)
-        g = load3(state, b + 2 * L, L)
-        w = alpha * T
-        we = w * dot(g, colour)
-        s = we - alpha * r * R
+        R, g = load(state, b + L), load3(state, b + 2 * L, L)
+        T, after, w, beta, _r, we = step_back(alpha, load(state, b), R, g, colour)
+        s = we - beta * R
         if capped:
             s = select(uncapped <= frame.cap, s, 0.0)
         store(state, b, T)
-        store(state, b + L, R + we)
+        store(state, b + L, after)
         moments = add_row(moments, v, s, w, g)
     store_moments(sums, np.int64(lists.slots[e]), moments, u)
 
@@ -463,11 +515,9 @@ def end_tangent_row(state, b, L, frame, planes, transmittances, i, p):
 
 @formula
 def tangent_row(state, b, L, alpha, w, w_dq, colour, dcolour):
-    """w' = w q' + alpha T';  T' <- T' - w';  image' += w c' + w' c."""
-    dT = load(state, b)
-    dw = w_dq + alpha * dT
-    store(state, b, dT - dw)
-    store3(state, b + L, L, plus(plus(load3(state, b + L, L), w, dcolour), dw, colour))
+    dT, dimage = step_tangent(load(state, b), load3(state, b + L, L), alpha, w, w_dq, colour, dcolour)
+    store(state, b, dT)
+    store3(state, b + L, L, dimage)
 
 
 @formula
@@ -567,33 +617,29 @@ def curvature(counter, params, tangents, lists, frame, pixels, cotangent, transm
 def begin_curvature_row(state, b, L, frame, pixels, cotangent, transmittances, cotangents, i, p):
     q = 4 * i * frame.size + p
     T, dT = load(pixels.transmittance, p), load(transmittances, i * frame.size + p)
-    behind = behind_all(cotangent, p, frame.size, frame.background)
-    dbehind = behind_all(cotangents, q, frame.size, frame.background)
+    g, dg = load_cotangent(cotangent, p, frame.size), load_cotangent(cotangents, q, frame.size)
     store(state, b, dT / T)
-    store(state, b + L, dT * behind + T * dbehind)
-    store3(state, b + 2 * L, L, load3(cotangents, q, frame.size))
+    store(state, b + L, dT * behind_all(g, frame.background) + T * behind_all(dg, frame.background))
+    store3(state, b + 2 * L, L, dg)
 
 
 @formula
 def curvature_row(state, b, L, w, beta, rR, dq, g, colour, dcolour):
     """s' and h of a row, and the update of tau and R'."""
-    dR = load(state, b + L)
-    tau = load(state, b) + beta * dq
-    h = plus(load3(state, b + 2 * L, L), dq + tau, g)
-    z = w * dot_plus(h, colour, dot(g, dcolour))
+    tau, dR, dg = load(state, b), load(state, b + L), load3(state, b + 2 * L, L)
+    tau, dR, ds, h = step_curvature(tau, dR, dg, w, beta, rR, dq, g, colour, dcolour)
     store(state, b, tau)
-    store(state, b + L, dR + z)
-    return z - beta * (rR * dq + dR), h
+    store(state, b + L, dR)
+    return ds, h
 
 
 @formula
 def backward_row(state, b, L, alpha, g, colour):
     """Restore T and advance R; w, beta and r R of a row."""
-    r = 1.0 / (1.0 - alpha)
-    T, R = load(state, b) * r, load(state, b + L)
-    w, beta = alpha * T, alpha * r
+    R = load(state, b + L)
+    T, after, w, beta, r, _we = step_back(alpha, load(state, b), R, g, colour)
     store(state, b, T)
-    store(state, b + L, R + w * dot(g, colour))
+    store(state, b + L, after)
     return w, beta, r * R
 
 

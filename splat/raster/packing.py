@@ -27,12 +27,6 @@ from splat.raster.compositing import (
     MX,
     MY,
     PARAMS,
-    Q0,
-    QU,
-    QUU,
-    QUV,
-    QV,
-    QVV,
     RED,
     SHEAR,
     SUMS,
@@ -40,6 +34,7 @@ from splat.raster.compositing import (
     formula,
     kernel,
 )
+from splat.raster.simd import select
 from splat.raster.whitening import LOG2_E, ROUND, plain_adjoint, put, whitened, whitening
 
 
@@ -65,18 +60,28 @@ def pack_splats(start, stop, splats, log2_alpha_min, contour, params):
         params[p + RED], params[p + GREEN], params[p + BLUE] = splats[i, 6], splats[i, 7], splats[i, 8]
 
 
+@formula
+def exponent_tangent(W, opacity, y):
+    """The coefficients Q0, QU, ... of q' along a splat's tangent y."""
+    u, v, uu, uv, vv = whitened(W, y)
+    return ratio(y[5], opacity), ROUND * u, ROUND * v, -0.5 * uu, -uv, -0.5 * vv
+
+
+@formula
+def ratio(x, opacity):
+    """x / opacity, 0 where nothing is drawn."""
+    return select(opacity > 0, x / opacity, 0.0)
+
+
 @kernel
 def pack_tangents(start, stop, splats, directions, tangents):
     """tangents (n * K * TANGENTS) of directions (n, K, 9)."""
     K = directions.shape[1]
     for i in range(start, stop):
-        W, opacity = whitening(splats[i]), splats[i, 5]
+        W = whitening(splats[i])
         for k in range(K):
             t, y = (i * K + k) * TANGENTS, directions[i, k]
-            u, v, uu, uv, vv = whitened(W, y)
-            tangents[t + Q0] = y[5] / opacity if opacity > 0 else 0.0
-            tangents[t + QU], tangents[t + QV] = ROUND * u, ROUND * v
-            tangents[t + QUU], tangents[t + QUV], tangents[t + QVV] = -0.5 * uu, -uv, -0.5 * vv
+            put(tangents[t : t + 6], exponent_tangent(W, splats[i, 5], y))
             tangents[t + DRED], tangents[t + DGREEN], tangents[t + DBLUE] = y[6], y[7], y[8]
 
 
@@ -99,16 +104,38 @@ def sum_of_slots(sums, first, last, stride, offset):
     return s0, s1, s2, s3, s4, s5, s6, s7, s8
 
 
+@formula
+def first_order(W, opacity, total):
+    """The gradient in mean, conic and opacity from a splat's sums."""
+    S, Su, Sv, Suu, Suv, Svv = total[0], total[1], total[2], total[3], total[4], total[5]
+    x, y, a, b, c = plain_adjoint(W, (ROUND * Su, ROUND * Sv, -0.5 * Suu, -Suv, -0.5 * Svv))
+    return x, y, a, b, c, ratio(S, opacity)
+
+
+@formula
+def second_order(W, opacity, y, moments, total):
+    """The gradient's tangent in mean, conic and opacity along a splat's tangent y; moments: S, Su, Sv of the gradient."""
+    S, Su, Sv = moments[0], moments[1], moments[2]
+    mu, mv, uu, uv, vv = whitened(W, y)
+    white = (
+        ROUND * (total[1] - mu * S) + uu * Su + uv * Sv,
+        ROUND * (total[2] - mv * S) + uv * Su + vv * Sv,
+        -0.5 * (total[3] - 2 * mu * Su),
+        -(total[4] - mu * Sv - mv * Su),
+        -0.5 * (total[5] - 2 * mv * Sv),
+    )
+    x, y_bar, a, b, c = plain_adjoint(W, white)
+    return x, y_bar, a, b, c, ratio(total[0] - S * ratio(y[5], opacity), opacity)
+
+
 @kernel
 def reduce_gradient(start, stop, splats, slot_start, sums, moments, gradient):
     """gradient (n, 9) and the moments S, Su, Sv (n, 3) from the sums of the entries (slots, SUMS)."""
     for i in range(start, stop):
-        S, Su, Sv, Suu, Suv, Svv, red, green, blue = sum_of_slots(sums, slot_start[i], slot_start[i + 1], SUMS, 0)
-        moments[i, 0], moments[i, 1], moments[i, 2] = S, Su, Sv
-        white = (ROUND * Su, ROUND * Sv, -0.5 * Suu, -Suv, -0.5 * Svv)
-        put(gradient[i], plain_adjoint(whitening(splats[i]), white))
-        gradient[i, 5] = S / splats[i, 5] if splats[i, 5] > 0 else 0.0
-        gradient[i, 6], gradient[i, 7], gradient[i, 8] = red, green, blue
+        total = sum_of_slots(sums, slot_start[i], slot_start[i + 1], SUMS, 0)
+        moments[i, 0], moments[i, 1], moments[i, 2] = total[0], total[1], total[2]
+        put(gradient[i], first_order(whitening(splats[i]), splats[i, 5], total))
+        gradient[i, 6], gradient[i, 7], gradient[i, 8] = total[6], total[7], total[8]
 
 
 @kernel
@@ -117,18 +144,8 @@ def reduce_curvature(start, stop, splats, directions, slot_start, sums, moments,
     K = directions.shape[1]
     for i in range(start, stop):
         W, opacity = whitening(splats[i]), splats[i, 5]
-        S, Su, Sv = moments[i, 0], moments[i, 1], moments[i, 2]
         for k in range(K):
             total = sum_of_slots(sums, slot_start[i], slot_start[i + 1], K * SUMS, k * SUMS)
-            y, out = directions[i, k], product[i, k]
-            mu, mv, uu, uv, vv = whitened(W, y)
-            white = (
-                ROUND * (total[1] - mu * S) + uu * Su + uv * Sv,
-                ROUND * (total[2] - mv * S) + uv * Su + vv * Sv,
-                -0.5 * (total[3] - 2 * mu * Su),
-                -(total[4] - mu * Sv - mv * Su),
-                -0.5 * (total[5] - 2 * mv * Sv),
-            )
-            put(out, plain_adjoint(W, white))
-            out[5] = (total[0] - S * y[5] / opacity) / opacity if opacity > 0 else 0.0
+            out = product[i, k]
+            put(out, second_order(W, opacity, directions[i, k], moments[i], total))
             out[6], out[7], out[8] = total[6], total[7], total[8]

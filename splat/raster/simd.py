@@ -10,7 +10,7 @@ any width and type: the array that a vector is loaded from decides its dtype, an
     x + y, x - y, x * y, x / y, -x  may be contracted to fused multiply-adds by the compiler
     fma(x, y, z)                    x y + z with one rounding, always: for values that decide a comparison
     minimum(x, y), maximum(x, y), sqrt(x)
-    x < y ..., m & n                masks;  select(m, x, y);  any_lane(m)
+    x < y ..., m & n                masks;  select(m, x, y), of numbers too;  any_lane(m)
     exp2(x)                         for -126 <= x <= 126 (float32), -1022 <= x <= 1022 (float64); relative error: EXP2_ERROR
     store_sums(a, i, (v0, ...))     the sum over the lanes of each vector to a[i], a[i+1], ...
     prefetch(a, i)                  hint that a[i] will be read soon; no effect on results
@@ -347,7 +347,7 @@ def maximum(typing, x, y):
 
 @intrinsic
 def select(typing, mask, x, y):
-    vector = _common((x, y))
+    vector = typing.unify_types(x, y) if isinstance(mask, types.Boolean) else _common((x, y))
     if vector is None:
         return None
     return vector(mask, vector, vector), lambda context, builder, sig, args: builder.select(*args)

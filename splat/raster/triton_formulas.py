@@ -7,8 +7,8 @@ this module.  Formulas therefore take and give numbers and tuples of numbers, in
 
     quadratic, dot = twins(compositing.quadratic, compositing.dot)
 
-`jit` marks kernels and `device` what they call: `triton.jit` too, or with Triton's interpreter (TRITON_INTERPRET=1) the plain function, since
-the interpreter patches its language anew at every call of a jitted one.
+`jit` marks kernels and `device` what they call: `triton.jit` too, or with Triton's interpreter (TRITON_INTERPRET=1) the plain
+function, since the interpreter patches its language anew at every call of a jitted one.
 """
 
 from collections.abc import Callable

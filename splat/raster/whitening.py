@@ -18,6 +18,7 @@ The formulas take and give five numbers, of the mean x, y and the conic a, b, c,
 from math import log, sqrt
 
 from splat.raster.compositing import formula
+from splat.raster.simd import select
 
 LOG2_E = 1 / log(2)
 ROUND = 2 / LOG2_E  # the conic in whitened coordinates is this times the identity
@@ -28,10 +29,10 @@ LEAST_RATIO = 2.0**-50  # of a - b^2 / c to a: beneath it, the difference is rou
 def whitening(splat):
     """along, across and shear of W; the identity where a splat is not drawn."""
     a, b, c = splat[2], splat[3], splat[4]
-    if not c > 0:
-        return 1.0, 1.0, 0.0
-    shear = b / c
-    return sqrt(LOG2_E / 2 * max(a - b * shear, LEAST_RATIO * a)), sqrt(LOG2_E / 2 * c), shear
+    drawn = c > 0
+    shear = select(drawn, b / c, 0.0)
+    along = sqrt(LOG2_E / 2 * max(a - b * shear, LEAST_RATIO * a))
+    return select(drawn, along, 1.0), select(drawn, sqrt(LOG2_E / 2 * c), 1.0), shear
 
 
 @formula
@@ -79,7 +80,7 @@ def plain_adjoint(W, y):
 
 
 @formula
-def put(out, five):
-    """Write five numbers to the first places of an array."""
-    for j in range(5):
-        out[j] = five[j]
+def put(out, numbers):
+    """Write a tuple of numbers to the first places of an array."""
+    for j in range(len(numbers)):
+        out[j] = numbers[j]
