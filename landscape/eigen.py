@@ -5,16 +5,24 @@ T = Q^T H Q is kept whole, so that nothing is assumed of its shape after a resta
 vectors is full, the Ritz vectors next to both ends are kept and the recurrence goes on from them.
 
 A run ends when every wanted pair has an estimated residual |B s| under max(rtol |lambda|, atol), or under the round-off
-of the matvec, or at its budget.  The residuals reported are measured with the operator itself.  The recurrence knows
-r_i = H v_i - lambda_i v_i up to round-off: its next vectors times B s_i.  One product with all the k pairs, signs at random,
+of the matvec, or at its budget.  The recurrence knows r_i = H v_i - lambda_i v_i, its next vectors times B s_i, up to the
+noise of its products: their rounding, or whatever else sets them off.
+
+**What the recurrence sees of it.**  By symmetry a product H q_j has the components T_ij on all the q_i before it, which are
+known already.  Each is off by q_i . e_j - e_i . q_j, e the noise of a product.  As the q begin at a random vector, they see
+noise as random vectors do: 2 |e|^2 / n in the mean square, over m (m - 1) / 2 pairs in m steps.  MARGIN of this |e| is added to
+the |r_i| reported, or of the round-off that a product of this precision has at best, eps |lambda|_max.  No product is spent on
+the noise where that sum is as small as was asked for, or where less than this round-off was asked for.
+
+**What it does not see.**  The components are sums in the vectors' precision, which in long float32 vectors is the larger
+noise.  Then one product with all the k pairs, signs at random,
 
     f = H x - sum_i +-(lambda_i v_i + r_i),  x = sum_i +-v_i
 
-shows what it does not know, |f|^2 = k times the mean square of one pair's on average, and |r_i +- f| is the residual.  Where
-that is more than was asked for, as at the end of a budget, each pair has a product of its own.
-
-The noise of a product is measured once before, with one vector more, when an estimate that is still above its goal has come
-under NEAR times the largest value: from there on steps might be made in vain.
+shows what the recurrence does not know, |f|^2 = k times the mean square of one pair's on average, and |r_i +- f| is the
+residual.  Where that is more than was asked for, as at the end of a budget, each pair has a product of its own.  And the noise
+is measured once before, with one vector more, when an estimate that is still above its goal has come near what the
+recurrence sees of it: from there on steps might be made in vain.
 """
 
 from dataclasses import dataclass
@@ -33,7 +41,12 @@ from landscape.results import EigenEnds, Eigenpairs, Progress, StopReason
 
 KEEP = 0.6  # share of the basis that a restart keeps
 CHUNK = 1 << 16  # rows of vectors that a restart recombines at a time
-NEAR = 3e-4  # root of the eps of float32, which a product's rounding stays below in either precision
+MARGIN = 4.0  # of the noise that the recurrence sees: what it may be in the directions of the wanted vectors
+NEAR = 30.0  # of that noise, from which on it is measured
+NEAREST = (
+    3e-4  # of the largest value: root of the eps of float32, which a product's rounding stays below in either precision
+)
+PAIRS = 10  # from which it can be told
 WARM_NOISE = 0.01  # share of a random vector in a warm start: an end that the old vectors miss is still found
 
 
@@ -106,7 +119,7 @@ def extreme_eigenpairs(
         spent = krylov.matvecs + settings.block + settings.wanted + 2 > settings.max_matvecs
         late = monotonic() > deadline
         goal = strictness * settings.rtol, max(strictness * settings.atol, krylov.floor(ritz))
-        near, converged = ritz.near(NEAR, *goal), ritz.converged(*goal)
+        near, converged = ritz.near(krylov.seen_noise, *goal), ritz.converged(*goal)
         if converged or spent or late:
             ends, more = krylov.measured(ritz, "time budget" if late else "matvec budget", converged)
             if not more or spent or late:
@@ -133,9 +146,9 @@ class _Ritz:
     def converged(self, rtol: float, floor: float) -> bool:
         return not self._open(rtol, floor).numel()
 
-    def near(self, share: float, rtol: float, floor: float) -> bool:
-        """Whether an open residual is under this share of the largest value."""
-        return bool((self._open(rtol, floor) < share * self.values.abs().max()).any())
+    def near(self, noise: float, rtol: float, floor: float) -> bool:
+        """Whether an open residual is near this noise."""
+        return bool((self._open(rtol, floor) < min(NEAR * noise, NEAREST * float(self.values.abs().max()))).any())
 
     def _open(self, rtol: float, floor: float) -> Float64[Tensor, " k"]:
         """The residuals above their goals."""
@@ -168,16 +181,26 @@ class _Krylov:
         self.T = torch.zeros(self.capacity, self.capacity, dtype=torch.float64)
         self.size, self.width, self.scale = 0, 0, 1.0
         self.coupling = torch.zeros(0, 0, dtype=torch.float64)
+        self.pairs, self.surprise = (
+            0,
+            0.0,
+        )  # components that were known before, and the sum of squares that they are off by
         self.random_start, self.first_cycle = start is None, 0
         first = draw_probes(operator.dim, min(settings.block, self.capacity), generator, operator.dtype)
         if start is not None:
             first[:, 0] = _mixed(start, first[:, 0])
         self._append(first.T.contiguous())
+        self.foreseen = torch.zeros(0, self.width, dtype=torch.float64)
         self.noise, self.matvecs, self._restarted = nan, 0, False
 
     @property
     def full(self) -> bool:
         return self.size + self.width > self.capacity
+
+    @property
+    def seen_noise(self) -> float:
+        """The noise of a product as far as symmetry shows it; nan: not yet."""
+        return sqrt(self.operator.dim * self.surprise / (2 * self.pairs)) if self.pairs >= PAIRS else nan
 
     def expand(self, near_noise: bool) -> None:
         """Apply H to the next rows, project, and find the rows after them; the first time near the noise, measure it."""
@@ -195,11 +218,15 @@ class _Krylov:
             )
         self.scale = max(self.scale if old else 0.0, *(norm(w) for w in W))
         components = orthogonalise(W, self.basis[:new])
+        self.surprise += float((components[:old] - self.foreseen).square().sum())
+        self.pairs += self.foreseen.numel()
         self.T[:new, old:new] = components
         self.T[old:new, :new] = components.T
         self.T[old:new, old:new] = (components[old:] + components[old:].T) / 2
         self.size = new
         self.coupling = self._append(W)
+        self.foreseen = torch.zeros(new, self.width, dtype=torch.float64)
+        self.foreseen[old:] = self.coupling.T
         self.first_cycle += not self._restarted
 
     def _append(self, W: Float[Tensor, "b n"]) -> Float64[Tensor, "next b"]:
@@ -237,9 +264,12 @@ class _Krylov:
         return _Ritz(values, coordinates, residuals, list(range(m - 1, m - 1 - s.largest, -1)), list(range(s.smallest)))
 
     def floor(self, ritz: _Ritz) -> float:
-        """The residual that the matvec's round-off leaves at least."""
-        rounding = torch.finfo(self.basis.dtype).eps * float(ritz.values.abs().max())
-        return rounding if isnan(self.noise) else max(self.noise, rounding)
+        """The residual that the matvec's noise leaves at least, as far as it was measured."""
+        return self.rounding(ritz) if isnan(self.noise) else max(self.noise, self.rounding(ritz))
+
+    def rounding(self, ritz: _Ritz) -> float:
+        """What rounding leaves of a product at best, independent in every row."""
+        return torch.finfo(self.basis.dtype).eps * float(ritz.values.abs().max())
 
     def restart(self, ritz: _Ritz) -> None:
         """Keep the share KEEP of the memory in Ritz vectors, and the rows that come next.
@@ -258,6 +288,7 @@ class _Krylov:
         self.basis[keep : keep + self.width] = self.basis[m : m + self.width].clone()
         self.T.zero_()
         self.T[:keep, :keep] = torch.diag(ritz.values[kept])
+        self.foreseen = (self.coupling @ ritz.coordinates[m - self.coupling.shape[1] :, kept]).T
         self.size, self._restarted = keep, True
 
     def measured(self, ritz: _Ritz, budget: StopReason, converged: bool) -> tuple[EigenEnds, bool]:
@@ -266,15 +297,20 @@ class _Krylov:
         vectors = self.basis[: self.size].T @ ritz.coordinates[:, ritz.wanted].to(self.basis.dtype)
         vectors /= torch.linalg.vector_norm(vectors, dim=0)  # restarts leave a little of their round-off
         values = ritz.values[ritz.wanted]
-        enough = (s.rtol * values.abs()).clamp_min(max(s.atol, self.floor(ritz)))
-        residuals = self._together(ritz, vectors) if converged else torch.full_like(values, inf)
-        if not (residuals <= enough).all():
-            values, residuals = rayleigh(self.operator, vectors)
-            self.matvecs += s.wanted
         estimated = ritz.residuals[ritz.wanted]
+        rounding = self.rounding(ritz)
+        residuals = estimated + MARGIN * max(self.seen_noise, rounding)
+        asked = (s.rtol * values.abs()).clamp_min(s.atol)
+        out_of_reach = (asked <= rounding) & (self.seen_noise <= MARGIN * rounding)
+        if not (converged and ((residuals <= asked) | out_of_reach).all()):
+            enough = asked.clamp_min(self.floor(ritz))
+            residuals = self._together(ritz, vectors) if converged else torch.full_like(values, inf)
+            if not (residuals <= enough).all():
+                values, residuals = rayleigh(self.operator, vectors)
+                self.matvecs += s.wanted
         # a residual far above the recurrence's estimate is the matvec's round-off: more steps cannot lower it
         stuck = (estimated <= residuals / 4) | (estimated <= self.floor(ritz))
-        reached = residuals <= (s.rtol * values.abs()).clamp_min(s.atol)
+        reached = residuals <= asked
         errors = residuals / ritz.gaps()
 
         def end(part: slice, descending: bool) -> Eigenpairs:
@@ -290,7 +326,8 @@ class _Krylov:
             beyond = _beyond(self.operator.dim, self.first_cycle, float(ritz.values[-1] - ritz.values[0]))
         largest, smallest = end(slice(0, s.largest), True), end(slice(s.largest, s.wanted), False)
         spectrum = torch.stack([ritz.values, ritz.residuals])
-        ends = EigenEnds(largest, smallest, "lanczos", self.matvecs, beyond, self.noise, spectrum)
+        noise = self.seen_noise if isnan(self.noise) else self.noise
+        ends = EigenEnds(largest, smallest, "lanczos", self.matvecs, beyond, noise, spectrum)
         return ends, not bool((reached | stuck).all())
 
     def _together(self, ritz: _Ritz, vectors: Float[Tensor, "n k"]) -> Float64[Tensor, " k"]:
