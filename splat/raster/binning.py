@@ -10,7 +10,7 @@ from math import ceil, floor, inf, log, sqrt
 import numpy as np
 
 from splat.raster.compositing import CAPPED, TILE_ROWS, Lists, formula, kernel
-from splat.raster.simd import lanes_of
+from splat.raster.simd import lanes_of, select
 from splat.raster.threads import over_range
 from splat.settings import RenderSettings
 
@@ -51,17 +51,15 @@ def radix_argsort(keys, index):
 @formula
 def ellipse_of(splat, alpha_min, contour):
     """Half-extents of a splat's ellipse and its widened level; a level of 0 where it is nowhere drawn."""
-    a, b, c, opacity = np.float64(splat[2]), np.float64(splat[3]), np.float64(splat[4]), np.float64(splat[5])
-    if opacity < alpha_min or opacity <= 0:
-        return 0.0, 0.0, 0.0, 0.0
-    level = contour * contour
-    if alpha_min > 0:
-        level = min(level, 2 * log(opacity / alpha_min))
+    a, b, c, opacity = splat[2], splat[3], splat[4], splat[5]
+    drawn = (opacity >= alpha_min) & (opacity > 0)
+    level = min(contour * contour, 2 * log(select(drawn, opacity, 1.0) / alpha_min))
     level = level * (1 + WIDEN) + WIDEN
     det = a * c - b * b
-    if level == inf or det <= 0:
-        return inf, inf, inf, det
-    return sqrt(level * c / det), sqrt(level * a / det), level, det
+    level = select((level == inf) | (det <= 0), inf, level)
+    level = select(drawn, level, 0.0)
+    bounded = level < inf
+    return select(bounded, sqrt(level * c / det), inf), select(bounded, sqrt(level * a / det), inf), level, det
 
 
 @formula
@@ -74,10 +72,8 @@ def pixels_within(centre, reach, size):
 
 @formula
 def rows_in_strip(splat, level, det, ex, ey, left, right):
-    """Lowest and highest y, relative to the mean, of the ellipse in the strip left <= x <= right (relative too)."""
-    if level == inf:
-        return -inf, inf
-    b, c = np.float64(splat[3]), np.float64(splat[4])
+    """Lowest and highest y, relative to the mean, of a bounded ellipse in the strip left <= x <= right (relative too)."""
+    b, c = splat[3], splat[4]
     x_top = -b * ey / splat[2]  # where the ellipse is highest; it is lowest at -x_top
     x = min(max(x_top, left), right)
     high = (-b * x + sqrt(max(0.0, c * level - det * x * x))) / c
@@ -86,18 +82,36 @@ def rows_in_strip(splat, level, det, ex, ey, left, right):
     return low, high
 
 
+@formula
+def rows_of_strip(splat, ellipse, column, tile, width, height):
+    """First and last pixel row of a splat's ellipse in a column of tiles; empty if first > last."""
+    ex, ey, level, det = ellipse
+    mx, my = splat[0] - 0.5, splat[1] - 0.5
+    x0, x1 = pixels_within(mx, ex, width)
+    left, right = max(column * tile, x0) - mx, min(column * tile + tile - 1, x1) - mx
+    low, high = rows_in_strip(splat, level, det, ex, ey, left, right)
+    bounded = level < inf
+    return pixels_within(select(bounded, my + (low + high) / 2, my), select(bounded, (high - low) / 2, inf), height)
+
+
+@formula
+def box_of(splat, ellipse, width, height):
+    """First and last pixel column and row of the box of a splat's ellipse; empty if a first > its last."""
+    ex, ey, level, _det = ellipse
+    x0, x1 = pixels_within(splat[0] - 0.5, ex, width)
+    y0, y1 = pixels_within(splat[1] - 0.5, ey, height)
+    return x0, select(level > 0, x1, x0 - 1), y0, y1
+
+
 @kernel
 def count_tiles(start, stop, splats, order, tile, width, height, alpha_min, contour, bound):
     """An upper bound of the number of tiles each splat touches: those of its ellipse's box."""
     for i in range(start, stop):
         splat = splats[order[i]]
-        ex, ey, level, _det = ellipse_of(splat, alpha_min, contour)
+        x0, x1, y0, y1 = box_of(splat, ellipse_of(splat, alpha_min, contour), width, height)
         bound[i] = 0
-        if level > 0:
-            x0, x1 = pixels_within(splat[0] - 0.5, ex, width)
-            y0, y1 = pixels_within(splat[1] - 0.5, ey, height)
-            if x0 <= x1 and y0 <= y1:
-                bound[i] = (x1 // tile - x0 // tile + 1) * (y1 // TILE_ROWS - y0 // TILE_ROWS + 1)
+        if x0 <= x1 and y0 <= y1:
+            bound[i] = (x1 // tile - x0 // tile + 1) * (y1 // TILE_ROWS - y0 // TILE_ROWS + 1)
 
 
 @kernel
@@ -124,15 +138,12 @@ def list_tiles(
 
 @kernel
 def list_splat(splat, tile, columns, width, height, alpha_min, contour, cap, tiles, rows):
-    ex, ey, level, det = ellipse_of(splat, alpha_min, contour)
-    mx, my = splat[0] - 0.5, splat[1] - 0.5
-    x0, x1 = pixels_within(mx, ex, width)
+    ellipse = ellipse_of(splat, alpha_min, contour)
+    x0, x1, _y0, _y1 = box_of(splat, ellipse, width, height)
     flags = CAPPED if splat[5] > cap else 0
     k = 0
     for column in range(x0 // tile, x1 // tile + 1):
-        left, right = max(column * tile, x0) - mx, min(column * tile + tile - 1, x1) - mx
-        low, high = rows_in_strip(splat, level, det, ex, ey, left, right)
-        y0, y1 = pixels_within(my + (low + high) / 2 if level < inf else my, (high - low) / 2, height)
+        y0, y1 = rows_of_strip(splat, ellipse, column, tile, width, height)
         if y0 <= y1:
             for row in range(y0 // TILE_ROWS, y1 // TILE_ROWS + 1):
                 top, bottom = max(y0 - row * TILE_ROWS, 0), min(y1 - row * TILE_ROWS, TILE_ROWS - 1)
