@@ -15,14 +15,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from rich.console import Console
 
 from analysis.compare_table import Run, compare_table, comparison, frame
 from analysis.drawing import draw
 from analysis.options import CompareOptions, ProbeOptions
 from analysis.records import FILE, read_record
-from analysis.report import pictures_in
+from analysis.report import pictures_in, template_environment
 from analysis.training import CHECKPOINT, METRICS
 from splat.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
@@ -153,13 +152,7 @@ def _write(runs: Sequence[Run], out: Path) -> None:
 
 def render_page(runs: Sequence[Run], rows: Sequence[Any], notes: Sequence[str], out: Path) -> str:
     """The page as text, with the pictures that lie in the folder."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = template_environment()
     sections = {
         name: [row for row in rows if row.section == name] for name in dict.fromkeys(row.section for row in rows)
     }

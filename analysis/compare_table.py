@@ -16,13 +16,11 @@ from rich.table import Table
 
 from analysis.family_table import INDICES, OPERATOR_NAMES, Cell, bracketed
 from analysis.overrides import leaves
-from analysis.quantities import measured, quantity
+from analysis.quantities import PLACES, SCORES, measured, quantity
 from analysis.verdict import attribute_name
 from splat.checkpoint import Checkpoint
 from splat.regularizers.methods import MethodSettings
 
-PLACES = {"psnr": 2, "ssim": 4, "lpips": 4}
-SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}
 FAMILIES = "families"  # a section that only the page and the file show
 
 

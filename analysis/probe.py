@@ -76,12 +76,8 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
 
 def scene_objective(checkpoint: Checkpoint, scene: Scene, *, keep_unseen: bool = False) -> SceneObjective:
     """The training's loss over its views, at the checkpoint.  keep_unseen: see `SceneObjective`."""
-    training = checkpoint.training
-    config = training.config
-    background = torch.tensor(config.background, dtype=training.gaussians.flat.dtype)
-    views = scene.load(checkpoint.scene.train)
-    gaussians = training.gaussians
-    return SceneObjective(gaussians, views, config.loss, background, config.render, keep_unseen=keep_unseen)
+    training, views = checkpoint.training, scene.load(checkpoint.scene.train)
+    return training.config.objective(training.gaussians, views, keep_unseen=keep_unseen)
 
 
 def _settings(options: ProbeOptions) -> ProbeSettings:

@@ -9,6 +9,8 @@ from decimal import Decimal
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
+SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}  # of metrics.json
+PLACES = {"psnr": 2, "ssim": 4, "lpips": 4}
 
 
 def quantity(value: float | None, error: float | None = None) -> str:

@@ -42,15 +42,20 @@ def write_report(folder: str | Path) -> Path:
     return path
 
 
-def render_report(record: Record) -> str:
-    """The page as text."""
-    environment = jinja2.Environment(
+def template_environment() -> jinja2.Environment:
+    """Of the pages whose templates lie beside this file."""
+    return jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
+
+def render_report(record: Record) -> str:
+    """The page as text."""
+    environment = template_environment()
     environment.filters |= {"quantity": quantity, "measured": measured, "attribute": attribute_name, "cell": _cell}
     surface = interactive_surface(record)
     return environment.get_template("report.html.jinja").render(

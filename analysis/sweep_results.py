@@ -19,7 +19,7 @@ from rich import box
 from rich.table import Table
 
 from analysis.family_table import INDICES
-from analysis.quantities import quantity
+from analysis.quantities import PLACES, SCORES, quantity
 from analysis.records import read_record
 from analysis.sweep_file import Cell, Sweep
 from analysis.training import METRICS
@@ -27,15 +27,8 @@ from analysis.verdict import attribute_name
 from splat.checkpoint import write_atomically
 
 RESULTS, SUMMARY, PROBE = "results.csv", "summary.csv", "probe"
-SCORES = {
-    "psnr": "PSNR (dB)",
-    "ssim": "SSIM",
-    "lpips": "LPIPS",
-    "gaussians": "Gaussians",
-    "wall_ratio": "time ×",
-    "cpu_ratio": "CPU time ×",
-}
-PLACES = {"psnr": 2, "ssim": 4, "lpips": 4, "gaussians": 0, "wall_ratio": 2, "cpu_ratio": 2}
+TRAINING = SCORES | {"gaussians": "Gaussians", "wall_ratio": "time ×", "cpu_ratio": "CPU time ×"}
+DECIMALS = PLACES | {"gaussians": 0, "wall_ratio": 2, "cpu_ratio": 2}
 SPLIT = "split_"
 
 
@@ -139,7 +132,7 @@ def tables(summary: pd.DataFrame) -> list[Table]:
     indices = {name: name.replace("_", " ") for name in INDICES}
     split = {f"{SPLIT}{name}": title for name, title in indices.items()}
     parts = {
-        "mean ± standard deviation over the seeds": SCORES,
+        "mean ± standard deviation over the seeds": TRAINING,
         "traces": traces,
         "ends of the spectrum": ends,
         "anisotropy": indices,
@@ -177,5 +170,5 @@ def _cell(row: Mapping[Any, Any], name: str, most: int) -> str:
     if not n:
         return quantity(None)
     parts = [mean] if n < 2 or math.isnan(deviation) else [mean, deviation]
-    text = " ± ".join(f"{part:.{PLACES[name]}f}" for part in parts) if name in PLACES else quantity(*parts)
+    text = " ± ".join(f"{part:.{DECIMALS[name]}f}" for part in parts) if name in DECIMALS else quantity(*parts)
     return text if n == most else f"{text} (n = {n})"

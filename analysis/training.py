@@ -226,7 +226,7 @@ def _progress(console: Console) -> Progress:
 def _report(training: Training, views: list[View], held_out: list[View], out: Path) -> None:
     """Score the views, write renders and metrics, print the table."""
     config = training.config
-    background = torch.tensor(config.background, dtype=training.gaussians.flat.dtype)
+    background = config.background_colour(training.gaussians.flat.dtype)
     renders = out / RENDERS
 
     def keep(name: str, image: Tensor) -> None:

@@ -58,7 +58,7 @@ from splat.densify import Densified
 from splat.gaussians import ATTRIBUTES, Gaussians
 from splat.scenes.view import View
 from splat.traces import exact_traces
-from splat.train import TrainConfig, Training
+from splat.train import Training
 
 START = "start"
 Row = dict[str, Any]
@@ -121,10 +121,7 @@ class Trajectory:
 
     def follow(self, change: Densified) -> None:
         """The Gaussians were replaced: rows of those that are kept go along, new ones are zero."""
-        self.vectors = [vector.select(change.parents) for vector in self.vectors]
-        for vector in self.vectors:
-            for values in vector.attributes.values():
-                values[change.fresh] = 0
+        self.vectors = [vector.select(change.parents, fresh=change.fresh) for vector in self.vectors]
 
     def after_step(self, trained: float) -> None:
         """Record where it is time to.  trained: seconds that the steps so far took."""
@@ -158,7 +155,7 @@ class Trajectory:
         return seconds * len(self.training.gaussians) / gaussians
 
     def _recorded(self, seconds: float) -> Row:
-        objective = _objective(self.training.gaussians, self.views, self.training.config)
+        objective = self.training.config.objective(self.training.gaussians, self.views)
         start = self._start(objective)
         found = measure(objective, self._generator(), self.settings, seconds, start)
         self.least = found.least, len(self.training.gaussians)
@@ -234,11 +231,6 @@ def measure(
     return Found(traces, ends, density, operator.matvecs, least, tuple(short))
 
 
-def _objective(gaussians: Gaussians, views: Sequence[View], config: TrainConfig) -> SceneObjective:
-    background = torch.tensor(config.background, dtype=gaussians.flat.dtype)
-    return SceneObjective(gaussians, views, config.loss, background, config.render)
-
-
 def _columns(found: Found) -> Row:
     row: Row = {}
     for name, trace in found.traces.items():
@@ -289,7 +281,7 @@ def _read_vectors(run: Path, training: Training) -> list[Gaussians]:
 
 def _compile(training: Training, views: Sequence[View]) -> None:
     """Compile the kernels of a record, which would count as its time, on a few Gaussians."""
-    seen = _objective(training.gaussians, views, training.config).mask.nonzero()[:8, 0]
-    objective = _objective(training.gaussians.select(seen), views, training.config)
+    seen = training.config.objective(training.gaussians, views).mask.nonzero()[:8, 0]
+    objective = training.config.objective(training.gaussians.select(seen), views)
     least = TrajectorySettings(1, eigen=EigenSettings(max_matvecs=10), density_steps=FEWEST_STEPS)
     measure(objective, torch.Generator().manual_seed(0), least)

@@ -54,11 +54,7 @@ class Adam:
         self, index: Int[Tensor, " n"], fresh: Bool[Tensor, " n"] | None = None, sh_degree: int | None = None
     ) -> None:
         """Follow a change of the Gaussians: `Gaussians.select(index, sh_degree)`, with zero moments where fresh."""
-        self.first, self.second = (moment.select(index, sh_degree) for moment in (self.first, self.second))
-        if fresh is not None:
-            for moment in (self.first, self.second):
-                for values in moment.attributes.values():
-                    values[fresh] = 0
+        self.first, self.second = (moment.select(index, sh_degree, fresh) for moment in (self.first, self.second))
 
     def forget(self, attribute: str) -> None:
         """Zero the moments of one attribute, whose values were overwritten."""

@@ -109,14 +109,21 @@ class Gaussians:
     def to(self, dtype: torch.dtype) -> "Gaussians":
         return self.with_flat(self.flat.to(dtype))
 
-    def select(self, index: Tensor, sh_degree: int | None = None) -> "Gaussians":
-        """The Gaussians at index (a mask or indices, may repeat), with the SH bands up to sh_degree (zero-padded above)."""
+    def select(self, index: Tensor, sh_degree: int | None = None, fresh: Tensor | None = None) -> "Gaussians":
+        """The Gaussians at index (a mask or indices, may repeat), with the SH bands up to sh_degree (zero-padded above).
+
+        fresh: a mask of those chosen whose numbers are 0 instead: for moments and directions, which new Gaussians lack.
+        """
         degree = self.sh_degree if sh_degree is None else sh_degree
         chosen = {name: value[index] for name, value in self.attributes.items()}
         bands = (degree + 1) ** 2
         missing = bands - chosen["sh"].shape[1]
         chosen["sh"] = torch.nn.functional.pad(chosen["sh"], (0, 0, 0, max(missing, 0)))[:, :bands]
-        return Gaussians.pack(chosen)
+        result = Gaussians.pack(chosen)
+        if fresh is not None:
+            for values in result.attributes.values():
+                values[fresh] = 0
+        return result
 
     def require_finite(self) -> None:
         """Raise ValueError that names the attribute and the first Gaussian that has no finite image and derivatives.

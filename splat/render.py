@@ -57,20 +57,29 @@ def render(
         return Rendering(image, alpha, expected if depth else None, splats)
     splats = _gained(project_by_kernel(gaussians, camera, settings), opacity_gain)
     image, alpha = rasterize_by_kernel(splats, background, camera.width, camera.height, settings)
-    expected = _expected_depth(splats, gaussians, camera, settings) if depth else None
+    expected = _layered_depth(splats, gaussians, camera, settings)[0] if depth else None
     return Rendering(image, alpha, expected, splats)
+
+
+def render_depth(
+    gaussians: Gaussians, camera: Camera, settings: RenderSettings = RenderSettings()
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Expected depth and accumulated alpha of `render`, without a pass for the colours."""
+    gaussians.require_finite()
+    return _layered_depth(project_by_kernel(gaussians, camera, settings), gaussians, camera, settings)
 
 
 def _gained(splats: Splats, opacity_gain: Float[Tensor, " n"] | None) -> Splats:
     return splats if opacity_gain is None else replace(splats, opacities=splats.opacities * opacity_gain)
 
 
-def _expected_depth(
+def _layered_depth(
     splats: Splats, gaussians: Gaussians, camera: Camera, settings: RenderSettings
-) -> Float[Tensor, "h w"]:
-    """Depth is composited like a colour: one more pass over the same splats with z for red, on black."""
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Depth, which is composited like a colour, with z for red, on black; and alpha."""
     axis, centre = camera.forward.to(gaussians.flat), camera.centre.to(gaussians.flat)
     z = (gaussians.means - centre) @ axis
     layers = replace(splats, colours=torch.stack([z, torch.zeros_like(z), torch.zeros_like(z)], dim=1))
     black = torch.zeros(3, dtype=z.dtype)
-    return rasterize_by_kernel(layers, black, camera.width, camera.height, settings)[0][0]
+    planes, alpha = rasterize_by_kernel(layers, black, camera.width, camera.height, settings)
+    return planes[0], alpha

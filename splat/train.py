@@ -23,6 +23,7 @@ from torch import Tensor
 
 from splat.adam import Adam
 from splat.camera import Camera
+from splat.curvature import SceneObjective
 from splat.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.gaussians import Gaussians
 from splat.losses import LossSettings
@@ -86,6 +87,14 @@ class TrainConfig:
             raise ValueError(f"expected sh_degree_every of at least 1, got {self.sh_degree_every}")
         if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
             raise ValueError(f"expected a background of three numbers in [0, 1], got {self.background}")
+
+    def background_colour(self, dtype: torch.dtype) -> Float[Tensor, "3"]:
+        return torch.tensor(self.background, dtype=dtype)
+
+    def objective(self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False) -> SceneObjective:
+        """The loss of a training over its views, at some Gaussians.  keep_unseen: see `SceneObjective`."""
+        background = self.background_colour(gaussians.flat.dtype)
+        return SceneObjective(gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen)
 
 
 @dataclass(frozen=True)
@@ -246,7 +255,7 @@ def _next_step(training: Training, number: int, views: Sequence[View], losses: S
     """The view of a step and what it is compared with."""
     config, gaussians = training.config, training.gaussians
     chosen = training.next_view(len(views))
-    background, loss = torch.tensor(config.background, dtype=gaussians.flat.dtype), losses[chosen]
+    background, loss = config.background_colour(gaussians.flat.dtype), losses[chosen]
     if config.random_background:
         drawn = torch.rand(3, generator=training.generator, dtype=background.dtype)
         target = with_background(views[chosen], background, drawn)

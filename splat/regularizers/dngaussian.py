@@ -29,7 +29,7 @@ from splat.gaussians import Gaussians
 from splat.photometric import Photometric
 from splat.regularizers.depth_prior import DepthKind, prior, require_kind, require_maps
 from splat.regularizers.regularizer import Method, Regularizer, Step
-from splat.render import render
+from splat.render import render_depth
 from splat.scenes.view import View
 
 if TYPE_CHECKING:
@@ -97,8 +97,7 @@ class DNRegularizer(Regularizer):
         leaf = parts[attribute] = parts[attribute].clone().requires_grad_()
         if attribute == "means":
             parts["opacity_logits"] = torch.full_like(parts["opacity_logits"], HARD)
-        rendered = render(Gaussians.pack(parts), step.camera, settings=step.config.render, depth=True).depth
-        assert rendered is not None
+        rendered, _alpha = render_depth(Gaussians.pack(parts), step.camera, step.config.render)
         target = prior(step.views[step.chosen], self.settings.depths, rendered)
         loss = self._loss(rendered, target)
         if loss.requires_grad:

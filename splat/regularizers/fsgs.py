@@ -36,7 +36,7 @@ from splat.gaussians import Gaussians
 from splat.photometric import Photometric
 from splat.regularizers.depth_prior import DepthKind, prior, require_kind, require_maps
 from splat.regularizers.regularizer import Method, Regularizer, Step
-from splat.render import render
+from splat.render import render_depth
 from splat.scenes.view import View
 
 if TYPE_CHECKING:
@@ -98,8 +98,7 @@ class FSGSRegularizer(Regularizer):
         if not weight:
             return base.gradient
         flat = step.gaussians.flat.detach().requires_grad_()
-        rendered = render(step.gaussians.with_flat(flat), step.camera, settings=step.config.render, depth=True).depth
-        assert rendered is not None
+        rendered, _alpha = render_depth(step.gaussians.with_flat(flat), step.camera, step.config.render)
         if rendered.min() == rendered.max():  # nothing is seen
             return base.gradient
         loss = depth_loss(rendered, step.views[step.chosen], settings.depths)

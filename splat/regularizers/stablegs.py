@@ -15,8 +15,9 @@ Left out because it cannot matter: the traces of attributes that are not probed;
 loss of weight 0; viewpoints that see nothing; the edges where nothing turns about them.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from landscape.trace import PAPER, estimate_traces
 from splat.camera import Camera
-from splat.curvature import SceneHessian, SceneObjective
+from splat.curvature import SceneHessian
 from splat.densify import on_screen
 from splat.gaussians import Gaussians
 from splat.losses_cpu import consistency_loss
@@ -39,13 +40,16 @@ from splat.regularizers.attribute_probe import (
 from splat.regularizers.occlusion_edge import dominant_edge
 from splat.regularizers.regularizer import Method, Regularizer, Step
 from splat.regularizers.viewpoint_probe import ViewpointSettings, composite_pose
-from splat.render import render
+from splat.render import render, render_depth
 from splat.scenes.capture import capture_geometry
+from splat.scenes.view import View
 from splat.traces import exact_traces
 
-SAMPLES = (
-    4  # of the coupling between pixels: on a trained scene an error of 1% of the traces, seldom 10%; rho takes the root
-)
+if TYPE_CHECKING:
+    from splat.train import Training
+
+# of the coupling between pixels: on a trained scene an error of 1% of the traces, seldom 10%; rho takes the root
+SAMPLES = 4
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,10 @@ class StableRegularizer(Regularizer):
         self.magnitudes: dict[str, Magnitude] = {}
         self.normals: list[Tensor] = []
 
+    def begin(self, training: "Training", views: Sequence[View]) -> None:
+        if self.settings.vsp_weight:
+            self.geometry = capture_geometry([view.camera for view in views])
+
     def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
         settings = self.settings
         since = step.number - settings.warm_up - 1
@@ -115,8 +123,7 @@ class StableRegularizer(Regularizer):
     def _diagnose(self, step: Step) -> None:
         """Magnitudes from the traces, and the edges."""
         settings, config, names = self.settings, step.config, self.settings.probe.on
-        background = torch.tensor(config.background, dtype=step.gaussians.flat.dtype)
-        objective = SceneObjective(step.gaussians, step.views, config.loss, background, config.render)
+        objective = config.objective(step.gaussians, step.views)
         if not names:
             estimates = {}
         elif settings.traces == "exact":
@@ -150,12 +157,11 @@ class StableRegularizer(Regularizer):
         if not settings.vsp_weight:
             return []
         cameras = [view.camera for view in step.views]
-        geometry = capture_geometry(cameras)
         which = range(len(cameras)) if settings.viewpoints == "all" else [step.chosen]
         still = torch.zeros(2)
         return [
             composite_pose(
-                cameras, m, self.normals[m] if self.normals else still, geometry, settings.viewpoint,
+                cameras, m, self.normals[m] if self.normals else still, self.geometry, settings.viewpoint,
                 generator=self.generator,
             )
             for m in which
@@ -173,9 +179,7 @@ class StableRegularizer(Regularizer):
 
 def _edge_normal(step: Step, camera: Camera) -> Float[Tensor, "2"]:
     with torch.no_grad():
-        rendering = render(step.gaussians, camera, settings=step.config.render, depth=True)
-    assert rendering.depth is not None
-    return dominant_edge(rendering.depth, rendering.alpha)[0]
+        return dominant_edge(*render_depth(step.gaussians, camera, step.config.render))[0]
 
 
 def _disagreement(step: Step, probed: Gaussians, probe: Perturbation, pose: Camera) -> Float[Tensor, " p"]:

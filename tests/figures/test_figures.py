@@ -43,6 +43,20 @@ def words(figure, renderer):
     return [(text.get_text(), text.get_window_extent(renderer)) for text in texts]
 
 
+def require_layout(figure):
+    """Everything drawn lies inside the figure, of a column's width, and no two texts overlap."""
+    renderer = laid_out(figure)
+    drawn = figure.get_tightbbox(renderer)
+    assert figure.get_figwidth() == COLUMN
+    assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
+    assert drawn.x1 <= COLUMN + POINT and drawn.y1 <= figure.get_figheight() + POINT
+    boxes = words(figure, renderer)
+    pairs = [
+        (a, b) for i, (a, box) in enumerate(boxes) for b, other in boxes[:i] if box.shrunk(0.9, 0.9).overlaps(other)
+    ]
+    assert pairs == []
+
+
 def difficult(case):
     """The synthetic record and what can be wrong with one."""
     if case in {"1e-12", "1e9"}:
@@ -83,16 +97,7 @@ def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, m
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", surface.RendererMissing)
         figure = module.draw(recorded(tmp_path / "probe", *difficult(case)))
-    renderer = laid_out(figure)
-    drawn = figure.get_tightbbox(renderer)
-    assert figure.get_figwidth() == COLUMN
-    assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
-    assert drawn.x1 <= COLUMN + POINT and drawn.y1 <= figure.get_figheight() + POINT
-    boxes = words(figure, renderer)
-    pairs = [
-        (a, b) for i, (a, box) in enumerate(boxes) for b, other in boxes[:i] if box.shrunk(0.9, 0.9).overlaps(other)
-    ]
-    assert pairs == []
+    require_layout(figure)
 
 
 def test_the_drawn_traces_are_the_recorded_ones(tmp_path):

@@ -8,8 +8,8 @@ from matplotlib.colors import to_hex
 
 from analysis.records import SLICE, Record, read_record, record_folder, write_record
 from figures import make_all, slice1d, slice2d
-from figures.style import BLACK, BLUE, COLUMN, SKY, VERMILION
-from tests.figures.test_figures import POINT, laid_out, words
+from figures.style import BLACK, BLUE, SKY, VERMILION
+from tests.figures.test_figures import require_layout
 from tests.recorded import synthetic_line
 
 
@@ -40,15 +40,7 @@ def difficult(case):
 @pytest.mark.parametrize("case", ["plain", "1e-12", "1e9", "no numbers", "flat", "least"])
 def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, case):
     figure = slice1d.draw(recorded(tmp_path / "slice", *difficult(case)))
-    renderer = laid_out(figure)
-    drawn = figure.get_tightbbox(renderer)
-    assert figure.get_figwidth() == COLUMN
-    assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
-    assert drawn.x1 <= COLUMN + POINT and drawn.y1 <= figure.get_figheight() + POINT
-    boxes = words(figure, renderer)
-    assert not [
-        (a, b) for i, (a, box) in enumerate(boxes) for b, other in boxes[:i] if box.shrunk(0.9, 0.9).overlaps(other)
-    ]
+    require_layout(figure)
 
 
 def test_dots_are_renders_and_the_blue_ones_are_crossed(tmp_path):

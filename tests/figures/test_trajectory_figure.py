@@ -12,9 +12,8 @@ from analysis.cli import main
 from analysis.trajectories import gathered
 from analysis.trajectory import COLUMNS
 from figures import trajectory
-from figures.style import COLUMN
 from figures.trajectory import COLOURS
-from tests.figures.test_figures import POINT, laid_out, words
+from tests.figures.test_figures import require_layout
 from tests.recorded import ATTRIBUTES
 
 
@@ -49,15 +48,7 @@ def run(folder: Path, scale: float = 1.0) -> Path:
 @pytest.mark.parametrize("scale", [1e-12, 1e9])
 def test_labels_stay_inside_the_column_and_apart_whatever_the_records(tmp_path, scale):
     figure = trajectory.draw(gathered([run(tmp_path / "3dgs", scale), run(tmp_path / "stablegs", 3 * scale)]))
-    renderer = laid_out(figure)
-    drawn = figure.get_tightbbox(renderer)
-    assert figure.get_figwidth() == COLUMN
-    assert drawn.x0 >= -POINT and drawn.y0 >= -POINT
-    assert drawn.x1 <= COLUMN + POINT and drawn.y1 <= figure.get_figheight() + POINT
-    boxes = words(figure, renderer)
-    assert not [
-        (a, b) for i, (a, box) in enumerate(boxes) for b, other in boxes[:i] if box.shrunk(0.9, 0.9).overlaps(other)
-    ]
+    require_layout(figure)
 
 
 def test_what_is_drawn_is_what_was_recorded(tmp_path):

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from splat.camera import Camera
 from splat.gaussians import Gaussians
-from splat.render import Backend, render
+from splat.render import Backend, render, render_depth
 from splat.settings import SMOOTH, RenderSettings
 from tests.splat.held_scenes import BACKGROUND
 from tests.splat.random_scenes import (
@@ -60,6 +60,13 @@ def test_float32_renders_and_differentiates_within_its_tolerance():
         assert got[name].dtype == torch.float32 and relative_error(got[name], expected[name]) < IMAGE[torch.float32]
     for name in ("gradient", "product"):
         assert max(errors_by_block(got[name], expected[name], gaussians.blocks).values()) < DERIVATIVE[torch.float32]
+
+
+def test_depth_without_colours_is_that_of_a_whole_render():
+    gaussians, camera = random_gaussians(40, 3, logit=1.0), random_camera(focal=30.0)
+    whole = render(gaussians, camera, BACKGROUND, SMOOTH, depth=True)
+    depth, alpha = render_depth(gaussians, camera, SMOOTH)
+    assert torch.equal(depth, whole.depth) and torch.equal(alpha, whole.alpha)  # pyright: ignore[reportArgumentType]
 
 
 def test_torchs_own_checks_of_first_and_second_derivatives_pass():

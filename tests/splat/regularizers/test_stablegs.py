@@ -28,7 +28,8 @@ def first_step(settings: StableGS, **others) -> Step:
     gaussians = tiny_gaussians(sh_degree=1, dtype=torch.float64)
     config = TrainConfig(5, method=settings, **others)
     training = Training.start(gaussians, EXTENT, config)
-    background = torch.tensor(config.background, dtype=torch.float64)
+    training.regularizer.begin(training, views)
+    background = config.background_colour(torch.float64)
     loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
     return Step(settings.warm_up + 1, training, training.gaussians, views, 1, background, loss)
 
