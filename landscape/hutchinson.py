@@ -100,8 +100,8 @@ class TraceSettings:
 class Looks:
     """When an adaptive run looks at its error, and whether it may then stop.  next: the number of probes at the next look."""
 
-    def __init__(self, settings: TraceSettings, first: int | None = None) -> None:
-        self.next, self._most, self._confirming = first or settings.min_probes, settings.max_probes, False
+    def __init__(self, first: int, most: int) -> None:
+        self.next, self._most, self._confirming = first, most, False
 
     def end(self, probes: int, reached: bool) -> bool:
         """Whether the run ends with this look, at which the error asked for was reached or not."""
@@ -144,7 +144,7 @@ class Hutchinson:
         self, done_before: int = 0, most: int = 0, progress: Progress | None = None
     ) -> dict[str, TraceEstimate]:
         """Progress counts matvecs, from done_before to most."""
-        settings, probes, looks = self.settings, 0, Looks(self.settings, self.first_look)
+        settings, probes, looks = self.settings, 0, Looks(self.first_look, self.settings.max_probes)
         if self.operator.dim == 0 or self.part is self.operator:
             return self._exact()
         while True:

@@ -118,6 +118,11 @@ class SceneObjective:
         return torch.from_numpy(seen)
 
     @property
+    def view_numbers(self) -> range:
+        """Where the views that this process holds stand among all views: here they are all."""
+        return range(len(self.views))
+
+    @property
     def blocks(self) -> Mapping[str, slice]:
         return self.active.blocks
 

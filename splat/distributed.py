@@ -53,6 +53,11 @@ class DistributedObjective(SceneObjective):
     def _support(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
         return self.ranks.any(super()._support(gaussians))
 
+    @property
+    def view_numbers(self) -> range:
+        first = sum(self.held_views[: self.ranks.rank])
+        return range(first, first + len(self.views))
+
     def mean(self, total: Tensor) -> Tensor:
         return self.ranks.sum(total) / sum(self.held_views)
 

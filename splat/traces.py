@@ -6,7 +6,9 @@ With E_b the columns of block b, J the Jacobian of the images, D the pixel-diago
     x = |J E_b z|^2 in the metric l'',  y = the same in the metric D,  z random signs;  E[y] = C_b is exact too
 
 so y is a control variate: each sample is x - c (y - C_b), with c fitted to the other samples (so that no sample takes part in
-its own coefficient and the mean stays unbiased).  A sample costs one J u of as many vectors as there are blocks whose error is
+its own coefficient and the mean stays unbiased).  x and y are sums over views, each with signs of its own: M views then have
+up to M times less variance than with common ones, at no cost (three views of fern: position, rotation and SH 2.6 to 3.6 times
+less, log-scales and opacity 1.2 to 1.9).  A sample costs one J u of as many vectors as there are blocks whose error is
 not yet small enough, and no backward pass.  Where the loss is a sum over pixels, l'' = D and the traces are exact.
 """
 
@@ -15,7 +17,7 @@ from math import sqrt
 from time import monotonic
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from scipy.stats import t as student
 from torch import Tensor
 
@@ -55,10 +57,11 @@ def exact_traces(
             name: TraceEstimate.exact(name, sizes[name], value, settings.confidence) for name, value in known.items()
         }
     pixelwise = objective.block_diagonal(gauss_newton=True).traces(quats)
-    blocks = [_Block(name, sizes[name], known[name], pixelwise[name], settings, samples) for name in known]
+    first, most = (samples, samples) if samples else (settings.min_probes, settings.max_probes)
+    blocks = [_Block(name, sizes[name], known[name], pixelwise[name], settings, first, most) for name in known]
     deadline = monotonic() + settings.max_seconds
     while still := [block for block in blocks if block.open]:
-        count, next_look = still[0].count, min(block.next_look for block in still)
+        count, next_look = still[0].count, min(block.looks.next for block in still)
         # few blocks leave room for several samples in the pass over the pixels
         together = min(max(COLUMNS // len(still), 1), next_look - count)
         sampled = _sample(objective, generator, [block.name for block in still], together)
@@ -67,35 +70,31 @@ def exact_traces(
             block.add(x, y, late)
         if progress:
             state = f"traces: {count + together} samples of the coupling between pixels"
-            progress(count + together, samples or settings.max_probes, state)
+            progress(count + together, most, state)
     return {block.name: block.estimate() for block in blocks}
 
 
 class _Block:
-    """The samples of one block, and whether it needs more."""
+    """The samples of one block, from first to most, and whether it needs more."""
 
     def __init__(
-        self, name: str, dim: int, known: float, pixelwise: float, settings: TraceSettings, samples: int | None
+        self, name: str, dim: int, known: float, pixelwise: float, settings: TraceSettings, first: int, most: int
     ):
-        self.name, self.dim, self.settings, self.samples = name, dim, settings, samples
+        self.name, self.dim, self.settings, self.first, self.most = name, dim, settings, first, most
         self.exact, self.mean = known - pixelwise, pixelwise
         self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
-        self.looks, self.open, self.late = Looks(settings), True, False
+        self.looks, self.open, self.late = Looks(first, most), True, False
 
     @property
     def count(self) -> int:
         return len(self.full)
 
-    @property
-    def next_look(self) -> int:
-        return self.samples or self.looks.next
-
     def add(self, x: Float64[Tensor, " s"], y: Float64[Tensor, " s"], late: bool) -> None:
         self.full, self.diagonal = torch.cat([self.full, x]), torch.cat([self.diagonal, y])
-        self.late = late and self.count >= self.settings.min_probes
-        if self.late or self.count == self.samples:
+        self.late = late and self.count >= self.first
+        if self.late:
             self.open = False
-        elif self.count == self.looks.next and not self.samples:
+        elif self.count == self.looks.next:
             self.open = not self.looks.end(self.count, self.estimate().reason == "tolerance")
 
     def estimate(self) -> TraceEstimate:
@@ -105,7 +104,7 @@ class _Block:
         error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.mean))
         # the slope of the control variate is one more number that the samples had to give
         quantile = float(student.ppf((1 + settings.confidence) / 2, self.count - 2))
-        half = quantile * error * (WIDENING if settings.adaptive and not self.samples else 1.0)
+        half = quantile * error * (WIDENING if settings.adaptive and self.first < self.most else 1.0)
         reason: StopReason = "time budget" if self.late else "matvec budget"
         if settings.reached(value, value - half, value + half):
             reason = "tolerance"
@@ -131,12 +130,22 @@ def _sample(
     objective: SceneObjective, generator: torch.Generator, names: list[str], count: int
 ) -> tuple[Float64[Tensor, "b s"], Float64[Tensor, "b s"]]:
     """x and y of the named blocks for so many draws of signs, which are the same whatever the names and the count are."""
-    p = objective.active.flat.numel()
-    draws = [draw_probes(p, 1, generator, objective.active.flat.dtype, "rademacher")[:, 0] for _ in range(count)]
-    U = torch.zeros(p, len(names), count, dtype=draws[0].dtype)
-    for i, name in enumerate(names):
-        rows = objective.blocks[name]
-        U[rows, i] = torch.stack([z[rows] for z in draws], dim=1)
-    views = [torch.stack(view.loss_curvatures(U.flatten(1))) for view in objective.linearized]
-    x, y = objective.mean(torch.stack(views).sum(dim=0))
+    seeds = torch.randint(2**62, (count,), generator=generator).tolist()
+    total = torch.zeros(2, len(names) * count, dtype=torch.float64)
+    for view, held in zip(objective.view_numbers, objective.linearized, strict=True):
+        U = _signs(objective, [seed + view for seed in seeds], names)
+        total += torch.stack(held.loss_curvatures(U.flatten(1)))
+    x, y = objective.mean(total)
     return x.view(len(names), count), y.view(len(names), count)
+
+
+def _signs(objective: SceneObjective, seeds: list[int], names: list[str]) -> Float[Tensor, "p b s"]:
+    """A draw of signs for each seed, in as many vectors as blocks."""
+    p, dtype = objective.active.flat.numel(), objective.active.flat.dtype
+    U = torch.zeros(p, len(names), len(seeds), dtype=dtype)
+    for j, seed in enumerate(seeds):
+        z = draw_probes(p, 1, torch.Generator().manual_seed(seed), dtype, "rademacher")[:, 0]
+        for i, name in enumerate(names):
+            rows = objective.blocks[name]
+            U[rows, i, j] = z[rows]
+    return U
