@@ -58,23 +58,32 @@ def feed_pair(x, y, top, row, shape, taps, b0, b1, b2, ring):
 
 
 @formula
+def pair_slopes(m, p, mean, variance):
+    """1 - S, and what is blurred for the gradients in r (2) and in a (2)."""
+    w = p - m * m
+    r1 = 1.0 / (2.0 * mean * mean + 0.5 * m * m + C1)
+    r2 = 1.0 / (2.0 * variance + 0.5 * w + C2)
+    far, apart = m * m * r1, w * r2
+    l, s = 1.0 - far, 1.0 - apart
+    dp, dv = l * (1.0 - 0.5 * apart) * r2, -2.0 * l * apart * r2
+    in_m = m * (s * (2.0 - far) * r1 - 2.0 * dp)
+    in_mean = -4.0 * s * far * mean * r1 - 2.0 * (mean - CENTRE) * dv
+    return far + apart - far * apart, in_m, dp, in_mean, dv
+
+
+@formula
 def differentiate_pair(ring, row, shape, taps, b0, b1, b2, b3, values, slopes):
     """Stage two: the derivatives of 1 - S at a row, blurred along it; the sum of 1 - S."""
     _height, width, _plane_rows, stride = shape
     for i in range(0, stride, lanes(ring)):
         m, p = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
         mean, variance = moments_down(ring, 2, 3, row, i, stride, taps)
-        w = p - m * m
-        r1 = 1.0 / (2.0 * mean * mean + 0.5 * m * m + C1)
-        r2 = 1.0 / (2.0 * variance + 0.5 * w + C2)
-        far, apart = m * m * r1, w * r2
-        l, s = 1.0 - far, 1.0 - apart
-        dp, dv = l * (1.0 - 0.5 * apart) * r2, -2.0 * l * apart * r2
-        store(values, BORDER + i, far + apart - far * apart)
-        store(b0, BORDER + i, m * (s * (2.0 - far) * r1 - 2.0 * dp))
-        store(b1, BORDER + i, dp)
-        store(b2, BORDER + i, -4.0 * s * far * mean * r1 - 2.0 * (mean - CENTRE) * dv)
-        store(b3, BORDER + i, dv)
+        distance, in_m, in_p, in_mean, in_variance = pair_slopes(m, p, mean, variance)
+        store(values, BORDER + i, distance)
+        store(b0, BORDER + i, in_m)
+        store(b1, BORDER + i, in_p)
+        store(b2, BORDER + i, in_mean)
+        store(b3, BORDER + i, in_variance)
     blur_along(b0, width, stride, taps, slopes, ring_row(0, row, stride))
     blur_along(b1, width, stride, taps, slopes, ring_row(1, row, stride))
     blur_along(b2, width, stride, taps, slopes, ring_row(2, row, stride))

@@ -9,6 +9,7 @@ duals, its Jacobian; applied to the adjoint of a function, its Hessian.  Branche
     dual(x, dx)         value_of(x)         tangent_of(x)        value_of takes floats too
     variable(a, x, i)   x, whose derivative is 1 in direction i and 0 in the others; a: an array of the tangents' dtype
     sqrt(x), exp(x)     of floats and duals
+    select(c, x, y)     x where c holds, else y, of floats and duals: for formulas that other compilers take, too (`traced.py`)
 """
 
 # pyright: reportOptionalCall=false
@@ -21,6 +22,7 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin, models, register_model
 
+from splat.raster.compositing import formula
 from splat.raster.simd import VectorType, intrinsic
 
 CONTRACT = ("contract",)
@@ -215,6 +217,11 @@ def _unary(llvm_name, derivative):
 
     typed.__name__ = llvm_name
     return intrinsic(typed)
+
+
+@formula
+def select(condition, x, y):
+    return x if condition else y
 
 
 sqrt = _unary("sqrt", lambda e, x, root: e.builder.fdiv(x.type(0.5), root))

@@ -87,18 +87,50 @@ def similarity(m, p, q, mu, var):
 
 
 @formula
-def store_second(second, at, size, far, apart, dl, sm, sp, sq, mean, centred, r1, r2):
-    """The SECONDS second derivatives of S at a row."""
+def slopes_of(found):
+    """1 - S, and S_m, S_p, S_q, from `similarity`."""
+    far, apart, dl, sm, sp, sq, _mean, _centred, _r1, _r2 = found
+    l = 1.0 - far
+    return far + apart - far * apart, dl * (1.0 - apart) + l * sm, l * sp, l * sq
+
+
+@formula
+def seconds_of(found):
+    """The SECONDS second derivatives of S, from `similarity`."""
+    far, apart, dl, sm, sp, sq, mean, centred, r1, r2 = found
     l, s = 1.0 - far, 1.0 - apart
     ddl = -((2.0 * l + 4.0 * mean * dl) * r1)
     smm, smp = (2.0 * s + 4.0 * centred * sm) * r2, (2.0 * centred * sp - sm) * r2
     smq = 2.0 * (centred * sq - sm) * r2
-    store(second, at, ddl * s + 2.0 * dl * sm + l * smm)
-    store(second, size + at, dl * sp + l * smp)
-    store(second, 2 * size + at, dl * sq + l * smq)
-    store(second, 3 * size + at, -2.0 * l * sp * r2)
-    store(second, 4 * size + at, -(l * (sq + 2.0 * sp) * r2))
-    store(second, 5 * size + at, -4.0 * l * sq * r2)
+    return (
+        ddl * s + 2.0 * dl * sm + l * smm,
+        dl * sp + l * smp,
+        dl * sq + l * smq,
+        -2.0 * l * sp * r2,
+        -(l * (sq + 2.0 * sp) * r2),
+        -4.0 * l * sq * r2,
+    )
+
+
+@formula
+def bent(second, dm, dp, dq):
+    """S_m', S_p', S_q': the second derivatives applied to m', p', q'."""
+    mm, mp, mq, pp, pq, qq = second
+    return mm * dm + mp * dp + mq * dq, mp * dm + pp * dp + pq * dq, mq * dm + pq * dp + qq * dq
+
+
+@formula
+def spread(residual, aim, bm, bp, bq):
+    """blur(S_m) + 2 r blur(S_p) + (y - c) blur(S_q), or the same of other fields; aim: y - c."""
+    return bm + 2.0 * residual * bp + aim * bq
+
+
+@formula
+def own_bend(second, blurred_sp, residual, aim):
+    """The diagonal of the Hessian of sum S, from its second derivatives blurred by the squared window."""
+    mm, mp, mq, pp, pq, qq = second
+    coupled = mm + 4.0 * residual * (mp + residual * pp + aim * pq) + aim * (2.0 * mq + aim * qq)
+    return coupled + 2.0 * blurred_sp
 
 
 @formula
@@ -155,7 +187,7 @@ def value_rows(start, stop, shape, taps, r, y, target, kind, eps, structural, pi
                 m, p = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
                 q = blur_down(ring, 2, row, i, stride, taps)
                 found = similarity(m, p, q, load(target, at + i), load(target, size + at + i))
-                store(values, BORDER + i, found[0] + found[1] - found[0] * found[1])
+                store(values, BORDER + i, slopes_of(found)[0])
             distances[channel * height + row] = row_sum(values, width)
 
 
@@ -170,14 +202,19 @@ def differentiate_row(ring, row, at, size, shape, taps, target, second, inside, 
         m, p = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
         q = blur_down(ring, 2, row, i, stride, taps)
         found = similarity(m, p, q, load(target, at + i), load(target, size + at + i))
-        far, apart, dl, sm, sp, sq, mean, centred, r1, r2 = found
-        l = 1.0 - far
-        store(values, BORDER + i, far + apart - far * apart)
-        store(b0, BORDER + i, dl * (1.0 - apart) + l * sm)
-        store(b1, BORDER + i, l * sp)
-        store(b2, BORDER + i, l * sq)
+        distance, sm, sp, sq = slopes_of(found)
+        store(values, BORDER + i, distance)
+        store(b0, BORDER + i, sm)
+        store(b1, BORDER + i, sp)
+        store(b2, BORDER + i, sq)
         if inside and second.size:
-            store_second(second, at + i, size, far, apart, dl, sm, sp, sq, mean, centred, r1, r2)
+            mm, mp, mq, pp, pq, qq = seconds_of(found)
+            store(second, at + i, mm)
+            store(second, size + at + i, mp)
+            store(second, 2 * size + at + i, mq)
+            store(second, 3 * size + at + i, pp)
+            store(second, 4 * size + at + i, pq)
+            store(second, 5 * size + at + i, qq)
     blur_three(b0, b1, b2, width, stride, taps, slopes, row)
     return row_sum(values, width)
 
@@ -227,7 +264,7 @@ def gradient_rows(
                 if structural != 0:
                     bm, bp = blur_down(slopes, 0, row, i, stride, taps), blur_down(slopes, 1, row, i, stride, taps)
                     bq = blur_down(slopes, 2, row, i, stride, taps)
-                    slope -= structural * (bm + 2.0 * residual * bp + (load(y, at + i) - CENTRE) * bq)
+                    slope -= structural * spread(residual, load(y, at + i) - CENTRE, bm, bp, bq)
                     if blurred_sp.size:
                         store(blurred_sp, at + i, bp)
                 store(gradient, at + i, slope)
@@ -244,9 +281,10 @@ def curve_row(ring, row, at, size, width, stride, taps, second, b0, b1, b2, slop
         dq = blur_down(ring, 2, row, i, stride, taps)
         mm, mp, mq = load(second, at + i), load(second, size + at + i), load(second, 2 * size + at + i)
         pp, pq, qq = load(second, 3 * size + at + i), load(second, 4 * size + at + i), load(second, 5 * size + at + i)
-        store(b0, BORDER + i, mm * dm + mp * dp + mq * dq)
-        store(b1, BORDER + i, mp * dm + pp * dp + pq * dq)
-        store(b2, BORDER + i, mq * dm + pq * dp + qq * dq)
+        sm, sp, sq = bent((mm, mp, mq, pp, pq, qq), dm, dp, dq)
+        store(b0, BORDER + i, sm)
+        store(b1, BORDER + i, sp)
+        store(b2, BORDER + i, sq)
     blur_three(b0, b1, b2, width, stride, taps, slopes, row)
 
 
@@ -283,8 +321,8 @@ def product_rows(start, stop, shape, taps, v, r, y, kind, eps, pixel, structural
                 if structural != 0:
                     bm, bp = blur_down(slopes, 0, row, i, stride, taps), blur_down(slopes, 1, row, i, stride, taps)
                     bq = blur_down(slopes, 2, row, i, stride, taps)
-                    bent = 2.0 * (residual * bp + tangent * load(blurred_sp, at + i))
-                    total -= structural * (bm + bent + (load(y, at + i) - CENTRE) * bq)
+                    turned = spread(residual, load(y, at + i) - CENTRE, bm, bp, bq)
+                    total -= structural * (turned + 2.0 * tangent * load(blurred_sp, at + i))
                 store(product, at + i, total)
             for i in range(width, stride):
                 product[at + i] = 0
@@ -322,8 +360,8 @@ def diagonal_rows(start, stop, shape, taps, r, y, kind, eps, pixel, structural, 
                     mm, mp = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
                     mq, pp = blur_down(ring, 2, row, i, stride, taps), blur_down(ring, 3, row, i, stride, taps)
                     pq, qq = blur_down(ring, 4, row, i, stride, taps), blur_down(ring, 5, row, i, stride, taps)
-                    coupled = mm + 4.0 * residual * (mp + residual * pp + aim * pq) + aim * (2.0 * mq + aim * qq)
-                    total -= structural * (coupled + 2.0 * load(blurred_sp, at + i))
+                    second_here = (mm, mp, mq, pp, pq, qq)
+                    total -= structural * own_bend(second_here, load(blurred_sp, at + i), residual, aim)
                 store(diagonal, at + i, total)
             for i in range(width, stride):
                 diagonal[at + i] = 0

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splat.dual import exp, sqrt, value_of
+from splat.dual import exp, select, sqrt, value_of
 from splat.harmonics import Y00, Y1, Y2A, Y2B, Y2C, Y3A, Y3B, Y3C, Y3D
 from splat.raster.compositing import formula
 
@@ -87,11 +87,8 @@ def offset_from(lens, mean):
 @formula
 def clamped(x, limit):
     """x clamped to [-limit, limit]; duals lose their tangent where the clamp holds."""
-    if value_of(x) > limit:
-        return x * 0.0 + limit
-    if value_of(x) < -limit:
-        return x * 0.0 - limit
-    return x
+    below = select(value_of(x) < -limit, x * 0.0 - limit, x)
+    return select(value_of(x) > limit, x * 0.0 + limit, below)
 
 
 @formula
@@ -176,10 +173,8 @@ def geometry_adjoint(lens, mean, log_scales, quat, bar):
     along_x, along_y = scaled(r1_bar, (shrink * lens.fx) * depth), scaled(r2_bar, (shrink * lens.fy) * depth)
     row_z = (m0[2], m1[2], m2[2])
     u_bar, v_bar = -dot(along_x, row_z), -dot(along_y, row_z)
-    if abs(value_of(x * depth)) > lens.limit_x:
-        u_bar = u_bar * 0.0
-    if abs(value_of(y * depth)) > lens.limit_y:
-        v_bar = v_bar * 0.0
+    u_bar = select(abs(value_of(x * depth)) > lens.limit_x, u_bar * 0.0, u_bar)
+    v_bar = select(abs(value_of(y * depth)) > lens.limit_y, v_bar * 0.0, v_bar)
     x_bar, y_bar = (lens.fx * bar[0] + u_bar) * depth, (lens.fy * bar[1] + v_bar) * depth
     z_bar = -((dot(r1_bar, r1) + dot(r2_bar, r2)) * depth) - (x * x_bar + y * y_bar) * depth
     mean_bar = to_world(lens, (x_bar, y_bar, z_bar))
