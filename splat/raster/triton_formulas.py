@@ -19,8 +19,10 @@ from typing import Any
 import triton
 import triton.language as tl
 from triton import knobs
+from triton.language.standard import _elementwise_max, _sum_combine
 
 INTERPRETED = knobs.runtime.interpret
+static_range: Any = tl.static_range  # a loop that is unrolled; typed as what kernels see of it
 
 
 def jit(function: Callable) -> Any:
@@ -60,7 +62,24 @@ def _meaning(name: str, names: dict[str, Any]) -> Any:
     value = names[name]
     if isinstance(value, bool | int | float):
         return value if INTERPRETED else tl.constexpr(value)
+    if not isinstance(getattr(value, "py_func", value), FunctionType):
+        raise TypeError(
+            f"expected a formula's names to be formulas, numbers or in MEANING, got {name}; give it a meaning"
+        )
     return twin(value)
+
+
+# --- reductions: `tl.sum` and `tl.max` are jitted functions themselves, which the interpreter would take its time over ------
+
+
+@device
+def sum_over(x, axis: tl.constexpr):
+    return tl.reduce(x, axis, _sum_combine)
+
+
+@device
+def max_over(x, axis: tl.constexpr):
+    return tl.reduce(x, axis, _elementwise_max)
 
 
 # --- what the names of the formulas mean ------------------------------------------------------------------------------
@@ -118,6 +137,21 @@ def log2(x):
     return tl.log2(x)
 
 
+@device
+def ceil(x):
+    return tl.ceil(x)
+
+
+@device
+def floor(x):
+    return tl.floor(x)
+
+
+@device
+def truncated(x):
+    return x.to(tl.int32)
+
+
 MEANING: dict[str, Any] = {
     "fma": fma,
     "select": select,
@@ -131,4 +165,7 @@ MEANING: dict[str, Any] = {
     "log": log,
     "exp2": exp2,
     "log2": log2,
+    "ceil": ceil,
+    "floor": floor,
+    "int": truncated,
 }

@@ -1,0 +1,232 @@
+"""The compositing of splats on the GPU: a view held still, with the interface of `cpu.Raster` for tensors.
+
+`CudaRaster` has done all that depends on the splats alone (order, tile lists, final transmittances, stops); its methods are
+passes over the pixels.  Images are planes without padding, (planes, height, width), contiguous, in the precision of the pixels
+(that of `depths`); a splat is nine numbers (`packing.py`), in double precision.
+
+deterministic: sums go through slots and are added in a fixed order, so every result is the same to the last bit from run to
+run; otherwise entries are added atomically to their splats as they come, which is faster and takes less memory.
+
+Two sizes are read back by the constructor, a third by the first derivative in deterministic mode; no later call waits for the
+device.  Everything runs on the current stream of the splats' device; without a GPU, on the CPU by Triton's interpreter.
+"""
+
+from math import inf, log2
+
+import torch
+import triton
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splat.raster import cuda_binning, cuda_compositing, cuda_packing
+from splat.raster.cuda_binning import HEIGHT, WIDTH, Slots, grid
+from splat.settings import RenderSettings
+
+LEAST_TRANSMITTANCE = {torch.float32: 1e-30, torch.float64: 1e-290}  # beneath it T would underflow
+LEAST_LOG2_ALPHA = {torch.float32: -126.0, torch.float64: -1022.0}  # the range of exp2
+TOGETHER = 4  # tangents that one launch has in registers
+TILE = {"WIDTH": WIDTH, "HEIGHT": HEIGHT}
+LAUNCH = {"num_warps": 1, "enable_fp_fusion": True}
+BLOCK = 128  # splats a program of the kernels that run over splats
+SPLATS = {"BLOCK": BLOCK, "num_warps": 4, "enable_fp_fusion": True}
+ROWS = 8  # splats whose slots a program sums
+
+
+class CudaRaster:
+    """One view of one set of splats, composited and held still.
+
+    splats: (n, 9), finite, in double precision; depths: (n,) positive where drawn, in the precision of the pixels.  With
+    transmittance_min = 0 a pixel still stops at LEAST_TRANSMITTANCE.  planes: red, green, blue and accumulated alpha.
+    """
+
+    def __init__(
+        self,
+        splats: Float[Tensor, "n 9"],
+        depths: Float[Tensor, "n"],
+        drawn: Bool[Tensor, "n"],
+        background: Float[Tensor, "3"],
+        width: int,
+        height: int,
+        settings: RenderSettings,
+        deterministic: bool = True,
+    ):
+        self.splats, self.dtype, self.device = splats.double().contiguous(), depths.dtype, splats.device
+        self.width, self.height, self.deterministic = width, height, deterministic
+        n = len(splats)
+        self.frame = _frame(background, settings, self.dtype, self.device)
+        self.lists = cuda_binning.bin_splats(self.splats, depths, drawn, width, height, self.frame)
+        self.params = self._empty(n, cuda_packing.PARAMS)
+        if n:
+            cuda_packing.pack_splats[grid(n, BLOCK)](self.splats, self.frame, self.params, n, **SPLATS)
+        self.planes = self._empty(4, height, width)
+        self._transmittance, self._stop = self._empty(height, width), self._empty(height, width, dtype=torch.int32)
+        self._reached = self._empty(len(self.lists.start) - 1, dtype=torch.int32)
+        self._order = _heaviest_first(self.lists.start.diff())
+        self._launch(
+            cuda_compositing.forward, self.lists.start, self.lists.splat, self.params, self.frame, self.planes,
+            self._transmittance, self._stop, self._reached,
+        )  # fmt: skip
+        self._order = _heaviest_first(self._reached)
+        self._slots: Slots | None = None
+
+    def _empty(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
+        return torch.empty(shape, dtype=dtype or self.dtype, device=self.device)
+
+    def _launch(self, kernel, *arguments, **constants) -> None:
+        """A kernel on every tile, heaviest first."""
+        columns = -(-self.width // WIDTH)
+        kernel[(len(self._order),)](
+            self._order, *arguments, columns, self.width, self.height, **constants, **TILE, **LAUNCH
+        )
+
+    @property
+    def entries(self) -> int:
+        """How many entries the tile lists have: splats in tiles."""
+        return len(self.lists.splat)
+
+    @property
+    def slots(self) -> Slots:
+        """Where the sums of the entries go that some pixel reaches; in deterministic mode."""
+        if self._slots is None:
+            self._slots = cuda_binning.number_slots(self.lists, self._reached)
+        return self._slots
+
+    @property
+    def touched(self) -> Int[Tensor, "m"]:
+        """The splats that have entries that some pixel reaches; reads their number back."""
+        kept = cuda_binning.kept_entries(self.lists, self._reached)
+        count = torch.zeros(len(self.splats), dtype=torch.int32, device=self.device)
+        return count.index_add_(0, self.lists.splat, kept.to(torch.int32)).nonzero()[:, 0]
+
+    @property
+    def bytes(self) -> int:
+        """Memory of what is held."""
+        tensors = [self.splats, self.params, *self.lists, self.planes, self._transmittance, self._stop, self._reached]
+        tensors += [] if self._slots is None else self._slots[:3]
+        return sum(tensor.nbytes for tensor in tensors)
+
+    def crop(self, planes: Float[Tensor, "*planes h w"]) -> Float[Tensor, "*planes h w"]:
+        """The planes themselves: they have no padding here."""
+        return planes
+
+    def pad(self, planes: Float[Tensor, "*planes h w"]) -> Float[Tensor, "*planes h w"]:
+        """Planes as the kernels take them: contiguous, in the precision of the pixels."""
+        return planes.to(self.dtype).contiguous()
+
+    def totals(self, kernel, vectors: int, width: int, *arguments, **constants) -> Float[Tensor, "n vectors width"]:
+        """The totals over every splat's entries of a kernel that leaves `vectors` times `width` sums an entry.
+
+        Its first arguments are those of `backward`, its last the sums.
+        """
+        n = len(self.splats)
+        count = self.slots.count if self.deterministic else n
+        sums = (
+            self._empty(count, vectors, width)
+            if self.deterministic
+            else torch.zeros(n, vectors, width, dtype=self.dtype, device=self.device)
+        )
+        self._launch(
+            kernel, self.lists.start, self._reached, self.lists.splat,
+            self.slots.slot if self.deterministic else self.lists.splat, self.params, self.frame, self._transmittance,
+            self._stop, *arguments, sums, ATOMIC=not self.deterministic, **constants,
+        )  # fmt: skip
+        if not self.deterministic or not n:
+            return sums
+        totals = self._empty(n, vectors, width, dtype=torch.float64)
+        cuda_packing.sum_slots[(*grid(n, ROWS), vectors)](
+            self.slots.first, self.slots.last, sums, totals, n, vectors,
+            WIDTH=width, PADDED=triton.next_power_of_2(width), BLOCK=ROWS, num_warps=1,
+        )  # fmt: skip
+        return totals
+
+    def backward(self, cotangent: Float[Tensor, "4 h w"]) -> "CudaAdjoint":
+        """The gradient in the splats from cotangent planes."""
+        return CudaAdjoint(self, cotangent)
+
+    def jvp(self, directions: Float[Tensor, "n K 9"]) -> "CudaTangent":
+        """J u for directions of the splats."""
+        return CudaTangent(self, directions)
+
+
+def _frame(background: Tensor, settings: RenderSettings, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """What all pixels share, in double precision (`cuda_packing`)."""
+    least = max(log2(settings.alpha_min) if settings.alpha_min else -inf, LEAST_LOG2_ALPHA[dtype])
+    contour = inf if settings.contour_sigma is None else settings.contour_sigma
+    free = inf if settings.gradient_through_cap else settings.alpha_max
+    floor = max(settings.transmittance_min, LEAST_TRANSMITTANCE[dtype])
+    numbers = [settings.alpha_min, contour, least, settings.alpha_max, free, floor]
+    shared = torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
+    return torch.cat([shared, background.to(device, torch.float64)])
+
+
+def _heaviest_first(work: Int[Tensor, "tiles"]) -> Int[Tensor, "tiles"]:
+    """Tiles with the most work first, so that the last programs to start are short."""
+    return torch.argsort(work, descending=True, stable=True).to(torch.int32)
+
+
+class CudaAdjoint:
+    """The first-order adjoint of the splats: `gradient` (n, 9), `moments` S, Su, Sv (n, 3), and the cotangent it came from."""
+
+    def __init__(self, raster: CudaRaster, cotangent: Float[Tensor, "4 h w"]):
+        n, self.cotangent = len(raster.splats), raster.pad(cotangent)
+        self.totals = raster.totals(cuda_compositing.backward, 1, cuda_packing.SUMS, self.cotangent)[:, 0]
+        self.gradient = torch.empty_like(raster.splats)
+        if n:
+            cuda_packing.reduce_gradient[grid(n, BLOCK)](raster.splats, self.totals, self.gradient, n, **SPLATS)
+
+    @property
+    def moments(self) -> Float[Tensor, "n 3"]:
+        return self.totals[:, :3]
+
+
+class CudaTangent:
+    """J u of K directions: `planes` (K, 4, h, w), and what the second-order pass needs of it."""
+
+    def __init__(self, raster: CudaRaster, directions: Float[Tensor, "n K 9"]):
+        self.raster, self.directions = raster, directions.double().contiguous()
+        n, K = directions.shape[:2]
+        self.planes = raster._empty(K, 4, raster.height, raster.width)
+        self._transmittances = raster._empty(K, raster.height, raster.width)
+        self._packed: list[Tensor] = []
+        for part in _parts(K):
+            size = part.stop - part.start
+            packed = raster._empty(n, size, cuda_packing.TANGENTS)
+            if n:
+                cuda_packing.pack_tangents[(*grid(n, BLOCK), size)](
+                    raster.splats, self.directions, packed, n, K, part.start, size, **SPLATS
+                )
+            raster._launch(
+                cuda_compositing.tangent, raster.lists.start, raster._reached, raster.lists.splat, raster.params,
+                raster.frame, raster._stop, packed, self.planes[part], self._transmittances[part], K=size,
+            )  # fmt: skip
+            self._packed.append(packed)
+
+    def curvature(self, adjoint: CudaAdjoint, cotangents: Float[Tensor, "K 4 h w"]) -> Float[Tensor, "n K 9"]:
+        """The tangent of `CudaRaster.backward` along the directions.
+
+        cotangents: the tangents of the adjoint's cotangent; 0 for the second derivative of the compositing alone.
+        """
+        raster, (n, K) = self.raster, self.directions.shape[:2]
+        cotangents, product = raster.pad(cotangents), torch.empty_like(self.directions)
+        for packed, part in zip(self._packed, _parts(K), strict=True):
+            size = part.stop - part.start
+            totals = raster.totals(
+                cuda_compositing.curvature, size, cuda_packing.SUMS, adjoint.cotangent, packed,
+                self._transmittances[part], cotangents[part], K=size,
+            )  # fmt: skip
+            if n:
+                cuda_packing.reduce_curvature[(*grid(n, BLOCK), size)](
+                    raster.splats, self.directions, adjoint.totals, totals, product, n, K, part.start, size, **SPLATS
+                )
+        return product
+
+
+def _parts(K: int) -> list[slice]:
+    """K tangents in parts of TOGETHER, the rest in smaller powers of 2."""
+    parts, start, size = [], 0, TOGETHER
+    while start < K:
+        while size > K - start:
+            size //= 2
+        parts.append(slice(start, start + size))
+        start += size
+    return parts

@@ -1,0 +1,323 @@
+"""The compositing kernels on the GPU: `compositing.py`, whose glossary and formulas hold here, in Triton.
+
+A program has one tile of WIDTH x HEIGHT pixels and goes through its entries one by one; a warp has 256 pixels, eight a thread.
+Why so few threads: the nine sums of an entry over a tile cost a warp some ninety instructions whatever the tile's size, and
+warps that share a tile would have to wait for one another at every entry.  A thread's eight pixels are independent, which
+hides the latency that more warps would.  K tangents are the first axis of every array, in registers, so that K = 1 and
+K = 4 are one code and the primal quantities of an entry are computed once for all K.
+
+An entry's numbers are the same for all threads: the loads are uniform, from a cache line of 64 bytes a splat.
+
+The sums: in deterministic mode every entry writes to its own slot, to be summed in a fixed order (`cuda_packing.sum_slots`);
+in the other, entries add atomically to their splat, in whatever order they come.
+
+Decisions are those of the CPU up to the last bits of l and alpha: the exponential is the hardware's (2 units in the last
+place), u and v are rounded at other places.
+"""
+
+import triton.language as tl
+
+from splat.raster import compositing
+from splat.raster.cuda_packing import (
+    ACROSS,
+    ALONG,
+    ALPHA_MAX,
+    BACKGROUND,
+    CAP,
+    CUT,
+    FLOOR,
+    LO,
+    RED,
+    SHEAR,
+    SHEAR_REST,
+    U,
+    V,
+    X,
+    Y,
+)
+from splat.raster.triton_formulas import device, fma, jit, max_over, static_range, sum_over, twins
+
+NEVER = tl.constexpr(2**31 - 1)  # the stop index of a pixel that does not stop
+CHUNK = tl.constexpr(16)  # entries between two looks whether all pixels of a tile have stopped
+
+alpha_row, quadratic, along_row, plus, behind_all = twins(
+    compositing.alpha_row, compositing.quadratic, compositing.along_row, compositing.plus, compositing.behind_all
+)
+step_back, step_tangent, step_curvature, row_terms, column_terms = twins(
+    compositing.step_back,
+    compositing.step_tangent,
+    compositing.step_curvature,
+    compositing.row_terms,
+    compositing.column_terms,
+)
+
+
+# --- what the kernels share -------------------------------------------------------------------------------------------
+
+
+@device
+def pixels_of(tile, columns, width, height, WIDTH, HEIGHT):
+    """A tile's first pixel, its pixels' offsets from there, their indices in a plane, and whether they are in the image."""
+    x0, y0 = tile % columns * WIDTH, tile // columns * HEIGHT
+    x, y = tl.arange(0, WIDTH)[None, None, :], tl.arange(0, HEIGHT)[None, :, None]
+    inside = (x0 + x < width) & (y0 + y < height)
+    return x0, y0, x, y, (y0 + y) * width + (x0 + x), inside
+
+
+@device
+def exponent_terms(params, x0, y0, x, y):
+    """u of a tile's columns, v of its pixels, and what log2 alpha is made of: `alpha_terms` and `row_v` of the CPU.
+
+    Between pixels offsets are exact, so what the first fma leaves of a needle's v has its digits.
+    """
+    along, across, shear = tl.load(params + ALONG), tl.load(params + ACROSS), tl.load(params + SHEAR)
+    dx, dy = x0 - tl.load(params + X), y0 - tl.load(params + Y)
+    u = fma(x, along, fma(along, dx, tl.load(params + U)))
+    corner = fma(across, fma(tl.load(params + SHEAR_REST), dx, fma(shear, dx, dy)), tl.load(params + V))
+    v = fma(y, across, fma(x, across * shear, corner))
+    return u, v, (v, across, fma(-u, u, tl.load(params + LO)), tl.load(params + CUT))
+
+
+@device
+def load3(array, at):
+    return tl.load(array + at), tl.load(array + at + 1), tl.load(array + at + 2)
+
+
+@device
+def load_planes(planes, p, size, inside):
+    """Four planes of a tile, 0 outside the image."""
+    return (
+        tl.load(planes + p, inside, other=0.0),
+        tl.load(planes + size + p, inside, other=0.0),
+        tl.load(planes + 2 * size + p, inside, other=0.0),
+        tl.load(planes + 3 * size + p, inside, other=0.0),
+    )
+
+
+@device
+def store_planes(planes, p, size, image, alpha, inside):
+    tl.store(planes + p, image[0], inside)
+    tl.store(planes + size + p, image[1], inside)
+    tl.store(planes + 2 * size + p, image[2], inside)
+    tl.store(planes + 3 * size + p, alpha, inside)
+
+
+@device
+def any_lit(g):
+    """Whether a cotangent's four planes are not all exactly 0 in a tile; NaN is not 0."""
+    lit = (g[0] != 0) | (g[1] != 0) | (g[2] != 0) | (g[3] != 0)
+    return max_over(max_over(max_over(lit.to(tl.int32), 2), 1), 0) > 0
+
+
+@device
+def nine_sums(v, u, s, w, h):
+    """The nine sums over a tile, (K, 16) with zeros after them: over the rows of each column first."""
+    rows = row_terms(v, s, w, h)
+    columns = (
+        sum_over(rows[0], 1),
+        sum_over(rows[1], 1),
+        sum_over(rows[2], 1),
+        sum_over(rows[3], 1),
+        sum_over(rows[4], 1),
+        sum_over(rows[5], 1),
+    )
+    nine = column_terms(columns, sum_over(u, 1))
+    j = tl.arange(0, 16)[None, :]
+    total = tl.where(j == 0, sum_over(nine[0], 1)[:, None], 0.0)
+    for i in static_range(1, 9):
+        total = tl.where(j == i, sum_over(nine[i], 1)[:, None], total)
+    return total
+
+
+@device
+def put_sums(sums, at, total, K: tl.constexpr, ATOMIC: tl.constexpr):
+    """Write or add an entry's sums, K times nine from at * K * 9."""
+    j, k = tl.arange(0, 16)[None, :], tl.arange(0, K)[:, None]
+    place = sums + (at.to(tl.int64) * K + k) * 9 + j
+    if ATOMIC:
+        tl.atomic_add(place, total, (j < 9) & (k < K), sem="relaxed")
+    else:
+        tl.store(place, total, (j < 9) & (k < K))
+
+
+@device
+def clear_slots(slots, first, count, sums, WIDTH: tl.constexpr):
+    """Zeros for the sums, WIDTH an entry, of a tile's entries."""
+    j = tl.arange(0, 16)
+    for e in range(first, first + count):
+        at = tl.load(slots + e).to(tl.int64) * WIDTH
+        for start in range(0, WIDTH, 16):
+            tl.store(sums + at + start + j, tl.zeros((16,), sums.dtype.element_ty), start + j < WIDTH)
+
+
+# --- forward and backward ---------------------------------------------------------------------------------------------
+
+
+@jit
+def forward(
+    order, start, splat_of, params, frame, planes, transmittance, stop, reached, columns, width, height,
+    WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
+):  # fmt: skip
+    """Render planes (4, h, w), the final T and the entry at which each pixel stopped; how many entries each tile reached."""
+    real: tl.constexpr = params.dtype.element_ty
+    tile = tl.load(order + tl.program_id(0))
+    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
+    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    cap, floor = tl.load(frame + ALPHA_MAX).to(real), tl.load(frame + FLOOR).to(real)
+    first = tl.load(start + tile)
+    count = tl.load(start + tile + 1) - first
+    T = tl.where(inside, 1.0, -1.0).to(real)  # negative once stopped
+    stopped = tl.where(inside, NEVER, 0)
+    zero = tl.zeros((1, HEIGHT, WIDTH), real)
+    red, green, blue = zero, zero, zero
+    done = 0
+    while done < count:
+        for k in range(done, tl.minimum(done + CHUNK, count)):
+            splat = params + tl.load(splat_of + first + k).to(tl.int64) * 16
+            _u, v, terms = exponent_terms(splat, x0, y0, x, y)
+            alpha, _uncapped = alpha_row(v, terms, T > 0, cap)
+            w, after = alpha * T, fma(-alpha, T, T)
+            ends = (after < floor) & (T > 0)
+            w, T = tl.where(ends, 0.0, w), tl.where(ends, -T, after)
+            stopped = tl.where(ends, k, stopped)
+            red, green, blue = plus((red, green, blue), w, load3(splat, RED))
+        running = max_over(max_over(max_over(T, 2), 1), 0)
+        done = tl.where(running > 0, done + CHUNK, count)
+    T = tl.abs(T)
+    image = plus((red, green, blue), T, load3(frame, BACKGROUND))
+    size = width * height
+    store_planes(planes, p, size, (image[0].to(real), image[1].to(real), image[2].to(real)), 1.0 - T, inside)
+    tl.store(transmittance + p, T, inside)
+    tl.store(stop + p, stopped, inside)
+    furthest = max_over(max_over(max_over(stopped, 2), 1), 0)
+    tl.store(reached + tile, tl.minimum(count, furthest))
+
+
+@jit
+def backward(
+    order, start, reached, splat_of, slots, params, frame, transmittance, stop, cotangent, sums, columns, width, height,
+    WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
+):  # fmt: skip
+    """The nine sums of every entry or, added up, of every splat, from the cotangent of the planes."""
+    real: tl.constexpr = params.dtype.element_ty
+    tile = tl.load(order + tl.program_id(0))
+    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
+    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
+    first, count = tl.load(start + tile), tl.load(reached + tile)
+    T, g = tl.load(transmittance + p, inside, other=1.0), load_planes(cotangent, p, size, inside)
+    stopped = tl.load(stop + p, inside, other=0)
+    R = T * behind_all(g, load_background(frame, real))
+    if not any_lit(g):
+        if not ATOMIC:
+            clear_slots(slots, first, count, sums, 9)
+        count = 0
+    for back in range(0, count):
+        k = count - 1 - back
+        s_index = tl.load(splat_of + first + k)
+        splat = params + s_index.to(tl.int64) * 16
+        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
+        T, after, w, beta, _r, we = step_back(alpha, T, R, g, load3(splat, RED))
+        s = tl.where(uncapped <= tl.load(splat + CAP), we - beta * R, 0.0)
+        R = after
+        at = s_index if ATOMIC else tl.load(slots + first + k)
+        put_sums(sums, at, nine_sums(v, u, s, w, g), 1, ATOMIC)
+
+
+@device
+def load_background(frame, real: tl.constexpr):
+    background = load3(frame, BACKGROUND)
+    return background[0].to(real), background[1].to(real), background[2].to(real)
+
+
+# --- second order -----------------------------------------------------------------------------------------------------
+
+
+@device
+def tangents_of(tangents, splat, k, K):
+    """K tangents of a splat: the coefficients of q', and of its colour."""
+    at = tangents + (splat.to(tl.int64) * K + k) * 12
+    q = (tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3), tl.load(at + 4), tl.load(at + 5))
+    return q, load3(at, 6)
+
+
+@jit
+def tangent(
+    order, start, reached, splat_of, params, frame, stop, tangents, planes, transmittances, columns, width, height,
+    K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
+):  # fmt: skip
+    """J u for K tangents: their planes (K, 4, h, w) and the tangents of the final transmittance (K, h, w)."""
+    real: tl.constexpr = params.dtype.element_ty
+    tile = tl.load(order + tl.program_id(0))
+    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
+    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
+    first, count = tl.load(start + tile), tl.load(reached + tile)
+    stopped = tl.load(stop + p, inside, other=0)
+    i = tl.arange(0, K)[:, None, None]
+    T = tl.full((1, HEIGHT, WIDTH), 1.0, real)
+    dT = tl.zeros((K, HEIGHT, WIDTH), real)
+    red, green, blue = dT, dT, dT
+    for k in range(0, count):
+        s_index = tl.load(splat_of + first + k)
+        splat = params + s_index.to(tl.int64) * 16
+        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
+        w = alpha * T
+        T = fma(-alpha, T, T)
+        q, dcolour = tangents_of(tangents, s_index, i, K)
+        w_dq = tl.where(uncapped <= tl.load(splat + CAP), w, 0.0) * quadratic(v, along_row(q, u))
+        dT, image = step_tangent(dT, (red, green, blue), alpha, w, w_dq, load3(splat, RED), dcolour)
+        red, green, blue = image
+    at = i * 4 * size + p
+    image = plus((red, green, blue), dT, load_background(frame, real))
+    store_planes(planes, at, size, image, -dT, inside & (i < K))
+    tl.store(transmittances + i * size + p, dT, inside & (i < K))
+
+
+@jit
+def curvature(
+    order, start, reached, splat_of, slots, params, frame, transmittance, stop, cotangent, tangents, transmittances,
+    cotangents, sums, columns, width, height,
+    K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
+):  # fmt: skip
+    """The nine sums of the tangent of `backward`, K times nine an entry or, added up, a splat.
+
+    cotangent: g, 4 planes; cotangents: g' of every tangent, (K, 4, h, w); transmittances: as `tangent` left them.
+    """
+    real: tl.constexpr = params.dtype.element_ty
+    tile = tl.load(order + tl.program_id(0))
+    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
+    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
+    first, count = tl.load(start + tile), tl.load(reached + tile)
+    stopped = tl.load(stop + p, inside, other=0)
+    i = tl.arange(0, K)[:, None, None]
+    T, g = tl.load(transmittance + p, inside, other=1.0), load_planes(cotangent, p, size, inside)
+    dT = tl.load(transmittances + i * size + p, inside & (i < K), other=0.0)
+    dg = load_planes(cotangents, i * 4 * size + p, size, inside & (i < K))
+    background = load_background(frame, real)
+    behind = behind_all(g, background)
+    R = T * behind
+    dR = dT * behind + T * behind_all(dg, background)
+    tau = dT / T
+    if not (any_lit(g) | any_lit(dg)):
+        if not ATOMIC:
+            clear_slots(slots, first, count, sums, 9 * K)
+        count = 0
+    for back in range(0, count):
+        k = count - 1 - back
+        s_index = tl.load(splat_of + first + k)
+        splat = params + s_index.to(tl.int64) * 16
+        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
+        free = uncapped <= tl.load(splat + CAP)
+        colour = load3(splat, RED)
+        T, after, w, beta, r, _we = step_back(alpha, T, R, g, colour)
+        q, dcolour = tangents_of(tangents, s_index, i, K)
+        dq = tl.where(free, quadratic(v, along_row(q, u)), 0.0)
+        tau, dR, ds, h = step_curvature(tau, dR, (dg[0], dg[1], dg[2]), w, beta, r * R, dq, g, colour, dcolour)
+        R = after
+        at = s_index if ATOMIC else tl.load(slots + first + k)
+        put_sums(sums, at, nine_sums(v, u, tl.where(free, ds, 0.0), w, h), K, ATOMIC)

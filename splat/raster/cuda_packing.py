@@ -1,0 +1,146 @@
+"""From splats to what the compositing kernels on the GPU read, and from their sums back to splats: `packing.py` in Triton.
+
+Every thread holds one splat; splats, tangents and totals are in double precision.  A splat's numbers for the kernels are those
+of the CPU but for the mean, of which a pixel near by is kept, and the whitened offset from it: an offset between pixels is a
+whole number, exact in single precision, so the kernels need no double precision to tell what is left of a needle's v.
+
+    X, Y    the pixel nearest to the mean          U, V    the whitened offset of that pixel from the mean
+    CAP     alpha above which derivatives in ln alpha are 0: infinite where the splat cannot reach it
+"""
+
+import triton.language as tl
+
+from splat.raster import packing, whitening
+from splat.raster.cuda_binning import load_splat
+from splat.raster.triton_formulas import device, jit, max_over, static_range, twin, twins
+
+PARAMS = 16
+X, Y, U, V, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT, CAP = (tl.constexpr(i) for i in range(14))
+TANGENTS = 12
+SUMS = 9
+FARTHEST = tl.constexpr(2.0**22)  # a pixel farther out is not exact in single precision
+# what all pixels share, in double precision
+ALPHA_MIN, CONTOUR, LEAST_LOG2_ALPHA, ALPHA_MAX, FREE_CAP, FLOOR = (tl.constexpr(i) for i in range(6))
+BACKGROUND = tl.constexpr(6)
+FRAME = 9
+HALF_LOG2_E = tl.constexpr(whitening.LOG2_E / 2)
+
+whiten = twin(whitening.whitening)
+exponent_tangent, first_order, second_order = twins(packing.exponent_tangent, packing.first_order, packing.second_order)
+
+
+@device
+def nearest(x):
+    return tl.minimum(tl.maximum(tl.floor(x + 0.5), -FARTHEST), FARTHEST)
+
+
+@device
+def load_six(array, at, inside):
+    """Six numbers side by side, in double precision."""
+    return (
+        tl.load(array + at, inside, other=0.0).to(tl.float64),
+        tl.load(array + at + 1, inside, other=0.0).to(tl.float64),
+        tl.load(array + at + 2, inside, other=0.0).to(tl.float64),
+        tl.load(array + at + 3, inside, other=0.0).to(tl.float64),
+        tl.load(array + at + 4, inside, other=0.0).to(tl.float64),
+        tl.load(array + at + 5, inside, other=0.0).to(tl.float64),
+    )
+
+
+@device
+def store_six(array, at, numbers, inside):
+    for j in static_range(6):
+        tl.store(array + at + j, numbers[j], inside)
+
+
+@device
+def copy_colour(target, to, source, at, inside):
+    for j in static_range(6, 9):
+        tl.store(target + to + j, tl.load(source + at + j, inside, other=0.0), inside)
+
+
+@jit
+def pack_splats(splats, frame, params, n, BLOCK: tl.constexpr):
+    """params (n, 16) of splats (n, 9)."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < n
+    splat = load_splat(splats, i, inside)
+    along, across, shear = whiten(splat)
+    mx, my = splat[0] - 0.5, splat[1] - 0.5
+    x, y = nearest(mx), nearest(my)
+    p = params + i.to(tl.int64) * 16
+    tl.store(p + X, x, inside)
+    tl.store(p + Y, y, inside)
+    tl.store(p + U, along * (x - mx), inside)
+    tl.store(p + V, across * (shear * (x - mx) + (y - my)), inside)
+    tl.store(p + ALONG, along, inside)
+    tl.store(p + ACROSS, across, inside)
+    rounded = shear.to(params.dtype.element_ty)
+    tl.store(p + SHEAR, rounded, inside)
+    tl.store(p + SHEAR_REST, shear - rounded.to(tl.float64), inside)
+    opacity = splat[5]
+    level = tl.where(opacity > 0, tl.log2(tl.where(opacity > 0, opacity, 1.0)), float("-inf"))
+    contour = tl.load(frame + CONTOUR)
+    cut = tl.maximum(tl.load(frame + LEAST_LOG2_ALPHA), level - HALF_LOG2_E * contour * contour)
+    cap = tl.load(frame + FREE_CAP)
+    tl.store(p + LO, level, inside)
+    tl.store(p + CUT, cut, inside)
+    tl.store(p + CAP, tl.where(opacity > cap, cap, float("inf")), inside)
+    copy_colour(p, RED - 6, splats, i.to(tl.int64) * 9, inside)
+
+
+@jit
+def pack_tangents(splats, directions, tangents, n, K, begin, size, BLOCK: tl.constexpr):
+    """tangents (n, size, 12) of the directions begin, begin + 1, ... of (n, K, 9); a program has one of them."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < n
+    splat = load_splat(splats, i, inside)
+    k = tl.program_id(1)
+    at, to = (i.to(tl.int64) * K + begin + k) * 9, (i.to(tl.int64) * size + k) * 12
+    store_six(tangents, to, exponent_tangent(whiten(splat), splat[5], load_six(directions, at, inside)), inside)
+    copy_colour(tangents, to, directions, at, inside)
+
+
+@jit
+def sum_slots(first, last, sums, totals, n, K, WIDTH: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr):
+    """totals (n, K, WIDTH) in double precision of the sums (slots, K, WIDTH), slot by slot: in a fixed order.
+
+    A row of threads has a splat's sums side by side, so that it reads whole sectors.  PADDED: WIDTH rounded up to a power of 2.
+    """
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    j = tl.arange(0, PADDED)[None, :]
+    start, stop = tl.load(first + i, i < n, other=0), tl.load(last + i, i < n, other=0)
+    k = tl.program_id(1)
+    total = tl.zeros((BLOCK, PADDED), tl.float64)
+    longest = max_over(stop - start, 0)
+    for s in range(0, longest):
+        slot = (start + s)[:, None]
+        total += tl.load(sums + (slot * K + k) * WIDTH + j, (slot < stop[:, None]) & (j < WIDTH), other=0.0).to(
+            tl.float64
+        )
+    at = (i.to(tl.int64)[:, None] * K + k) * WIDTH
+    tl.store(totals + at + j, total, (i < n)[:, None] & (j < WIDTH))
+
+
+@jit
+def reduce_gradient(splats, totals, gradient, n, BLOCK: tl.constexpr):
+    """gradient (n, 9) from totals (n, 9)."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < n
+    splat, at = load_splat(splats, i, inside), i.to(tl.int64) * 9
+    store_six(gradient, at, first_order(whiten(splat), splat[5], load_six(totals, at, inside)), inside)
+    copy_colour(gradient, at, totals, at, inside)
+
+
+@jit
+def reduce_curvature(splats, directions, moments, totals, product, n, K, begin, size, BLOCK: tl.constexpr):
+    """product (n, K, 9) along the directions begin, begin + 1, ... from totals (n, size, 9); moments: the gradient's totals."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < n
+    splat = load_splat(splats, i, inside)
+    k = tl.program_id(1)
+    at, source = (i.to(tl.int64) * K + begin + k) * 9, (i.to(tl.int64) * size + k) * 9
+    y, total = load_six(directions, at, inside), load_six(totals, source, inside)
+    moment = load_six(moments, i.to(tl.int64) * 9, inside)
+    store_six(product, at, second_order(whiten(splat), splat[5], y, moment, total), inside)
+    copy_colour(product, at, totals, source, inside)
