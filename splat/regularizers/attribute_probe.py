@@ -148,22 +148,17 @@ def magnitudes(
 
 
 @dataclass(frozen=True, eq=False)
-class Perturbation:
-    """A step away from a set of Gaussians.  shift: added to the stored parameters, 0 in quats; turns: exp(omega), unit."""
+class Probed:
+    """The probed copy of a set of Gaussians (Eq. (14)), off the autograd graph.  turns: exp(omega), unit."""
 
-    shift: Gaussians
+    gaussians: Gaussians
     turns: Float[Tensor, "n 4"]
 
-    def apply(self, gaussians: Gaussians) -> Gaussians:
-        """The probed Gaussians (Eq. (14)), differentiable in the given ones."""
-        moved = {name: value + self.shift.attributes[name] for name, value in gaussians.attributes.items()}
-        return Gaussians.pack({**moved, "quats": hamilton(gaussians.quats, self.turns)})
-
     def pull(self, gradient: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
-        """The gradient in the parameters, given that at the probed ones: (q x e).p = q.(p x conjugate e)."""
-        pulled = self.shift.with_flat(gradient.clone())
+        """The gradient in the parameters, given that at the probed ones, in its place: (q x e).p = q.(p x conjugate e)."""
+        pulled = self.gaussians.with_flat(gradient)
         pulled.quats.copy_(hamilton(pulled.quats, self.turns * self.turns.new_tensor([1, -1, -1, -1])))
-        return pulled.flat
+        return gradient
 
 
 @torch.no_grad()
@@ -175,21 +170,21 @@ def probe_attributes(
     magnitudes: Mapping[str, Magnitude],
     settings: ProbeSettings,
     generator: torch.Generator,
-) -> Perturbation:
-    """The step from these Gaussians, each attribute by its magnitude; those without one stay.
+) -> Probed:
+    """The Gaussians after a step of each attribute by its magnitude; those without one stay.
 
     gradient, splats: of the sampled view's loss and render.  Whatever is probed, the generator gives one number for each
     attribute that is drawn, which seeds that attribute's own generator: no probe changes the draws of another, nor
     what the generator gives next.
     """
-    shift = gaussians.with_flat(torch.zeros_like(gaussians.flat))
-    step, slope = shift.attributes, gaussians.with_flat(gradient).attributes
+    probed = gaussians.with_flat(torch.zeros_like(gaussians.flat))  # first the step, then what it leads to
+    step, slope = probed.attributes, gaussians.with_flat(gradient).attributes
     rho = {name: magnitude.rho for name, magnitude in magnitudes.items()}
     seeds = torch.randint(2**63 - 1, (len(DRAWN),), generator=generator).tolist()
-    own = {name: torch.Generator(shift.flat.device).manual_seed(seed) for name, seed in zip(DRAWN, seeds, strict=True)}
-    omega = torch.zeros_like(shift.means)
+    own = {name: torch.Generator(probed.flat.device).manual_seed(seed) for name, seed in zip(DRAWN, seeds, strict=True)}
+    omega = torch.zeros_like(probed.means)
     if "means" in rho:
-        rays = gaussians.means.double() - camera.centre.to(shift.flat.device)
+        rays = gaussians.means.double() - camera.centre.to(probed.flat.device)
         step["means"].copy_(rho["means"] * depth_biased(slope["means"], rays, settings.gamma))
     if "log_scales" in rho:
         step["log_scales"].normal_(0, rho["log_scales"], generator=own["log_scales"])
@@ -201,7 +196,10 @@ def probe_attributes(
     if "sh" in rho:
         weights = [1 + isqrt(k) / max(gaussians.sh_degree, 1) for k in range(step["sh"].shape[1])]
         step["sh"].normal_(0, rho["sh"], generator=own["sh"]).mul_(step["sh"].new_tensor(weights)[:, None])
-    return Perturbation(shift, exponential(omega))
+    turns = exponential(omega)
+    probed.flat.add_(gaussians.flat)
+    probed.quats.copy_(hamilton(gaussians.quats, turns))
+    return Probed(probed, turns)
 
 
 def depth_biased(gradient: Float[Tensor, "n 3"], rays: Float64[Tensor, "n 3"], gamma: float) -> Float64[Tensor, "n 3"]:

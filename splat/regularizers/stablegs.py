@@ -27,12 +27,11 @@ from landscape.trace import PAPER, estimate_traces
 from splat.camera import Camera
 from splat.curvature import SceneHessian
 from splat.densify import on_screen
-from splat.gaussians import Gaussians
 from splat.losses_cpu import consistency_loss
 from splat.photometric import Photometric, photometric
 from splat.regularizers.attribute_probe import (
     Magnitude,
-    Perturbation,
+    Probed,
     ProbeSettings,
     magnitudes,
     probe_attributes,
@@ -104,7 +103,7 @@ class StableRegularizer(Regularizer):
             return base.gradient
         if since % settings.every == 0:
             self._diagnose(step)
-        probe = probe_attributes(
+        probed = probe_attributes(
             step.gaussians, base.gradient, step.camera, base.splats, self.magnitudes, settings.probe, self.generator
         )
         poses = self._poses(step)
@@ -112,12 +111,12 @@ class StableRegularizer(Regularizer):
             not self.magnitudes
         ):  # the probed copy is the original: its gradient is known, and both agree from everywhere
             return (1 + settings.asp_weight) * base.gradient
-        probed, total = probe.apply(step.gaussians), base.gradient.clone()
+        total = base.gradient.clone()
         if settings.asp_weight:
-            again = photometric(probed, step.camera, step.loss, step.background, step.config.render)
-            total.add_(probe.pull(again.gradient), alpha=settings.asp_weight)
+            again = photometric(probed.gaussians, step.camera, step.loss, step.background, step.config.render)
+            total.add_(probed.pull(again.gradient), alpha=settings.asp_weight)
         for pose in poses:
-            total.add_(_disagreement(step, probed, probe, pose), alpha=settings.vsp_weight / len(poses))
+            total.add_(_disagreement(step, probed, pose), alpha=settings.vsp_weight / len(poses))
         return total
 
     def _diagnose(self, step: Step) -> None:
@@ -182,15 +181,12 @@ def _edge_normal(step: Step, camera: Camera) -> Float[Tensor, "2"]:
         return dominant_edge(*render_depth(step.gaussians, camera, step.config.render))[0]
 
 
-def _disagreement(step: Step, probed: Gaussians, probe: Perturbation, pose: Camera) -> Float[Tensor, " p"]:
+def _disagreement(step: Step, probed: Probed, pose: Camera) -> Float[Tensor, " p"]:
     """The gradient of the loss between the images of the Gaussians and of their probed copy at a pose (Eq. (21))."""
-    flats = [gaussians.flat.detach().requires_grad_() for gaussians in (step.gaussians, probed)]
-    renders = [
-        render(probed.with_flat(flat), pose, step.background, step.config.render)
-        for flat in flats
-    ]  # fmt: skip
+    flats = [gaussians.flat.detach().requires_grad_() for gaussians in (step.gaussians, probed.gaussians)]
+    renders = [render(step.gaussians.with_flat(flat), pose, step.background, step.config.render) for flat in flats]
     if not any(on_screen(each.splats.detach(), pose).any() for each in renders):
         return torch.zeros_like(flats[0])
     loss = consistency_loss(renders[0].image, renders[1].image, step.config.loss)
     own, other = torch.autograd.grad(loss, flats)
-    return own + probe.pull(other)
+    return own.add_(probed.pull(other))

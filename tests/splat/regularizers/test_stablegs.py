@@ -17,6 +17,7 @@ from splat.regularizers.stablegs import StableGS
 from splat.regularizers.viewpoint_probe import ViewpointSettings
 from splat.render import render
 from splat.train import TrainConfig, Training, train
+from tests.splat.regularizers.test_attribute_probe import probed_again
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
 SMALL = Caps(0.01, 0.05, 0.05, 0.05, 0.05)  # so that no splat crosses another between the two derivatives
@@ -50,7 +51,7 @@ def test_the_gradient_is_that_of_the_total_loss_with_the_probes_held_constant(mo
 
     flat = step.gaussians.flat.detach().requires_grad_()
     gaussians = step.gaussians.with_flat(flat)
-    probed = probes[0].apply(gaussians)
+    probed = probed_again(probes[0], step.gaussians, gaussians)
 
     def image(these, camera):
         return render(these, camera, step.background, backend="reference").image
