@@ -3,7 +3,7 @@
     0    done
     1    a self-check failed under --strict, or a cell of a sweep failed
     2    bad input: one sentence on stderr that says what was expected, what came and what to do
-    130  interrupted with Ctrl-C
+    130  interrupted with Ctrl-C or SIGTERM
 
 Every subcommand imports what it needs when it runs, so that `landscape --help` does not wait for torch.
 """

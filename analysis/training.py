@@ -175,7 +175,7 @@ def _follow(
     trajectory: Trajectory | None,
     console: Console,
 ) -> bool:
-    """Train to the end with a progress bar and checkpoints; False where Ctrl-C ended it, after a checkpoint."""
+    """Train to the end with a progress bar and checkpoints; False where a signal ended it, after a checkpoint."""
     total, spent = training.config.iterations, Spent.read(path.parent)
     with interruption() as interrupted, _progress(console) as progress:
         bar = progress.add_task("training", total=total, completed=training.step, loss=math.nan, gaussians=0)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -134,23 +135,24 @@ def test_a_run_killed_at_an_arbitrary_moment_and_resumed_is_the_run_that_was_not
     assert (out / "metrics.json").exists() and not list(out.glob(".*"))
 
 
-def test_ctrl_c_saves_a_checkpoint_and_says_how_to_continue(finished, original, capsys, monkeypatch):
-    out = finished.with_name("stopped")
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "a scheduler's"])
+def test_a_signal_saves_a_checkpoint_and_says_how_to_continue(finished, original, capsys, monkeypatch, kind):
+    out = finished.with_name(f"stopped by {kind.name}")
     command = arguments(original, out, "--checkpoint-every", "1000")
 
     def press(gaussians, camera, background, settings, *, presses=[], **others):  # noqa: B006
         presses.append(1)
         if len(presses) == 4:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), kind)
         return render(gaussians, camera, background, settings, **others)
 
-    before = signal.getsignal(signal.SIGINT)
+    before = [signal.getsignal(each) or signal.SIG_DFL for each in (signal.SIGINT, signal.SIGTERM)]
     with monkeypatch.context() as patch:
         patch.setattr("splat.photometric.render", press)
         assert main(command) == 130
-    assert signal.getsignal(signal.SIGINT) is before
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
     said = " ".join(capsys.readouterr().err.split())
-    assert f"stopped after step 4; to continue: landscape {' '.join(command)} --resume" in said
+    assert f"stopped after step 4; to continue: landscape {shlex.join(command)} --resume" in said
     assert load_checkpoint(out / "checkpoint.pt").training.step == 4 and not (out / "metrics.json").exists()
     assert main([*command, "--resume"]) == 0
     assert (out / "checkpoint.pt").read_bytes() == (finished / "checkpoint.pt").read_bytes()
