@@ -1,8 +1,9 @@
 """Figure: the landscape along one or several trainings, from the table that `landscape trajectory` wrote.
 
 `python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Bands: 95% intervals of the traces, residuals of
-the eigenvalues; bars: brackets of the indices, with an arrow where there is no upper bound.  An axis is logarithmic where all
-of its values are positive and span more than a decade.  |lambda_max / lambda_min| has open markers where it is negative.
+the eigenvalues; bars: brackets of the indices; triangles: lower bounds, where that is all that is known.  An axis is
+logarithmic where all of its values are positive and span more than a decade.  |lambda_max / lambda_min| has open markers where
+it is negative.
 """
 
 import argparse
@@ -77,7 +78,10 @@ def draw(table: pd.DataFrame) -> Figure:
 
 
 def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], name: str) -> None:
-    """An index of every run over the steps, its magnitude on a logarithmic axis, with its bracket.  runs: name -> colour."""
+    """An index of every run over the steps, its magnitude on a logarithmic axis, with its bracket.  runs: name -> colour.
+
+    Hollow where it is negative.  Of one that has only a lower bound, the bound is drawn, as a triangle; without one, nothing.
+    """
     axes.set_yscale("log")
     for run, colour in runs.items():
         part = pd.DataFrame(measured[(measured["run"] == run) & measured[name].notna()])
@@ -86,15 +90,20 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
         ends = np.stack([np.abs(part[f"{name}_low"].to_numpy(float)), np.abs(part[f"{name}_high"].to_numpy(float))])
         unbounded = ~np.isfinite(ends).all(axis=0)
         low = np.fmin(np.nanmin(ends, axis=0, initial=np.inf), magnitudes)
-        high = np.where(unbounded, magnitudes, np.fmax(ends.max(axis=0), magnitudes))
+        shown = np.where(unbounded, low, magnitudes)
+        shown[shown == 0] = np.nan  # of which a logarithmic axis has no place
+        high = np.where(unbounded, shown, np.fmax(ends.max(axis=0), magnitudes))
         axes.errorbar(
-            steps, magnitudes, yerr=np.stack([magnitudes - low, high - magnitudes]), lolims=unbounded, color=colour,
-            linewidth=1.0, elinewidth=0.6, capsize=1.2, markersize=2, capthick=0.6,
+            steps, shown, yerr=np.stack([shown - low, high - shown]), color=colour, linewidth=1.0, elinewidth=0.6,
+            capsize=1.2, capthick=0.6,
         )  # fmt: skip
-        for sign, face in ((values >= 0, colour), (values < 0, "white")):
-            axes.plot(
-                steps[sign], magnitudes[sign], "o", color=colour, markerfacecolor=face, markersize=3, linestyle="none"
-            )
+        for kind, marker in ((~unbounded, "o"), (unbounded, "^")):
+            for sign, face in ((values >= 0, colour), (values < 0, "white")):
+                chosen = kind & sign
+                axes.plot(
+                    steps[chosen], shown[chosen], marker, color=colour, markerfacecolor=face, markersize=3,
+                    linestyle="none",
+                )  # fmt: skip
     _few_decades(axes)
 
 

@@ -63,8 +63,18 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
     hollow = [x for x in literal.lines if x.get_marker() == "o" and to_hex(x.get_markerfacecolor()) == "#ffffff"]
     assert [float(y) for x in hollow for y in np.asarray(x.get_ydata())] == [4.0, 9.0, 16.0] * 2
     assert literal.get_yscale() == "log" and panels["trace of log scale"].get_yscale() == "log"
+    bounds = [x for x in panels["effective rank"].lines if x.get_marker() == "^" and len(np.asarray(x.get_xdata()))]
+    assert [float(y) for x in bounds for y in np.asarray(x.get_ydata())] == [10.0, 15.0, 20.0] * 2
     gaussians = panels["Gaussians"].lines[0]
     assert list(np.asarray(gaussians.get_ydata())) == [1000, 2000, 3000, 4000]
+
+
+def test_of_an_index_without_any_bound_nothing_is_drawn(tmp_path):
+    table = rows().assign(run="a")
+    table.loc[2, ["literal_low", "literal_high"]] = 0.0, math.nan
+    panels = {axes.get_title(): axes for axes in trajectory.draw(table).axes}
+    drawn = [float(y) for x in panels["|λmax / λmin|"].lines for y in np.asarray(x.get_ydata())]
+    assert 9.0 not in drawn and {4.0, 16.0} <= set(drawn)
 
 
 def test_the_command_prints_the_first_and_last_values_and_writes_table_and_picture(tmp_path, capsys, monkeypatch):
