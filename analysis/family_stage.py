@@ -125,11 +125,10 @@ class FamilyFindings:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Nodes and weights of every density."""
-        parts = ("nodes", "weights")
         return {
-            f"{row.scene}.{row.operator}.{row.block}.{part}": getattr(row.family.density, part).numpy()
+            f"{row.scene}.{row.operator}.{row.block}.{part}": found.numpy()
             for row in self.rows
-            for part in parts
+            for part, found in zip(("nodes", "weights"), row.family.density.table(), strict=True)
         }
 
 

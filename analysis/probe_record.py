@@ -48,7 +48,9 @@ def probe_arrays(findings: Findings) -> dict[str, dict[str, np.ndarray]]:
     arrays["spectrum"] = {"ritz_values": values, "residuals": residuals}
     arrays["eigenvectors"] = {"largest": findings.ends.largest.vectors.numpy()}
     if findings.density is not None:
-        arrays["spectrum"] |= {"nodes": findings.density.nodes.numpy(), "weights": findings.density.weights.numpy()}
+        arrays["spectrum"] |= dict(
+            zip(("nodes", "weights"), (x.numpy() for x in findings.density.table()), strict=True)
+        )
     if findings.plane is not None:
         plane = findings.plane.slice
         x, y = plane.coordinates

@@ -49,11 +49,16 @@ def is_dust(length: float, scale: float, dtype: torch.dtype) -> bool:
 
 
 def lanczos(
-    operator: SymmetricOperator, starts: Float[Tensor, "n k"], steps: int, progress: Progress | None = None
+    operator: SymmetricOperator,
+    starts: Float[Tensor, "n k"],
+    steps: int,
+    progress: Progress | None = None,
+    scale: float = 0.0,
 ) -> list[LanczosFactorization]:
     """One factorisation per column of starts, run in lock-step so that the operator sees blocks of k vectors.
 
-    Memory: k * steps vectors.
+    Memory: k * steps vectors.  scale: |H|, where the starts were chosen so that they do not show it: what is its round-off ends
+    a recurrence.
 
     >>> from landscape.operator import DenseOperator
     >>> A = DenseOperator(torch.diag(torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)))
@@ -80,11 +85,11 @@ def lanczos(
         products = operator.apply(basis[running, j].T.contiguous()).T
         for i, product in zip(list(running), products, strict=True):
             w = product.clone()[None]
-            scale = norm(w)
+            length = norm(w)
             T[i, j, j] = orthogonalise(w, basis[i, : j + 1])[j, 0]
             sizes[i], remainders[i] = j + 1, w[0]
             beta = norm(w)
-            if is_dust(beta, max(scale, float(T[i].abs().max())), operator.dtype):
+            if is_dust(beta, max(scale, length, float(T[i].abs().max())), operator.dtype):
                 running.remove(i)
                 remainders[i] = 0
             elif j + 1 < steps:

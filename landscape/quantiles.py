@@ -18,8 +18,10 @@ follows from that of mu: f(y) = y^(-1/2) gives
 a variance of at most 2 F (1 - F) / n a start vector: the beta distribution of that mean and variance says how far the mean
 over the start vectors may be off at F = p.  The sums of curvature are compared by Student's interval of (curvature above t) -
 (1 - p) (all curvature), which is linear in what the start vectors see.  A bracket ends where the test just fails to exclude t.
+Eigenvalues that are known are counted as such, and the tests are of the others.
 """
 
+from collections.abc import Callable
 from math import inf
 
 import torch
@@ -28,10 +30,13 @@ from scipy.stats import beta
 from scipy.stats import t as student
 from torch import Tensor
 
-from landscape.density import absolute_bounds
+from landscape.density import bounds_of_rules
 from landscape.lanczos import lanczos
 from landscape.operator import DenseOperator
 from landscape.results import Bracket, SpectralDensity
+
+EPS = torch.finfo(torch.float64).eps
+TINY = torch.finfo(torch.float64).tiny
 
 
 def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Bracket:
@@ -45,46 +50,62 @@ def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Br
     """
     _require_share(p)
     rules = list(zip(density.nodes, density.weights, strict=True))
-    grid = density.nodes[density.weights > 0].unique()
+    grid = torch.cat([density.nodes[density.weights > 0], density.known]).unique()
     below, upto = (torch.zeros(len(rules), len(grid), dtype=torch.float64) for _ in range(2))
     for i, (nodes, weights) in enumerate(rules):
         nodes, order = nodes[weights > 0].sort()
-        sums = torch.nn.functional.pad((weights[weights > 0][order] / weights.sum()).cumsum(0), (1, 0))
+        sums = torch.nn.functional.pad((weights[weights > 0][order] / weights.sum().clamp_min(TINY)).cumsum(0), (1, 0))
         # mu(x <= grid) is at least the sum before its last node that is not above, at most the sum to the next node
         below[i] = sums[(torch.searchsorted(nodes, grid, right=True) - 1).clamp_min(0)]
         upto[i] = sums[(torch.searchsorted(nodes, grid) + 1).clamp_max(len(nodes))]
-    trials = len(rules) * density.dim / 2
-    least, most = beta.ppf([(1 - confidence) / 2, (1 + confidence) / 2], trials * p, trials * (1 - p))
-    above = grid[upto.mean(dim=0) < least]
-    reached = grid[below.mean(dim=0) >= most]
-    return _bracket(density, p, density.weights, above.max() if len(above) else -inf, _first(reached, inf))
+    trials = len(rules) * density.rest / 2
+    # of the others, the share that has to lie at or below as well
+    share = (p * density.dim - torch.searchsorted(density.known, grid, right=True)) / max(density.rest, 1)
+    inner = share.clamp(TINY, 1 - EPS)
+    levels = torch.tensor([[(1 - confidence) / 2], [(1 + confidence) / 2]], dtype=torch.float64)
+    least, most = torch.from_numpy(beta.ppf(levels, max(trials, TINY) * inner, max(trials, TINY) * (1 - inner)))
+    above = grid[(share > 0) & ((upto.mean(dim=0) < least) | (share > 1))]
+    reached = grid[(share <= 0) | ((below.mean(dim=0) >= most) & (share <= 1))]
+    high = _first(reached, inf)
+    return _bracket(density, p, torch.ones_like, above.max() if len(above) else -inf, high)
 
 
 def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: float = 0.95) -> Bracket:
     """The magnitude t such that the share p of sum |lambda| comes from |lambda| <= t."""
     _require_share(p)
-    tails = [_Tail(*rule) for rule in zip(density.nodes, density.weights, strict=True)]
-    grid = torch.cat([torch.zeros(1, dtype=torch.float64), *(tail.magnitudes for tail in tails)]).unique()
+    bounds = zip(*bounds_of_rules(density), strict=True)
+    tails = [_Tail(*rule, (float(low), float(high))) for rule, (low, high) in zip(density.rules(), bounds, strict=True)]
+    known = density.known.abs().sort().values
+    grid = torch.cat([torch.zeros(1, dtype=torch.float64), known, *(tail.magnitudes for tail in tails)]).unique()
     if len(grid) == 1:
         return Bracket(None, 0.0, inf, "the operator is zero")
-    least, most = (torch.stack(column) for column in zip(*(tail.excess(grid, p) for tail in tails), strict=True))
+    at_or_below = torch.nn.functional.pad(known.cumsum(0), (1, 0))[torch.searchsorted(known, grid, right=True)]
+    certain = p * known.sum() - at_or_below  # what is known above t, less (1 - p) of all that is known
+    least, most = (
+        density.rest * torch.stack(column) + certain
+        for column in zip(*(tail.excess(grid, p) for tail in tails), strict=True)
+    )
     margin = float(student.ppf((1 + confidence) / 2, len(tails) - 1)) / len(tails) ** 0.5
     beneath = least.mean(dim=0) - margin * least.std(dim=0) > 0  # t is certainly too low, up to the next of the grid
     beyond = most.mean(dim=0) + margin * most.std(dim=0) <= 0  # certainly high enough
-    totals = torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64)
-    floor = p * float(totals.mean() - margin * totals.std())  # n eigenvalues up to t add up to n t at most
+    totals = density.rest * torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64) + known.sum()
+    floor = (
+        p * float(totals.mean() - margin * totals.std()) / density.dim
+    )  # n eigenvalues up to t add up to n t at most
     low = float(grid[int(beneath.long().cumprod(0).sum().clamp_max(len(grid) - 1))])
-    certain = int(beyond.long().flip(0).cumprod(0).sum())
-    high = float(grid[-certain]) if certain else inf
-    return _bracket(density, p, density.weights * density.nodes.abs(), max(low, floor), high, magnitudes=True)
+    last = int(beyond.long().flip(0).cumprod(0).sum())
+    high = float(grid[-last]) if last else inf
+    return _bracket(density, p, torch.abs, max(low, floor), high, magnitudes=True)
 
 
 class _Tail:
     """What one start vector says of the curvature at magnitudes above t."""
 
-    def __init__(self, nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"]) -> None:
-        self.total = absolute_bounds(nodes, weights)
-        scale = float(nodes.abs().max())
+    def __init__(
+        self, nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"], total: tuple[float, float]
+    ) -> None:
+        self.total = total
+        scale = float(nodes.abs().max()) if len(nodes) else 0.0
         squares = (nodes / scale).square() if scale else torch.zeros_like(nodes)
         mass = weights * squares
         kept = mass > 0
@@ -112,15 +133,16 @@ class _Tail:
 def _bracket(
     density: SpectralDensity,
     p: float,
-    mass: Tensor,
+    mass: Callable[[Tensor], Tensor],
     low: Tensor | float,
     high: Tensor | float,
     magnitudes: bool = False,
 ) -> Bracket:
     """The quantile of all nodes together, within what is certain."""
     low, high = float(low), float(high)
-    at, order = (density.nodes.abs() if magnitudes else density.nodes).flatten().sort()
-    sums = mass.flatten()[order].cumsum(0)
+    nodes, weights = density.table()
+    at, order = (nodes.abs() if magnitudes else nodes).flatten().sort()
+    sums = (weights * mass(nodes)).flatten()[order].cumsum(0)
     value = float(at[int(torch.searchsorted(sums, p * sums[-1]).clamp_max(len(at) - 1))])
     steps = int((density.weights > 0).sum(dim=1).max())
     return Bracket(

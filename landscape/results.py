@@ -10,8 +10,8 @@
 `record()` gives the scalars of a result as plain Python values for JSON; what is infinite or undefined is None there.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from math import inf, isfinite, sqrt
 from typing import Literal
 
@@ -185,27 +185,50 @@ class Bracket:
 class SpectralDensity:
     """The spectrum as seen by stochastic Lanczos quadrature: for every start vector, nodes and weights of a Gauss rule.
 
-    The density of eigenvalues, normalised to 1, is about the mean over starts of sum_j weights_j delta(x - nodes_j);
-    it is exact in expectation for polynomials of degree below 2 steps.  dim: of how many eigenvalues, those of a known
-    null space left out (the weights of a start vector then sum to 1 on average only).
+    known: simple eigenvalues that were found themselves.  The density of all the others, normalised to 1, is about the mean
+    over starts of sum_j weights_j delta(x - nodes_j); it is exact in expectation for polynomials of degree below 2 steps.
+    dim: of how many eigenvalues in all, those of a known null space left out (where some are left out or known, the weights of
+    a start vector sum to 1 on average only).  complete: start vectors whose rule is their measure itself; None: of those
+    with weights of 0.
     """
 
     nodes: Float64[Tensor, "starts steps"]
     weights: Float64[Tensor, "starts steps"]
     dim: int
     matvecs: int
+    known: Float64[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    complete: Bool[Tensor, " starts"] | None = None
+
+    @property
+    def rest(self) -> int:
+        """How many eigenvalues are not known."""
+        return self.dim - len(self.known)
+
+    def rules(self) -> Iterator[tuple[Float64[Tensor, " m"], Float64[Tensor, " m"]]]:
+        """Nodes and weights of each start vector; with weights of 0 where they are the measure itself."""
+        for i, (nodes, weights) in enumerate(zip(self.nodes, self.weights, strict=True)):
+            kept = weights > 0
+            whole = self.complete is None or bool(self.complete[i])
+            yield (nodes, weights) if whole else (nodes[kept], weights[kept])
+
+    def table(self) -> tuple[Float64[Tensor, "starts m"], Float64[Tensor, "starts m"]]:
+        """Nodes and weights of all eigenvalues, for drawing: those that are known are nodes of every start vector."""
+        everywhere = self.known.expand(len(self.nodes), -1)
+        weights = [self.weights * self.rest, torch.ones_like(everywhere)]
+        return torch.cat([self.nodes, everywhere], dim=1), torch.cat(weights, dim=1) / self.dim
 
     def integral(self, function: Callable[[Tensor], Tensor], confidence: float = 0.95) -> Bracket:
         """sum_i f(lambda_i) with the interval of its spread over start vectors (the rule's own error is not in it)."""
-        samples = self.dim * (self.weights * function(self.nodes)).sum(dim=1)
+        samples = self.rest * (self.weights * function(self.nodes)).sum(dim=1) + function(self.known).sum()
         value, _, low, high = t_interval(samples, confidence)
         return Bracket(value, low, high, f"spread over {samples.numel()} start vectors")
 
     def smoothed(self, at: Float64[Tensor, " m"], width: float) -> Float64[Tensor, "starts m"]:
         """The density at `at`, one row a start vector, each node blurred by a Gaussian of standard deviation width."""
-        offset = (at[None, :, None] - self.nodes[:, None, :]) / width
+        nodes, weights = self.table()
+        offset = (at[None, :, None] - nodes[:, None, :]) / width
         kernel = torch.exp(-offset.square() / 2) / (width * sqrt(2 * torch.pi))
-        return (kernel * self.weights[:, None, :]).sum(dim=2)
+        return (kernel * weights[:, None, :]).sum(dim=2)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from landscape.density import ActiveSpace, absolute_sum, spectral_density
+from landscape.density import ActiveSpace, absolute_bounds, absolute_sum, spectral_density
 from landscape.operator import DenseOperator, ProjectedOperator
 from landscape.probes import draw_probes
 from landscape.quantiles import _Tail, absolute_quantile, quantile
@@ -26,15 +26,15 @@ def by_curvature(true, p):
 @pytest.mark.parametrize("name", NOT_ZERO)
 def test_the_curvature_that_a_start_vector_sees_above_any_magnitude_is_within_its_bounds(name, steps):
     H = operator(name)
-    density = spectral_density(H, generator(), starts=3, steps=steps)
+    density = spectral_density(H, generator(), starts=3, steps=steps, batch=1)
     values, vectors = torch.linalg.eigh(H.matrix)
     seen = (vectors.T @ draw_probes(N, 3, generator(), torch.float64, "rademacher")).square() / N
     scale = float(values.abs().max())
     # off the eigenvalues, where the exact side of a jump is round-off's to choose
     levels = scale * torch.linspace(0, 1.1, 1000, dtype=torch.float64) ** 3 + 1e-5 * scale
     rounding = 1e-7 * scale  # bounds of sum |lambda| are good to the root of eps
-    for i in range(3):
-        tail = _Tail(density.nodes[i], density.weights[i])
+    for i, rule in enumerate(density.rules()):
+        tail = _Tail(*rule, absolute_bounds(*rule))
         for p in (0.05, 0.5):
             exact = ((values.abs() > levels[:, None]) * values.abs() * seen[:, i]).sum(dim=1)
             exact -= (1 - p) * (values.abs() * seen[:, i]).sum()
