@@ -264,8 +264,9 @@ def _eigenthings(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Metho
     for starts, steps in (*DENSITIES, (6, 32)):
 
         def sums(case: Case, operator: Meter, seed: int, starts: int = starts, steps: int = steps) -> list[Answer]:
+            # it seeds its start vectors one after the other: those of two seeds must not overlap
             found = module.spectral_density(
-                wrapped(operator), num_runs=starts, lanczos_steps=steps, num_grid_points=2, seed=seed
+                wrapped(operator), num_runs=starts, lanczos_steps=steps, num_grid_points=2, seed=1000 * seed
             )
             kept = found.raw_weights > 0
             values, weights = found.raw_eigenvalues[kept].double(), found.raw_weights[kept].double() / starts
