@@ -2,7 +2,8 @@
 
 `python -m figures.fig7 RUN_3DGS RUN_STABLEGS --out fig7.png`.  Above: |lambda_max / lambda_min| (Eq. (3); open: negative) with
 its bracket, and the loss around both checkpoints along the two steepest eigenvectors.  Below: the same around the start of the
-first run, and sections through all three along e_1 and e_2.  All landscapes share their axes (`figures.manifold`).
+first run, and sections through all three along e_1 and e_2.  All axes are those of the two ends (`figures.manifold`), but for
+the start's surface, whose title says how much farther it reaches: a start may be hundreds of times wider than an end.
 """
 
 import argparse
@@ -29,7 +30,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     names = names_of(runs)
     measured = _measured(runs, names)
     ends, start = [landscape_of(run) for run in runs], start_of(runs[0])
-    scale = Scale.of(*ends, start)
+    scale, wide = Scale.of(*ends), Scale.of(start)
     with style():
         figure = new_figure(4.4)
         figure.set_figwidth(PAGE)
@@ -40,7 +41,7 @@ def draw(runs: Sequence[Path]) -> Figure:
         index.grid(True)
         for i, (end, name) in enumerate(zip(ends, names, strict=True)):
             surface(figure, (2, 3, 2 + i), end, scale, f"{name}, end")
-        surface(figure, (2, 3, 4), start, scale, BEGINNING)
+        surface(figure, (2, 3, 4), start, wide, f"{BEGINNING}, steps × {wide.reach / scale.reach:.2g}")
         for axis, direction in enumerate(("e₁", "e₂")):
             axes = figure.add_subplot(2, 3, 5 + axis)
             section(axes, start, scale, axis, color=BLUE, linestyle="--")

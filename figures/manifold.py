@@ -136,5 +136,6 @@ def section(axes: Axes, landscape: Plane, scale: Scale, axis: int, **look: objec
     along, other = (landscape.x, landscape.y) if axis == 0 else (landscape.y, landscape.x)
     line = change_of(landscape).take(other.centre, axis=1 - axis) / 10.0**scale.loss
     axes.plot(along.steps / 10.0**scale.steps, line, **look)  # pyright: ignore[reportArgumentType]
-    axes.set(xlim=(-scale.reach / 10.0**scale.steps, scale.reach / 10.0**scale.steps))
+    reach, loss = scale.reach / 10.0**scale.steps, 10.0**scale.loss
+    axes.set(xlim=(-reach, reach), ylim=(scale.low / loss, scale.high / loss))
     axes.grid(True)

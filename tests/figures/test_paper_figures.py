@@ -48,15 +48,18 @@ def test_everything_stays_inside_the_page(runs, module):
     assert drawn.x1 <= figure.get_figwidth() + POINT and drawn.y1 <= figure.get_figheight() + POINT
 
 
-def test_all_landscapes_of_a_figure_share_their_axes(runs):
+def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
     figure = fig7.draw(runs)
     surfaces = [axes for axes in figure.axes if hasattr(axes, "get_zlim")]
     assert len(surfaces) == 3
     widest = landscape_of(runs[1])
     reach = float(np.abs(widest.y.steps).max())  # of the flattest direction of the flattest landscape
-    assert Scale.of(widest, start_of(runs[0])).reach == reach
-    limits = {(axes.get_xlim(), axes.get_ylim(), axes.get_zlim()) for axes in surfaces}  # pyright: ignore[reportAttributeAccessIssue]
-    assert len(limits) == 1
+    assert Scale.of(*map(landscape_of, runs)).reach == reach
+    ends = {(axes.get_xlim(), axes.get_ylim(), axes.get_zlim()) for axes in surfaces[:2]}  # pyright: ignore[reportAttributeAccessIssue]
+    assert len(ends) == 1
+    wide = Scale.of(start_of(runs[0]))
+    assert surfaces[2].get_title().startswith(f"start, steps × {wide.reach / reach:.2g}\n")
+    assert surfaces[2].get_xlim()[1] == pytest.approx(wide.reach / 10.0**wide.steps)
     across, along = figure.axes[-2:]
     assert across.get_xlim() == along.get_xlim()
     start, first, second = (np.ptp(np.asarray(line.get_xdata())) for line in across.lines)
