@@ -18,13 +18,15 @@ import triton
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splat.raster import cuda_binning, cuda_compositing, cuda_packing
+from splat.raster import cuda_binning, cuda_blocks, cuda_compositing, cuda_packing
 from splat.raster.cuda_binning import HEIGHT, WIDTH, Slots, grid
 from splat.settings import RenderSettings
 
 LEAST_TRANSMITTANCE = {torch.float32: 1e-30, torch.float64: 1e-290}  # beneath it T would underflow
 LEAST_LOG2_ALPHA = {torch.float32: -126.0, torch.float64: -1022.0}  # the range of exp2
-TOGETHER = 4  # tangents that one launch has in registers
+TOGETHER = (
+    2  # tangents that one launch has in registers: with 4, a thread of `curvature` would need more than there are
+)
 TILE = {"WIDTH": WIDTH, "HEIGHT": HEIGHT}
 LAUNCH = {"num_warps": 1, "enable_fp_fusion": True}
 BLOCK = 128  # splats a program of the kernels that run over splats
@@ -142,6 +144,18 @@ class CudaRaster:
     def backward(self, cotangent: Float[Tensor, "4 h w"]) -> "CudaAdjoint":
         """The gradient in the splats from cotangent planes."""
         return CudaAdjoint(self, cotangent)
+
+    def own_blocks(
+        self, adjoint: "CudaAdjoint", curvature: Float[Tensor, "3 h w"], index: Int[Tensor, "m"], gauss_newton: bool
+    ) -> Float[Tensor, "m 9 9"]:
+        """Own blocks of the splats at index: of the Hessian or of its Gauss-Newton part.
+
+        adjoint: that of the loss's gradient; curvature: the pixel-diagonal of l''.
+        """
+        gradient = torch.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent
+        totals = self.totals(cuda_blocks.block_moments, 1, cuda_blocks.BLOCK_SUMS, gradient, self.pad(curvature))[:, 0]
+        moments = torch.zeros_like(adjoint.moments) if gauss_newton else adjoint.moments
+        return cuda_blocks.own_blocks(self.splats[index], totals[index].double(), moments[index].double())
 
     def jvp(self, directions: Float[Tensor, "n K 9"]) -> "CudaTangent":
         """J u for directions of the splats."""

@@ -4,15 +4,19 @@ The backward of each is a function of its own, whose backward runs the tangent k
 create_graph=True)` followed by another `grad` costs two tangent passes, not a trace through the compositing loop.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splat.camera import Camera
+from splat.device import by_triton
 from splat.gaussians import Gaussians
 from splat.projection import Splats
 from splat.projection_cpu import attribute_arrays, lens_of, project_adjoint, project_arrays
+from splat.projection_formulas import Lens
 from splat.projection_linear import Projection
 from splat.raster.cpu import Raster
 from splat.raster.threads import over_range
@@ -21,14 +25,14 @@ from splat.settings import RenderSettings
 PARTS = (2, 3, 1, 3)  # mean, conic, opacity, colour in a splat of nine numbers
 
 
-def _parts(splats: np.ndarray, like: Tensor) -> tuple[Tensor, ...]:
+def _parts(splats: np.ndarray | Tensor, like: Tensor) -> tuple[Tensor, ...]:
     """The four attributes of splats (n, 9) as tensors in the precision of another; opacity (n,)."""
-    means, conics, opacities, colours = torch.from_numpy(splats).to(like.dtype).split(PARTS, dim=1)
+    means, conics, opacities, colours = torch.as_tensor(splats).to(like.dtype).split(PARTS, dim=1)
     return means.contiguous(), conics.contiguous(), opacities.reshape(-1), colours.contiguous()
 
 
-def _joined(parts: tuple[Tensor, ...]) -> np.ndarray:
-    return torch.cat([part.detach().reshape(len(part), -1) for part in parts], dim=1).numpy()
+def _joined(parts: tuple[Tensor, ...]) -> Tensor:
+    return torch.cat([part.detach().reshape(len(part), -1) for part in parts], dim=1)
 
 
 THIRD = "expected at most two derivatives of the kernels, got a third; render with backend='reference' for more"
@@ -52,14 +56,55 @@ def last_derivative(values: tuple[Tensor, ...], *sources: Tensor, refusal: str =
     return _Last.apply(refusal, len(values), *values, *sources)  # pyright: ignore[reportReturnType]
 
 
+def _projected(gaussians: Gaussians, lens: Lens) -> tuple[Tensor, Tensor, Tensor]:
+    """Splats (n, 9), depths and which are drawn."""
+    if by_triton(gaussians.flat):
+        from splat.projection_cuda import project
+
+        return project(gaussians, lens)
+    splats, depths, drawn = project_arrays(gaussians, lens)
+    return torch.from_numpy(splats), torch.from_numpy(depths), torch.from_numpy(drawn)
+
+
+def _pulled(gaussians: Gaussians, lens: Lens, splats: Tensor, drawn: Tensor, bar: Tensor) -> Tensor:
+    """The gradient in the flat vector, given the adjoint of the splats."""
+    if by_triton(gaussians.flat):
+        from splat.projection_cuda import project_adjoint as pulled
+
+        return pulled(gaussians, lens, splats, drawn, bar.double())
+    gradient = torch.zeros_like(gaussians.flat)
+    means, log_scales, quats, _, sh = attribute_arrays(gaussians)
+    over_range(
+        len(gaussians), project_adjoint, lens, means, log_scales, quats, sh, splats.numpy(), drawn.numpy(), bar.numpy(),
+        *attribute_arrays(gaussians.with_flat(gradient)),
+    )  # fmt: skip
+    return gradient
+
+
+def _pushed_and_curved(
+    gaussians: Gaussians, lens: Lens, splats: Tensor, drawn: Tensor, bar: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Of one direction in the flat vector, P' u (n, 9) and (bar . P'') u."""
+    if by_triton(gaussians.flat):
+        from splat.projection_cuda import CudaProjection
+
+        projection = CudaProjection(gaussians, lens, splats, bar.double(), drawn.nonzero()[:, 0])
+        tangents = projection.jvp(direction[:, None])
+        return tangents[:, 0], projection.pull(torch.zeros_like(tangents), direction[:, None])[:, 0]
+    projection = Projection(gaussians, lens, splats.numpy(), bar.numpy(), np.flatnonzero(drawn.numpy()))
+    tangents, product = projection.jvp(direction.numpy()[:, None]), torch.zeros_like(gaussians.flat)
+    projection.pull(np.zeros_like(tangents), direction.numpy()[:, None], product.numpy()[:, None])
+    return torch.from_numpy(tangents[:, 0]), product
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, flat: Tensor, sh_degree: int, camera: Camera, settings: RenderSettings):
         gaussians, lens = Gaussians(flat.detach(), sh_degree), lens_of(camera, settings)
-        splats, depths, drawn = project_arrays(gaussians, lens)
+        splats, depths, drawn = _projected(gaussians, lens)
         ctx.held = (sh_degree, lens, splats, drawn)
         ctx.save_for_backward(flat)
-        outputs = (*_parts(splats, flat), torch.from_numpy(depths), torch.from_numpy(drawn))
+        outputs = (*_parts(splats, flat), depths, drawn)
         ctx.mark_non_differentiable(*outputs[4:])
         return outputs
 
@@ -72,36 +117,44 @@ class _ProjectAdjoint(torch.autograd.Function):
     @staticmethod
     def forward(ctx, flat: Tensor, held: tuple, *bars: Tensor) -> Tensor:
         sh_degree, lens, splats, drawn = held
-        gaussians, gradient = Gaussians(flat.detach(), sh_degree), torch.zeros_like(flat)
-        means, log_scales, quats, _, sh = attribute_arrays(gaussians)
-        bar = _joined(bars)
-        over_range(
-            len(gaussians), project_adjoint, lens, means, log_scales, quats, sh, splats, drawn, bar,
-            *attribute_arrays(gaussians.with_flat(gradient)),
-        )  # fmt: skip
-        ctx.held, ctx.bar = held, bar
+        ctx.held, ctx.bar = held, _joined(bars)
         ctx.save_for_backward(flat)
-        return gradient
+        return _pulled(Gaussians(flat.detach(), sh_degree), lens, splats, drawn, ctx.bar)
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
         (flat,) = ctx.saved_tensors
         sh_degree, lens, splats, drawn = ctx.held
-        gaussians = Gaussians(flat.detach(), sh_degree)
-        projection = Projection(gaussians, lens, splats, ctx.bar, np.flatnonzero(drawn))
-        direction = outputs[0].detach().numpy()[:, None]
-        tangents, product = projection.jvp(direction), torch.zeros_like(flat)
-        projection.pull(np.zeros_like(tangents), direction, product.numpy()[:, None])
-        product, *parts = last_derivative((product, *_parts(tangents[:, 0], flat)), flat, *outputs)
+        gaussians, direction = Gaussians(flat.detach(), sh_degree), outputs[0].detach()
+        tangents, product = _pushed_and_curved(gaussians, lens, splats, drawn, ctx.bar, direction)
+        product, *parts = last_derivative((product, *_parts(tangents, flat)), flat, *outputs)
         return product, None, *parts
+
+
+def held_view(
+    splats: Tensor, depths: Tensor, drawn: Tensor, background: Tensor, width: int, height: int, settings: RenderSettings,
+    deterministic: bool = True,
+) -> Any:  # fmt: skip
+    """A view held still where its splats (n, 9) are: `cpu.Raster` in arrays, or `cuda.CudaRaster` in tensors."""
+    if not by_triton(splats):
+        arrays = (splats.numpy(), depths.numpy(), drawn.numpy(), background.numpy())
+        return Raster(*arrays, width, height, settings)
+    from splat.raster.cuda import CudaRaster  # needs triton, which a machine without a GPU may not have
+
+    return CudaRaster(splats, depths, drawn, background, width, height, settings, deterministic)
+
+
+def _native(raster: Any, tensor: Tensor) -> Any:
+    """A tensor as a held view takes it."""
+    return tensor.detach().numpy() if isinstance(raster, Raster) else tensor.detach()
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, raster: Raster, *splats: Tensor) -> Tensor:
+    def forward(ctx, raster: Any, *splats: Tensor) -> Tensor:
         ctx.raster = raster
         ctx.save_for_backward(*splats)
-        return torch.from_numpy(raster.crop(raster.planes).copy())
+        return torch.as_tensor(raster.crop(raster.planes)).clone()
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
@@ -110,18 +163,18 @@ class _Rasterize(torch.autograd.Function):
 
 class _RasterizeAdjoint(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, raster: Raster, cotangent: Tensor, *splats: Tensor):
+    def forward(ctx, raster: Any, cotangent: Tensor, *splats: Tensor):
         ctx.raster = raster
-        ctx.adjoint = raster.backward(raster.pad(cotangent.detach().numpy()))
+        ctx.adjoint = raster.backward(raster.pad(_native(raster, cotangent)))
         ctx.save_for_backward(cotangent, *splats)
         return _parts(ctx.adjoint.gradient, cotangent)
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
         raster = ctx.raster
-        tangent = raster.jvp(_joined(outputs)[:, None])
-        product = tangent.curvature(ctx.adjoint, np.zeros_like(tangent.planes))
-        values = (torch.from_numpy(raster.crop(tangent.planes[0]).copy()), *_parts(product[:, 0], outputs[0]))
+        tangent = raster.jvp(_native(raster, _joined(outputs)[:, None]))
+        product = tangent.curvature(ctx.adjoint, _native(raster, torch.zeros_like(torch.as_tensor(tangent.planes))))
+        values = (torch.as_tensor(raster.crop(tangent.planes[0])).clone(), *_parts(product[:, 0], outputs[0]))
         return None, *last_derivative(values, *ctx.saved_tensors, *outputs)
 
 
@@ -131,18 +184,20 @@ def project_by_kernel(gaussians: Gaussians, camera: Camera, settings: RenderSett
 
 
 def rasterize_by_kernel(
-    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, settings: RenderSettings
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    settings: RenderSettings,
+    deterministic: bool = True,
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
-    """Colour and accumulated alpha of `reference.rasterize_reference`, by the kernels."""
+    """Colour and accumulated alpha of `reference.rasterize_reference`, by the kernels, where the splats are.
+
+    deterministic: of the kernels for GPUs (`cuda.CudaRaster`); those for the CPU always are.
+    """
     parts = (splats.means, splats.conics, splats.opacities, splats.colours)
-    raster = Raster(
-        _joined(parts),
-        splats.depths.detach().numpy(),
-        splats.drawn.numpy(),
-        background.numpy(),
-        width,
-        height,
-        settings,
+    raster = held_view(
+        _joined(parts), splats.depths.detach(), splats.drawn, background, width, height, settings, deterministic
     )
     planes = _Rasterize.apply(raster, *parts)
     return planes[:3], planes[3]  # pyright: ignore

@@ -22,7 +22,7 @@ from triton import knobs
 from triton.language.standard import _elementwise_max, _sum_combine
 
 INTERPRETED = knobs.runtime.interpret
-static_range: Any = tl.static_range  # a loop that is unrolled; typed as what kernels see of it
+static_range: Any = range if INTERPRETED else tl.static_range  # a loop that is unrolled
 
 
 def jit(function: Callable) -> Any:

@@ -53,6 +53,19 @@ CASES = {
 }
 
 
+# few enough entries for an interpreter: in one tile of 16 x 16 pixels all that the cases above have
+TINY = {
+    "tiny walled": Case(20, size=(6, 5), logit=6.0, spread=0.05, focal=150.0),
+    "tiny capped": Case(6, size=(9, 12), logit=5.0, focal=20.0, settings=RenderSettings(transmittance_min=1e-7)),
+    "tiny smooth": Case(5, size=(10, 10), focal=20.0, settings=SMOOTH),
+    "tiny three sigma": Case(9, size=(12, 8), logit=2.0, focal=20.0, settings=RenderSettings(contour_sigma=3.0)),
+    "tiny through the cap": Case(
+        9, size=(9, 8), logit=4.0, focal=20.0, settings=RenderSettings(gradient_through_cap=True)
+    ),
+    "tiny equal depths": Case(6, size=(20, 9), logit=1.0, layers=2, focal=20.0),
+}
+
+
 @dataclass(frozen=True)
 class Truth:
     """What the specification says of a case; G: cotangent (4, h, w), dG and U: K tangents of it and of the splats."""
@@ -87,7 +100,7 @@ def composite(splats: Tensor, depths: Tensor, drawn: Tensor, case: Case) -> Tens
 
 @cache
 def truth(name: str) -> Truth:
-    case = CASES[name]
+    case = (CASES | TINY)[name]
     width, height = case.size
     camera = random_camera(width, height, focal=case.focal)
     projected = project(random_gaussians(case.n, logit=case.logit, spread=case.spread), camera, case.settings)

@@ -1,0 +1,190 @@
+"""The compositing kernels for GPUs against the float64 specification; on a machine without one, by Triton's interpreter."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("triton", reason="the kernels for GPUs need triton; install splat-landscape[gpu]")
+
+from splat.projection import Splats
+from splat.raster import functions
+from splat.raster.cuda import TOGETHER, CudaRaster
+from splat.settings import RenderSettings
+from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, NUMPY, relative_error
+from tests.splat.raster.compositing_cases import BACKGROUND, BLOCKS, CASES, TINY, truth
+
+FAST = torch.cuda.is_available()
+each_case = pytest.mark.parametrize("name", [*CASES, *TINY] if FAST else TINY)
+each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
+VECTORS = TOGETHER + 1  # a full launch and one more
+
+
+@dataclass(frozen=True)
+class Results:
+    """All that the kernels compute of a case."""
+
+    raster: CudaRaster
+    gradient: Tensor
+    jvp: Tensor
+    curvature: Tensor
+
+
+def raster_of(name: str, dtype: torch.dtype, device: torch.device, deterministic: bool = True) -> CudaRaster:
+    expected = truth(name)
+    splats, depths = expected.splats.to(device), expected.depths.to(device, dtype)
+    return CudaRaster(
+        splats, depths, expected.drawn.to(device), BACKGROUND.to(device), *expected.case.size, expected.case.settings,
+        deterministic,
+    )  # fmt: skip
+
+
+@cache
+def results(
+    name: str, dtype: torch.dtype, device: torch.device, deterministic: bool = True, K: int = VECTORS
+) -> Results:
+    expected = truth(name)
+    raster = raster_of(name, dtype, device, deterministic)
+    adjoint = raster.backward(expected.G.to(device))
+    tangent = raster.jvp(expected.U[:, :K].to(device))
+    product = tangent.curvature(adjoint, expected.dG[:K].to(device))
+    return Results(raster, adjoint.gradient, tangent.planes, product)
+
+
+def errors(got: Tensor, expected: Tensor) -> dict[str, float]:
+    """The relative error of every attribute of splats (n, ..., 9)."""
+    return {name: relative_error(got[..., rows].cpu(), expected[..., rows]) for name, rows in BLOCKS.items()}
+
+
+def at_most(bound: float) -> dict[str, object]:
+    return dict.fromkeys(BLOCKS, pytest.approx(0, abs=bound))
+
+
+@each_dtype
+@each_case
+def test_colour_and_alpha_are_those_of_the_specification(name, dtype, device):
+    expected, planes = truth(name), results(name, dtype, device).raster.planes.cpu()
+    assert planes.dtype == dtype
+    assert relative_error(planes * expected.decided, expected.planes * expected.decided) < IMAGE[dtype]
+
+
+@each_dtype
+@each_case
+def test_the_gradient_is_that_of_the_specification(name, dtype, device):
+    got = results(name, dtype, device).gradient
+    assert got.dtype == torch.float64 and errors(got, truth(name).gradient) == at_most(DERIVATIVE[dtype])
+
+
+@each_dtype
+@each_case
+def test_tangents_and_curvature_are_those_of_the_specification(name, dtype, device):
+    expected, got = truth(name), results(name, dtype, device)
+    jvp = got.jvp.cpu() * expected.decided
+    assert relative_error(jvp, expected.jvp[:VECTORS] * expected.decided) < DERIVATIVE[dtype]
+    assert errors(got.curvature, expected.curvature[:, :VECTORS]) == at_most(DERIVATIVE[dtype])
+
+
+def test_the_cases_stop_pixels_leave_entries_unreached_and_reach_the_cap(device):
+    walled = results("tiny walled", torch.float64, device).raster
+    assert walled.slots.count < walled.entries
+    for name in ("tiny walled", "tiny capped", "tiny through the cap"):
+        assert (truth(name).splats[:, 5] > 0.99).sum() > 0
+    for name in TINY:
+        assert truth(name).planes[3].max() > 0.2 and truth(name).decided.double().mean() > 0.9
+
+
+@pytest.mark.parametrize("name", [*CASES, *TINY] if FAST else ["tiny equal depths"])
+def test_atomic_sums_differ_from_slots_by_round_off(name, device):
+    one, other = results(name, torch.float64, device), results(name, torch.float64, device, deterministic=False)
+    assert torch.equal(one.raster.planes, other.raster.planes) and torch.equal(one.jvp, other.jvp)
+    assert relative_error(one.gradient, other.gradient) < 1e-14
+    assert relative_error(one.curvature, other.curvature) < 1e-13
+
+
+@pytest.mark.parametrize("name", CASES if FAST else ["tiny equal depths"])
+def test_results_are_the_same_to_the_last_bit_when_repeated(name, device):
+    one, other = results(name, torch.float32, device), results.__wrapped__(name, torch.float32, device)
+    assert torch.equal(one.gradient, other.gradient) and torch.equal(one.curvature, other.curvature)
+
+
+@each_dtype
+def test_own_blocks_are_those_of_the_cpu(dtype, device):
+    expected, got = truth("tiny walled"), results("tiny walled", dtype, device).raster
+    cpu, index = expected.raster(dtype), torch.arange(expected.case.n)
+    h = torch.rand(3, got.height, got.width, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for gauss_newton in (False, True) if dtype == torch.float64 else (False,):
+        adjoint = cpu.backward(cpu.pad(expected.G.numpy()))
+        want = cpu.own_blocks(adjoint, cpu.pad(h.numpy().astype(NUMPY[dtype])), index.numpy(), gauss_newton)
+        blocks = got.own_blocks(got.backward(expected.G.to(device)), h.to(device), index.to(device), gauss_newton)
+        assert relative_error(blocks, want) < DERIVATIVE[dtype]
+
+
+@each_dtype
+def test_nothing_drawn_is_the_background_and_has_no_derivative(dtype, device):
+    background = torch.tensor([0.25, 0.5, 0.75], device=device)
+    splats, depths = torch.zeros(3, 9, device=device), torch.ones(3, dtype=dtype, device=device)
+    for n in (3, 0):
+        drawn = torch.zeros(n, dtype=torch.bool, device=device)
+        raster = CudaRaster(splats[:n], depths[:n], drawn, background, 7, 5, RenderSettings())
+        assert (raster.planes[:3] == background[:, None, None]).all() and (raster.planes[3] == 0).all()
+        adjoint, tangent = raster.backward(raster.planes), raster.jvp(torch.ones(n, 2, 9, device=device))
+        product = tangent.curvature(adjoint, torch.zeros_like(tangent.planes))
+        assert not adjoint.gradient.any() and not tangent.planes.any() and not product.any()
+        assert (
+            adjoint.gradient.shape == (n, 9)
+            and product.shape == (n, 2, 9)
+            and raster.entries == len(raster.touched) == 0
+        )
+
+
+def test_tiles_with_a_cotangent_of_zero_add_nothing(device):
+    expected, raster = truth("tiny equal depths"), raster_of("tiny equal depths", torch.float64, device)
+    tangent, whole = raster.jvp(expected.U[:, :1].to(device)), results("tiny equal depths", torch.float64, device)
+    lit = torch.zeros(raster.height, raster.width, device=device, dtype=torch.float64)
+    lit[:, :16] = 1  # the first of two tiles
+    gradients, products = [], []
+    for part in (lit, 1 - lit):
+        adjoint = raster.backward(part * expected.G.to(device))
+        gradients.append(adjoint.gradient)
+        products.append(tangent.curvature(adjoint, part * expected.dG[:1].to(device)))
+    assert min(gradient.abs().max() for gradient in gradients) > 0
+    assert relative_error(gradients[0] + gradients[1], whole.gradient) < 1e-13
+    assert relative_error(products[0] + products[1], whole.curvature[:, :1]) < 1e-13
+
+
+def test_a_cotangent_that_is_not_a_number_is_not_taken_for_zero(device):
+    raster = raster_of("tiny smooth", torch.float64, device)
+    cotangent = torch.zeros_like(raster.planes)
+    cotangent[1, raster.planes[3].argmax() // raster.width, raster.planes[3].argmax() % raster.width] = torch.nan
+    assert raster.backward(cotangent).gradient.isnan().any()
+
+
+def test_the_splats_with_entries_are_those_with_slots(device):
+    raster = results("tiny walled", torch.float64, device).raster
+    slots = raster.slots
+    assert raster.touched.tolist() == (slots.last > slots.first).nonzero()[:, 0].tolist()
+    assert 0 < len(raster.touched) < len(raster.splats)
+    assert raster.bytes > raster.params.nbytes
+
+
+def test_as_a_torch_function_it_has_the_derivatives_of_the_cpu(device, monkeypatch):
+    expected = truth("tiny equal depths")
+    splats = expected.splats.to(device)
+    drawn = (expected.depths.to(device), expected.drawn.to(device))
+    found = []
+    for make in (functions.held_view, CudaRaster):
+        monkeypatch.setattr(functions, "held_view", make)
+        where = device if make is CudaRaster else torch.device("cpu")
+        parts = [part.to(where).requires_grad_() for part in splats.split((2, 3, 1, 3), dim=1)]
+        shown = Splats(parts[0], parts[1], parts[2][:, 0], parts[3], *(tensor.to(where) for tensor in drawn))
+        image, alpha = functions.rasterize_by_kernel(
+            shown, BACKGROUND.to(where), *expected.case.size, expected.case.settings
+        )
+        loss = image.square().sum() + (alpha * image[0]).sum()
+        gradient = torch.cat(torch.autograd.grad(loss, parts, create_graph=True), dim=1)
+        product = torch.autograd.grad((gradient * expected.U[:, 0].to(where)).sum(), parts)
+        found.append((gradient.detach().cpu(), torch.cat(product, dim=1).cpu()))
+    for one, other in zip(*found, strict=True):
+        assert relative_error(one, other) < DERIVATIVE[torch.float64]

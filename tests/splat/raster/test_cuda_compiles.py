@@ -1,0 +1,60 @@
+"""Every kernel of the rasterizer compiles for GPUs, without a GPU: what the interpreter accepts, the compiler may not."""
+
+from tests.splat.ahead_of_time import compile_kernel, run_as_script
+
+INTEGERS = (
+    "order", "start", "reached", "splat_of", "slots", "stop", "first_column", "count", "strip_rank",
+)  # fmt: skip
+LONG = ("strip_start", "last")
+DOUBLES = ("frame", "splats", "limits", "directions", "totals", "gradient", "moments", "product")
+REALS = (
+    "params", "planes", "transmittance", "cotangent", "sums", "tangents", "transmittances", "cotangents", "curvature",
+)  # fmt: skip
+
+
+def types(real: str) -> dict[str, str]:
+    """The types of the kernels' parameters by name."""
+    pointers = dict.fromkeys(INTEGERS, "*i32") | dict.fromkeys(LONG, "*i64") | dict.fromkeys(DOUBLES, "*fp64")
+    return pointers | dict.fromkeys(REALS, f"*{real}") | {"drawn": "*i8"}
+
+
+def kernels() -> list[tuple]:
+    """Every kernel with the types of its parameters, its constants and its warps, as `cuda.py` launches it."""
+    from splat.raster import cuda_binning, cuda_blocks, cuda_compositing, cuda_packing
+    from splat.raster.cuda import BLOCK, LAUNCH, ROWS, TILE, TOGETHER
+
+    single = types("fp32")
+    tiled, blocked = LAUNCH["num_warps"], {"BLOCK": BLOCK}
+    strips = {"BLOCK": cuda_binning.BLOCK, "WIDTH": cuda_binning.WIDTH}
+    slots = {"WIDTH": cuda_packing.SUMS, "PADDED": 16, "BLOCK": ROWS}
+    to_first = {"first": "*i32"}
+    return [
+        (cuda_binning.count_strips, single | to_first, strips, 4),
+        (cuda_binning.count_rows, single | to_first, strips | {"HEIGHT": cuda_binning.HEIGHT}, 4),
+        (cuda_packing.pack_splats, single, blocked, 4),
+        (cuda_packing.pack_tangents, single, blocked, 4),
+        (cuda_packing.sum_slots, single | {"first": "*i64"}, slots, 1),
+        (cuda_packing.reduce_gradient, single, blocked, 4),
+        (cuda_packing.reduce_curvature, single, blocked, 4),
+        (cuda_compositing.forward, single, TILE, tiled),
+        (cuda_compositing.forward, types("fp64"), TILE, tiled),
+        (cuda_compositing.backward, single, TILE | {"ATOMIC": False}, tiled),
+        (cuda_compositing.backward, single, TILE | {"ATOMIC": True}, tiled),
+        (cuda_compositing.tangent, single, TILE | {"K": TOGETHER}, tiled),
+        (cuda_compositing.curvature, single, TILE | {"K": TOGETHER, "ATOMIC": False}, tiled),
+        (cuda_blocks.block_moments, single | {"gradient": "*fp32"}, TILE | {"ATOMIC": False}, tiled),
+    ]
+
+
+def test_every_kernel_compiles_and_spills_no_register():
+    lines = run_as_script(__file__)
+    assert len(lines) == 14
+    for line in lines:
+        name, real, registers, stack = line.split()
+        assert 16 <= int(registers) <= 255, name
+        assert stack == "0" or real == "*fp64", name
+
+
+if __name__ == "__main__":
+    for kernel, parameters, constants, warps in kernels():
+        print(kernel.__name__, parameters["params"], *compile_kernel(kernel, parameters, constants, warps))
