@@ -1,0 +1,42 @@
+"""Where a scene is worked on: the CPU, by kernels in Numba, or an NVIDIA GPU, by kernels in Triton.
+
+Parameters, images and probe vectors are tensors on that device, and the device of the parameters decides which kernels run.
+Cameras, colours of backgrounds and generators of random numbers may stay on the CPU.
+"""
+
+from importlib.util import find_spec
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+
+
+def device_named(name: DeviceName) -> torch.device:
+    """The device; auto: the GPU where it can be used, else the CPU.  ValueError where cuda is asked for and cannot be used."""
+    if name not in ("auto", "cpu", "cuda"):
+        raise ValueError(f"expected the device 'auto', 'cpu' or 'cuda', got {name!r}")
+    lack = None if name == "cpu" else _lack()
+    if name == "cuda" and lack:
+        raise ValueError(f"expected an NVIDIA GPU for the device cuda, got {lack}, or use the device cpu")
+    return torch.device("cpu" if name == "cpu" or lack else "cuda")
+
+
+def _lack() -> str | None:
+    """What is missing for work on a GPU, and what to do about it."""
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__}, which was built without CUDA; install torch's CUDA build"
+    if not torch.cuda.is_available():
+        return "none that torch can use; look whether nvidia-smi lists one and its driver is new enough"
+    if find_spec("triton") is None:
+        return "no triton to compile its kernels; pip install splat-landscape[gpu]"
+    return None
+
+
+INTERPRETED = False  # tests of the Triton kernels without a GPU set this: then they take tensors on the CPU, too
+
+
+def by_triton(tensor: Tensor) -> bool:
+    """Whether what is computed from this tensor is computed by the Triton kernels."""
+    return INTERPRETED or tensor.device.type != "cpu"
