@@ -35,7 +35,7 @@ from splat.raster.cuda_packing import (
     X,
     Y,
 )
-from splat.raster.triton_formulas import device, fma, jit, max_over, static_range, sum_over, twins
+from splat.raster.triton_formulas import device, fma, jit, max_over, sum_over, twins
 
 NEVER = tl.constexpr(2**31 - 1)  # the stop index of a pixel that does not stop
 CHUNK = tl.constexpr(16)  # entries between two looks whether all pixels of a tile have stopped
@@ -110,34 +110,62 @@ def any_lit(g):
 
 
 @device
-def nine_sums(v, u, s, w, h):
-    """The nine sums over a tile, (K, 16) with zeros after them: over the rows of each column first."""
+def side_by_side(one, other, lane, axis: tl.constexpr):
+    """The sums of two arrays over an axis of length 2, one at either place of it."""
+    first = (lane >> (5 - axis)) % 2 == 0
+    return tl.where(first, sum_over(one, axis, True), sum_over(other, axis, True))
+
+
+@device
+def nine_sums(v, u, s, w, h, K: tl.constexpr, HEIGHT: tl.constexpr):
+    """The nine sums over a tile, (K, 16): sum j at `place_of_sums` j.
+
+    A thread adds up its rows.  Then the threads of a warp, five axes of length 2, halve the number of sums with every exchange:
+    20 exchanges for nine sums instead of 45.
+    """
     rows = row_terms(v, s, w, h)
     columns = (
-        sum_over(rows[0], 1),
-        sum_over(rows[1], 1),
-        sum_over(rows[2], 1),
-        sum_over(rows[3], 1),
-        sum_over(rows[4], 1),
-        sum_over(rows[5], 1),
+        sum_over(tl.reshape(rows[0], (K, HEIGHT // 2, 2, 16)), 1),
+        sum_over(tl.reshape(rows[1], (K, HEIGHT // 2, 2, 16)), 1),
+        sum_over(tl.reshape(rows[2], (K, HEIGHT // 2, 2, 16)), 1),
+        sum_over(tl.reshape(rows[3], (K, HEIGHT // 2, 2, 16)), 1),
+        sum_over(tl.reshape(rows[4], (K, HEIGHT // 2, 2, 16)), 1),
+        sum_over(tl.reshape(rows[5], (K, HEIGHT // 2, 2, 16)), 1),
     )
-    nine = column_terms(columns, sum_over(u, 1))
-    j = tl.arange(0, 16)[None, :]
-    total = tl.where(j == 0, sum_over(nine[0], 1)[:, None], 0.0)
-    for i in static_range(1, 9):
-        total = tl.where(j == i, sum_over(nine[i], 1)[:, None], total)
-    return total
+    nine = column_terms(columns, u)
+    lane = tl.reshape(tl.arange(0, 32), (1, 2, 2, 2, 2, 2))
+    a = side_by_side(threads(nine[0], K), threads(nine[1], K), lane, 1)
+    b = side_by_side(threads(nine[2], K), threads(nine[3], K), lane, 1)
+    c = side_by_side(threads(nine[4], K), threads(nine[5], K), lane, 1)
+    d = side_by_side(threads(nine[6], K), threads(nine[7], K), lane, 1)
+    ninth = sum_over(sum_over(sum_over(threads(nine[8], K), 1, True), 2, True), 3, True)
+    eight = side_by_side(side_by_side(a, b, lane, 2), side_by_side(c, d, lane, 2), lane, 3)
+    return tl.reshape(sum_over(side_by_side(eight, ninth, lane, 4), 5), (K, 16))
+
+
+@device
+def threads(x, K: tl.constexpr):
+    return tl.reshape(x, (K, 2, 2, 2, 2, 2))
+
+
+@device
+def place_of_sums():
+    """Which sum lies at each of the 16 places that `nine_sums` fills, (1, 16), and where it is no copy."""
+    place = tl.arange(0, 16)[None, :]
+    even = place % 2 == 0
+    return tl.where(even, place // 8 + place // 4 % 2 * 2 + place // 2 % 2 * 4, 8), even | (place == 1)
 
 
 @device
 def put_sums(sums, at, total, K: tl.constexpr, ATOMIC: tl.constexpr):
     """Write or add an entry's sums, K times nine from at * K * 9."""
-    j, k = tl.arange(0, 16)[None, :], tl.arange(0, K)[:, None]
+    j, kept = place_of_sums()
+    k = tl.arange(0, K)[:, None]
     place = sums + (at.to(tl.int64) * K + k) * 9 + j
     if ATOMIC:
-        tl.atomic_add(place, total, (j < 9) & (k < K), sem="relaxed")
+        tl.atomic_add(place, total, kept & (k < K), sem="relaxed")
     else:
-        tl.store(place, total, (j < 9) & (k < K))
+        tl.store(place, total, kept & (k < K))
 
 
 @device
@@ -212,9 +240,10 @@ def backward(
         if not ATOMIC:
             clear_slots(slots, first, count, sums, 9)
         count = 0
+    following = tl.load(splat_of + first + tl.maximum(count - 1, 0))
     for back in range(0, count):
-        k = count - 1 - back
-        s_index = tl.load(splat_of + first + k)
+        k, s_index = count - 1 - back, following
+        following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
         splat = params + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
@@ -222,7 +251,7 @@ def backward(
         s = tl.where(uncapped <= tl.load(splat + CAP), we - beta * R, 0.0)
         R = after
         at = s_index if ATOMIC else tl.load(slots + first + k)
-        put_sums(sums, at, nine_sums(v, u, s, w, g), 1, ATOMIC)
+        put_sums(sums, at, nine_sums(v, u, s, w, g, 1, HEIGHT), 1, ATOMIC)
 
 
 @device
@@ -259,8 +288,10 @@ def tangent(
     T = tl.full((1, HEIGHT, WIDTH), 1.0, real)
     dT = tl.zeros((K, HEIGHT, WIDTH), real)
     red, green, blue = dT, dT, dT
+    following = tl.load(splat_of + first)
     for k in range(0, count):
-        s_index = tl.load(splat_of + first + k)
+        s_index = following
+        following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
         splat = params + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
@@ -306,9 +337,10 @@ def curvature(
         if not ATOMIC:
             clear_slots(slots, first, count, sums, 9 * K)
         count = 0
+    following = tl.load(splat_of + first + tl.maximum(count - 1, 0))
     for back in range(0, count):
-        k = count - 1 - back
-        s_index = tl.load(splat_of + first + k)
+        k, s_index = count - 1 - back, following
+        following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
         splat = params + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
@@ -320,4 +352,4 @@ def curvature(
         tau, dR, ds, h = step_curvature(tau, dR, (dg[0], dg[1], dg[2]), w, beta, r * R, dq, g, colour, dcolour)
         R = after
         at = s_index if ATOMIC else tl.load(slots + first + k)
-        put_sums(sums, at, nine_sums(v, u, tl.where(free, ds, 0.0), w, h), K, ATOMIC)
+        put_sums(sums, at, nine_sums(v, u, tl.where(free, ds, 0.0), w, h, K, HEIGHT), K, ATOMIC)
