@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import cached_property, reduce
 from operator import add
 
-import numpy as np
 import psutil
 import torch
 from jaxtyping import Bool, Float
@@ -21,14 +20,19 @@ from torch import Tensor
 
 from landscape.operator import require_vectors
 from splat.gaussians import Gaussians
-from splat.linearize import LinearizedView, OwnBlocks, rasterize_view, touches
+from splat.linearize import LinearizedView, OwnBlocks, hold, order_of, rasterize_view, touches
 from splat.losses import LossSettings
-from splat.losses_cpu import ViewLoss
+from splat.losses_cpu import loss_against
 from splat.null_space import RowSpace, seen_harmonics, seen_parameters
 from splat.scenes.view import View
 from splat.settings import RenderSettings
 
 MOST_VECTORS = 8  # beyond it a block of vectors gains no more: it has left the second-level cache
+
+
+def _free_memory(device: torch.device) -> int:
+    """Bytes, where the Gaussians are."""
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
 
 
 @dataclass(frozen=True)
@@ -85,9 +89,9 @@ class SceneObjective:
         gaussians.require_finite()
         flat, degree = gaussians.flat, gaussians.sh_degree if sh_degree is None else sh_degree
         self.settings, self.views = settings, tuple(views)
-        self.background = torch.zeros(3, dtype=flat.dtype) if background is None else background.to(flat)
+        self.background = flat.new_zeros(3) if background is None else background.to(flat)
         self.couples_pixels = loss.ssim_weight > 0
-        self._losses = [ViewLoss.of(view.image, loss, flat.dtype) for view in views]
+        self._losses = [loss_against(view.image, loss, flat) for view in views]
         everyone = gaussians.select(torch.arange(len(gaussians)), degree)
         self.mask: Bool[Tensor, " n"] = self._support(everyone)
         if not self.mask.any():
@@ -108,14 +112,16 @@ class SceneObjective:
             radial_quaternions=len(active),
             views=len(views),
         )
-        self._memory = psutil.virtual_memory().available // 2 if memory is None else memory
+        self._memory = _free_memory(flat.device) // 2 if memory is None else memory
         self._kept: dict[int, LinearizedView] = {}
 
     def _support(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
-        seen = np.zeros(len(gaussians), np.bool_)
+        seen = gaussians.flat.new_zeros(len(gaussians), dtype=torch.bool)
         for view in self.views:
             seen |= touches(rasterize_view(gaussians, view.camera, self.background, self.settings))
-        return torch.from_numpy(seen)
+        return seen
+
+    collective = False  # whether processes share the views, and so have to call every method together, one at a time
 
     @property
     def view_numbers(self) -> range:
@@ -135,7 +141,7 @@ class SceneObjective:
         for view, loss in zip(self.views, self._losses, strict=True):
             raster = rasterize_view(self.active.with_flat(flat), view.camera, self.background, self.settings)
             total += loss.value(raster.planes)
-            pieces.append(hash(raster.lists.splat.tobytes()))
+            pieces.append(order_of(raster))
         return float(self.mean(torch.tensor(total, dtype=torch.float64))), self.joined(hash(tuple(pieces)))
 
     def loss(self, flat: Float[Tensor, " p"]) -> float:
@@ -149,6 +155,10 @@ class SceneObjective:
     def mean(self, total: Tensor) -> Tensor:
         """The mean over all views, given the sum over those that this process holds: here all of them."""
         return total / len(self.views)
+
+    def total(self, count: int) -> int:
+        """The sum over the processes that share the views, given this one's part."""
+        return count
 
     def stacked(self, rows: Float[Tensor, "n m d"]) -> Float[Tensor, "n _ d"]:
         """The rows of all views, given those of the views that this process holds: here all of them."""
@@ -181,7 +191,7 @@ class SceneObjective:
     def linearize(self, index: int, gaussians: Gaussians | None = None) -> LinearizedView:
         """A view held still at the active Gaussians or, for comparison, at others; nothing is kept."""
         camera, at = self.views[index].camera, self.active if gaussians is None else gaussians
-        return LinearizedView(at, camera, self._losses[index], self.background, self.settings)
+        return hold(at, camera, self._losses[index], self.background, self.settings)
 
     @cached_property
     def gradient(self) -> Float[Tensor, " p"]:
@@ -263,7 +273,8 @@ class SceneHessian:
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         require_vectors(V, self.dim)
-        V, total = self.project(V), torch.zeros(V.shape, dtype=self.dtype)
+        V = self.project(V)
+        total = torch.zeros_like(V, dtype=self.dtype)
         at_once = self.objective.memory_plan.vectors
         for view in self.objective.linearized:
             for start in range(0, V.shape[1], at_once):

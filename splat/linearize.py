@@ -14,6 +14,7 @@ the clamps are held fixed; they are piecewise constant.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from splat.camera import Camera
+from splat.device import by_triton
 from splat.gaussians import Gaussians
 from splat.losses_cpu import LinearLoss, ViewLoss
 from splat.projection_cpu import lens_of, project_arrays
@@ -33,11 +35,17 @@ from splat.settings import RenderSettings
 
 def rasterize_view(
     gaussians: Gaussians, camera: Camera, background: Float[Tensor, "3"], settings: RenderSettings
-) -> Raster:
-    """Project and composite a view by the kernels, without derivatives."""
+) -> Any:
+    """Project and composite a view by the kernels where the Gaussians are, without derivatives."""
     gaussians.require_finite()
+    background, size = background.to(gaussians.flat), (camera.width, camera.height)
+    if by_triton(gaussians.flat):
+        from splat.projection_cuda import project
+        from splat.raster.cuda import CudaRaster
+
+        return CudaRaster(*project(gaussians, lens_of(camera, settings)), background, *size, settings)
     splats, depths, drawn = project_arrays(gaussians, lens_of(camera, settings))
-    return Raster(splats, depths, drawn, background.to(gaussians.flat).numpy(), camera.width, camera.height, settings)
+    return Raster(splats, depths, drawn, background.numpy(), *size, settings)
 
 
 GEOMETRY_COLUMNS = {
@@ -204,10 +212,32 @@ class LinearizedView:
         return torch.from_numpy(out)
 
 
-def touches(raster: Raster) -> Bool[np.ndarray, " n"]:
+def hold(
+    gaussians: Gaussians, camera: Camera, loss: Any, background: Float[Tensor, "3"], settings: RenderSettings
+) -> Any:
+    """A view held still where its Gaussians are: a `LinearizedView` or a `CudaLinearizedView`, of one interface."""
+    if by_triton(gaussians.flat):
+        from splat.linearize_cuda import CudaLinearizedView
+
+        return CudaLinearizedView(gaussians, camera, loss, background, settings)
+    return LinearizedView(gaussians, camera, loss, background, settings)
+
+
+def touches(raster: Any) -> Bool[Tensor, " n"]:
     """Which splats have any weight in any pixel of the image: the exact support of the view's derivatives."""
-    ones = raster.pad(np.ones((4, raster.height, raster.width), raster.dtype))
-    return raster.backward(ones).gradient[:, 6] != 0
+    if isinstance(raster, Raster):
+        ones = raster.pad(np.ones((4, raster.height, raster.width), raster.dtype))
+        return torch.from_numpy(raster.backward(ones).gradient[:, 6] != 0)
+    return raster.backward(torch.ones_like(raster.planes)).gradient[:, 6] != 0
+
+
+def order_of(raster: Any) -> int:
+    """Which splats each tile draws, in which order: the same number for the same lists."""
+    if isinstance(raster, Raster):
+        return hash(raster.lists.splat.tobytes())
+    splat = raster.lists.splat.long()
+    mixed = (splat + 1) * 0x1E3779B97F4A7C15 ^ torch.arange(len(splat), device=splat.device) * 0x3F58476D1CE4E5B9
+    return int(((mixed ^ (mixed >> 31)) * 0x14D049BB133111EB).sum())
 
 
 def _block(U: Tensor) -> np.ndarray:

@@ -7,6 +7,7 @@ Planes are padded as in `raster/cpu.py`; only the first three are read, and the 
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.consistency_kernels import consistency_rows
+from splat.device import by_triton
 from splat.losses import LossSettings, window
 from splat.losses_kernels import CHARBONNIER, L1, L2, SECONDS, diagonal_rows, gradient_rows, product_rows, value_rows
 from splat.raster.compositing import TILE_ROWS
@@ -61,6 +63,15 @@ class ImageLoss:
 
     def _value(self, pixels: np.ndarray, distances: np.ndarray) -> float:
         return float(self.pixel * pixels.sum() + self.structural * distances.sum())
+
+    def consistency(self, x: np.ndarray, y: np.ndarray) -> tuple[Tensor, np.ndarray]:
+        """The loss between two padded images, and its gradients in both (2, 3, ...)."""
+        gradients, (pixels, distances) = self.planes(2), np.zeros((2, 3 * self.shape[0]))
+        over_range(
+            len(pixels), consistency_rows, self.shape, self.taps, x.reshape(-1), y.reshape(-1), *self._pointwise(),
+            *gradients.reshape(2, -1), pixels, distances,
+        )  # fmt: skip
+        return torch.tensor(self._value(pixels, distances), dtype=torch.from_numpy(gradients).dtype), gradients
 
 
 class ViewLoss(ImageLoss):
@@ -128,6 +139,10 @@ class LinearLoss:
         self.loss, self.value, self.gradient = loss, value, gradient
         self._residual, self._second, self._blurred = residual, second, blurred
 
+    def scalar(self, like: Tensor) -> Float[Tensor, ""]:
+        """The value as a tensor like another."""
+        return like.new_tensor(self.value)
+
     def _held(self) -> tuple:
         return self._residual, self.loss.target.reshape(-1), *self.loss._pointwise(), self._second, self._blurred
 
@@ -173,7 +188,7 @@ class _Photometric(torch.autograd.Function):
         linear = loss.linearize(loss.padded(image), second_order=False)
         ctx.loss, ctx.gradient = loss, loss.cropped(linear.gradient)
         ctx.save_for_backward(image)
-        return image.new_tensor(linear.value)
+        return linear.scalar(image)
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
@@ -196,7 +211,16 @@ class _PhotometricGradient(torch.autograd.Function):
         return *last_derivative(values, image, weight, outputs[0]), None, None
 
 
-def view_loss(image: Float[Tensor, "3 h w"], loss: ViewLoss) -> Float[Tensor, ""]:
+def loss_against(target: Float[Tensor, "3 h w"], settings: LossSettings, like: Tensor) -> Any:
+    """The loss of images where `like` is, in its precision: a `ViewLoss`, or a `CudaViewLoss` of the same interface."""
+    if by_triton(like):
+        from splat.losses_cuda import CudaViewLoss
+
+        return CudaViewLoss(target.to(like.device), settings, like.dtype)
+    return ViewLoss.of(target, settings, like.dtype)
+
+
+def view_loss(image: Float[Tensor, "3 h w"], loss: Any) -> Float[Tensor, ""]:
     """The loss of an image as a torch scalar, twice differentiable, by the kernels."""
     return _Photometric.apply(image, loss)  # pyright: ignore[reportReturnType]
 
@@ -206,18 +230,12 @@ SECOND = "expected one derivative of the consistency of two images, got a second
 
 class _Consistency(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x: Tensor, y: Tensor, settings: LossSettings) -> Tensor:
-        loss = ImageLoss(x.shape, settings, NUMPY[x.dtype])
-        pair, gradients = (loss.padded(x).reshape(-1), loss.padded(y).reshape(-1)), loss.planes(2)
-        pixels, distances = np.zeros((2, 3 * loss.shape[0]))
-        over_range(
-            len(pixels), consistency_rows, loss.shape, loss.taps, *pair, *loss._pointwise(),
-            *gradients.reshape(2, -1), pixels, distances,
-        )  # fmt: skip
+    def forward(ctx, x: Tensor, y: Tensor, loss: Any) -> Tensor:
+        value, gradients = loss.consistency(loss.padded(x), loss.padded(y))
         needed = zip(ctx.needs_input_grad, gradients, strict=False)
         ctx.gradients = [loss.cropped(gradient) for need, gradient in needed if need]
         ctx.save_for_backward(x, y)
-        return x.new_tensor(loss._value(pixels, distances))
+        return value
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
@@ -235,4 +253,8 @@ def consistency_loss(x: Float[Tensor, "3 h w"], y: Float[Tensor, "3 h w"], setti
     if (x.shape, x.dtype) != (y.shape, y.dtype):
         kinds = " and ".join(f"{tuple(image.shape)} of {image.dtype}" for image in (x, y))
         raise ValueError(f"expected two images of one shape and dtype, got {kinds}; render both alike")
-    return _Consistency.apply(x, y, settings)  # pyright: ignore[reportReturnType]
+    if by_triton(x):
+        from splat.losses_cuda import CudaImageLoss
+
+        return _Consistency.apply(x, y, CudaImageLoss(x.detach(), settings))  # pyright: ignore[reportReturnType]
+    return _Consistency.apply(x, y, ImageLoss(x.shape, settings, NUMPY[x.dtype]))  # pyright: ignore[reportReturnType]

@@ -38,7 +38,9 @@ class RowSpace:
     def scaled(self, scale: Float[Tensor, "n d"]) -> "RowSpace":
         """The space of all D x, D = diag(scale) > 0 and x in this space."""
         directions = torch.linalg.qr((self.basis.double() * scale[:, None].double()).mT).Q.mT
-        held = torch.arange(self.basis.shape[1]) < self.rank[:, None]  # the padding is at the end
+        held = (
+            torch.arange(self.basis.shape[1], device=self.basis.device) < self.rank[:, None]
+        )  # the padding is at the end
         return RowSpace(torch.where(held[:, :, None], directions, 0.0).to(self.basis.dtype), self.rank)
 
 
@@ -54,18 +56,18 @@ def seen_harmonics(views: Sequence[Held], n: int, bands: int, stacked: Stacked =
 
     stacked: completes the rows of these views to those of all views, where other processes hold some.
     """
-    rows = torch.zeros(n, 4 * len(views), bands, dtype=torch.float64)
+    rows = _like(views).new_zeros(n, 4 * len(views), bands, dtype=torch.float64)
     for m, held in enumerate(views):
-        index = torch.from_numpy(held.index)
-        rows[index, 4 * m] = torch.from_numpy(held.harmonic[:, :bands]).double()
-        rows[index, 4 * m + 1 : 4 * m + 4] = torch.from_numpy(held.slope[:, :bands]).double().mT
-    return _row_space(stacked(rows), _dtype(views))
+        index = torch.as_tensor(held.index)
+        rows[index, 4 * m] = torch.as_tensor(held.harmonic[:, :bands]).double()
+        rows[index, 4 * m + 1 : 4 * m + 4] = torch.as_tensor(held.slope[:, :bands]).double().mT
+    return _row_space(stacked(rows), _like(views).dtype)
 
 
 def seen_parameters(views: Sequence[Held], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
     """The directions of a Gaussian's parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
     parts = [
-        _row_space(stacked(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), _dtype(views))
+        _row_space(stacked(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), _like(views).dtype)
         for start in range(0, n, CHUNK)
     ]
     width = max(part.basis.shape[1] for part in parts)
@@ -73,22 +75,24 @@ def seen_parameters(views: Sequence[Held], n: int, bands: int, stacked: Stacked 
     return RowSpace(torch.cat(padded), torch.cat([part.rank for part in parts]))
 
 
-def _dtype(views: Sequence[Held]) -> torch.dtype:
-    return torch.from_numpy(views[0].jacobian[:0]).dtype
+def _like(views: Sequence[Held]) -> Tensor:
+    """An empty tensor of the views' precision, on their device."""
+    return torch.as_tensor(views[0].jacobian[:0])
 
 
 def _jacobian_rows(views: Sequence[Held], start: int, stop: int, bands: int) -> Float[Tensor, "n r d"]:
     """The Jacobians of the splats of Gaussians start..stop in every view, stacked: nine rows a view, zero where unseen."""
-    rows = torch.zeros(stop - start, 9 * len(views), GEOMETRY + 1 + 3 * bands, dtype=torch.float64)
+    width = GEOMETRY + 1 + 3 * bands
+    rows = _like(views).new_zeros(stop - start, 9 * len(views), width, dtype=torch.float64)
     for m, held in enumerate(views):
-        index = torch.from_numpy(held.index)
+        index = torch.as_tensor(held.index)
         here = (index >= start) & (index < stop)
         i, at = index[here] - start, 9 * m
-        geometry = torch.from_numpy(held.jacobian)[here].double()
-        harmonic = torch.from_numpy(held.harmonic)[here, :bands].double()
+        geometry = torch.as_tensor(held.jacobian)[here].double()
+        harmonic = torch.as_tensor(held.harmonic)[here, :bands].double()
         slope, visible = (
-            torch.from_numpy(held.colour_slope)[here].double(),
-            torch.from_numpy(held.visible)[here].double(),
+            torch.as_tensor(held.colour_slope)[here].double(),
+            torch.as_tensor(held.visible)[here].double(),
         )
         rows[i, at : at + 5, :GEOMETRY] = geometry
         rows[i, at + 5, GEOMETRY] = 1.0
