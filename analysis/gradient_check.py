@@ -51,13 +51,13 @@ def check_against_gradient(
         done += 1
         if progress:
             progress(done, 2 * len(STEPS), "gradients in double precision")
-        return _without_lengths(total / len(objective.views), double)
+        return _without_lengths(objective.mean(total), double)
 
     def order(theta: Float[Tensor, " p"]) -> Hashable:
         means = double.with_flat(theta).means
         cameras = (view.camera for view in objective.views)
         depths = torch.stack([(means - camera.centre) @ camera.forward for camera in cameras])
-        return hash(depths.argsort(dim=1, stable=True).numpy().tobytes())
+        return objective.joined(hash(depths.argsort(dim=1, stable=True).numpy().tobytes()))
 
     return check_gradient(operator, gradient, double.flat, direction, STEPS, order)
 

@@ -306,7 +306,8 @@ def _plane(
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
-    allowed = SliceSettings(workers=thread_count(), max_seconds=max(seconds, SHORTEST))
+    workers = 1 if objective.collective else thread_count()
+    allowed = SliceSettings(workers=workers, max_seconds=max(seconds, SHORTEST))
     evaluate = evaluation(objective, allowed.workers)
     plane = evaluate_slice(evaluate, center, vectors, axes, gradient, operator, allowed, generator, progress=report)
     notes += slice_notes(plane)

@@ -6,6 +6,7 @@ The operator is the exact Hessian of the training loss over the training views, 
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from math import inf, isfinite
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -28,9 +29,11 @@ from analysis.skips import estimator_skips, product_skips
 from analysis.stages import Stages
 from analysis.tables import probe_table
 from analysis.verdict import verdict
+from landscape.distributed import Ranks, torchrun_ranks
 from landscape.probes import split
 from splat.checkpoint import Checkpoint, load_checkpoint
 from splat.curvature import SceneObjective
+from splat.distributed import DistributedObjective
 from splat.raster.simd import lanes_of
 from splat.scenes.scene import Scene
 
@@ -38,16 +41,29 @@ CHECK_FAILED = 1
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
-    """Probe the checkpoint; returns the exit code.  command: as typed, for the record."""
+    """Probe the checkpoint; returns the exit code.  command: as typed, for the record.
+
+    Started by torchrun, the processes share the views, and the first one writes.
+    """
+    with torchrun_ranks() as ranks:
+        return _run(options, command, ranks)
+
+
+def _run(options: ProbeOptions, command: Sequence[str], ranks: Ranks | None) -> int:
     out = options.out or options.checkpoint.parent / "probe"
-    settings, family_options = _settings(options), _family_options(options)
+    settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
+    if ranks is not None and family_options is not None:
+        raise ValueError(
+            "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
+        )
+    writes = ranks is None or ranks.rank == 0
     require_replaceable(out)
-    console, start = Console(stderr=True), perf_counter()
+    console, start = Console(stderr=True, quiet=not writes), perf_counter()
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint = load_checkpoint(options.checkpoint)
         scene = checkpoint.load_scene(options.checkpoint, options.scene)
-        objective = scene_objective(checkpoint, scene)
+        objective = scene_objective(checkpoint, scene, ranks)
     console.print(_introduction(scene, checkpoint, objective), highlight=False)
     with stages:
         loss = checkpoint.training.config.loss
@@ -66,24 +82,38 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
             data["notes"] += found.notes
             data["provenance"]["families"] = asdict(family_options)
             arrays["families"] = found.arrays()
-        with record_folder(out) as folder:
-            write_with_pictures(folder, data, arrays, PROBE, stages, start)
-            write_report(folder)
-    _conclude(data, out)
+        if writes:
+            with record_folder(out) as folder:
+                write_with_pictures(folder, data, arrays, PROBE, stages, start)
+                write_report(folder)
+    if writes:
+        _conclude(data, out)
     failed = any(check["passed"] is False for check in data["checks"].values())
     return CHECK_FAILED if options.strict and failed else 0
 
 
-def scene_objective(checkpoint: Checkpoint, scene: Scene, *, keep_unseen: bool = False) -> SceneObjective:
-    """The training's loss over its views, at the checkpoint.  keep_unseen: see `SceneObjective`."""
-    training, views = checkpoint.training, scene.load(checkpoint.scene.train)
-    return training.config.objective(training.gaussians, views, keep_unseen=keep_unseen)
+def scene_objective(
+    checkpoint: Checkpoint, scene: Scene, ranks: Ranks | None = None, *, keep_unseen: bool = False
+) -> SceneObjective:
+    """The training's loss over its views, at the checkpoint; ranks: share them.  keep_unseen: see `SceneObjective`."""
+    training, names = checkpoint.training, checkpoint.scene.train
+    config, gaussians = training.config, training.gaussians
+    if ranks is None:
+        return config.objective(gaussians, scene.load(names), keep_unseen=keep_unseen)
+    background = config.background_colour(gaussians.flat.dtype)
+    views = scene.load(ranks.share(names))
+    return DistributedObjective(gaussians, views, ranks, config.loss, background, config.render)
 
 
-def _settings(options: ProbeOptions) -> ProbeSettings:
+def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:
+    """shared: by several processes, none of whose clocks may decide what is measured."""
     settings = ProbeSettings.quick() if options.quick else ProbeSettings()
     points = settings.slice_points if options.slice_points is None else options.slice_points
     seconds = settings.seconds if options.seconds is None else options.seconds
+    if shared:
+        if options.seconds is not None and isfinite(options.seconds):
+            raise ValueError(f"expected --seconds inf under torchrun, as without --seconds, got {options.seconds:g}")
+        seconds = inf
     return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=seconds)
 
 

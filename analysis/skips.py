@@ -44,8 +44,8 @@ def product_skips(objective: SceneObjective, gaussians: Gaussians, products: int
     counts = {
         "gaussians_out_of_sight": len(gaussians) - len(active),
         "sh_bands_not_in_use": (stored + 1) ** 2 - (active.sh_degree + 1) ** 2,
-        "entries_behind_opaque_fronts": sum(view.entries_behind for view in objective.linearized),
-        "tiles_of_zero_cotangent": sum(view.dark_tiles for view in objective.linearized),
+        "entries_behind_opaque_fronts": objective.total(sum(view.entries_behind for view in objective.linearized)),
+        "tiles_of_zero_cotangent": objective.total(sum(view.dark_tiles for view in objective.linearized)),
     }
     variants: dict[str, Callable[[], LinearizedView]] = {
         "gaussians_out_of_sight": lambda: objective.linearize(0, gaussians.select(_all(gaussians), active.sh_degree)),
@@ -60,6 +60,7 @@ def product_skips(objective: SceneObjective, gaussians: Gaussians, products: int
     skips = {
         name: Skip(count, max(times[name] - times[""], 0.0) * made if count else 0.0) for name, count in counts.items()
     }
+    spared = objective.total(spared)
     return {**skips, "products_of_views_not_concerned": Skip(spared, spared * times[""])}
 
 

@@ -11,7 +11,8 @@ the numbers are those of one process but for the order of the sum.  What clocks 
 budgets have to stay infinite.  Before a product the ranks compare their vectors, bit for bit: where they parted, all raise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import TypeVar
@@ -99,6 +100,19 @@ class Ranks:
         total = x.to(self.device, copy=True).contiguous()
         dist.all_reduce(total, operation, group=self.group)
         return total.to(x.device)
+
+
+@contextmanager
+def torchrun_ranks() -> Iterator[Ranks | None]:
+    """The processes that torchrun started with this one, joined for as long as the block runs; None without torchrun."""
+    if not dist.is_available() or not dist.is_torchelastic_launched():
+        yield None
+        return
+    dist.init_process_group("gloo")
+    try:
+        yield Ranks.joined()
+    finally:
+        dist.destroy_process_group()
 
 
 class DistributedOperator:

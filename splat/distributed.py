@@ -31,6 +31,8 @@ class DistributedObjective(SceneObjective):
     Raises ValueError on all ranks where their Gaussians differ.
     """
 
+    collective = True
+
     def __init__(
         self,
         gaussians: Gaussians,
@@ -60,6 +62,9 @@ class DistributedObjective(SceneObjective):
 
     def mean(self, total: Tensor) -> Tensor:
         return self.ranks.sum(total) / sum(self.held_views)
+
+    def total(self, count: int) -> int:
+        return int(self.ranks.sum(torch.tensor(count)))
 
     def stacked(self, rows: Float[Tensor, "n m d"]) -> Float[Tensor, "n _ d"]:
         each = rows.shape[1] // len(self.views)
