@@ -4,8 +4,10 @@ points      points: the scene's, from structure from motion, those seen by at le
                 the scene's photographs helped to place them, the test views too
             triangulated: from the training views alone, their poses given (`splat/scenes/triangulation.py`)
             random: a random pixel of a random training view at a depth uniform between near and far, kept where at
-                least two views see it, in that pixel's colour.  near, far: the scene files' depth range, else half and
-                one and a half times the camera's distance to the place that all cameras look at
+                least two views see it and no view is transparent there (alpha 0), in that pixel's colour.  near, far:
+                the scene files' depth range, else half and one and a half times the camera's distance to the place that
+                all cameras look at.  Gaussians of the background's colour in front of it would have no gradient: they
+                stay, and hide the object from other viewpoints
             scene: points where the scene has any, else random
 means       the points                          quats   the identity
 log_scales  isotropic: log of the root mean square distance to the three nearest neighbours (3DGS)
@@ -18,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -28,7 +30,7 @@ from splat.harmonics import Y00
 from splat.scenes.capture import common_target
 from splat.scenes.scene import Scene
 from splat.scenes.triangulation import triangulated_points
-from splat.scenes.view import Frame, Points, View, inside_image
+from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
 
 Source = Literal["scene", "points", "triangulated", "random"]
 OPACITY = 0.1
@@ -102,7 +104,7 @@ def points_in_common_volume(
     depth_ranges: Sequence[tuple[float, float] | None] | None = None,
     min_views: int = 2,
 ) -> Points:
-    """n random points that at least min_views (or all, if they are fewer) of the views see.
+    """n random points that at least min_views (or all, if they are fewer) of the views see, and none as transparent.
 
     depth_ranges: (near, far) of each view, world units; None derives it from where the cameras look.
     """
@@ -119,9 +121,22 @@ def points_in_common_volume(
             )
         xyz, rgb = _random_batch(views, ranges, n, generator)
         sightings = torch.stack([inside_image(v.camera, xyz, r) for v, r in zip(views, ranges)]).sum(dim=0)
-        kept.append((xyz[sightings >= needed], rgb[sightings >= needed]))
+        fit = sightings >= needed
+        for view in views:
+            fit &= ~_transparent(view, xyz)
+        kept.append((xyz[fit], rgb[fit]))
         draws += n
     return Points(torch.cat([xyz for xyz, _ in kept])[:n], torch.cat([rgb for _, rgb in kept])[:n])
+
+
+def _transparent(view: View, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Which points fall on a pixel of the view whose alpha is 0."""
+    found = torch.zeros(len(xyz), dtype=torch.bool)
+    if view.alpha is not None:
+        inside = inside_image(view.camera, xyz)
+        u, v = pixel_coordinates(view.camera, xyz[inside])[0].long().unbind(-1)
+        found[inside] = view.alpha[v, u] == 0
+    return found
 
 
 def _random_batch(

@@ -1,5 +1,6 @@
 """The Gaussians that a training starts from."""
 
+from dataclasses import replace
 from math import cos, log, pi, sin
 from pathlib import Path
 
@@ -120,6 +121,20 @@ def test_random_points_lie_where_two_views_see_them_in_the_colour_of_a_pixel_the
         # the colour is the pixel's index; a point at a pixel's edge may round into the neighbour
         torch.testing.assert_close((points.rgb[mine, 0] * 32).double() + 0.5, column, atol=0.5 + 1e-5, rtol=0)
         torch.testing.assert_close((points.rgb[mine, 1] * 24).double() + 0.5, row, atol=0.5 + 1e-5, rtol=0)
+
+
+def test_random_points_keep_out_of_what_a_view_shows_as_transparent() -> None:
+    """A ball of radius 1/2 about the place where all look, in front of nothing: 2-D discs, whose cones meet around it."""
+    seen = []
+    for view in views():
+        v, u = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(32) + 0.5, indexing="ij")
+        seen.append(replace(view, alpha=((u - 16).square() + (v - 12).square() < 6**2).float()))
+    points = points_in_common_volume(seen, 300, torch.Generator().manual_seed(0)).xyz
+    for view in seen:
+        x, y, z = ((points - view.camera.centre) @ view.camera.rotation.T).unbind(-1)
+        at = torch.stack([40 * x / z + 16, 40 * y / z + 12], dim=1)
+        # the farthest corner of a pixel whose centre is inside
+        assert bool(((at - torch.tensor([16.0, 12.0])).norm(dim=1) < 6 + 0.5**0.5).all())
 
 
 def test_random_depths_are_uniform_between_near_and_far() -> None:
