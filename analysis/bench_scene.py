@@ -47,7 +47,7 @@ class ViewBench:
         self.loss = ViewLoss.of(self.view.image, workload.loss, flat.dtype)
         self.raster = self._rasterize()
         self.lists = self.raster.lists
-        self.cotangent = self.loss.linearize(self.raster.planes, second_order=False).gradient
+        self.cotangent = self.loss.linearize(self.raster.planes).gradient
         self.adjoint = self.raster.backward(self.cotangent)
         self.linearized = self._linearize()
         generator = torch.Generator().manual_seed(0)
@@ -69,7 +69,7 @@ class ViewBench:
         splats, depths, drawn = project_arrays(self.workload.gaussians, self.lens)
         camera = self.view.camera
         raster = Raster(splats, depths, drawn, self.background, camera.width, camera.height, self.workload.settings)
-        adjoint = raster.backward(self.loss.linearize(raster.planes, second_order=False).gradient)
+        adjoint = raster.backward(self.loss.linearize(raster.planes).gradient)
         return self._to_parameters(splats, drawn, adjoint.gradient)
 
     def _to_parameters(self, splats: np.ndarray, drawn: np.ndarray, bar: np.ndarray) -> np.ndarray:
@@ -117,7 +117,7 @@ class ViewBench:
             "pack": lambda: over_range(n, packing.pack_splats, self.splats, -8.0, np.inf, np.empty_like(raster.params)),
             "forward": forward,
             "slots": slots,
-            "loss": lambda: self.loss.linearize(raster.planes, second_order=False),
+            "loss": lambda: self.loss.linearize(raster.planes),
             "backward + reduce": backward,
             "project adjoint": lambda: self._to_parameters(self.splats, self.drawn, adjoint.gradient),
             "compositing": lambda: (forward(), backward()),

@@ -17,7 +17,7 @@ from torch import Tensor
 from splat.consistency_kernels import consistency_rows
 from splat.device import by_triton
 from splat.losses import LossSettings, window
-from splat.losses_kernels import CHARBONNIER, L1, L2, SECONDS, diagonal_rows, gradient_rows, product_rows, value_rows
+from splat.losses_kernels import CHARBONNIER, L1, L2, diagonal_rows, gradient_rows, product_rows, value_rows
 from splat.raster.compositing import TILE_ROWS
 from splat.raster.cpu import aligned
 from splat.raster.functions import last_derivative
@@ -94,57 +94,48 @@ class ViewLoss(ImageLoss):
         over_range(3 * self.shape[0], moments_rows, self.shape, self.taps, *flat)
         return moments
 
-    def _residual(self, image: np.ndarray) -> np.ndarray:
-        return np.subtract(image[:3], self.target, out=self.planes(1)[0]).reshape(-1)
+    def _against(self, image: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The image's three planes, the target's, and the latter's moments, flat."""
+        x = np.ascontiguousarray(image[:3], self.dtype)
+        return x.reshape(-1), self.target.reshape(-1), self._target_moments.reshape(-1)
 
     def value(self, image: np.ndarray) -> float:
         """The loss at padded planes: two blurs instead of the gradient's four."""
-        r, kind, eps = self._residual(image), *self._pointwise()[:2]
+        kind, eps, _, structural = self._pointwise()
         pixels, distances = np.zeros((2, 3 * self.shape[0]))
         over_range(
-            len(pixels), value_rows, self.shape, self.taps, r, self.target.reshape(-1), self._target_moments.reshape(-1),
-            kind, eps, self._pointwise()[3], pixels, distances,
+            len(pixels), value_rows, self.shape, self.taps, *self._against(image), kind, eps, structural, pixels, distances
         )  # fmt: skip
         return self._value(pixels, distances)
 
     def linearize(self, image: np.ndarray, second_order: bool = True) -> "LinearLoss":
-        """Value and gradient at padded planes (at least three), and what the Hessian's product needs if second_order."""
-        r = self._residual(image)
-        second = blurred_sp = np.empty(0, self.dtype)
-        if self.structural and second_order:
-            second, blurred_sp = self.planes(SECONDS).reshape(-1), self.planes(1).reshape(-1)
+        """Value, gradient and Hessian's products at padded planes (at least three), which must not change.
+
+        second_order: on a GPU more is held for the products; here it costs nothing.
+        """
         gradient = aligned((4, *self.shape[2:]), self.dtype)
         gradient[:, self.shape[0] :] = 0
         gradient[3] = 0
         pixels, distances = np.zeros((2, 3 * self.shape[0]))
         over_range(
-            len(pixels), gradient_rows, self.shape, self.taps, r, self.target.reshape(-1), self._target_moments.reshape(-1),
-            *self._pointwise(), second, blurred_sp, gradient.reshape(-1), pixels, distances,
+            len(pixels), gradient_rows, self.shape, self.taps, *self._against(image), *self._pointwise(),
+            gradient.reshape(-1), pixels, distances,
         )  # fmt: skip
-        return LinearLoss(self, self._value(pixels, distances), gradient, r, second, blurred_sp)
+        return LinearLoss(self, self._value(pixels, distances), gradient, image)
 
 
 class LinearLoss:
     """A loss held still at an image: value, gradient (4, padded planes; that of alpha is 0) and Hessian-vector products."""
 
-    def __init__(
-        self,
-        loss: ViewLoss,
-        value: float,
-        gradient: np.ndarray,
-        residual: np.ndarray,
-        second: np.ndarray,
-        blurred: np.ndarray,
-    ):
-        self.loss, self.value, self.gradient = loss, value, gradient
-        self._residual, self._second, self._blurred = residual, second, blurred
+    def __init__(self, loss: ViewLoss, value: float, gradient: np.ndarray, image: np.ndarray):
+        self.loss, self.value, self.gradient, self._image = loss, value, gradient, image
 
     def scalar(self, like: Tensor) -> Float[Tensor, ""]:
         """The value as a tensor like another."""
         return like.new_tensor(self.value)
 
     def _held(self) -> tuple:
-        return self._residual, self.loss.target.reshape(-1), *self.loss._pointwise(), self._second, self._blurred
+        return *self.loss._against(self._image), *self.loss._pointwise()
 
     def hvp(self, tangents: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """l'' v for K padded tangents (K, 4, ...), to out (which may be the tangents themselves)."""
@@ -163,9 +154,8 @@ class LinearLoss:
 
     @property
     def bytes(self) -> int:
-        """Memory of what is held, the target's included."""
-        loss, held = self.loss, (self.gradient, self._residual, self._second, self._blurred)
-        return loss.target.nbytes + loss._target_moments.nbytes + sum(array.nbytes for array in held)
+        """Memory of what is held, the target's included, the image's not."""
+        return self.loss.target.nbytes + self.loss._target_moments.nbytes + self.gradient.nbytes
 
     @cached_property
     def diagonal(self) -> np.ndarray:
@@ -174,7 +164,7 @@ class LinearLoss:
         diagonal = loss.planes(1)[0]
         diagonal[:, loss.shape[0] :] = 0
         over_range(
-            3 * loss.shape[0], diagonal_rows, loss.shape, loss.taps**2, *self._held(), diagonal.reshape(-1)
+            3 * loss.shape[0], diagonal_rows, loss.shape, loss.taps, loss.taps**2, *self._held(), diagonal.reshape(-1)
         )  # fmt: skip
         return diagonal
 
