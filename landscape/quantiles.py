@@ -26,8 +26,7 @@ from math import inf
 
 import torch
 from jaxtyping import Float64
-from scipy.stats import beta
-from scipy.stats import t as student
+from scipy.special import betaincinv, stdtrit
 from torch import Tensor
 
 from landscape.density import bounds_of_rules
@@ -63,7 +62,7 @@ def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Br
     share = (p * density.dim - torch.searchsorted(density.known, grid, right=True)) / max(density.rest, 1)
     inner = share.clamp(TINY, 1 - EPS)
     levels = torch.tensor([[(1 - confidence) / 2], [(1 + confidence) / 2]], dtype=torch.float64)
-    least, most = torch.from_numpy(beta.ppf(levels, max(trials, TINY) * inner, max(trials, TINY) * (1 - inner)))
+    least, most = torch.from_numpy(betaincinv(max(trials, TINY) * inner, max(trials, TINY) * (1 - inner), levels))
     above = grid[(share > 0) & ((upto.mean(dim=0) < least) | (share > 1))]
     reached = grid[(share <= 0) | ((below.mean(dim=0) >= most) & (share <= 1))]
     high = _first(reached, inf)
@@ -85,7 +84,7 @@ def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: flo
         density.rest * torch.stack(column) + certain
         for column in zip(*(tail.excess(grid, p) for tail in tails), strict=True)
     )
-    margin = float(student.ppf((1 + confidence) / 2, len(tails) - 1)) / len(tails) ** 0.5
+    margin = float(stdtrit(len(tails) - 1, (1 + confidence) / 2)) / len(tails) ** 0.5
     beneath = least.mean(dim=0) - margin * least.std(dim=0) > 0  # t is certainly too low, up to the next of the grid
     beyond = most.mean(dim=0) + margin * most.std(dim=0) <= 0  # certainly high enough
     totals = density.rest * torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64) + known.sum()

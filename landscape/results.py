@@ -17,7 +17,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Float64
-from scipy.stats import t as student
+from scipy.special import stdtrit
 from torch import Tensor
 
 StopReason = Literal["tolerance", "noise floor", "matvec budget", "evaluation budget", "time budget", "exact"]
@@ -39,7 +39,7 @@ def t_interval(samples: Float64[Tensor, " s"], confidence: float) -> tuple[float
     if count < 2:
         return mean, inf, -inf, inf
     error = float(samples.std()) / sqrt(count)
-    half = float(student.ppf((1 + confidence) / 2, count - 1)) * error
+    half = float(stdtrit(count - 1, (1 + confidence) / 2)) * error
     return mean, error, mean - half, mean + half
 
 
