@@ -116,15 +116,19 @@ def check_gradient(
     direction: Float[Tensor, " n"],
     steps: Sequence[float] = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6),
     signature: Callable[[Tensor], Hashable] | None = None,
+    enough: float = 0.0,
 ) -> DerivativeCheck:
-    """H v against the central difference of gradient(theta) along v = direction, in units of which steps are given."""
+    """H v against the central difference of gradient(theta) along v = direction, in units of which steps are given.
+
+    enough: the relative error at which no further step is tried.
+    """
     product = operator.apply(direction.to(operator.dtype)[:, None])[:, 0].double()
 
     def discrepancy(step: float) -> float:
         ahead, behind = (gradient(_moved(center, direction, sign * step)).double() for sign in (1, -1))
         return float(((ahead - behind) / (2 * step) - product).norm())
 
-    return _best_step(discrepancy, float(product.norm()), center, direction, steps, signature)
+    return _best_step(discrepancy, float(product.norm()), center, direction, steps, signature, enough)
 
 
 def check_objective(
@@ -158,18 +162,22 @@ def _best_step(
     direction: Tensor,
     steps: Sequence[float],
     signature: Callable[[Tensor], Hashable] | None,
+    enough: float = 0.0,
 ) -> DerivativeCheck:
     """The smallest relative discrepancy: large steps see the next derivative, small ones round-off."""
     if not steps or min(steps) <= 0:
         raise ValueError(f"expected positive steps, got {tuple(steps)}")
     here = signature(center) if signature else None
-    kept, errors = [], []
+    kept, errors, skipped = [], [], 0
     for step in steps:
+        if errors and min(errors) <= enough:
+            break
         if signature and any(signature(_moved(center, direction, sign * step)) != here for sign in (1, -1)):
+            skipped += 1
             continue
         difference = discrepancy(step)
         kept.append(step)
         errors.append(difference / size if size else (inf if difference else 0.0))
     best = min(range(len(kept)), key=errors.__getitem__, default=None)
     error, step = (nan, nan) if best is None else (errors[best], kept[best])
-    return DerivativeCheck(error, step, tuple(kept), tuple(errors), len(steps) - len(kept))
+    return DerivativeCheck(error, step, tuple(kept), tuple(errors), skipped)

@@ -110,6 +110,13 @@ def test_steps_across_a_change_of_signature_are_skipped():
     assert check.skipped == 2 and check.steps == (1e-4, 1e-5) and check.error < 1e-8
 
 
+def test_no_further_step_is_tried_once_one_is_good_enough():
+    steps = (1e-2, 1e-3, 1e-5, 1e-6)
+    every = check_gradient(H, gradient, POINT, DIRECTION, steps)
+    first = check_gradient(H, gradient, POINT, DIRECTION, steps, enough=every.errors[1])
+    assert first.steps == steps[:2] and first.error == every.errors[1] and first.skipped == every.skipped == 0
+
+
 def test_where_every_step_is_skipped_there_is_no_number():
     check = check_gradient(H, gradient, POINT, DIRECTION, signature=lambda x: float(x.sum()))
     assert check.skipped == 5 and check.record()["error"] is None
