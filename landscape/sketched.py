@@ -41,7 +41,7 @@ from time import monotonic
 
 import torch
 from jaxtyping import Float, Float64
-from scipy.stats import t as student
+from scipy.special import stdtrit
 from torch import Tensor
 
 from landscape.hutchinson import GROWTH, LEAST, WIDENING, Hutchinson, TraceSettings
@@ -105,7 +105,7 @@ def xtrace(
         Q, HQ = torch.cat([Q, new], dim=1), torch.cat([HQ, _products(operator, new, settings, name)], dim=1)
         samples, without = _leave_out(Omega, Y, Q, HQ, kind == "gaussian")
         value, error, spent = float(samples.mean()), _error(samples, without), count + Q.shape[1]
-        half = float(student.ppf((1 + settings.confidence) / 2, count - 1)) * error
+        half = float(stdtrit(count - 1, (1 + settings.confidence) / 2)) * error
         half *= WIDENING if settings.adaptive else 1
         late, reached = monotonic() > deadline, settings.reached(value, value - half, value + half)
         if reached or late or count == most:

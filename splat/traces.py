@@ -18,7 +18,7 @@ from time import monotonic
 
 import torch
 from jaxtyping import Float, Float64
-from scipy.stats import t as student
+from scipy.special import stdtrit
 from torch import Tensor
 
 from landscape.control import controlled
@@ -103,7 +103,7 @@ class _Block:
         value = float(samples.mean())
         error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.mean))
         # the slope of the control variate is one more number that the samples had to give
-        quantile = float(student.ppf((1 + settings.confidence) / 2, self.count - 2))
+        quantile = float(stdtrit(self.count - 2, (1 + settings.confidence) / 2))
         half = quantile * error * (WIDENING if settings.adaptive and self.first < self.most else 1.0)
         reason: StopReason = "time budget" if self.late else "matvec budget"
         if settings.reached(value, value - half, value + half):
