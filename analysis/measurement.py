@@ -57,6 +57,7 @@ from splat.traces import exact_traces
 
 GIB = 2**30
 FEWEST_STEPS, FEWEST_POINTS = 8, 5  # of a density and along a side of a slice that are worth their time
+FEWEST_STARTS = 2  # of a density: its spread is an error
 FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds
 # shares of the time; measured on 8,000 Gaussians in 3 views of 504 x 378 pixels
@@ -242,17 +243,22 @@ def _density(
     report: Progress,
     notes: list[str],
 ) -> SpectralDensity | None:
-    """As many steps as time and memory allow; None where that is too few to say anything."""
+    """As many steps as time and memory allow, from fewer start vectors where they are few; None where they are too few."""
     starts, steps = settings.density_starts, settings.density_steps
     room = vectors_within(operator, settings.memory)
     start = monotonic()
     operator.apply(torch.ones(operator.dim, starts, dtype=operator.dtype))
-    steps = int(min(steps, seconds / (monotonic() - start), room))
+    each = (monotonic() - start) / starts
+    if seconds < FEWEST_STEPS * starts * each:
+        starts = min(starts, FEWEST_STARTS)
+    steps = int(min(steps, seconds / (starts * each), room))
     if steps < min(FEWEST_STEPS, active.rank):
         notes.append(
             f"the spectral density was left out: time and memory allowed {steps} steps for each of {starts} start vectors"
         )
         return None
+    if starts < settings.density_starts:
+        notes.append(f"the spectral density took {starts} start vectors instead of {settings.density_starts}")
     if steps < settings.density_steps:
         notes.append(f"the spectral density took {steps} steps instead of {settings.density_steps}, to stay in budget")
     batch = max(1, min(starts, room // steps))
