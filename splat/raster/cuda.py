@@ -20,6 +20,7 @@ from torch import Tensor
 
 from splat.raster import cuda_binning, cuda_blocks, cuda_compositing, cuda_packing
 from splat.raster.cuda_binning import HEIGHT, WIDTH, Slots, grid
+from splat.raster.triton_formulas import launch
 from splat.settings import RenderSettings
 
 LEAST_TRANSMITTANCE = {torch.float32: 1e-30, torch.float64: 1e-290}  # beneath it T would underflow
@@ -28,9 +29,9 @@ TOGETHER = (
     2  # tangents that one launch has in registers: with 4, a thread of `curvature` would need more than there are
 )
 TILE = {"WIDTH": WIDTH, "HEIGHT": HEIGHT}
-LAUNCH = {"num_warps": 1, "enable_fp_fusion": True}
+LAUNCH = {"num_warps": 1}
 BLOCK = 128  # splats a program of the kernels that run over splats
-SPLATS = {"BLOCK": BLOCK, "num_warps": 4, "enable_fp_fusion": True}
+SPLATS = {"BLOCK": BLOCK, "num_warps": 4}
 ROWS = 8  # splats whose slots a program sums
 
 
@@ -58,8 +59,7 @@ class CudaRaster:
         self.frame = _frame(background, settings, self.dtype, self.device)
         self.lists = cuda_binning.bin_splats(self.splats, depths, drawn, width, height, self.frame)
         self.params = self._empty(n, cuda_packing.PARAMS)
-        if n:
-            cuda_packing.pack_splats[grid(n, BLOCK)](self.splats, self.frame, self.params, n, **SPLATS)
+        launch(cuda_packing.pack_splats, grid(n, BLOCK), self.splats, self.frame, self.params, n, **SPLATS)
         self.planes = self._empty(4, height, width)
         self._transmittance, self._stop = self._empty(height, width), self._empty(height, width, dtype=torch.int32)
         self._reached = self._empty(len(self.lists.start) - 1, dtype=torch.int32)
@@ -77,8 +77,9 @@ class CudaRaster:
     def _launch(self, kernel, *arguments, **constants) -> None:
         """A kernel on every tile, heaviest first."""
         columns = -(-self.width // WIDTH)
-        kernel[(len(self._order),)](
-            self._order, *arguments, columns, self.width, self.height, **constants, **TILE, **LAUNCH
+        programs = (len(self._order),)
+        launch(
+            kernel, programs, self._order, *arguments, columns, self.width, self.height, **constants, **TILE, **LAUNCH
         )
 
     @property
@@ -120,23 +121,18 @@ class CudaRaster:
 
         Its first arguments are those of `backward`, its last the sums.
         """
-        n = len(self.splats)
-        count = self.slots.count if self.deterministic else n
-        sums = (
-            self._empty(count, vectors, width)
-            if self.deterministic
-            else torch.zeros(n, vectors, width, dtype=self.dtype, device=self.device)
-        )
+        n, ordered = len(self.splats), self.deterministic
+        sums = self._empty(self.slots.count if ordered else n, vectors, width)
         self._launch(
-            kernel, self.lists.start, self._reached, self.lists.splat,
-            self.slots.slot if self.deterministic else self.lists.splat, self.params, self.frame, self._transmittance,
-            self._stop, *arguments, sums, ATOMIC=not self.deterministic, **constants,
+            kernel, self.lists.start, self._reached, self.lists.splat, self.slots.slot if ordered else self.lists.splat,
+            self.params, self.frame, self._transmittance, self._stop, *arguments, sums if ordered else sums.zero_(),
+            ATOMIC=not ordered, **constants,
         )  # fmt: skip
-        if not self.deterministic or not n:
+        if not ordered:
             return sums
         totals = self._empty(n, vectors, width, dtype=torch.float64)
-        cuda_packing.sum_slots[(*grid(n, ROWS), vectors)](
-            self.slots.first, self.slots.last, sums, totals, n, vectors,
+        launch(
+            cuda_packing.sum_slots, (*grid(n, ROWS), vectors), self.slots.first, self.slots.last, sums, totals, n, vectors,
             WIDTH=width, PADDED=triton.next_power_of_2(width), BLOCK=ROWS, num_warps=1,
         )  # fmt: skip
         return totals
@@ -185,8 +181,8 @@ class CudaAdjoint:
         n, self.cotangent = len(raster.splats), raster.pad(cotangent)
         self.totals = raster.totals(cuda_compositing.backward, 1, cuda_packing.SUMS, self.cotangent)[:, 0]
         self.gradient = torch.empty_like(raster.splats)
-        if n:
-            cuda_packing.reduce_gradient[grid(n, BLOCK)](raster.splats, self.totals, self.gradient, n, **SPLATS)
+        arguments = (raster.splats, self.totals, self.gradient, n)
+        launch(cuda_packing.reduce_gradient, grid(n, BLOCK), *arguments, **SPLATS)
 
     @property
     def moments(self) -> Float[Tensor, "n 3"]:
@@ -205,10 +201,8 @@ class CudaTangent:
         for part in _parts(K):
             size = part.stop - part.start
             packed = raster._empty(n, size, cuda_packing.TANGENTS)
-            if n:
-                cuda_packing.pack_tangents[(*grid(n, BLOCK), size)](
-                    raster.splats, self.directions, packed, n, K, part.start, size, **SPLATS
-                )
+            arguments = (raster.splats, self.directions, packed, n, K, part.start, size)
+            launch(cuda_packing.pack_tangents, (*grid(n, BLOCK), size), *arguments, **SPLATS)
             raster._launch(
                 cuda_compositing.tangent, raster.lists.start, raster._reached, raster.lists.splat, raster.params,
                 raster.frame, raster._stop, packed, self.planes[part], self._transmittances[part], K=size,
@@ -228,10 +222,8 @@ class CudaTangent:
                 cuda_compositing.curvature, size, cuda_packing.SUMS, adjoint.cotangent, packed,
                 self._transmittances[part], cotangents[part], K=size,
             )  # fmt: skip
-            if n:
-                cuda_packing.reduce_curvature[(*grid(n, BLOCK), size)](
-                    raster.splats, self.directions, adjoint.totals, totals, product, n, K, part.start, size, **SPLATS
-                )
+            arguments = (raster.splats, self.directions, adjoint.totals, totals, product, n, K, part.start, size)
+            launch(cuda_packing.reduce_curvature, (*grid(n, BLOCK), size), *arguments, **SPLATS)
         return product
 
 

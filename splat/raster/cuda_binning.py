@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splat.raster import binning
-from splat.raster.triton_formulas import device, jit, twins
+from splat.raster.triton_formulas import device, jit, launch, twins
 
 WIDTH, HEIGHT = 16, 16  # of a tile, in pixels
 BLOCK = 256
@@ -106,6 +106,19 @@ def count_rows(
     tl.store(count + i, tl.where(y0 <= y1, y1 // HEIGHT - y0 // HEIGHT + 1, 0), inside)
 
 
+@jit
+def list_entries(
+    entry_strip, strip_rank, order, entry_start, first_tile, tile, splat, entries, columns, BLOCK: tl.constexpr
+):
+    """The tile and the splat of every entry."""
+    e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = e < entries
+    strip = tl.load(entry_strip + e, inside, other=0)
+    down = (e - tl.load(entry_start + strip, inside, other=0)).to(tl.int32)
+    tl.store(tile + e, tl.load(first_tile + strip, inside, other=0) + down * columns, inside)
+    tl.store(splat + e, tl.load(order + tl.load(strip_rank + strip, inside, other=0), inside, other=0), inside)
+
+
 def grid(size: int, block: int = BLOCK) -> tuple[int]:
     return (triton.cdiv(size, block),)
 
@@ -119,8 +132,7 @@ def starts(count: Int[Tensor, "n"]) -> Int[Tensor, "n_1"]:
 
 def repeated(count: Int[Tensor, "n"], start: Int[Tensor, "n_1"]) -> Int[Tensor, "total"]:
     """The index i, count[i] times over; reads the total back."""
-    index = torch.arange(len(count), dtype=torch.int32, device=count.device)
-    return torch.repeat_interleave(index, count, output_size=int(start[-1]))
+    return torch.repeat_interleave(count, output_size=int(start[-1]))
 
 
 def bin_splats(
@@ -137,27 +149,30 @@ def bin_splats(
     tiles = columns * triton.cdiv(height, HEIGHT)
     order = torch.argsort(depths, stable=True).to(torch.int32)
     first_column, count = (torch.empty(n, dtype=torch.int32, device=device) for _ in range(2))
-    if n:
-        count_strips[grid(n)](
-            order, drawn.to(torch.int8), splats, limits, first_column, count, n, width, height, WIDTH=WIDTH, BLOCK=BLOCK
-        )
+    launch(
+        count_strips, grid(n), order, drawn.to(torch.int8), splats, limits, first_column, count, n, width, height,
+        WIDTH=WIDTH, BLOCK=BLOCK,
+    )  # fmt: skip
     strip_start = starts(count)
     strip_rank = repeated(count, strip_start)
     strips = len(strip_rank)
     first_tile, rows = (torch.empty(strips, dtype=torch.int32, device=device) for _ in range(2))
-    if strips:
-        count_rows[grid(strips)](
-            strip_rank, order, splats, limits, first_column, strip_start, first_tile, rows, strips, columns, width, height,
-            WIDTH=WIDTH, HEIGHT=HEIGHT, BLOCK=BLOCK,
-        )  # fmt: skip
+    launch(
+        count_rows, grid(strips), strip_rank, order, splats, limits, first_column, strip_start, first_tile, rows, strips,
+        columns, width, height, WIDTH=WIDTH, HEIGHT=HEIGHT, BLOCK=BLOCK,
+    )  # fmt: skip
     entry_start = starts(rows)
-    strip = repeated(rows, entry_start)
-    down = torch.arange(len(strip), device=device) - entry_start[strip]
-    tile = (first_tile[strip] + down * columns).to(torch.int16 if tiles < 2**15 else torch.int32)
+    entry_strip = repeated(rows, entry_start)
+    entries = len(entry_strip)
+    tile = torch.empty(entries, dtype=torch.int16 if tiles < 2**15 else torch.int32, device=device)
+    splat = torch.empty(entries, dtype=torch.int32, device=device)
+    launch(
+        list_entries, grid(entries), entry_strip, strip_rank, order, entry_start, first_tile, tile, splat, entries, columns,
+        BLOCK=BLOCK,
+    )  # fmt: skip
     tile, place = torch.sort(tile, stable=True)
     start = torch.searchsorted(tile, torch.arange(tiles + 1, dtype=tile.dtype, device=device), out_int32=True)
-    splat = order[strip_rank[strip[place]]]
-    return Lists(start, tile, splat, place.to(torch.int32), entry_start[strip_start], order)
+    return Lists(start, tile, splat[place], place.to(torch.int32), entry_start[strip_start], order)
 
 
 def kept_entries(lists: Lists, reached: Int[Tensor, "tiles"]) -> Bool[Tensor, "entries"]:

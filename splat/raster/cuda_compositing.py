@@ -1,18 +1,36 @@
 """The compositing kernels on the GPU: `compositing.py`, whose glossary and formulas hold here, in Triton.
 
-A program has one tile of WIDTH x HEIGHT pixels and goes through its entries one by one; a warp has 256 pixels, eight a thread.
-Why so few threads: the nine sums of an entry over a tile cost a warp some ninety instructions whatever the tile's size, and
-warps that share a tile would have to wait for one another at every entry.  A thread's eight pixels are independent, which
-hides the latency that more warps would.  K tangents are the first axis of every array, in registers, so that K = 1 and
-K = 4 are one code and the primal quantities of an entry are computed once for all K.
+A program is one warp.  It has one tile of 16 x 16 pixels, eight a thread, and goes through the tile's entries one by one:
 
-An entry's numbers are the same for all threads: the loads are uniform, from a cache line of 64 bytes a splat.
+- the sums of an entry over a tile cost a warp the same instructions whatever the tile's size, and several warps to a tile
+  would have to wait for one another at every entry; with one there is no barrier and no shared memory
+- a thread's eight pixels are independent, which hides the latency that more warps would
+- an entry's numbers are the same for all threads: the loads are uniform, from one cache line of 64 bytes a splat, and the index
+  of the next entry is loaded one entry ahead
+- K tangents are the first axis of every array, in registers: one code for every K, and an entry's primal quantities are
+  computed once for all.  K = 2 takes all 255 registers; K = 4 would spill (`cuda.TOGETHER`)
+- sums as products with a matrix of ones are for the tensor cores, which round to 10 bits; in full precision they would take
+  more instructions than the exchanges of `nine_sums`
 
-The sums: in deterministic mode every entry writes to its own slot, to be summed in a fixed order (`cuda_packing.sum_slots`);
-in the other, entries add atomically to their splat, in whatever order they come.
+In deterministic mode every entry writes its sums to its own slot, to be added in a fixed order (`cuda_packing.sum_slots`); in
+the other, entries add them atomically to their splat, in whatever order they come.
 
 Decisions are those of the CPU up to the last bits of l and alpha: the exponential is the hardware's (2 units in the last
-place), u and v are rounded at other places.
+place), u and v are rounded at other places (`exponent_terms`).
+
+What an entry costs, counted in the machine code for sm_90 in single precision, for all 256 pixels of its tile; operations are
+counted from the formulas a pixel as `analysis/bench_scene.py` does; bytes come from and go to memory or a cache:
+
+                     instructions a warp   operations a pixel   bytes an entry             bytes a pixel of the image
+    forward          169                   17                   4 + 64                     24
+    backward         354                   30                   8 + 64 + 36               24
+    tangent K = 1    234                   25                   4 + 64 + 48                4 + 20
+    tangent K = 2    334                   36                   4 + 64 + 96                4 + 40
+    curvature K = 1  517                   46                   8 + 64 + 48 + 36          24 + 20
+    curvature K = 2  812                   70                   8 + 64 + 96 + 72          24 + 40
+
+Deterministic mode reads the 36 bytes (a tangent) of an entry once more.  Around that a splat costs 72 + 64 bytes to pack,
+72 + 48 a tangent to pack, 72 for the totals and 3 x 72 to turn them into a gradient, 5 x 72 into the gradient's tangent.
 """
 
 import triton.language as tl
@@ -198,10 +216,12 @@ def forward(
     stopped = tl.where(inside, NEVER, 0)
     zero = tl.zeros((1, HEIGHT, WIDTH), real)
     red, green, blue = zero, zero, zero
+    following = tl.load(splat_of + first, count > 0, other=0)
     done = 0
     while done < count:
         for k in range(done, tl.minimum(done + CHUNK, count)):
-            splat = params + tl.load(splat_of + first + k).to(tl.int64) * 16
+            splat = params + following.to(tl.int64) * 16
+            following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
             _u, v, terms = exponent_terms(splat, x0, y0, x, y)
             alpha, _uncapped = alpha_row(v, terms, T > 0, cap)
             w, after = alpha * T, fma(-alpha, T, T)
@@ -212,9 +232,8 @@ def forward(
         running = max_over(max_over(max_over(T, 2), 1), 0)
         done = tl.where(running > 0, done + CHUNK, count)
     T = tl.abs(T)
-    image = plus((red, green, blue), T, load3(frame, BACKGROUND))
-    size = width * height
-    store_planes(planes, p, size, (image[0].to(real), image[1].to(real), image[2].to(real)), 1.0 - T, inside)
+    image = plus((red, green, blue), T, load_background(frame, real))
+    store_planes(planes, p, width * height, image, 1.0 - T, inside)
     tl.store(transmittance + p, T, inside)
     tl.store(stop + p, stopped, inside)
     furthest = max_over(max_over(max_over(stopped, 2), 1), 0)
@@ -240,7 +259,7 @@ def backward(
         if not ATOMIC:
             clear_slots(slots, first, count, sums, 9)
         count = 0
-    following = tl.load(splat_of + first + tl.maximum(count - 1, 0))
+    following = tl.load(splat_of + first + count - 1, count > 0, other=0)
     for back in range(0, count):
         k, s_index = count - 1 - back, following
         following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
@@ -288,7 +307,7 @@ def tangent(
     T = tl.full((1, HEIGHT, WIDTH), 1.0, real)
     dT = tl.zeros((K, HEIGHT, WIDTH), real)
     red, green, blue = dT, dT, dT
-    following = tl.load(splat_of + first)
+    following = tl.load(splat_of + first, count > 0, other=0)
     for k in range(0, count):
         s_index = following
         following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
@@ -337,7 +356,7 @@ def curvature(
         if not ATOMIC:
             clear_slots(slots, first, count, sums, 9 * K)
         count = 0
-    following = tl.load(splat_of + first + tl.maximum(count - 1, 0))
+    following = tl.load(splat_of + first + count - 1, count > 0, other=0)
     for back in range(0, count):
         k, s_index = count - 1 - back, following
         following = tl.load(splat_of + first + tl.maximum(k - 1, 0))

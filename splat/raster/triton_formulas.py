@@ -16,6 +16,7 @@ from functools import cache
 from types import FunctionType
 from typing import Any
 
+import torch
 import triton
 import triton.language as tl
 from triton import knobs
@@ -26,8 +27,15 @@ static_range: Any = range if INTERPRETED else tl.static_range  # a loop that is 
 
 
 def jit(function: Callable) -> Any:
-    """A kernel, launched by `function[grid](arguments)`: `triton.jit`."""
+    """A kernel, run by `launch`: `triton.jit`."""
     return triton.jit(function)
+
+
+def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
+    """Run a kernel, if any programs, on the device of its first argument, which need not be the current one."""
+    if all(programs):
+        with torch.cuda.device_of(arguments[0]):
+            kernel[programs](*arguments, enable_fp_fusion=True, **constants)
 
 
 def device(function: Callable) -> Any:

@@ -15,8 +15,8 @@ def lists_of(name: str, device: torch.device):
     expected, settings = truth(name), CASES[name].settings
     contour = np.inf if settings.contour_sigma is None else settings.contour_sigma
     limits = torch.tensor([settings.alpha_min, contour], dtype=torch.float64, device=device)
-    inputs = (expected.splats, expected.depths, expected.drawn)
-    return bin_splats(*(tensor.to(device) for tensor in inputs), *expected.case.size, limits)
+    splats, depths, drawn = expected.splats.to(device), expected.depths.to(device), expected.drawn.to(device)
+    return bin_splats(splats, depths, drawn, *expected.case.size, limits)
 
 
 @pytest.mark.parametrize("name", ["typical", "opaque", "three sigma", "equal depths", "less than a tile", "one column"])
