@@ -62,7 +62,7 @@ def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Br
     share = (p * density.dim - torch.searchsorted(density.known, grid, right=True)) / max(density.rest, 1)
     inner = share.clamp(TINY, 1 - EPS)
     levels = torch.tensor([[(1 - confidence) / 2], [(1 + confidence) / 2]], dtype=torch.float64)
-    least, most = torch.from_numpy(betaincinv(max(trials, TINY) * inner, max(trials, TINY) * (1 - inner), levels))
+    least, most = torch.as_tensor(betaincinv(max(trials, TINY) * inner, max(trials, TINY) * (1 - inner), levels))
     above = grid[(share > 0) & ((upto.mean(dim=0) < least) | (share > 1))]
     reached = grid[(share <= 0) | ((below.mean(dim=0) >= most) & (share <= 1))]
     high = _first(reached, inf)

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from splat.device import by_triton
 from splat.gaussians import Gaussians
 
 BETA1, BETA2 = 0.9, 0.999
@@ -42,13 +43,19 @@ class Adam:
         """One step of the parameters, in place."""
         self.updates += 1
         m, v = self.first.flat, self.second.flat
-        m.lerp_(gradient, 1 - BETA1)
         grid = 1024 * torch.finfo(m.dtype).tiny / torch.finfo(m.dtype).eps
+        root, scale = sqrt(1 - BETA2**self.updates), 1 / (1 - BETA1**self.updates)
+        if by_triton(parameters):
+            from splat.adam_cuda import update
+
+            update(parameters, gradient, rates, m, v, root, scale, (BETA1, BETA2, EPS, grid))
+            return
+        m.lerp_(gradient, 1 - BETA1)
         m.add_(grid).sub_(grid)  # no subnormal numbers, to which unseen Gaussians' m would decay: they are 20x slower
         v.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-        denominator = v.sqrt().div_(sqrt(1 - BETA2**self.updates)).add_(EPS)
+        denominator = v.sqrt().div_(root).add_(EPS)
         step = torch.div(m, denominator, out=denominator).mul_(rates)
-        parameters.sub_(step, alpha=1 / (1 - BETA1**self.updates))
+        parameters.sub_(step, alpha=scale)
 
     def select(
         self, index: Int[Tensor, " n"], fresh: Bool[Tensor, " n"] | None = None, sh_degree: int | None = None

@@ -10,10 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-DeviceName = Literal["auto", "cpu", "cuda"]
 
-
-def device_named(name: DeviceName) -> torch.device:
+def device_named(name: Literal["auto", "cpu", "cuda"]) -> torch.device:
     """The device; auto: the GPU where it can be used, else the CPU.  ValueError where cuda is asked for and cannot be used."""
     if name not in ("auto", "cpu", "cuda"):
         raise ValueError(f"expected the device 'auto', 'cpu' or 'cuda', got {name!r}")

@@ -16,7 +16,7 @@ from splat.losses_kernels import CHARBONNIER, L1, L2, SECONDS
 from splat.raster.triton_formulas import INTERPRETED
 
 KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
-BLOCK = 4096 if INTERPRETED else 256
+BLOCK = 1024 if INTERPRETED else 256
 FORMULAS = kernels.FORMULAS
 
 
@@ -51,7 +51,7 @@ class CudaImageLoss:
         return self.pixel * pixels + self.structural * distances
 
     def run(self, kernel, *arguments, vectors: int = 1, **flags) -> None:
-        kernel[(self.programs, vectors)](*arguments, *self.shape, **flags, BLOCK=BLOCK)
+        kernel[(self.programs, vectors)](*arguments, *self.shape, **flags, BLOCK=BLOCK, enable_fp_fusion=True)
 
     def padded(self, image: Tensor) -> Tensor:
         """An image as the kernels take it."""

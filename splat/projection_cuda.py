@@ -28,7 +28,7 @@ def _block(compiled: int) -> int:
 
 
 def _run(kernel: Any, programs: tuple[int, ...], *arguments) -> None:
-    kernel[programs](*arguments, kernels.FORMULAS)
+    kernel[programs](*arguments, kernels.FORMULAS, enable_fp_fusion=True)
 
 
 def _lens_numbers(lens: Lens, device: torch.device) -> Float64[Tensor, " 20"]:
@@ -87,10 +87,11 @@ class CudaProjection:
         self._splats, self._bar, self._index = splats, bar.contiguous(), index
         shapes = ((5, GEOMETRY), (SYMMETRIC,), (16,), (16, 3), (3,), (3,), (3, 3))
         self._held = tuple(flat.new_empty(*shape, m) for shape in shapes)
-        _run(
-        kernels.linearize, (cdiv(m, block),),
-            flat, _lens_numbers(lens, flat.device), splats, self._bar, index, *self._held, self.n, m, self.bands, block
-        )  # fmt: skip
+        inputs = (flat, _lens_numbers(lens, flat.device), splats, self._bar, index)
+        jacobian, curvature, *colours = self._held
+        programs = (cdiv(m, block),)
+        _run(kernels.linearize_geometry, programs, *inputs, jacobian, curvature, self.n, m, block)
+        _run(kernels.linearize_colour, programs, *inputs, curvature, *colours, self.n, m, self.bands, block)
 
     @property
     def held(self) -> Held:
@@ -105,7 +106,7 @@ class CudaProjection:
     def _grid(self, vectors: int) -> tuple[tuple[int, int], int, int]:
         """The programs of a product, and how many Gaussians and vectors each takes."""
         wide = min(next_power_of_2(vectors), WIDEST)
-        block = _block(256 // wide)
+        block = _block(128 // wide)
         return (cdiv(self._index.numel(), block), cdiv(vectors, wide)), block, wide
 
     def jvp(self, block: Float[Tensor, "p k"]) -> Float64[Tensor, "n k 9"]:

@@ -58,21 +58,25 @@ def adjoint_of(lens, mean, log_scales, quat, bar, weight, bands):
 
 
 @traced
-def linearized(lens, mean, log_scales, quat, splat, bar, weight, bands, lane):
-    """The whitened Jacobian (5) and the Hessian (10) of the geometry, the harmonics and their slopes (16 each), row by row.
-
-    Of bar . splat and weight . harmonics; each row a tensor with the direction along its last axis: `lane`.
-    """
+def linearized_geometry(lens, mean, log_scales, quat, splat, bar, lane):
+    """The whitened Jacobian (5 rows) and the Hessian of bar . geometry (10 rows), one direction at each place of `lane`."""
     camera = lens_from(lens)
     numbers = (*mean, *log_scales, *quat)
     variables = [variable(number, lane, i) for i, number in enumerate(numbers)]
     x, s, q = variables[:3], variables[3:6], variables[6:]
     jacobian = whitened(whitening(splat), [tangent_of(value) for value in geometry(camera, x, s, q)])
     m, t, r = geometry_adjoint(camera, x, s, q, bar)
-    along = colour_adjoint(camera, x, weight, bands)
-    rows = (m[0] + along[0], m[1] + along[1], m[2] + along[2], *t, *r)
+    return jacobian, [tangent_of(row) for row in (*m, *t, *r)]
+
+
+@traced
+def linearized_colour(lens, mean, weight, bands, lane):
+    """The harmonics at the view direction, their slopes in the mean, and the Hessian of weight . harmonics (3 rows)."""
+    camera = lens_from(lens)
+    x = [variable(number, lane, i) for i, number in enumerate(mean)]
     slopes = [tangent_of(harmonic) for harmonic in basis(direction_of(camera, x)[0])]
-    return jacobian, [tangent_of(row) for row in rows], basis(direction_of(camera, mean)[0]), slopes
+    along = [tangent_of(row) for row in colour_adjoint(camera, x, weight, bands)]
+    return basis(direction_of(camera, mean)[0]), slopes, along
 
 
 @traced
@@ -238,25 +242,38 @@ def project_adjoint(
 
 
 @triton.jit
-def linearize(
-    flat, lens, splats, bar, index, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope, n, m,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+def linearize_geometry(
+    flat, lens, splats, bar, index, jacobian, curvature, n, m, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
 ):  # fmt: skip
-    """What is held of the Gaussians at index (m,), one direction a lane."""
+    """What is held of the geometry of the Gaussians at index (m,), one direction a lane."""
     e, lane = places(BLOCK, 16)
     here = e < m
     i = tl.load(index + e, here, other=0)
-    camera = numbers(lens, LENS)
-    bars, lit = colour_bars(bar, splats, i, here)
-    weight = harmonic_weights(flat, bars, i, n, BANDS, here)
-    rows, bends, values, slopes = linearized(
-        camera, row(flat, i, 3, 3, here), row(flat + start_of(1, n), i, 3, 3, here),
-        row(flat + start_of(2, n), i, 4, 4, here), row(splats, i, 9, 5, here), row(bar, i, 9, 5, here), weight, BANDS, lane,
+    rows, bends = linearized_geometry(
+        numbers(lens, LENS), row(flat, i, 3, 3, here), row(flat + start_of(1, n), i, 3, 3, here),
+        row(flat + start_of(2, n), i, 4, 4, here), row(splats, i, 9, 5, here), row(bar, i, 9, 5, here), lane,
     )  # fmt: skip
     for r in tl.static_range(5):
         tl.store(jacobian + (r * 10 + lane) * m + e, rows[r], here & (lane < 10))
     for j in tl.static_range(10):
         tl.store(curvature + (j * (j + 1) // 2 + lane) * m + e, bends[j], here & (lane <= j))
+
+
+@triton.jit
+def linearize_colour(
+    flat, lens, splats, bar, index, curvature, harmonic, slope, colour_bar, visible, colour_slope, n, m,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+):  # fmt: skip
+    """What is held of the colours, one direction a lane; what they add to the curvature is added."""
+    e, lane = places(BLOCK, 16)
+    here = e < m
+    i = tl.load(index + e, here, other=0)
+    bars, lit = colour_bars(bar, splats, i, here)
+    weight = harmonic_weights(flat, bars, i, n, BANDS, here)
+    values, slopes, along = linearized_colour(numbers(lens, LENS), row(flat, i, 3, 3, here), weight, BANDS, lane)
+    for j in tl.static_range(3):
+        at, held = curvature + (j * (j + 1) // 2 + lane) * m + e, here & (lane <= j)
+        tl.store(at, tl.load(at, held, other=0.0) + along[j], held)
     for k in tl.static_range(16):
         tl.store(harmonic + k * m + e, values[k], here & (lane == 0))
         tl.store(slope + (k * 3 + lane) * m + e, slopes[k], here & (lane < 3))
