@@ -25,7 +25,7 @@ from landscape.results import Progress
 from splat.curvature import SceneHessian, SceneObjective
 from splat.gaussians import Gaussians
 from splat.losses import LossSettings
-from splat.losses_cpu import ViewLoss, view_loss
+from splat.losses_cpu import loss_against, view_loss
 from splat.projection import project
 from splat.raster.functions import rasterize_by_kernel
 
@@ -39,7 +39,7 @@ def check_against_gradient(
     operator, double = SceneHessian(objective), objective.active.to(torch.float64)
     background, settings = objective.background.double(), objective.settings
     direction = operator.project(_direction(objective, generator)[:, None])[:, 0]
-    losses = [ViewLoss.of(view.image, loss, torch.float64) for view in objective.views]
+    losses = [loss_against(view.image, loss, double.flat) for view in objective.views]
     done = 0
 
     def gradient(theta: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
@@ -57,7 +57,7 @@ def check_against_gradient(
         return _without_lengths(objective.mean(total), double)
 
     def order(theta: Float[Tensor, " p"]) -> Hashable:
-        means = double.with_flat(theta).means
+        means = double.with_flat(theta).means.cpu()
         cameras = (view.camera for view in objective.views)
         depths = torch.stack([(means - camera.centre) @ camera.forward for camera in cameras])
         return objective.joined(hash(depths.argsort(dim=1, stable=True).numpy().tobytes()))

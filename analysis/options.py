@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 Along = Literal["eigenvectors", "random", "gradient", "line"]
+DeviceName = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class TrainOptions:
     """What is trained: 3dgs, stablegs or another of `splat/regularizers/methods.py`, at its published settings."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """KEY=VALUE changes a setting of the method or of the training, as in vsp_weight=0; may be repeated."""
+    device: DeviceName = "auto"
+    """Where to train.  auto: on the GPU where there is one that can be used, else on the CPU."""
     resume: FlagCreatePairsOff[bool] = False
     """Continue the run in OUT; the other options must be those that it was started with."""
     sh_degree: int = 3
@@ -98,6 +101,8 @@ class ProbeOptions:
     """Folder of the results.  Default: probe, beside the checkpoint."""
     seed: int = 0
     """Of the probe vectors."""
+    device: DeviceName = "auto"
+    """Where to work.  auto: on the GPU where there is one that can be used, else on the CPU."""
     strict: FlagCreatePairsOff[bool] = False
     """Exit with 1 if a self-check fails; the record is written all the same."""
     quick: FlagCreatePairsOff[bool] = False

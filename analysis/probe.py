@@ -33,6 +33,7 @@ from landscape.distributed import Ranks, torchrun_ranks
 from landscape.probes import split
 from splat.checkpoint import Checkpoint, load_checkpoint
 from splat.curvature import SceneObjective
+from splat.device import device_named
 from splat.distributed import DistributedObjective
 from splat.raster.simd import lanes_of
 from splat.scenes.scene import Scene
@@ -57,17 +58,19 @@ def _run(options: ProbeOptions, command: Sequence[str], ranks: Ranks | None) -> 
             "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
         )
     writes = ranks is None or ranks.rank == 0
+    device = device_named(options.device)
     require_replaceable(out)
     console, start = Console(stderr=True, quiet=not writes), perf_counter()
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint = load_checkpoint(options.checkpoint)
+        checkpoint.training.move(device)
         scene = checkpoint.load_scene(options.checkpoint, options.scene)
         objective = scene_objective(checkpoint, scene, ranks)
     console.print(_introduction(scene, checkpoint, objective), highlight=False)
     with stages:
         loss = checkpoint.training.config.loss
-        generator = torch.Generator().manual_seed(options.seed)
+        generator = torch.Generator(device).manual_seed(options.seed)
         findings = measure(objective, loss, settings, generator, stages.stage)
         data = probe_data(findings, objective, loss)
         with stages.stage("skips"):

@@ -46,7 +46,7 @@ def probe_arrays(findings: Findings) -> dict[str, dict[str, np.ndarray]]:
     assert findings.ends.ritz is not None
     values, residuals = findings.ends.ritz.numpy()
     arrays["spectrum"] = {"ritz_values": values, "residuals": residuals}
-    arrays["eigenvectors"] = {"largest": findings.ends.largest.vectors.numpy()}
+    arrays["eigenvectors"] = {"largest": findings.ends.largest.vectors.cpu().numpy()}
     if findings.density is not None:
         arrays["spectrum"] |= dict(
             zip(("nodes", "weights"), (x.numpy() for x in findings.density.table()), strict=True)

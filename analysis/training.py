@@ -39,6 +39,7 @@ from analysis.spent import Spent
 from analysis.trajectory import START, Trajectory, TrajectorySettings
 from splat.checkpoint import SceneReference, load_checkpoint, save_checkpoint, write_atomically
 from splat.densify import DensifySettings
+from splat.device import device_named
 from splat.evaluate import Evaluation, ViewScore, evaluate, have_masks
 from splat.losses import LossSettings
 from splat.perceptual import MissingPerceptual, load_lpips
@@ -65,6 +66,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
     scene, split, config, reference = planned(options, out)
+    device = device_named(options.device)
     views, held_out = scene.load(split.train), scene.load(split.test)
     for together in (views, held_out):
         have_masks(together)
@@ -78,6 +80,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         training = Training.start(start, scene.extent(split.train), config)
         _create_run(out, training, reference, keep_start=along is not None)
 
+    training.move(device)
     console = Console(stderr=True)
     camera = views[0].camera
     console.print(

@@ -83,7 +83,8 @@ def spectral_density(
     nodes = torch.zeros(starts, steps, dtype=torch.float64)
     weights = torch.zeros(starts, steps, dtype=torch.float64)
     complete = torch.zeros(starts, dtype=torch.bool)
-    known, V = torch.zeros(0, dtype=torch.float64), torch.zeros(operator.dim, 0, dtype=operator.dtype)
+    known = torch.zeros(0, dtype=torch.float64)
+    V = torch.zeros(operator.dim, 0, dtype=operator.dtype, device=generator.device)
     matvecs = 0
 
     def report(done: int, _: int, state: str) -> None:
@@ -106,7 +107,7 @@ def spectral_density(
         if first == 0 and count > 1:
             known, V, others = found_by_all(factorizations, rules)
         # 1, or 1 on average: keeps the sums unbiased
-        seen = Z.double().square().sum(dim=0) / max(rank - len(known), 1)
+        seen = Z.double().square().sum(dim=0).cpu() / max(rank - len(known), 1)
         for i, (values, vectors) in enumerate(rules):
             left = int(others[i].sum())
             nodes[first + i, :left] = values[others[i]]
@@ -124,8 +125,8 @@ def found_by_all(
         far = torch.tensor([inf], dtype=torch.float64)
         steps = torch.diff(values, prepend=-far, append=far)
         settled.append(norm(run.r) * S[-1].abs() <= SETTLED * torch.minimum(steps[:-1], steps[1:]))
-        vectors.append(run.Q @ S[:, settled[-1]].to(run.Q.dtype))
-    same = [gram(vectors[0], other).square() > 1 - SAME for other in vectors]
+        vectors.append(run.Q @ S[:, settled[-1]].to(run.Q))
+    same = [gram(vectors[0], other).cpu().square() > 1 - SAME for other in vectors]
     common = torch.stack([match.any(dim=1) for match in same]).all(dim=0)
     others = []
     for match, mask in zip(same, settled, strict=True):

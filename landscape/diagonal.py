@@ -77,12 +77,12 @@ class DiagonalEstimate:
             raise ValueError(
                 f"expected a group in 0..{count - 1} for each of {len(self.values)} rows, got shape {tuple(groups.shape)}"
             )
-        zero = torch.zeros(count, dtype=torch.float64)
+        groups, zero = groups.to(self.values.device), self.values.new_zeros(count)
         sums = zero.index_add(0, groups, self.values.abs())
         probes = self.samples.shape[1]
         if probes == 0:
             return GroupSums(sums, zero, zero)
-        signed = torch.zeros(count, probes, dtype=torch.float64)
+        signed = self.values.new_zeros(count, probes)
         signed.index_add_(0, groups, self.values.sign()[:, None] * self.samples)
         excess = zero.index_add(0, groups, _folded_excess(self.values.abs(), self.standard_errors))
         return GroupSums(sums, signed.std(dim=1) / sqrt(probes), excess)
@@ -112,7 +112,7 @@ def estimate_diagonal(
         return DiagonalEstimate(exact, torch.zeros_like(exact), exact.new_zeros(len(exact), 0), operator.blocks, 0)
     half = probes // 2
     choosing = method == "auto" and half >= FEWEST and operator.dim > probes and not isinstance(operator, PartlyKnown)
-    samples, controls = torch.zeros(2, operator.dim, 0, dtype=torch.float64)
+    samples, controls = torch.zeros(2, operator.dim, 0, dtype=torch.float64, device=generator.device)
     kept: list[tuple[Tensor, Tensor]] = []
     while (done := samples.shape[1]) < probes:
         Z = draw_probes(operator.dim, min(batch, probes - done), generator, operator.dtype, "rademacher")

@@ -177,7 +177,6 @@ class _Krylov:
     ) -> None:
         self.operator, self.generator, self.settings = operator, generator, settings
         self.capacity = min(settings.basis, operator.dim)
-        self.basis = torch.empty(self.capacity + settings.block, operator.dim, dtype=operator.dtype)
         self.T = torch.zeros(self.capacity, self.capacity, dtype=torch.float64)
         self.size, self.width, self.scale = 0, 0, 1.0
         self.coupling = torch.zeros(0, 0, dtype=torch.float64)
@@ -187,6 +186,7 @@ class _Krylov:
         )  # components that were known before, and the sum of squares that they are off by
         self.random_start, self.first_cycle = start is None, 0
         first = draw_probes(operator.dim, min(settings.block, self.capacity), generator, operator.dtype)
+        self.basis = first.new_empty(self.capacity + settings.block, operator.dim)
         if start is not None:
             first[:, 0] = _mixed(start, first[:, 0])
         self._append(first.T.contiguous())
@@ -281,7 +281,7 @@ class _Krylov:
         keep = max(s.wanted, min(int(self.capacity * KEEP), self.capacity - 2 * s.block))
         top = s.largest + (keep - s.wanted) // 2
         kept = list(range(keep - top)) + list(range(m - top, m))
-        combination = ritz.coordinates[:, kept].T.to(self.basis.dtype)
+        combination = ritz.coordinates[:, kept].T.to(self.basis)
         for first in range(0, self.basis.shape[1], CHUNK):
             columns = slice(first, first + CHUNK)
             self.basis[:keep, columns] = combination @ self.basis[:m, columns]
@@ -294,7 +294,7 @@ class _Krylov:
     def measured(self, ritz: _Ritz, budget: StopReason, converged: bool) -> tuple[EigenEnds, bool]:
         """The wanted pairs with residuals by the operator itself, and whether more steps would make them better."""
         s = self.settings
-        vectors = self.basis[: self.size].T @ ritz.coordinates[:, ritz.wanted].to(self.basis.dtype)
+        vectors = self.basis[: self.size].T @ ritz.coordinates[:, ritz.wanted].to(self.basis)
         vectors /= torch.linalg.vector_norm(vectors, dim=0)  # restarts leave a little of their round-off
         values = ritz.values[ritz.wanted]
         estimated = ritz.residuals[ritz.wanted]
@@ -337,7 +337,7 @@ class _Krylov:
         unknown = self.operator.apply((vectors @ signs.to(vectors.dtype))[:, None])[:, 0].double()
         self.matvecs += 1
         following = self.basis[self.size : self.size + self.width]
-        known = following.T @ (self.coupling @ last).to(vectors.dtype)
+        known = following.T @ (self.coupling @ last).to(vectors)
         for i, value in enumerate(ritz.values[ritz.wanted]):
             unknown -= signs[i] * (value * vectors[:, i] + known[:, i])
         self.noise = norm(unknown) / len(signs) ** 0.5

@@ -173,6 +173,7 @@ class Hutchinson:
         Z = draw_probes(self.operator.dim, count, self.generator, self.operator.dtype, self.settings.distribution)
         forms = [self.operator.apply(Z)] + ([] if self.part is None else [self.part.apply(Z)])
         sums = torch.stack([torch.stack([column_dots(Z[r], Y[r]) for r in self.rows.values()]) for Y in forms])
+        sums = sums.cpu()
         if not torch.isfinite(sums).all():
             raise ValueError(f"expected finite products H z, got z.Hz = {sums[0].tolist()} in {', '.join(self.rows)}")
         self.samples = torch.cat([self.samples, sums], dim=2)

@@ -29,13 +29,13 @@ class LanczosFactorization:
 def orthogonalise(
     vectors: Float[Tensor, "b n"], basis: Float[Tensor, "m n"], passes: int = 2
 ) -> Float64[Tensor, "m b"]:
-    """Remove from vectors, in place, their components along the orthonormal rows of basis; return these components."""
-    components = torch.zeros(basis.shape[0], vectors.shape[0], dtype=torch.float64)
+    """Remove from vectors, in place, their components along the orthonormal rows of basis; return these, on the CPU."""
+    components = basis.new_zeros(basis.shape[0], vectors.shape[0], dtype=torch.float64)
     for _ in range(passes):
         part = basis @ vectors.T
         vectors.addmm_(part.T, basis, alpha=-1)
         components += part.double()
-    return components
+    return components.cpu()
 
 
 def norm(vector: Tensor) -> float:
@@ -73,7 +73,7 @@ def lanczos(
     if not all(0 < length < torch.inf for length in lengths):
         raise ValueError(f"expected finite start vectors that are not zero, got lengths {lengths}")
     steps = min(steps, n)
-    basis = torch.empty(k, steps, n, dtype=operator.dtype)
+    basis = starts.new_empty(k, steps, n, dtype=operator.dtype)
     T = torch.zeros(k, steps, steps, dtype=torch.float64)
     remainders = torch.stack([start / length for start, length in zip(starts.T, lengths, strict=True)]).to(
         operator.dtype

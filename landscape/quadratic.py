@@ -56,7 +56,7 @@ class PowerSums:
 
 def gram(A: Float[Tensor, "n k"], B: Float[Tensor, "n l"]) -> Float64[Tensor, "k l"]:
     """A^T B, accumulated in float64."""
-    total = torch.zeros(A.shape[1], B.shape[1], dtype=torch.float64)
+    total = A.new_zeros(A.shape[1], B.shape[1], dtype=torch.float64)
     for start in range(0, len(A), ROWS):
         rows = slice(start, start + ROWS)
         total += A[rows].double().T @ B[rows].double()

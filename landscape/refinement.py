@@ -108,7 +108,8 @@ def _draw(known: np.ndarray, count: int, generator: torch.Generator) -> np.ndarr
     """Points that are not known, at random."""
     unknown = np.flatnonzero(~known)
     count = min(count, ceil(SHARE_HELD_OUT * len(unknown)))
-    return unknown[torch.randperm(len(unknown), generator=generator)[:count].numpy()]
+    order = torch.randperm(len(unknown), generator=generator, device=generator.device)
+    return unknown[order[:count].cpu().numpy()]
 
 
 class _Budget:

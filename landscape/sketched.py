@@ -96,7 +96,8 @@ def xtrace(
         raise ValueError(f"expected memory for {VECTORS * LEAST} vectors of {n} numbers, got {settings.memory:g} GiB")
     kind = "gaussian" if start is None else settings.distribution
     count = max(settings.min_probes, settings.least) // 2 if start is None else start[0].shape[1]
-    Omega, Y, Q, HQ = (torch.empty(n, 0, dtype=operator.dtype) for _ in range(4))
+    empty = torch.empty(n, 0, dtype=operator.dtype, device=generator.device if start is None else start[0].device)
+    Omega, Y, Q, HQ = (empty,) * 4
     while True:
         Z = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, kind) if start is None else start[0]
         HZ = _products(operator, Z, settings, name) if start is None else start[1]
@@ -153,7 +154,7 @@ def _leave_out(
     """
     (n, count), rank = Omega.shape, Q.shape[1]
     R, W, core, T = gram(Q, Y), gram(Q, Omega), gram(Q, HQ), gram(HQ, Omega)
-    S, less = torch.zeros(rank, count, dtype=torch.float64), 0
+    S, less = R.new_zeros(rank, count), 0
     if rank == count:
         U, sigma, Vh = torch.linalg.svd(R)
         S, less = U @ (Vh / sigma.clamp_min(EPS * float(sigma[0]))[:, None]), 1  # R^-T
@@ -173,7 +174,7 @@ def _leave_out(
     quadratic = quadratic + y.square() * own[:, None] + 2 * y * y_own * inner + y_own.square() * own
     left = core.trace() - (own[:, None] + own - 2 * angles * inner) / det
     length = (n - rank + 2 * less) / squares if spherical else 1.0
-    return t, left + length * quadratic
+    return t.cpu(), (left + length * quadratic).cpu()
 
 
 def by_identity(operator: SymmetricOperator, settings: TraceSettings, name: str, spent: int = 0) -> TraceEstimate:

@@ -137,7 +137,7 @@ class SceneObjective:
 
         The piece: which splats each tile draws, in which order.  Changes nothing, and may run in several threads at once.
         """
-        total, pieces = 0.0, []
+        total, pieces, flat = 0.0, [], flat.to(self.active.flat.device)
         for view, loss in zip(self.views, self._losses, strict=True):
             raster = rasterize_view(self.active.with_flat(flat), view.camera, self.background, self.settings)
             total += loss.value(raster.planes)
@@ -208,9 +208,9 @@ class SceneObjective:
 class SceneHessian:
     """H of L, or its Gauss-Newton part, on the complement of its exact null space (`null_space.py`): P H P.
 
-    A `landscape` operator: `dim`, `blocks`, `dtype`, `apply(V)`.  P leaves out, for the Hessian, the lengths of the quaternions
-    (null where the gradient vanishes, and by choice elsewhere) and the SH directions that no view sees; for Gauss-Newton all
-    that no view sees.  keep_null: P = 1 instead.
+    A `landscape` operator: `dim`, `blocks`, `dtype`, `apply(V)`, which gives its result where V is.  P leaves out, for the
+    Hessian, the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and the SH directions
+    that no view sees; for Gauss-Newton all that no view sees.  keep_null: P = 1 instead.
 
     passes, spared: products of a view with a vector that were made, and that were left out because the vector moves no
     Gaussian that the view draws (V on a few Gaussians, say).
@@ -273,7 +273,7 @@ class SceneHessian:
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         require_vectors(V, self.dim)
-        V = self.project(V)
+        home, V = V.device, self.project(V.to(self.objective.active.flat.device))
         total = torch.zeros_like(V, dtype=self.dtype)
         at_once = self.objective.memory_plan.vectors
         for view in self.objective.linearized:
@@ -284,4 +284,4 @@ class SceneHessian:
                     continue
                 self.passes += some.shape[1]
                 total[:, start : start + at_once] += view.ggn(some) if self.gauss_newton else view.hvp(some)
-        return self.project(self.objective.mean(total))
+        return self.project(self.objective.mean(total)).to(home)

@@ -92,8 +92,8 @@ class ScreenGradients:
     renders: Float[Tensor, " n"]
 
     @classmethod
-    def zero(cls, n: int, dtype: torch.dtype) -> "ScreenGradients":
-        return cls(torch.zeros(n, dtype=dtype), torch.zeros(n, dtype=dtype))
+    def zero(cls, n: int, dtype: torch.dtype, device: torch.device | None = None) -> "ScreenGradients":
+        return cls(*(torch.zeros(n, dtype=dtype, device=device) for _ in range(2)))
 
     @torch.no_grad()
     def add(self, gradient: Float[Tensor, "n 2"], splats: Splats, camera: Camera) -> None:
@@ -147,7 +147,7 @@ def densify(
     keep, clone, split = (mask.nonzero()[:, 0] for mask in (~(high & ~small), high & small, high & ~small))
     parents = torch.cat([keep, clone, split.repeat_interleave(SPLIT_INTO)])
     result = gaussians.select(parents)
-    fresh = torch.arange(len(parents)) >= len(keep)
+    fresh = torch.arange(len(parents), device=parents.device) >= len(keep)
     draw_from_parents(result, len(keep) + len(clone), generator)
 
     remain = result.opacity_logits.sigmoid() >= settings.min_opacity
@@ -161,7 +161,7 @@ def densify(
 def draw_from_parents(gaussians: Gaussians, start: int, generator: torch.Generator) -> None:
     """Turn the exact copies from `start` on into draws from the Gaussians they copy, smaller by 1.6; in place."""
     means, log_scales = gaussians.means[start:], gaussians.log_scales[start:]
-    noise = torch.randn(means.shape, dtype=means.dtype, generator=generator) * log_scales.exp()
+    noise = torch.randn(means.shape, dtype=means.dtype, generator=generator).to(means.device) * log_scales.exp()
     means += (rotation_matrices(gaussians.quats[start:]) @ noise[:, :, None])[:, :, 0]
     log_scales -= log(SPLIT_SHRINK)
 

@@ -68,7 +68,7 @@ def evaluate(
     masked = have_masks(views)
     scores = []
     for view in views:
-        image = render(gaussians, view.camera, background, settings).image
+        image = render(gaussians, view.camera, background, settings).image.to(view.image.device)
         scores.append(score(image, view, lpips))
         if on_image is not None:
             on_image(view.name, image)

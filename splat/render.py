@@ -70,7 +70,9 @@ def render_depth(
 
 
 def _gained(splats: Splats, opacity_gain: Float[Tensor, " n"] | None) -> Splats:
-    return splats if opacity_gain is None else replace(splats, opacities=splats.opacities * opacity_gain)
+    if opacity_gain is None:
+        return splats
+    return replace(splats, opacities=splats.opacities * opacity_gain.to(splats.opacities))
 
 
 def _layered_depth(

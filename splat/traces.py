@@ -130,21 +130,21 @@ def _sample(
     objective: SceneObjective, generator: torch.Generator, names: list[str], count: int
 ) -> tuple[Float64[Tensor, "b s"], Float64[Tensor, "b s"]]:
     """x and y of the named blocks for so many draws of signs, which are the same whatever the names and the count are."""
-    seeds = torch.randint(2**62, (count,), generator=generator).tolist()
+    seeds = torch.randint(2**62, (count,), generator=generator, device=generator.device).tolist()
     total = torch.zeros(2, len(names) * count, dtype=torch.float64)
     for view, held in zip(objective.view_numbers, objective.linearized, strict=True):
-        U = _signs(objective, [seed + view for seed in seeds], names)
-        total += torch.stack(held.loss_curvatures(U.flatten(1)))
+        generators = [torch.Generator(generator.device).manual_seed(seed + view) for seed in seeds]
+        total += torch.stack(held.loss_curvatures(_signs(objective, generators, names).flatten(1))).cpu()
     x, y = objective.mean(total)
     return x.view(len(names), count), y.view(len(names), count)
 
 
-def _signs(objective: SceneObjective, seeds: list[int], names: list[str]) -> Float[Tensor, "p b s"]:
-    """A draw of signs for each seed, in as many vectors as blocks."""
-    p, dtype = objective.active.flat.numel(), objective.active.flat.dtype
-    U = torch.zeros(p, len(names), len(seeds), dtype=dtype)
-    for j, seed in enumerate(seeds):
-        z = draw_probes(p, 1, torch.Generator().manual_seed(seed), dtype, "rademacher")[:, 0]
+def _signs(objective: SceneObjective, generators: list[torch.Generator], names: list[str]) -> Float[Tensor, "p b s"]:
+    """A draw of signs for each generator, in as many vectors as blocks."""
+    flat = objective.active.flat
+    U = flat.new_zeros(flat.numel(), len(names), len(generators))
+    for j, generator in enumerate(generators):
+        z = draw_probes(flat.numel(), 1, generator, flat.dtype, "rademacher")[:, 0]
         for i, name in enumerate(names):
             rows = objective.blocks[name]
             U[rows, i, j] = z[rows]

@@ -27,7 +27,7 @@ from splat.curvature import SceneObjective
 from splat.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.gaussians import Gaussians
 from splat.losses import LossSettings
-from splat.losses_cpu import ViewLoss
+from splat.losses_cpu import ViewLoss, loss_against
 from splat.photometric import Photometric, photometric
 from splat.regularizers.methods import MethodSettings, ThreeDGS
 from splat.regularizers.regularizer import Regularizer, Step
@@ -144,10 +144,19 @@ class Training:
             extent=extent,
             gaussians=gaussians.with_flat(flat),
             adam=Adam.zero(gaussians),
-            screen_gradients=ScreenGradients.zero(len(gaussians), flat.dtype),
+            screen_gradients=ScreenGradients.zero(len(gaussians), flat.dtype, flat.device),
             generator=torch.Generator().manual_seed(config.seed),
             regularizer=config.method.regularizer(config.seed),
         )
+
+    def move(self, device: torch.device) -> None:
+        """Go on at a device; the generator stays on the CPU, so that it draws the same numbers everywhere."""
+        gradients = self.screen_gradients
+        self.gaussians = self.gaussians.with_flat(self.gaussians.flat.to(device))
+        self.adam.first, self.adam.second = (
+            moment.with_flat(moment.flat.to(device)) for moment in (self.adam.first, self.adam.second)
+        )
+        self.screen_gradients = ScreenGradients(gradients.total.to(device), gradients.renders.to(device))
 
     def next_view(self, count: int) -> int:
         """Index of the next view; every view once before any again."""
@@ -182,7 +191,8 @@ class Training:
             raise ValueError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
         self.gaussians = change.gaussians
         self.adam.select(change.parents, change.fresh)
-        self.screen_gradients = ScreenGradients.zero(len(change.gaussians), change.gaussians.flat.dtype)
+        flat = change.gaussians.flat
+        self.screen_gradients = ScreenGradients.zero(len(change.gaussians), flat.dtype, flat.device)
         self.regularizer.follow(change)
         for watch in self.watchers:
             watch(change)
@@ -230,7 +240,7 @@ def train(training: Training, views: Sequence[View]) -> Iterator[Progress]:
     if not views:
         raise ValueError("expected at least one view to train on, got none")
     regularizer.begin(training, views)
-    losses = [ViewLoss.of(view.image, config.loss, training.gaussians.flat.dtype) for view in views]
+    losses = [loss_against(view.image, config.loss, training.gaussians.flat) for view in views]
     while training.step < config.iterations:
         number = training.step + 1
         training.raise_sh_degree(min(config.sh_degree, (number - 1) // config.sh_degree_every))
@@ -259,5 +269,5 @@ def _next_step(training: Training, number: int, views: Sequence[View], losses: S
     if config.random_background:
         drawn = torch.rand(3, generator=training.generator, dtype=background.dtype)
         target = with_background(views[chosen], background, drawn)
-        background, loss = drawn, ViewLoss.of(target, config.loss, background.dtype)
+        background, loss = drawn, loss_against(target, config.loss, gaussians.flat)
     return Step(number, training, gaussians, views, chosen, background, loss)
