@@ -80,10 +80,11 @@ arrays*           written by `write_record`: group -> name -> shape, one file `g
 Arrays (all optional):
 
 spectrum          ritz_values [k], residuals [k]: approximate eigenvalues, the two ends among them; and, where the
-                  density was estimated, nodes, weights [starts, steps]: a quadrature for each start vector
+                  density was estimated, nodes, weights [starts, steps + known]: a quadrature for each start vector, the
+                  eigenvalues that are known among the nodes of all
 eigenvectors      largest [parameters, k]: unit vectors of the k largest eigenvalues, of the Gaussians in sight
 traces            attribute -> [probes]: the samples whose mean is the trace
-families          SCENE.OPERATOR.BLOCK.nodes and .weights [starts, steps]: the quadrature of each family's density
+families          SCENE.OPERATOR.BLOCK.nodes and .weights [starts, steps + known]: the quadrature of each family's density
 slice             x [nx], y [ny]: steps along the two directions in parameter units; loss [nx, ny]: L at each point;
                   evaluated [nx, ny]: true where it is a true render, false where it is interpolated (absent: all are
                   renders); where known, model [nx, ny]: the quadratic model there, and crossed [nx, ny]: true where a

