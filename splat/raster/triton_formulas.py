@@ -81,8 +81,8 @@ def _meaning(name: str, names: dict[str, Any]) -> Any:
 
 
 @device
-def sum_over(x, axis: tl.constexpr, keep_dims: tl.constexpr = False):
-    return tl.reduce(x, axis, _sum_combine, keep_dims)
+def sum_over(x, axis: tl.constexpr, keep_dims: tl.constexpr = False):  # pyright: ignore[reportArgumentType]
+    return tl.reduce(x, axis, _sum_combine, keep_dims)  # pyright: ignore[reportArgumentType]
 
 
 @device

@@ -56,11 +56,13 @@ CASES = {
 # few enough entries for an interpreter: in one tile of 16 x 16 pixels all that the cases above have
 TINY = {
     "tiny walled": Case(14, size=(4, 3), logit=9.0, spread=0.02, focal=200.0),
-    "tiny capped": Case(5, size=(9, 12), logit=5.0, focal=20.0, settings=RenderSettings(transmittance_min=1e-7)),
+    "tiny capped": Case(
+        5, size=(9, 12), logit=9.0, spread=0.1, focal=120.0, settings=RenderSettings(transmittance_min=1e-9)
+    ),
     "tiny smooth": Case(5, size=(10, 10), focal=20.0, settings=SMOOTH),
     "tiny three sigma": Case(6, size=(12, 8), logit=2.0, focal=20.0, settings=RenderSettings(contour_sigma=3.0)),
     "tiny through the cap": Case(
-        6, size=(9, 8), logit=4.0, focal=20.0, settings=RenderSettings(gradient_through_cap=True)
+        5, size=(9, 12), logit=9.0, spread=0.1, focal=120.0, settings=RenderSettings(gradient_through_cap=True)
     ),
     "tiny equal depths": Case(6, size=(20, 9), logit=1.0, layers=2, focal=20.0),
 }
