@@ -24,6 +24,7 @@ Eigenvalues that are known are counted as such, and the tests are of the others.
 from collections.abc import Callable
 from math import inf
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from scipy.special import betaincinv, stdtrit
@@ -60,9 +61,9 @@ def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Br
     trials = len(rules) * density.rest / 2
     # of the others, the share that has to lie at or below as well
     share = (p * density.dim - torch.searchsorted(density.known, grid, right=True)) / max(density.rest, 1)
-    inner = share.clamp(TINY, 1 - EPS)
-    levels = torch.tensor([[(1 - confidence) / 2], [(1 + confidence) / 2]], dtype=torch.float64)
-    least, most = torch.as_tensor(betaincinv(max(trials, TINY) * inner, max(trials, TINY) * (1 - inner), levels))
+    inner, size = share.clamp(TINY, 1 - EPS).numpy(), max(trials, TINY)
+    levels = np.array([[(1 - confidence) / 2], [(1 + confidence) / 2]])
+    least, most = torch.from_numpy(betaincinv(size * inner, size * (1 - inner), levels))
     above = grid[(share > 0) & ((upto.mean(dim=0) < least) | (share > 1))]
     reached = grid[(share <= 0) | ((below.mean(dim=0) >= most) & (share <= 1))]
     high = _first(reached, inf)
