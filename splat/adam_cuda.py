@@ -9,7 +9,7 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.raster.triton_formulas import INTERPRETED
+from splat.raster.triton_formulas import INTERPRETED, launch
 
 BLOCK = 1 << 14 if INTERPRETED else 1024
 
@@ -44,7 +44,7 @@ def update(
 ) -> None:
     """In place.  root: sqrt(1 - beta2^t); scale: 1 / (1 - beta1^t); constants: beta1, beta2, eps and the grid of m."""
     numbers = torch.tensor([root, scale], dtype=torch.float64).to(parameters.device, non_blocking=True)
-    _step[(triton.cdiv(len(parameters), BLOCK),)](
+    launch(
+        _step, (triton.cdiv(len(parameters), BLOCK),),
         parameters, gradient.contiguous(), rates, first, second, numbers, len(parameters), *constants, BLOCK,
-        enable_fp_fusion=True,
     )  # fmt: skip

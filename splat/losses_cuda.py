@@ -13,7 +13,7 @@ from triton import cdiv
 from splat import losses_cuda_kernels as kernels
 from splat.losses import LossSettings, window
 from splat.losses_kernels import CHARBONNIER, L1, L2, SECONDS
-from splat.raster.triton_formulas import INTERPRETED
+from splat.raster.triton_formulas import INTERPRETED, launch
 
 KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
 BLOCK = 1024 if INTERPRETED else 256
@@ -51,7 +51,7 @@ class CudaImageLoss:
         return self.pixel * pixels + self.structural * distances
 
     def run(self, kernel, *arguments, vectors: int = 1, **flags) -> None:
-        kernel[(self.programs, vectors)](*arguments, *self.shape, **flags, BLOCK=BLOCK, enable_fp_fusion=True)
+        launch(kernel, (self.programs, vectors), *arguments, *self.shape, **flags, BLOCK=BLOCK)
 
     def padded(self, image: Tensor) -> Tensor:
         """An image as the kernels take it."""

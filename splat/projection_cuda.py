@@ -16,7 +16,7 @@ from splat.gaussians import Gaussians
 from splat.projection_cpu import LARGEST_SPLAT, require_sizes
 from splat.projection_formulas import Lens
 from splat.projection_linear import GEOMETRY, SYMMETRIC, Held
-from splat.raster.triton_formulas import INTERPRETED
+from splat.raster.triton_formulas import INTERPRETED, launch
 
 WIDEST = 8  # vectors that a program takes at a time
 CHUNK = 1 << 16  # Gaussians whose blocks are chained at a time
@@ -28,7 +28,7 @@ def _block(compiled: int) -> int:
 
 
 def _run(kernel: Any, programs: tuple[int, ...], *arguments) -> None:
-    kernel[programs](*arguments, kernels.FORMULAS, enable_fp_fusion=True)
+    launch(kernel, programs, *arguments, kernels.FORMULAS)
 
 
 def _lens_numbers(lens: Lens, device: torch.device) -> Float64[Tensor, " 20"]:
