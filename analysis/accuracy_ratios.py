@@ -55,8 +55,10 @@ class Curve:
         grids = [by_seed.pivot(index="settings", columns="seed", values=name).to_numpy() for name in ("square", cost)]
         return cls(*grids)
 
-    def drawn(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Errors and costs of the settings over the seeds chosen."""
+    def drawn(self, rng: np.random.Generator | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Errors and costs of the settings over all seeds, or over as many drawn with replacement."""
+        seeds = self.costs.shape[1]  # fewer of our settings that are not the default
+        chosen = np.arange(seeds) if rng is None else rng.integers(seeds, size=seeds)
         return np.sqrt(self.squares[:, chosen].mean(axis=1)), self.costs[:, chosen].mean(axis=1)
 
 
@@ -110,14 +112,13 @@ def _compared(default: pd.DataFrame, rivals: pd.DataFrame, cost: str, rng: np.ra
     """The ratio with the best rival, its bootstrap interval, and the two points compared."""
     own = Curve.of(default, cost)
     others = {str(name): Curve.of(runs, cost) for name, runs in rivals.groupby("method", sort=False)}
-    seeds = own.costs.shape[1]
-    errors, costs = own.drawn(np.arange(seeds))
-    found = {name: needed(*curve.drawn(np.arange(seeds)), errors[0]) for name, curve in others.items()}
+    errors, costs = own.drawn()
+    found = {name: needed(*curve.drawn(), errors[0]) for name, curve in others.items()}
     best = _best(found)
     draws = []
     for _ in range(DRAWS):
-        error, mine = own.drawn(rng.integers(seeds, size=seeds))
-        again = {n: needed(*curve.drawn(rng.integers(seeds, size=seeds)), error[0]) for n, curve in others.items()}
+        error, mine = own.drawn(rng)
+        again = {name: needed(*curve.drawn(rng), error[0]) for name, curve in others.items()}
         draws.append(mine[0] / again[_best(again)][0])
     low, high = np.quantile(draws, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     need, bound = found[best]
