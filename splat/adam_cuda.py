@@ -20,12 +20,12 @@ def _step(
     BETA1: tl.constexpr, BETA2: tl.constexpr, EPS: tl.constexpr, GRID: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here, number = at < n, first.dtype.element_ty
+    here = at < n
     g, m, v = tl.load(gradient + at, here, other=0.0), tl.load(first + at, here), tl.load(second + at, here)
     m += (g - m) * (1 - BETA1)
     m = (m + GRID) - GRID
     v = v * BETA2 + g * g * (1 - BETA2)
-    root, scale = tl.load(numbers).to(number), tl.load(numbers + 1).to(number)
+    root, scale = tl.load(numbers).to(m.dtype), tl.load(numbers + 1).to(m.dtype)
     step = m / (tl.sqrt(v) / root + EPS) * tl.load(rates + at, here) * scale
     tl.store(parameters + at, tl.load(parameters + at, here) - step, here)
     tl.store(first + at, m, here)
