@@ -16,7 +16,7 @@ from tests.splat.random_scenes import random_gaussians
 
 def toy() -> Workload:
     gaussians = random_gaussians(6, 0, logit=1.0, spread=0.7).to(torch.float32)
-    return Workload("toy", gaussians, tuple(two_views(18, 12)), torch.zeros(3), LossSettings("charbonnier"))
+    return Workload("toy", gaussians, tuple(two_views(18, 12)[:1]), torch.zeros(3), LossSettings("charbonnier"))
 
 
 def test_a_device_agrees_with_the_cpu_and_its_ratios_are_measured(device, monkeypatch):

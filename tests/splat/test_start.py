@@ -200,7 +200,8 @@ def test_lego_starts_round_its_middle(lego: Path) -> None:
     chosen = scene.load(split_scene(scene, 8).train)
     gaussians = initial_gaussians(scene, chosen, 0, generator=torch.Generator().manual_seed(0), random_points=2000)
     assert len(gaussians) == 2000
-    assert gaussians.means.mean(dim=0).norm() < 0.3 and 0.5 < float(gaussians.means.std(dim=0).mean()) < 1.5
+    assert gaussians.means.mean(dim=0).norm() < 0.3  # it is 2 long and half as wide, and so is what all views see
+    assert 0.3 < float(gaussians.means.std(dim=0).mean()) < 0.7
 
 
 def test_the_source_of_the_points_can_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
