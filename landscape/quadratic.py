@@ -31,10 +31,10 @@ from math import inf, sqrt
 
 import torch
 from jaxtyping import Float, Float64
-from scipy.special import stdtrit
 from torch import Tensor
 
 from landscape.probes import Distribution
+from landscape.results import t_quantile
 
 ROWS = 65_536  # taken to float64 at a time
 FEWEST = 4  # probes in which p_4 can be told from p_2^2
@@ -127,7 +127,7 @@ def mean_interval(
     spread = sum(group.pairs**2 * group.spread for group in groups) / weight**2
     common = c**6 * (8 * probes + 24) / (probes * (probes + 2))  # var(m^2) / E(m^2)^2 of one eigenvalue, k probes
     relative = max(spread * max(kurtosis, c * c) + 2 / weight - common, 1e-6)
-    q = float(stdtrit(2 / relative, (1 + confidence) / 2))
+    q = t_quantile(2 / relative, confidence)
     s, e = sqrt(2 * second / probes * (1 + 2 * c * c / probes)), sqrt(2 / probes) * c / 3
     ends = [mean + widening * s * _deviation(e, quantile) for quantile in (q, -q)]
     return sqrt(2 * second / probes), min(ends), max(ends)

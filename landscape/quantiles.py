@@ -27,13 +27,13 @@ from math import inf
 import numpy as np
 import torch
 from jaxtyping import Float64
-from scipy.special import betaincinv, stdtrit
+from scipy.special import betaincinv
 from torch import Tensor
 
 from landscape.density import bounds_of_rules
 from landscape.lanczos import lanczos
 from landscape.operator import DenseOperator
-from landscape.results import Bracket, SpectralDensity
+from landscape.results import Bracket, SpectralDensity, t_quantile
 
 EPS = torch.finfo(torch.float64).eps
 TINY = torch.finfo(torch.float64).tiny
@@ -85,7 +85,7 @@ def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: flo
         density.rest * torch.stack(column) + certain
         for column in zip(*(tail.excess(grid, p) for tail in tails), strict=True)
     )
-    margin = float(stdtrit(len(tails) - 1, (1 + confidence) / 2)) / len(tails) ** 0.5
+    margin = t_quantile(len(tails) - 1, confidence) / len(tails) ** 0.5
     beneath = least.mean(dim=0) - margin * least.std(dim=0) > 0  # t is certainly too low, up to the next of the grid
     beyond = most.mean(dim=0) + margin * most.std(dim=0) <= 0  # certainly high enough
     totals = density.rest * torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64) + known.sum()

@@ -33,13 +33,22 @@ def finite_or_none(value: float) -> Number:
     return float(value) if isfinite(value) else None
 
 
+def t_quantile(freedom: float, confidence: float) -> float:
+    """What Student's t of so many degrees of freedom stays within, on both sides, with this probability.
+
+    >>> round(t_quantile(9, 0.95), 3)
+    2.262
+    """
+    return float(stdtrit(freedom, (1 + confidence) / 2))
+
+
 def t_interval(samples: Float64[Tensor, " s"], confidence: float) -> tuple[float, float, float, float]:
     """Mean, standard error and both ends of Student's interval; a single sample has an infinite error."""
     count, mean = samples.numel(), float(samples.mean())
     if count < 2:
         return mean, inf, -inf, inf
     error = float(samples.std()) / sqrt(count)
-    half = float(stdtrit(count - 1, (1 + confidence) / 2)) * error
+    half = t_quantile(count - 1, confidence) * error
     return mean, error, mean - half, mean + half
 
 

@@ -41,7 +41,6 @@ from time import monotonic
 
 import torch
 from jaxtyping import Float, Float64
-from scipy.special import stdtrit
 from torch import Tensor
 
 from landscape.hutchinson import GROWTH, LEAST, WIDENING, Hutchinson, TraceSettings
@@ -49,7 +48,7 @@ from landscape.lanczos import is_dust
 from landscape.operator import ProjectedOperator, SymmetricOperator
 from landscape.probes import draw_probes
 from landscape.quadratic import column_dots, gram
-from landscape.results import StopReason, TraceEstimate
+from landscape.results import StopReason, TraceEstimate, t_quantile
 
 EPS = torch.finfo(torch.float64).eps
 GIB = 2**30
@@ -106,7 +105,7 @@ def xtrace(
         Q, HQ = torch.cat([Q, new], dim=1), torch.cat([HQ, _products(operator, new, settings, name)], dim=1)
         samples, without = _leave_out(Omega, Y, Q, HQ, kind == "gaussian")
         value, error, spent = float(samples.mean()), _error(samples, without), count + Q.shape[1]
-        half = float(stdtrit(count - 1, (1 + settings.confidence) / 2)) * error
+        half = t_quantile(count - 1, settings.confidence) * error
         half *= WIDENING if settings.adaptive else 1
         late, reached = monotonic() > deadline, settings.reached(value, value - half, value + half)
         if reached or late or count == most:

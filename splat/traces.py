@@ -18,13 +18,12 @@ from time import monotonic
 
 import torch
 from jaxtyping import Float, Float64
-from scipy.special import stdtrit
 from torch import Tensor
 
 from landscape.control import controlled
 from landscape.hutchinson import WIDENING, Looks, TraceSettings
 from landscape.probes import draw_probes
-from landscape.results import Progress, StopReason, TraceEstimate
+from landscape.results import Progress, StopReason, TraceEstimate, t_quantile
 from splat.curvature import SceneObjective
 from splat.gaussians import ATTRIBUTES
 
@@ -103,7 +102,7 @@ class _Block:
         value = float(samples.mean())
         error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.mean))
         # the slope of the control variate is one more number that the samples had to give
-        quantile = float(stdtrit(self.count - 2, (1 + settings.confidence) / 2))
+        quantile = t_quantile(self.count - 2, settings.confidence)
         half = quantile * error * (WIDENING if settings.adaptive and self.first < self.most else 1.0)
         reason: StopReason = "time budget" if self.late else "matvec budget"
         if settings.reached(value, value - half, value + half):
