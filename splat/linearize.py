@@ -174,9 +174,7 @@ class LinearizedView:
     def hvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """H U of the view's loss."""
         block = _block(U)
-        tangent = self._raster.jvp(self._projection.jvp(block))
-        cotangents = self._loss.hvp(tangent.planes, out=tangent.planes)
-        return self._pulled(tangent.curvature(self._adjoint, cotangents), block)
+        return self._pulled(self._curved(block), block)
 
     def ggn(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """G U, the Gauss-Newton part of H U."""
@@ -205,6 +203,12 @@ class LinearizedView:
         full = np.einsum("kchw,kchw->k", images, self._raster.crop(products), dtype=np.float64)
         pixelwise = np.einsum("kchw,kchw->k", images, weighted, dtype=np.float64)
         return torch.from_numpy(full), torch.from_numpy(pixelwise)
+
+    def _curved(self, block: np.ndarray) -> np.ndarray:
+        """The tangent of the splats' adjoint, (n, K, 9); all else that it takes is free again before the result is made."""
+        tangent = self._raster.jvp(self._projection.jvp(block))
+        cotangents = self._loss.hvp(tangent.planes, out=tangent.planes)
+        return tangent.curvature(self._adjoint, cotangents)
 
     def _pulled(self, cotangents: np.ndarray, block: np.ndarray | None) -> Tensor:
         out = np.zeros((self.gaussians.flat.numel(), cotangents.shape[1]), self._raster.dtype)

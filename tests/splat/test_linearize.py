@@ -1,5 +1,6 @@
 """A view held still, against the specification, dense matrices and finite differences."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -168,6 +169,19 @@ def test_a_product_repeats_to_the_last_bit():
     first = held.hvp(U)
     assert torch.equal(first, held.hvp(U)) and torch.equal(held.ggn(U), held.ggn(U))
     assert torch.equal(first, hold(gaussians, view, LossSettings(), torch.float32).hvp(U))
+
+
+def test_what_a_product_takes_is_free_before_its_result_is_made():
+    gaussians, view = random_gaussians(4000, 3), two_views()[0]
+    held = hold(gaussians, view, LossSettings(), torch.float32)
+    U = random_like((gaussians.flat.numel(), 4), 8).float()
+    result = held.hvp(U)  # the first one makes what is kept
+    tracemalloc.start()
+    held.hvp(U)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    cotangents = 8 * 9 * U.shape[1] * len(gaussians)  # of the splats, in float64: what the result is made of
+    assert result.nbytes + cotangents <= peak <= result.nbytes + 1.5 * cotangents
 
 
 def test_what_no_pixel_sees_has_no_derivative():
