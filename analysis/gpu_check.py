@@ -28,6 +28,7 @@ from splat.device import device_named
 from splat.linearize import hold
 from splat.losses_cpu import loss_against, view_loss
 from splat.raster.functions import project_by_kernel, rasterize_by_kernel
+from splat.settings import Sums
 from splat.traces import LEAST_SAMPLES, exact_traces
 
 REPETITIONS = 10
@@ -81,17 +82,18 @@ def ratios(workload: Workload, device: torch.device, repetitions: int = REPETITI
     loss = loss_against(view.image, w.loss, w.gaussians.flat)
     held = hold(w.gaussians, camera, loss, background, w.settings)
 
-    def gradient(deterministic: bool) -> None:
+    def gradient(sums: Sums) -> None:
         flat = w.gaussians.flat.detach().requires_grad_()
         splats = project_by_kernel(w.gaussians.with_flat(flat), camera, w.settings)
-        image, _ = rasterize_by_kernel(splats, background, camera.width, camera.height, w.settings, deterministic)
+        settings = replace(w.settings, sums=sums)
+        image, _ = rasterize_by_kernel(splats, background, camera.width, camera.height, settings)
         torch.autograd.grad(view_loss(image, loss), flat)
 
     generator = torch.Generator(device).manual_seed(0)
     vectors = draw_probes(w.gaussians.flat.numel(), MOST_VECTORS, generator, w.gaussians.flat.dtype)
     calls: dict[str, Callable[[], object]] = {
-        "deterministic": partial(gradient, True),
-        "atomic": partial(gradient, False),
+        "deterministic": partial(gradient, "ordered"),
+        "atomic": partial(gradient, "atomic"),
         "one": partial(held.hvp, vectors[:, :1].contiguous()),
         "eight": partial(held.hvp, vectors),
     }

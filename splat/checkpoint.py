@@ -224,7 +224,10 @@ def restored_training(content: dict[str, Any]) -> Training:
     flat = _get(content, "flat", Tensor)
     gaussians = Gaussians(_tensor(content, "flat", (flat.numel(),), flat.dtype), _get(content, "sh_degree", int))
     gaussians.require_finite()
-    config = _dataclass(TrainConfig, _get(content, "config", dict), "config")
+    config = _get(content, "config", dict)
+    if isinstance(thresholds := config.get("render"), dict):
+        config = {**config, "render": {"sums": "ordered", **thresholds}}  # a choice that older checkpoints did not have
+    config = _dataclass(TrainConfig, config, "config")
     regularizer = config.method.regularizer(config.seed)
     _restore(regularizer, _get(content, "regularizer", dict))
     adam, screen = _get(content, "adam", dict), _get(content, "screen_gradients", dict)

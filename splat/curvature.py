@@ -9,7 +9,7 @@ unit length first: the image does not change, and the trace of their block, whic
 """
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from operator import add
 
@@ -30,7 +30,7 @@ from splat.settings import RenderSettings
 MOST_VECTORS = 8  # beyond it a block of vectors gains no more: it has left the second-level cache
 
 
-def _free_memory(device: torch.device) -> int:
+def free_memory(device: torch.device) -> int:
     """Bytes, where the Gaussians are."""
     return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
 
@@ -88,7 +88,10 @@ class SceneObjective:
             raise ValueError("expected at least one view, got none")
         gaussians.require_finite()
         flat, degree = gaussians.flat, gaussians.sh_degree if sh_degree is None else sh_degree
-        self.settings, self.views = settings, tuple(views)
+        self.views = tuple(views)
+        self.settings = replace(
+            settings, sums="ordered"
+        )  # products are repeatable, however the training's steps were made
         self.background = flat.new_zeros(3) if background is None else background.to(flat)
         self.couples_pixels = loss.ssim_weight > 0
         self._losses = [loss_against(view.image, loss, flat) for view in views]
@@ -112,7 +115,7 @@ class SceneObjective:
             radial_quaternions=len(active),
             views=len(views),
         )
-        self._memory = _free_memory(flat.device) // 2 if memory is None else memory
+        self._memory = free_memory(flat.device) // 2 if memory is None else memory
         self._kept: dict[int, LinearizedView] = {}
 
     def _support(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:

@@ -135,19 +135,19 @@ class Gaussians:
         sizes = {
             name: value.detach().reshape(len(self), -1).abs().amax(dim=1) for name, value in self.attributes.items()
         }
-        for name, size in sizes.items():
-            self._require(torch.isfinite(size), name, "finite")
         largest = torch.finfo(self.flat.dtype).max ** 0.25
-        quats = sizes["quats"]
-        self._require(quats > 0, "quats", "non-zero")
-        self._require(
-            (quats >= 1 / largest) & (quats <= largest), "quats", "moderate", f" ({1 / largest:.1e} to {largest:.1e})"
-        )
-        self._require(sizes["sh"] <= largest, "sh", "moderate", f" (up to {largest:.1e})")
-
-    def _require(self, good: Tensor, name: str, quality: str, meaning: str = "") -> None:
-        if good.all():
+        quats, sh = sizes["quats"], sizes["sh"]
+        range_of_quats = f" ({1 / largest:.1e} to {largest:.1e})"
+        conditions = [(torch.isfinite(size), name, "finite", "") for name, size in sizes.items()] + [
+            (quats > 0, "quats", "non-zero", ""),
+            ((quats >= 1 / largest) & (quats <= largest), "quats", "moderate", range_of_quats),
+            (sh <= largest, "sh", "moderate", f" (up to {largest:.1e})"),
+        ]
+        if torch.stack([good.all() for good, *_ in conditions]).all():  # one answer, for which a GPU is waited for once
             return
+        self._refuse(*next(condition for condition in conditions if not condition[0].all()))
+
+    def _refuse(self, good: Tensor, name: str, quality: str, meaning: str) -> None:
         first = int((~good).nonzero()[0])
         raise ValueError(
             f"expected {quality} {name}{meaning}, got {self.attributes[name][first].tolist()} at Gaussian {first} "

@@ -56,7 +56,7 @@ class CudaLinearizedView:
     @property
     def entries(self) -> int:
         """How many (splat, tile) pairs a product passes over."""
-        return self._raster.slots.count
+        return self._raster.entries_reached
 
     @property
     def entries_behind(self) -> int:
@@ -82,7 +82,7 @@ class CudaLinearizedView:
     def workspace(self, vectors: int) -> int:
         """Bytes that `hvp` of so many vectors takes beside its argument and its result."""
         item, pixels, n = self._raster.dtype.itemsize, self._raster.height * self._raster.width, len(self.gaussians)
-        each = item * ((5 + 18) * pixels + SUMS * self.entries + TANGENTS * n) + 8 * (2 * 9 + SUMS) * n
+        each = item * ((5 + 18) * pixels + SUMS * self._raster.entries + TANGENTS * n) + 8 * (2 * 9 + SUMS) * n
         return vectors * each
 
     def concerns(self, U: Float[Tensor, "p k"]) -> bool:

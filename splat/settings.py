@@ -1,16 +1,19 @@
-"""The thresholds of the renderer, in one frozen object.
+"""The thresholds of the renderer, and how a GPU adds up, in one frozen object.
 
-Every one of them makes the image a discontinuous or merely piecewise smooth function of the parameters.  The values are
+Every threshold makes the image a discontinuous or merely piecewise smooth function of the parameters.  The values are
 those of the original 3DGS rasterizer (Kerbl et al. 2023); `SMOOTH` switches off what can be switched off, so that a study
 can measure what the thresholds do to the landscape.
 """
 
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+Sums = Literal["ordered", "atomic"]
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """Thresholds of projection and compositing.
+    """Thresholds of projection and compositing, and the order of a GPU's sums.
 
     blur: variance added to the diagonal of every 2-D covariance, in px^2.
     fov_clamp: the projection's Jacobian is taken at x/z and y/z clamped to this multiple of tan(fov / 2).
@@ -21,6 +24,7 @@ class RenderSettings:
     contour_sigma: an additional cut at this Mahalanobis distance (the original cuts at 3); None keeps alpha_min's contour.
     gradient_through_cap: pass derivatives in ln alpha through the cap, instead of the true 0; the original CUDA code passes
         those in alpha through, which is the same within 1%.
+    sums: how a GPU adds up gradients.  ordered: the same bits every time, as on the CPU; atomic: as they come, which is faster.
     """
 
     blur: float = 0.3
@@ -31,6 +35,7 @@ class RenderSettings:
     transmittance_min: float = 1e-4
     contour_sigma: float | None = None
     gradient_through_cap: bool = False
+    sums: Sums = "ordered"
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha_max < 1:
@@ -46,6 +51,8 @@ class RenderSettings:
             raise ValueError(f"expected blur >= 0, near > 0, fov_clamp > 0, got {self}")
         if self.contour_sigma is not None and not self.contour_sigma > 0:
             raise ValueError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
+        if self.sums not in get_args(Sums):
+            raise ValueError(f"expected sums 'ordered' or 'atomic', got {self.sums!r}")
 
 
 SMOOTH = replace(RenderSettings(), alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)

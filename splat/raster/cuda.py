@@ -4,11 +4,12 @@
 passes over the pixels.  Images are planes without padding, (planes, height, width), contiguous, in the precision of the pixels
 (that of `depths`); a splat is nine numbers (`packing.py`), in double precision.
 
-deterministic: sums go through slots and are added in a fixed order, so every result is the same to the last bit from run to
-run; otherwise entries are added atomically to their splats as they come, which is faster and takes less memory.
+Sums (`settings.sums`) are "ordered": they go through slots and are added in a fixed order, so every result is the same to the
+last bit from run to run; or "atomic": entries are added to their splats as they come, which is faster and takes less memory.
 
-Two sizes are read back by the constructor, a third by the first derivative in deterministic mode; no later call waits for the
-device.  Everything runs on the current stream of the splats' device; without a GPU, on the CPU by Triton's interpreter.
+Two sizes are read back by the constructor, the numbers of strips and of entries (`cuda_binning`), for which arrays are made;
+no later call waits for the device: there is room for the sums of all entries, also of those that no pixel reaches.
+Everything runs on the current stream of the splats' device; without a GPU, on the CPU by Triton's interpreter.
 """
 
 from math import inf, log2
@@ -51,25 +52,32 @@ class CudaRaster:
         width: int,
         height: int,
         settings: RenderSettings,
-        deterministic: bool = True,
     ):
         self.splats, self.dtype, self.device = splats.double().contiguous(), depths.dtype, splats.device
-        self.width, self.height, self.deterministic = width, height, deterministic
-        n = len(splats)
+        self.width, self.height, self.ordered = width, height, settings.sums == "ordered"
         self.frame = _frame(background, settings, self.dtype, self.device)
         self.lists = cuda_binning.bin_splats(self.splats, depths, drawn, width, height, self.frame)
-        self.params = self._empty(n, cuda_packing.PARAMS)
-        launch(cuda_packing.pack_splats, grid(n, BLOCK), self.splats, self.frame, self.params, n, **SPLATS)
+        self.params = self._empty(len(splats), cuda_packing.PARAMS)
         self.planes = self._empty(4, height, width)
         self._transmittance, self._stop = self._empty(height, width), self._empty(height, width, dtype=torch.int32)
         self._reached = self._empty(len(self.lists.start) - 1, dtype=torch.int32)
+        self._slots: Slots | None = None
+        self.pack()
+        self.forward()
+
+    def pack(self) -> None:
+        """The splats as the passes over the pixels read them."""
+        n = len(self.splats)
+        launch(cuda_packing.pack_splats, grid(n, BLOCK), self.splats, self.frame, self.params, n, **SPLATS)
+
+    def forward(self) -> None:
+        """The image, and where its pixels stop."""
         self._order = _heaviest_first(self.lists.start.diff())
         self._launch(
             cuda_compositing.forward, self.lists.start, self.lists.splat, self.params, self.frame, self.planes,
             self._transmittance, self._stop, self._reached,
         )  # fmt: skip
         self._order = _heaviest_first(self._reached)
-        self._slots: Slots | None = None
 
     def _empty(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
         return torch.empty(shape, dtype=dtype or self.dtype, device=self.device)
@@ -89,10 +97,18 @@ class CudaRaster:
 
     @property
     def slots(self) -> Slots:
-        """Where the sums of the entries go that some pixel reaches; in deterministic mode."""
+        """Where the sums of the entries go that some pixel reaches."""
         if self._slots is None:
-            self._slots = cuda_binning.number_slots(self.lists, self._reached)
+            self._slots = self.number_slots()
         return self._slots
+
+    def number_slots(self) -> Slots:
+        return cuda_binning.number_slots(self.lists, self._reached)
+
+    @property
+    def entries_reached(self) -> int:
+        """How many entries some pixel reaches; reads their number back."""
+        return int(self._reached.sum())
 
     @property
     def touched(self) -> Int[Tensor, "m"]:
@@ -105,7 +121,7 @@ class CudaRaster:
     def bytes(self) -> int:
         """Memory of what is held."""
         tensors = [self.splats, self.params, *self.lists, self.planes, self._transmittance, self._stop, self._reached]
-        tensors += [] if self._slots is None else self._slots[:3]
+        tensors += self._slots or ()
         return sum(tensor.nbytes for tensor in tensors)
 
     def crop(self, planes: Float[Tensor, "*planes h w"]) -> Float[Tensor, "*planes h w"]:
@@ -121,8 +137,8 @@ class CudaRaster:
 
         Its first arguments are those of `backward`, its last the sums.
         """
-        n, ordered = len(self.splats), self.deterministic
-        sums = self._empty(self.slots.count if ordered else n, vectors, width)
+        n, ordered = len(self.splats), self.ordered
+        sums = self._empty(self.entries if ordered else n, vectors, width)
         self._launch(
             kernel, self.lists.start, self._reached, self.lists.splat, self.slots.slot if ordered else self.lists.splat,
             self.params, self.frame, self._transmittance, self._stop, *arguments, sums if ordered else sums.zero_(),

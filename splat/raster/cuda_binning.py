@@ -9,7 +9,7 @@ a thread more work for a larger splat:
                them in order of (tile, depth); tile numbers are 16 bits wide where they fit, which halves the passes
 
 Before that sort an entry's place is splat-major: from it comes its slot, where its sums go.  Two sizes are read back: the
-numbers of strips and of entries; a third, that of slots, once derivatives are asked for.
+numbers of strips and of entries.
 """
 
 from typing import NamedTuple
@@ -48,13 +48,12 @@ class Slots(NamedTuple):
     """Where the sums go of the entries that some pixel reaches.
 
     slot: (entries,), that of an entry which none reaches has no meaning; first, last: (n,) splat i's slots are first[i] ..
-    last[i] - 1; count: how many slots there are.
+    last[i] - 1.
     """
 
     slot: Int[Tensor, "entries"]
     first: Int[Tensor, "n"]
     last: Int[Tensor, "n"]
-    count: int
 
 
 @device
@@ -183,7 +182,7 @@ def kept_entries(lists: Lists, reached: Int[Tensor, "tiles"]) -> Bool[Tensor, "e
 
 
 def number_slots(lists: Lists, reached: Int[Tensor, "tiles"]) -> Slots:
-    """The slots of the entries that some pixel reaches, splat by splat; reads their number back."""
+    """The slots of the entries that some pixel reaches, splat by splat."""
     kept, n = kept_entries(lists, reached), len(lists.order)
     by_place = torch.empty_like(kept)
     by_place[lists.place] = kept
@@ -191,4 +190,4 @@ def number_slots(lists: Lists, reached: Int[Tensor, "tiles"]) -> Slots:
     edges = slot[lists.splat_start]
     first, last = (torch.empty(n, dtype=torch.int64, device=kept.device) for _ in range(2))
     first[lists.order], last[lists.order] = edges[:-1], edges[1:]
-    return Slots(slot[lists.place].to(torch.int32), first, last, int(slot[-1]))
+    return Slots(slot[lists.place].to(torch.int32), first, last)

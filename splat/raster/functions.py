@@ -132,16 +132,15 @@ class _ProjectAdjoint(torch.autograd.Function):
 
 
 def held_view(
-    splats: Tensor, depths: Tensor, drawn: Tensor, background: Tensor, width: int, height: int, settings: RenderSettings,
-    deterministic: bool = True,
-) -> Any:  # fmt: skip
+    splats: Tensor, depths: Tensor, drawn: Tensor, background: Tensor, width: int, height: int, settings: RenderSettings
+) -> Any:
     """A view held still where its splats (n, 9) are: `cpu.Raster` in arrays, or `cuda.CudaRaster` in tensors."""
     if not by_triton(splats):
         arrays = (splats.numpy(), depths.numpy(), drawn.numpy(), background.numpy())
         return Raster(*arrays, width, height, settings)
     from splat.raster.cuda import CudaRaster  # needs triton, which a machine without a GPU may not have
 
-    return CudaRaster(splats, depths, drawn, background, width, height, settings, deterministic)
+    return CudaRaster(splats, depths, drawn, background, width, height, settings)
 
 
 def _native(raster: Any, tensor: Tensor) -> Any:
@@ -184,20 +183,10 @@ def project_by_kernel(gaussians: Gaussians, camera: Camera, settings: RenderSett
 
 
 def rasterize_by_kernel(
-    splats: Splats,
-    background: Float[Tensor, "3"],
-    width: int,
-    height: int,
-    settings: RenderSettings,
-    deterministic: bool = True,
+    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, settings: RenderSettings
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
-    """Colour and accumulated alpha of `reference.rasterize_reference`, by the kernels, where the splats are.
-
-    deterministic: of the kernels for GPUs (`cuda.CudaRaster`); those for the CPU always are.
-    """
+    """Colour and accumulated alpha of `reference.rasterize_reference`, by the kernels, where the splats are."""
     parts = (splats.means, splats.conics, splats.opacities, splats.colours)
-    raster = held_view(
-        _joined(parts), splats.depths.detach(), splats.drawn, background, width, height, settings, deterministic
-    )
+    raster = held_view(_joined(parts), splats.depths.detach(), splats.drawn, background, width, height, settings)
     planes = _Rasterize.apply(raster, *parts)
     return planes[:3], planes[3]  # pyright: ignore

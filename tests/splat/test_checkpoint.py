@@ -10,6 +10,7 @@ import torch
 
 from splat.checkpoint import load_checkpoint, save_checkpoint, write_atomically
 from splat.regularizers.methods import ThreeDGS
+from splat.settings import RenderSettings
 from splat.train import Training, train
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
@@ -135,6 +136,13 @@ def test_every_key_is_checked(path, key):
     del content[key]
     torch.save(content, path)
     refused(path, "missing|format")
+
+
+def test_a_checkpoint_from_before_sums_had_a_name_has_ordered_ones(path):
+    content = torch.load(path, weights_only=True)
+    del content["config"]["render"]["sums"]
+    torch.save(content, path)
+    assert load_checkpoint(path).training.config.render == RenderSettings()
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """The compositing kernels for GPUs against the float64 specification; on a machine without one, by Triton's interpreter."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import pytest
@@ -12,7 +12,7 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton; install 
 from splat.projection import Splats
 from splat.raster import functions
 from splat.raster.cuda import TOGETHER, CudaRaster
-from splat.settings import RenderSettings
+from splat.settings import RenderSettings, Sums
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, NUMPY, relative_error
 from tests.splat.raster.compositing_cases import BACKGROUND, BLOCKS, CASES, TINY, truth
 
@@ -36,19 +36,18 @@ class Results:
     curvature: Tensor
 
 
-def raster_of(name: str, dtype: torch.dtype, device: torch.device, deterministic: bool = True) -> CudaRaster:
+def raster_of(name: str, dtype: torch.dtype, device: torch.device, sums: Sums = "ordered") -> CudaRaster:
     expected = truth(name)
     splats, depths = expected.splats.to(device), expected.depths.to(device, dtype)
-    return CudaRaster(
-        splats, depths, expected.drawn.to(device), BACKGROUND.to(device), *expected.case.size, expected.case.settings,
-        deterministic,
-    )  # fmt: skip
+    settings = replace(expected.case.settings, sums=sums)
+    drawn, background = expected.drawn.to(device), BACKGROUND.to(device)
+    return CudaRaster(splats, depths, drawn, background, *expected.case.size, settings)
 
 
 @cache
-def results(name: str, dtype: torch.dtype, device: torch.device, deterministic: bool = True) -> Results:
+def results(name: str, dtype: torch.dtype, device: torch.device, sums: Sums = "ordered") -> Results:
     expected, K = truth(name), vectors(name)
-    raster = raster_of(name, dtype, device, deterministic)
+    raster = raster_of(name, dtype, device, sums)
     adjoint = raster.backward(expected.G.to(device))
     tangent = raster.jvp(expected.U[:, :K].to(device))
     product = tangent.curvature(adjoint, expected.dG[:K].to(device))
@@ -90,7 +89,7 @@ def test_tangents_and_curvature_are_those_of_the_specification(name, dtype, devi
 
 def test_the_cases_stop_pixels_leave_entries_unreached_and_reach_the_cap(device):
     walled = results("tiny walled", torch.float64, device).raster
-    assert walled.slots.count < walled.entries
+    assert walled.entries_reached < walled.entries
     for name in ("tiny capped", "tiny through the cap"):
         mx, my, a, b, c, opacity = truth(name).splats[:, :6].T[:, :, None, None]
         width, height = truth(name).case.size
@@ -103,7 +102,7 @@ def test_the_cases_stop_pixels_leave_entries_unreached_and_reach_the_cap(device)
 
 @pytest.mark.parametrize("name", [*CASES, *TINY] if FAST else ["tiny equal depths"])
 def test_atomic_sums_differ_from_slots_by_round_off(name, device):
-    one, other = results(name, torch.float64, device), results(name, torch.float64, device, deterministic=False)
+    one, other = results(name, torch.float64, device), results(name, torch.float64, device, sums="atomic")
     assert torch.equal(one.raster.planes, other.raster.planes) and torch.equal(one.jvp, other.jvp)
     assert relative_error(one.gradient, other.gradient) < 1e-14
     assert relative_error(one.curvature, other.curvature) < 1e-13
