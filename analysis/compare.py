@@ -19,7 +19,7 @@ from rich.console import Console
 
 from analysis.compare_table import Run, compare_table, comparison, frame
 from analysis.drawing import draw
-from analysis.options import CompareOptions, ProbeOptions
+from analysis.options import CompareOptions, DeviceName, ProbeOptions
 from analysis.records import FILE, read_record
 from analysis.report import pictures_in, template_environment
 from analysis.training import CHECKPOINT, METRICS
@@ -49,7 +49,7 @@ def run_compare(options: CompareOptions) -> int:
             f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
         )
     for path in missing:
-        _probe(path)
+        _probe(path, options.device)
     runs = [
         Run(path, label, checkpoint, _metrics(path), read_record(path / PROBE).data)
         for path, label, checkpoint in zip(options.runs, labels, checkpoints)
@@ -91,11 +91,11 @@ def probed(run: Path, checkpoint: Checkpoint) -> bool:
     return read_record(run / PROBE).data["provenance"].get("iteration") == checkpoint.training.step
 
 
-def _probe(run: Path) -> None:
+def _probe(run: Path, device: DeviceName) -> None:
     from analysis.probe import run_probe
 
     path = run / CHECKPOINT
-    run_probe(ProbeOptions(path), ["landscape", "probe", str(path)])
+    run_probe(ProbeOptions(path, device=device), ["landscape", "probe", str(path), "--device", device])
 
 
 def _metrics(run: Path) -> dict[str, Any]:

@@ -287,7 +287,7 @@ def _finite(
     if (2 * len(settings.probe_steps) + NOISE_POINTS + 1) * render > max(seconds, SHORTEST):
         notes.append("the finite probe was left out: its renders would have taken more than its share of the time")
         return None
-    center, vector = objective.active.flat.cpu(), ends.largest.vectors[:, 0].cpu()
+    center, vector = objective.active.flat, ends.largest.vectors[:, 0]
     return finite_probe(objective.evaluate, center, vector, operator, settings.probe_steps, report)
 
 
@@ -304,7 +304,7 @@ def _plane(
     report: Progress,
     notes: list[str],
 ) -> PlaneSlice | None:
-    center, loss_scale = objective.active.flat.cpu(), settings.slice_rise * value
+    center, loss_scale = objective.active.flat, settings.slice_rise * value
     points = _side(settings.slice_points, seconds, render, notes)
     curvatures: Float64[Tensor, 2] = ends.largest.values[:2]
     if loss_scale <= 0 or not curvatures.all():
@@ -312,8 +312,8 @@ def _plane(
         return None
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, points) for unit in (first, second)]
-    vectors, gradient = ends.largest.vectors[:, :2].cpu(), gradient.cpu()
-    workers = 1 if objective.collective or by_triton(objective.active.flat) else thread_count()
+    vectors = ends.largest.vectors[:, :2]
+    workers = 1 if objective.collective or by_triton(center) else thread_count()
     allowed = SliceSettings(workers=workers, max_seconds=max(seconds, SHORTEST))
     evaluate = evaluation(objective, allowed.workers)
     plane = evaluate_slice(evaluate, center, vectors, axes, gradient, operator, allowed, generator, progress=report)

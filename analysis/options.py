@@ -161,7 +161,9 @@ class SliceOptions:
     max_renders: Annotated[int | None, arg(help_behavior_hint="")] = None
     """Points that are rendered at most (each in all training views).  Default: no limit."""
     workers: Annotated[int | None, arg(help_behavior_hint="")] = None
-    """Points rendered at a time, each on one thread.  Default: one for each processor."""
+    """Points rendered at a time, each on one thread.  Default: one for each processor; one on a GPU."""
+    device: DeviceName = "auto"
+    """Where to work.  auto: on the GPU where there is one that can be used, else on the CPU."""
     seed: int = 0
     """Of random directions, of the start of Lanczos, and of the points that judge the interpolation."""
     scene: Annotated[Path | None, arg(help_behavior_hint="")] = None
@@ -190,6 +192,8 @@ class CompareOptions:
     """Folder of the page, the table and the pictures.  Default: compare, in the folder that holds all runs."""
     probe: FlagCreatePairsOff[bool] = False
     """Probe the runs that have no record of their checkpoint yet."""
+    device: DeviceName = "auto"
+    """Where to probe.  auto: on the GPU where there is one that can be used, else on the CPU."""
 
 
 @dataclass(frozen=True)

@@ -46,11 +46,12 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
 
     Started by torchrun, the processes share the views, and the first one writes.
     """
-    with torchrun_ranks() as ranks:
-        return _run(options, command, ranks)
+    device = device_named(options.device)
+    with torchrun_ranks(device) as ranks:
+        return _run(options, command, device, ranks)
 
 
-def _run(options: ProbeOptions, command: Sequence[str], ranks: Ranks | None) -> int:
+def _run(options: ProbeOptions, command: Sequence[str], device: torch.device, ranks: Ranks | None) -> int:
     out = options.out or options.checkpoint.parent / "probe"
     settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
     if ranks is not None and family_options is not None:
@@ -58,7 +59,6 @@ def _run(options: ProbeOptions, command: Sequence[str], ranks: Ranks | None) -> 
             "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
         )
     writes = ranks is None or ranks.rank == 0
-    device = device_named(options.device)
     require_replaceable(out)
     console, start = Console(stderr=True, quiet=not writes), perf_counter()
     stages = Stages(console)

@@ -103,5 +103,5 @@ def slice_arrays(found: Found) -> dict[str, dict[str, np.ndarray]]:
     known = {name: array.numpy() for name, array in optional.items() if array is not None}
     return {
         "slice": {**axes, "loss": grid.loss.numpy(), **known},
-        "directions": {"vectors": found.vectors.numpy()},
+        "directions": {"vectors": found.vectors.cpu().numpy()},
     }

@@ -53,6 +53,7 @@ from landscape.grid_evaluations import Evaluation, Loss, slice_digest
 from landscape.probes import split
 from splat.checkpoint import Checkpoint, load_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
+from splat.device import device_named
 from splat.gaussians import Gaussians
 from splat.scenes.scene import Scene
 
@@ -63,7 +64,8 @@ DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     """Slice the checkpoint's loss; returns the exit code.  command: as typed, for the record."""
     shape = Shape.of(options.along, options.dimension, options.radius, options.points, options.other is not None)
-    settings = _settings(options, shape)
+    device = device_named(options.device)
+    settings = _settings(options, shape, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
     require_replaceable(out, SLICE)
     unfinished = out.with_name(f".{out.name}.unfinished")
@@ -71,6 +73,7 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint = load_checkpoint(options.checkpoint)
+        checkpoint.training.move(device)
         other = None if options.other is None else _other_end(checkpoint, options.other)
         scene = checkpoint.load_scene(options.checkpoint, options.scene)
         objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
@@ -91,9 +94,10 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     return 0
 
 
-def _settings(options: SliceOptions, shape: Shape) -> SliceSettings:
-    """As asked for; a line of few points holds an eighth of them out."""
-    workers = torch.get_num_threads() if options.workers is None else options.workers
+def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
+    """As asked for; a line of few points holds an eighth of them out, and a GPU is full with one render."""
+    most = torch.get_num_threads() if device.type == "cpu" else 1
+    workers = most if options.workers is None else options.workers
     holdout = min(SliceSettings.holdout, ceil(options.points**shape.dimension / 8))
     if options.all_points:
         if options.max_renders is not None:
@@ -105,8 +109,8 @@ def _settings(options: SliceOptions, shape: Shape) -> SliceSettings:
             f"expected --max-renders of at least {least}, with which a slice of dimension {shape.dimension} can begin and be "
             f"judged, got {options.max_renders}"
         )
-    most = inf if options.max_renders is None else options.max_renders
-    return SliceSettings(options.tolerance, holdout, workers=workers, max_evaluations=most)
+    renders = inf if options.max_renders is None else options.max_renders
+    return SliceSettings(options.tolerance, holdout, workers=workers, max_evaluations=renders)
 
 
 def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
@@ -117,7 +121,7 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
             f"expected a checkpoint of {len(here):,} Gaussians with SH degree {here.sh_degree} at the other end of the line, "
             f"got {len(there):,} with {there.sh_degree} in {path}; take two of one training after densification has ended"
         )
-    there = Gaussians(there.flat.to(here.flat.dtype, copy=True), there.sh_degree)
+    there = Gaussians(there.flat.to(here.flat, copy=True), there.sh_degree)
     quats = there.quats
     quats /= quats.norm(dim=1, keepdim=True)
     quats *= torch.where((quats * here.quats).sum(dim=1, keepdim=True) < 0, -1.0, 1.0).to(quats)
@@ -130,7 +134,8 @@ def _known(probe: Path, unfinished: Path, checkpoint: Checkpoint, objective: Sce
     found = [torch.from_numpy(np.load(kept, allow_pickle=False))] if kept.is_file() else []
     center = objective.active.flat
     name, precision = loss_name(checkpoint.training.config.loss), torch.finfo(center.dtype).eps
-    return found + recorded_eigenvectors(probe, name, objective.loss(center), precision)
+    found += recorded_eigenvectors(probe, name, objective.loss(center), precision)
+    return [vectors.to(center.device) for vectors in found]
 
 
 def _measure(
@@ -143,9 +148,9 @@ def _measure(
     unfinished: Path,
     stages: Stages,
 ) -> Found:
-    seed = torch.Generator().manual_seed(options.seed)
-    generators = {name: split(seed) for name in ("eigenvectors", "random", "holdout")}
     center = objective.active.flat
+    seed = torch.Generator(center.device).manual_seed(options.seed)
+    generators = {name: split(seed) for name in ("eigenvectors", "random", "holdout")}
     with stages.stage("linearise") as report:
         report(0, 1, f"{len(objective.views)} views")
         gradient = objective.gradient
@@ -181,7 +186,7 @@ def _measure(
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:
     """For the run that continues this one, should it be killed."""
-    vectors = [direction.vector.numpy() for direction in directions if direction.kind == "eigenvectors"]
+    vectors = [direction.vector.cpu().numpy() for direction in directions if direction.kind == "eigenvectors"]
     if not vectors:
         return
     unfinished.mkdir(parents=True, exist_ok=True)

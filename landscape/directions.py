@@ -53,7 +53,11 @@ def random_directions(
             f"expected one group number, from 0, for each of {center.numel()} parameters, got {groups.dtype} of shape "
             f"{tuple(groups.shape)}"
         )
-    d = torch.randn(center.numel(), count, dtype=torch.float64, generator=generator)
+    d, groups = (
+        torch.empty(center.numel(), count, dtype=torch.float64, device=generator.device),
+        groups.to(center.device),
+    )
+    d = d.normal_(generator=generator).to(center.device)
     sizes = _lengths(center.detach().double()[:, None], groups) / _lengths(d, groups)
     d *= sizes[groups]
     if not (torch.isfinite(d).all() and d.any()):
@@ -64,8 +68,8 @@ def random_directions(
 def _lengths(rows: Float[Tensor, "n k"], groups: Int[Tensor, " n"]) -> Float[Tensor, "g k"]:
     """The norm over each group; 1 for numbers that are no parameter's."""
     number = int(groups.max()) + 1
-    squares = torch.zeros(number, rows.shape[1], dtype=rows.dtype).index_add_(0, groups, rows.square())
-    used = torch.zeros(number, dtype=torch.bool).index_fill_(0, groups, True)
+    squares = rows.new_zeros(number, rows.shape[1]).index_add_(0, groups, rows.square())
+    used = rows.new_zeros(number, dtype=torch.bool).index_fill_(0, groups, True)
     return torch.where(used[:, None], squares.sqrt(), 1.0)
 
 

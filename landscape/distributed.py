@@ -1,7 +1,7 @@
 """Operators whose terms are spread over processes: H V = sum_r H_r V, H_r the terms of rank r, added by an all-reduce.
 
     torchrun --nproc-per-node 2 study.py                     # in it, on every rank alike:
-    torch.distributed.init_process_group("gloo")             # "nccl" for ranks with a GPU each
+    torch.distributed.init_process_group("gloo")             # "nccl" for ranks with a GPU each, made current before
     ranks = Ranks.joined()
     H = DistributedOperator(SumOperator([term_of(view) for view in ranks.share(views)]), ranks)
     estimate_traces(H, torch.Generator().manual_seed(0))     # the same numbers on every rank
@@ -103,12 +103,19 @@ class Ranks:
 
 
 @contextmanager
-def torchrun_ranks() -> Iterator[Ranks | None]:
-    """The processes that torchrun started with this one, joined for as long as the block runs; None without torchrun."""
+def torchrun_ranks(device: torch.device) -> Iterator[Ranks | None]:
+    """The processes that torchrun started with this one, joined for as long as the block runs; None without torchrun.
+
+    device: this process's own; what the ranks exchange goes from GPU to GPU by NCCL, and by gloo between CPUs.
+    """
     if not dist.is_available() or not dist.is_torchelastic_launched():
         yield None
         return
-    dist.init_process_group("gloo")
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+        dist.init_process_group("nccl", device_id=device)
+    else:
+        dist.init_process_group("gloo")
     try:
         yield Ranks.joined()
     finally:

@@ -41,7 +41,7 @@ class GridEvaluations:
 
     value, known, crossed [points]: the loss (nan where not known), which are known, and which of those have another
     signature than the centre; has_signature: whether the objective gives any.  loss must be safe to call from several
-    threads if workers > 1.  Points are formed in float64 and rounded once to center's dtype.
+    threads if workers > 1.  Points are formed in float64, where center is, and rounded once to its dtype.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class GridEvaluations:
         store: Path | None = None,
         progress: Progress | None = None,
     ):
-        self._loss, self._center, self._points = loss, center.detach(), points
+        self._loss, self._center, self._points = loss, center.detach(), points.to(center.device)
         self._origin, self._spans = self._center.double(), directions.detach().double()
         self._workers, self._store, self._progress = workers, store, progress
         self.center_loss, self._here = evaluated_at(loss, self._center)

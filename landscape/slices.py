@@ -116,10 +116,10 @@ def evaluate_slice(
 
 
 def _derivatives(gradient: Tensor, operator: SymmetricOperator, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """b and A of the model."""
+    """b and A of the model, on the CPU as all that a slice gives."""
     spans = directions.detach().double()
-    curvature = spans.T @ operator.apply(directions.to(operator.dtype)).double()
-    return spans.T @ gradient.double(), (curvature + curvature.T) / 2
+    curvature = (spans.T @ operator.apply(directions.to(operator.dtype)).double()).cpu()
+    return (spans.T @ gradient.double()).cpu(), (curvature + curvature.T) / 2
 
 
 def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Tensor]) -> None:

@@ -11,13 +11,12 @@ rank; so are the traces of `exact_traces` and all that `landscape` finds with th
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
-import psutil
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from landscape.distributed import Ranks
-from splat.curvature import SceneHessian, SceneObjective
+from splat.curvature import SceneHessian, SceneObjective, free_memory
 from splat.gaussians import Gaussians
 from splat.losses import LossSettings
 from splat.scenes.view import View
@@ -27,7 +26,8 @@ from splat.settings import RenderSettings
 class DistributedObjective(SceneObjective):
     """The mean loss over the views of all ranks; `views` are this rank's.  Its methods are collective.
 
-    memory: for this rank's views; by default an even part of half of what is free, as if all ranks were on one machine.
+    memory: for this rank's views; by default half of what is free on its GPU, or on CPUs an even part of half of what is free,
+    as if all ranks were on one machine.
     Raises ValueError on all ranks where their Gaussians differ.
     """
 
@@ -48,8 +48,10 @@ class DistributedObjective(SceneObjective):
         ranks.require_same("set-up", (len(gaussians), gaussians.flat.dtype, sh_degree, loss, background, settings))
         ranks.require_same_vectors(gaussians.flat[:, None])
         self.held_views: list[int] = [int(count) for count in ranks.gather(torch.tensor(len(views)))]
-        share = psutil.virtual_memory().available // (2 * ranks.size) if memory is None else memory
-        super().__init__(gaussians, views, loss, background, settings, sh_degree, share)
+        if memory is None:
+            memory = free_memory(gaussians.flat.device) // 2
+            memory //= 1 if gaussians.flat.device.type == "cuda" else ranks.size
+        super().__init__(gaussians, views, loss, background, settings, sh_degree, memory)
         self.counts = replace(self.counts, views=sum(self.held_views))
 
     def _support(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:

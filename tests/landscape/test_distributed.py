@@ -1,8 +1,9 @@
 import pytest
 import torch
+import torch.distributed as dist
 
 from landscape.density import spectral_density
-from landscape.distributed import DistributedOperator, Ranks
+from landscape.distributed import DistributedOperator, Ranks, torchrun_ranks
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.operator import DenseOperator, SumOperator
 from landscape.trace import TraceSettings, estimate_traces
@@ -96,3 +97,22 @@ def test_masks_and_tensors_meet_in_the_order_of_ranks(found):
 def test_without_a_group_the_error_says_how_to_make_one():
     with pytest.raises(ValueError, match="torchrun"):
         Ranks.joined()
+
+
+def test_processes_of_torchrun_exchange_by_nccl_between_gpus_and_by_gloo_otherwise(monkeypatch):
+    said = []
+    monkeypatch.setattr(dist, "is_torchelastic_launched", lambda: True)
+    monkeypatch.setattr(dist, "init_process_group", lambda backend, device_id=None: said.append((backend, device_id)))
+    monkeypatch.setattr(torch.cuda, "set_device", said.append)
+    monkeypatch.setattr(dist, "destroy_process_group", lambda: said.append("left"))
+    monkeypatch.setattr(Ranks, "joined", lambda: Ranks(0, 2))
+    own = torch.device("cuda", 1)
+    for device in (torch.device("cpu"), own):
+        with torchrun_ranks(device) as ranks:
+            assert ranks == Ranks(0, 2)
+    assert said == [("gloo", None), "left", own, ("nccl", own), "left"]
+
+
+def test_without_torchrun_there_are_no_ranks():
+    with torchrun_ranks(torch.device("cpu")) as ranks:
+        assert ranks is None

@@ -35,7 +35,27 @@ def test_a_gpu_that_can_be_used_is_used(monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr("splat.device.find_spec", lambda name: object())
-    assert device_named("auto") == device_named("cuda") == torch.device("cuda")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert device_named("auto") == device_named("cuda") == torch.device("cuda", 0)
+
+
+def test_each_of_a_machines_processes_takes_a_gpu_of_its_own_and_too_few_are_one_clear_sentence(monkeypatch):
+    monkeypatch.setattr("splat.device._lack", lambda: None)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    for processes, taken in ((1, [0]), (2, [0, 1])):
+        monkeypatch.setenv("LOCAL_WORLD_SIZE", str(processes))
+        for rank in range(processes):
+            monkeypatch.setenv("LOCAL_RANK", str(rank))
+            assert device_named("auto") == device_named("cuda") == torch.device("cuda", taken[rank])
+            assert device_named("cpu") == torch.device("cpu")
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
+    for rank in range(3):  # also in those that would find one, lest the others wait for them
+        monkeypatch.setenv("LOCAL_RANK", str(rank))
+        with pytest.raises(
+            ValueError, match=r"^expected .* cuda, got 2 for the 3 processes of this machine; start torchrun"
+        ):
+            device_named("cuda")
+        assert device_named("auto") == torch.device("cpu")
 
 
 def test_an_unknown_device_is_refused():
