@@ -1,22 +1,27 @@
-"""What the subcommands of `landscape` accept.  Plain dataclasses that import nothing heavy, so that help is quick."""
+"""What the subcommands of `landscape` accept.  Plain dataclasses that import nothing heavy, so that help is quick.
+
+The help keeps the line breaks of these docstrings: a line is a sentence.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 Along = Literal["eigenvectors", "random", "gradient", "line"]
 DeviceName = Literal["auto", "cpu", "cuda"]
+T = TypeVar("T")
+Unset = Annotated[T | None, arg(help_behavior_hint="")]  # its docstring says what stands for None
 
 
 @dataclass(frozen=True)
 class TrainOptions:
     """Train 3D Gaussian Splatting on a few views of a scene and score it on the views held out."""
 
-    scene: Positional[Path]
-    """Folder of the scene: COLMAP, LLFF, Blender, instant-ngp or nerfstudio."""
-    out: Path | None = None
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder of the scene: COLMAP, LLFF, Blender, instant-ngp, nerfstudio or DTU."""
+    out: Unset[Path] = None
     """Folder of the run, which must not exist yet.  Default: runs/NAME, after the scene."""
     views: int | Literal["all"] = 3
     """Training views, chosen by the scene's protocol; all: every view that is not held out."""
@@ -24,20 +29,23 @@ class TrainOptions:
     """Steps, one view each."""
     seed: int = 0
     """Of everything random: the same seed gives the same checkpoint, bit for bit."""
-    images: str | None = None
+    images: Unset[str] = None
     """Folder of images within the scene.  Default: images, else the largest images_K."""
     downscale: float = 1.0
     """Reduce the images further by this factor."""
     start: Literal["scene", "points", "triangulated", "random"] = "scene"
-    """What the Gaussians start from.  points: the scene's, seen by two training views; triangulated: points of the training
-    views alone, with their poses; random: in their common volume; scene: points where there are any, else random."""
-    masks: Path | None = None
-    """Folder of object masks, named after the images, that the scores are taken inside.  Default: mask or masks in the
-    scene, or what its files name."""
-    depths: Path | None = None
+    """What the Gaussians start from.
+    scene: points where there are any, else random.
+    points: the scene's, seen by two training views.
+    triangulated: points of the training views alone, with their poses.
+    random: in the training views' common volume."""
+    masks: Unset[Path] = None
+    """Folder of object masks, named after the images, that the scores are taken inside.
+    Default: mask or masks in the scene, or what its files name."""
+    depths: Unset[Path] = None
     """Folder of relative depth maps for the training views, NAME.npy or 16-bit NAME.png, for methods that use depth."""
     method: str = "3dgs"
-    """What is trained: 3dgs, stablegs or another of `splat/regularizers/methods.py`, at its published settings."""
+    """What is trained: 3dgs, stablegs, sam, dropgaussian, dropoutgs, cor-gs, fsgs or dngaussian."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """KEY=VALUE changes a setting of the method or of the training, as in vsp_weight=0; may be repeated."""
     device: DeviceName = "auto"
@@ -56,19 +64,19 @@ class TrainOptions:
     """Weight of 1 - SSIM; the pixel loss has the rest."""
     checkpoint_every: int = 500
     """Steps between checkpoints: what a killed run loses at most."""
-    probe_every: Annotated[int | None, arg(help_behavior_hint="")] = None
+    probe_every: Unset[int] = None
     """Steps between records of traces, both ends of the spectrum and anisotropy in OUT/trajectory.csv.  Default: none."""
     probe_share: float = 0.1
-    """Time that these records may take, as a share of that of the steps; one that would not fit is skipped.  inf: no limit."""
+    """Time that these records may take, as a share of that of the steps; what would not fit is skipped.  inf: no limit."""
 
 
 @dataclass(frozen=True)
 class SfmOptions:
     """Make a scene from a folder of photographs: find where each was taken, with pycolmap."""
 
-    photos: Positional[Path]
+    photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
     """Folder of the photographs: at least 3 of one scene that does not move, from different places."""
-    out: Path | None = None
+    out: Unset[Path] = None
     """Folder of the scene, which must not exist yet.  Default: PHOTOS-scene, beside the photographs."""
 
 
@@ -81,7 +89,7 @@ class SweepOptions:
 
     file: Annotated[Positional[Path], arg(metavar="SWEEP.toml")]
     """The methods, seeds, scenes and settings; an example is in the README."""
-    out: Path | None = None
+    out: Unset[Path] = None
     """Folder of the runs and tables.  Default: the file's."""
     jobs: int = 1
     """Cells at once, each on its share of the processors."""
@@ -93,11 +101,11 @@ class SweepOptions:
 class ProbeOptions:
     """Measure the loss landscape at a checkpoint: traces, extreme eigenvalues, anisotropy, a slice."""
 
-    checkpoint: Positional[Path]
+    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
     """RUN/checkpoint.pt, as written by landscape train."""
-    scene: Path | None = None
+    scene: Unset[Path] = None
     """Folder of the scene, where it has moved since the training."""
-    out: Path | None = None
+    out: Unset[Path] = None
     """Folder of the results.  Default: probe, beside the checkpoint."""
     seed: int = 0
     """Of the probe vectors."""
@@ -107,21 +115,23 @@ class ProbeOptions:
     """Exit with 1 if a self-check fails; the record is written all the same."""
     quick: FlagCreatePairsOff[bool] = False
     """Rough numbers in about a third of the time."""
-    seconds: float | None = None
-    """Time for the estimators together; what a stage did not reach in its share is said. inf: no limit.  Default: 45, with
-    --quick 12."""
-    slice_points: int | None = None
+    seconds: Unset[float] = None
+    """Time for the estimators together; what a stage did not reach in its share is said.  inf: no limit.
+    Default: 45, with --quick 12."""
+    slice_points: Unset[int] = None
     """Points along each side of the slice, odd.  Default: 41, with --quick 11."""
     slice_rise: float = 0.001
     """Rise of the loss, as a share of it, that the slice's curvature units stand for; it reaches 3 units each way."""
     families: FlagCreatePairsOff[bool] = False
-    """Also the anisotropy family of the whole and of each attribute, for the Hessian and for Gauss-Newton: takes about
-    four times as many products as the rest."""
+    """Also the anisotropy family of the whole and of each attribute, for the Hessian and for Gauss-Newton.
+    Takes about four times as many products as the rest."""
     split_control: FlagCreatePairsOff[bool] = False
-    """The families, and the same of the scene with every Gaussian split in two: takes about 2.5 times as long as the
-    families alone."""
+    """The families, and the same of the scene with every Gaussian split in two.
+    Takes about 2.5 times as long as the families alone."""
     metric: Literal["parameters", "scene", "optimiser"] = "parameters"
-    """Units in which the families compare curvature.  parameters: as stored; scene: positions by the scene's size;
+    """Units in which the families compare curvature.
+    parameters: as stored.
+    scene: positions by the scene's size.
     optimiser: steps of the training's first learning rates."""
     family_seconds: float = 1800.0
     """Time for the families together, beside SECONDS.  inf: no limit."""
@@ -144,7 +154,7 @@ class SliceOptions:
     random: filter-normalised, each attribute of each Gaussian by its own size.
     gradient: the steepest ascent.
     line: to OTHER."""
-    dimension: Annotated[Literal[1, 2] | None, arg(help_behavior_hint="")] = None
+    dimension: Unset[Literal[1, 2]] = None
     """1: a line; 2: a plane.  Default: 2 for eigenvectors and random, 1 for gradient and line."""
     radius: UseAppendAction[tuple[float, ...]] = ()
     """How far to look each way; given twice, one for each direction.
@@ -158,17 +168,17 @@ class SliceOptions:
     """Error of what lies between renders, as a share of the range of the loss."""
     all_points: FlagCreatePairsOff[bool] = False
     """Render every point, whatever the tolerance."""
-    max_renders: Annotated[int | None, arg(help_behavior_hint="")] = None
+    max_renders: Unset[int] = None
     """Points that are rendered at most (each in all training views).  Default: no limit."""
-    workers: Annotated[int | None, arg(help_behavior_hint="")] = None
+    workers: Unset[int] = None
     """Points rendered at a time, each on one thread.  Default: one for each processor; one on a GPU."""
     device: DeviceName = "auto"
     """Where to work.  auto: on the GPU where there is one that can be used, else on the CPU."""
     seed: int = 0
     """Of random directions, of the start of Lanczos, and of the points that judge the interpolation."""
-    scene: Annotated[Path | None, arg(help_behavior_hint="")] = None
+    scene: Unset[Path] = None
     """Folder of the scene, where it has moved since the training."""
-    out: Annotated[Path | None, arg(help_behavior_hint="")] = None
+    out: Unset[Path] = None
     """Folder of the results.  Default: beside the checkpoint, such as slice-eigenvectors-2d or slice-line-1d."""
 
 
@@ -176,9 +186,9 @@ class SliceOptions:
 class TrajectoryOptions:
     """Plot the landscape along trainings that were made with --probe-every, several in one picture."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
     """Folders that landscape train wrote."""
-    out: Path | None = None
+    out: Unset[Path] = None
     """Folder of the table and the picture.  Default: trajectory, in the folder that holds all runs."""
 
 
@@ -188,7 +198,7 @@ class CompareOptions:
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
     """Folders that landscape train wrote, of the same views and loss, each probed."""
-    out: Annotated[Path | None, arg(help_behavior_hint="")] = None
+    out: Unset[Path] = None
     """Folder of the page, the table and the pictures.  Default: compare, in the folder that holds all runs."""
     probe: FlagCreatePairsOff[bool] = False
     """Probe the runs that have no record of their checkpoint yet."""
@@ -208,21 +218,26 @@ class DemoOptions:
 class BenchOptions:
     """Measure speed and memory: of the compositing kernels, or of first and second order on a scene; or errors at limits."""
 
-    subject: Positional[Literal["kernels", "stress", "accuracy"] | Path | None] = None
-    """kernels; stress: errors at the limits of the renderer, against bounds (exit code 1 where one is missed); accuracy:
-    work against true error of every estimator, beside peers; or a scene's folder or a checkpoint.
+    subject: Annotated[
+        Positional[Literal["kernels", "stress", "accuracy"] | Path | None],
+        arg(metavar="[SUBJECT]", help_behavior_hint=""),
+    ] = None
+    """kernels: the compositing kernels by themselves.
+    stress: errors at the limits of the renderer, against bounds; exit code 1 where one is missed.
+    accuracy: work against true error of every estimator, beside peers.
+    A scene's folder or a checkpoint: first and second order on it.
     Default: a synthetic scene."""
-    checkpoint: Positional[Path | None] = None
-    """accuracy only: a checkpoint to take instead of small scenes and matrices. Its truth is a long run, kept in OUT."""
+    checkpoint: Annotated[Positional[Path | None], arg(metavar="[CHECKPOINT]", help_behavior_hint="")] = None
+    """accuracy only: a checkpoint to take instead of small scenes and matrices.  Its truth is a long run, kept in OUT."""
     out: Path = Path("runs/bench")
     """Folder of the tables (CSV) and figures; files of an earlier run are replaced."""
     repetitions: int = 15
     """How often each thing is timed, in turns with what it is compared with; accuracy: seeds of each trace on a matrix."""
-    sizes: tuple[str, ...] = ()
-    """Synthetic sizes, GAUSSIANS@WIDTHxHEIGHT. Default: 10k@504x378 100k@504x378, and for kernels 500k@1600x1060."""
-    prototype: Path | None = None
-    """kernels only: folder of a prototype of the kernels to measure beside them. Its code is run."""
-    images: str | None = None
+    sizes: Annotated[tuple[str, ...], arg(metavar="SIZE...", help_behavior_hint="")] = ()
+    """Synthetic sizes, GAUSSIANS@WIDTHxHEIGHT.  Default: 10k@504x378 100k@504x378, and for kernels 500k@1600x1060."""
+    prototype: Unset[Path] = None
+    """kernels only: folder of a prototype of the kernels to measure beside them.  Its code is run."""
+    images: Unset[str] = None
     """Folder of images within the scene.  Default: images, else the largest images_K."""
     downscale: float = 1.0
     """Reduce the scene's images further by this factor."""

@@ -21,6 +21,7 @@ from analysis.training import render_name
 from splat.checkpoint import load_checkpoint
 from splat.gaussians import ATTRIBUTES
 from splat.losses import psnr
+from splat.regularizers.methods import METHODS
 from splat.regularizers.stablegs import StableGS
 from splat.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -266,6 +267,16 @@ def test_arguments_that_cannot_be_read_exit_with_2(wrong):
     with pytest.raises(SystemExit) as caught:
         main(wrong)
     assert caught.value.code == 2
+
+
+@pytest.mark.parametrize("command", ["sfm", "train", "sweep", "probe", "slice", "compare", "demo", "trajectory", "bench"])
+def test_help_says_what_an_option_that_is_left_out_stands_for(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "(default: None)" not in said and "(default: )" not in said
+    if command == "train":
+        assert all(method in said for method in METHODS)
 
 
 def test_help_needs_no_torch():
