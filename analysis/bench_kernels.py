@@ -24,7 +24,7 @@ import pandas as pd
 from analysis.prototype import Prototype
 from analysis.timing import Timing, interleaved
 from analysis.workloads import BACKGROUND, TANGENTS, Problem, Size, random_splats, splat_problem
-from splat.raster import binning, compositing, packing
+from splat.raster import binning, compositing, formulas, packing, tangents
 from splat.raster.cpu import Adjoint, Raster, aligned
 from splat.raster.threads import over_range, over_tiles, thread_count
 from splat.settings import RenderSettings
@@ -54,7 +54,7 @@ def own_stages(p: Problem) -> Stages:
     slot_start, splats = raster.slot_start, raster.splats
     n = len(splats)
     entries, scalars = int(slot_start[-1]), (raster.params, raster.lists, raster.frame, raster.pixels)
-    sums = aligned((entries * compositing.SUMS,), p.splats.dtype)
+    sums = aligned((entries * formulas.SUMS,), p.splats.dtype)
     cut = np.log2(settings.alpha_min)
 
     def slots():
@@ -87,9 +87,9 @@ def _own_tangent_stages(
 ) -> dict[str, Callable[[], object]]:
     splats, dtype, size, slot_start = raster.splats, raster.dtype, raster.frame.size, raster.slot_start
     n, directions = len(splats), np.ascontiguousarray(p.directions[:, :K], np.float64)
-    packed = aligned((n * K * compositing.TANGENTS,), dtype)
+    packed = aligned((n * K * formulas.TANGENTS,), dtype)
     planes, transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
-    sums = aligned((int(slot_start[-1]) * K * compositing.SUMS,), dtype)
+    sums = aligned((int(slot_start[-1]) * K * formulas.SUMS,), dtype)
     primal, cotangents = (raster.lists, raster.frame, raster.pixels), np.ascontiguousarray(cotangents).reshape(-1)
     product = np.empty_like(directions)
     results[f"J u {K}"] = raster.crop(planes.reshape(K, 4, *raster.plane)[:, :3])
@@ -97,10 +97,10 @@ def _own_tangent_stages(
     return {
         f"tangents {K}": lambda: over_range(n, packing.pack_tangents, splats, directions, packed),
         f"J u {K}": lambda: over_tiles(
-            compositing.tangent, raster.params, packed, *primal, planes, transmittances
+            tangents.tangent, raster.params, packed, *primal, planes, transmittances
         ),
         f"tangent of backward {K}": lambda: over_tiles(
-            compositing.curvature, raster.params, packed, *primal, adjoint.cotangent, transmittances, cotangents, sums
+            tangents.curvature, raster.params, packed, *primal, adjoint.cotangent, transmittances, cotangents, sums
         ),
         f"reduce {K}": lambda: over_range(
             n, packing.reduce_curvature, splats, directions, slot_start, sums, adjoint.moments, product

@@ -9,7 +9,7 @@
     H v K             a product with K vectors, per vector
     block diagonal    Hessian blocks of all attributes, one pass
 
-Arithmetic is counted from the formulas of `compositing.py`: additions, multiplications, fused multiply-adds, divisions and
+Arithmetic is counted from `raster/formulas.py`: additions, multiplications, fused multiply-adds, divisions and
 minima of one pixel and Gaussian, comparisons and integer operations left out, each worth one fused multiply-add.
 """
 
@@ -25,7 +25,7 @@ from analysis.workloads import Workload
 from splat.linearize import LinearizedView, OwnBlocks
 from splat.losses_cpu import ViewLoss, view_loss
 from splat.projection_cpu import attribute_arrays, lens_of, project_adjoint, project_arrays
-from splat.raster import binning, compositing, packing
+from splat.raster import binning, compositing, formulas, packing
 from splat.raster.cpu import Adjoint, Raster, aligned
 from splat.raster.threads import over_range, over_tiles
 from splat.render import render
@@ -91,7 +91,7 @@ class ViewBench:
         """The parts of a gradient and of a product with one vector, and compositing alone."""
         w, camera, raster = self.workload, self.view.camera, self.raster
         n, drawing = len(w.gaussians), (raster.params, raster.lists, raster.frame, raster.pixels)
-        sums = aligned((int(raster.slot_start[-1]) * compositing.SUMS,), raster.dtype)
+        sums = aligned((int(raster.slot_start[-1]) * formulas.SUMS,), raster.dtype)
         bins = (self.splats, self.depths, self.drawn, camera.width, camera.height, w.settings)
         adjoint = self.adjoint
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from analysis.timing import interleaved
-from splat.raster.compositing import kernel
+from splat.raster.jit import kernel
 from splat.raster.simd import fma, lanes, lanes_of, load, store
 from splat.raster.threads import over_range, thread_count
 

@@ -18,7 +18,7 @@ import numba
 import numpy as np
 
 from analysis.workloads import BACKGROUND, TANGENTS, Problem
-from splat.raster.compositing import TILE_ROWS
+from splat.raster.formulas import TILE_ROWS
 from splat.raster.simd import REGISTER_BITS, lanes_of
 from splat.raster.threads import thread_count
 

@@ -22,7 +22,7 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin, models, register_model
 
-from splat.raster.compositing import formula
+from splat.raster.jit import formula
 from splat.raster.simd import VectorType, intrinsic
 
 CONTRACT = ("contract",)

@@ -27,9 +27,8 @@ from splat.gaussians import Gaussians
 from splat.losses_cpu import LinearLoss, ViewLoss
 from splat.projection_cpu import lens_of, project_arrays
 from splat.projection_linear import Held, Projection, split
-from splat.raster import compositing
-from splat.raster.compositing import SUMS, TANGENTS
 from splat.raster.cpu import Adjoint, Raster
+from splat.raster.formulas import SUMS, TANGENTS, TILE_ROWS
 from splat.settings import RenderSettings
 
 
@@ -128,7 +127,7 @@ class LinearizedView:
     def dark_tiles(self) -> int:
         """How many tiles with entries are left out of products: the loss has neither slope nor curvature all over them."""
         raster = self._raster
-        rows, lanes = compositing.TILE_ROWS, raster.plane[1] // raster.frame.columns
+        rows, lanes = TILE_ROWS, raster.plane[1] // raster.frame.columns
         planes = np.concatenate([self._adjoint.cotangent.reshape(4, *raster.plane), self._loss.diagonal])
         lit = (planes != 0).reshape(len(planes), -1, rows, raster.frame.columns, lanes).any(axis=(0, 2, 4)).reshape(-1)
         _ = raster.slot_start  # entries that no pixel reaches are dropped by now

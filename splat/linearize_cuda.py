@@ -15,8 +15,8 @@ from splat.losses_cuda import CudaViewLoss
 from splat.projection_cpu import lens_of
 from splat.projection_cuda import CudaProjection
 from splat.projection_linear import Held
-from splat.raster.compositing import SUMS, TANGENTS
 from splat.raster.cuda import CudaTangent
+from splat.raster.formulas import SUMS, TANGENTS
 from splat.settings import RenderSettings
 
 

@@ -18,8 +18,8 @@ from splat.consistency_kernels import consistency_rows
 from splat.device import by_triton
 from splat.losses import LossSettings, window
 from splat.losses_kernels import CHARBONNIER, L1, L2, diagonal_rows, gradient_rows, product_rows, value_rows
-from splat.raster.compositing import TILE_ROWS
 from splat.raster.cpu import aligned
+from splat.raster.formulas import TILE_ROWS
 from splat.raster.functions import last_derivative
 from splat.raster.simd import lanes_of
 from splat.raster.threads import over_range

@@ -21,7 +21,7 @@ again of the work, a fifteenth of an H v, where six plane sets of S's second der
 """
 
 from splat.losses import C1, C2
-from splat.raster.compositing import formula, kernel
+from splat.raster.jit import formula, kernel
 from splat.raster.simd import broadcast, lanes, load, maximum, select, sqrt, store
 from splat.window_kernels import (
     BORDER,

@@ -20,7 +20,7 @@ from splat.projection_formulas import (
     offset_from,
     to_camera,
 )
-from splat.raster.compositing import formula, kernel
+from splat.raster.jit import formula, kernel
 from splat.raster.threads import over_range
 from splat.settings import RenderSettings
 

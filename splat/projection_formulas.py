@@ -19,7 +19,7 @@ import numpy as np
 
 from splat.dual import exp, select, sqrt, value_of
 from splat.harmonics import Y00, Y1, Y2A, Y2B, Y2C, Y3A, Y3B, Y3C, Y3D
-from splat.raster.compositing import formula
+from splat.raster.jit import formula
 
 
 class Lens(NamedTuple):

@@ -16,7 +16,7 @@ from splat.dual import DIRECTIONS, tangent_of, variable
 from splat.gaussians import Gaussians, attribute_shapes
 from splat.projection_cpu import attribute_arrays, point, quaternion
 from splat.projection_formulas import Lens, basis, colour_adjoint, direction_of, geometry, geometry_adjoint
-from splat.raster.compositing import formula, kernel
+from splat.raster.jit import formula, kernel
 from splat.raster.simd import store
 from splat.raster.threads import over_range
 from splat.raster.whitening import cancellation, plain, put, whitened, whitened_adjoint, whitening

@@ -15,7 +15,8 @@ stride) of `shape` = (height, width, plane_rows, stride).  What a range needs be
 """
 
 from splat.losses import WINDOW
-from splat.raster.compositing import formula, kernel, scratch
+from splat.raster.formulas import scratch
+from splat.raster.jit import formula, kernel
 from splat.raster.simd import lanes, load, store
 
 BORDER = 16  # floats before a row in scratch, so that the window may look past its ends

@@ -9,7 +9,8 @@ from math import ceil, floor, inf, log, sqrt
 
 import numpy as np
 
-from splat.raster.compositing import CAPPED, TILE_ROWS, Lists, formula, kernel
+from splat.raster.formulas import CAPPED, TILE_ROWS, Lists
+from splat.raster.jit import formula, kernel
 from splat.raster.simd import lanes_of, select
 from splat.raster.threads import over_range
 from splat.settings import RenderSettings

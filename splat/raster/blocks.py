@@ -19,7 +19,8 @@ Where the cap holds, q is constant: only c c is left.
 
 import numpy as np
 
-from splat.raster.compositing import (
+from splat.raster.compositing import prefetch
+from splat.raster.formulas import (
     CAPPED,
     PARAMS,
     RED,
@@ -30,12 +31,9 @@ from splat.raster.compositing import (
     clear_entries,
     corner_of,
     dark,
-    formula,
-    kernel,
     load3,
     next_tile,
     plus,
-    prefetch,
     reached,
     reciprocal,
     row_range,
@@ -43,6 +41,7 @@ from splat.raster.compositing import (
     scratch,
     store3,
 )
+from splat.raster.jit import formula, kernel
 from splat.raster.simd import broadcast, lanes, load, select, store, store_sums
 from splat.raster.whitening import ROUND, plain_adjoint, put, whitening
 

@@ -9,7 +9,7 @@ from math import log2
 
 import numpy as np
 
-from splat.raster import binning, blocks, compositing, packing
+from splat.raster import binning, blocks, compositing, formulas, packing, tangents
 from splat.raster.simd import lanes_of
 from splat.raster.threads import over_range, over_tiles
 from splat.settings import RenderSettings
@@ -51,24 +51,24 @@ class Raster:
         lanes = lanes_of(dtype)
         self.lists = binning.bin_splats(splats, depths, drawn, width, height, settings)
         self.listed = self.lists.splat.size
-        columns, tile_rows = -(-width // lanes), -(-height // compositing.TILE_ROWS)
-        self.plane = (tile_rows * compositing.TILE_ROWS, columns * lanes)
+        columns, tile_rows = -(-width // lanes), -(-height // formulas.TILE_ROWS)
+        self.plane = (tile_rows * formulas.TILE_ROWS, columns * lanes)
         size = self.plane[0] * self.plane[1]
         scalar = dtype.type
-        self.frame = compositing.Frame(
+        self.frame = formulas.Frame(
             columns,
             self.plane[1],
             size,
             scalar(settings.alpha_max),
             scalar(max(settings.transmittance_min, LEAST_TRANSMITTANCE[dtype])),
             np.ascontiguousarray(background, dtype),
-            np.repeat(np.arange(compositing.TILE_ROWS, dtype=dtype), lanes),
+            np.repeat(np.arange(formulas.TILE_ROWS, dtype=dtype), lanes),
         )
-        self.params = aligned((n * compositing.PARAMS,), dtype)
+        self.params = aligned((n * formulas.PARAMS,), dtype)
         least = log2(settings.alpha_min) if settings.alpha_min else -np.inf
         contour = np.inf if settings.contour_sigma is None else settings.contour_sigma
         over_range(n, packing.pack_splats, splats, max(least, LEAST_LOG2_ALPHA[dtype]), contour, self.params)
-        self.pixels = compositing.Pixels(aligned((4 * size,), dtype), aligned((size,), dtype), aligned((size,), dtype))
+        self.pixels = formulas.Pixels(aligned((4 * size,), dtype), aligned((size,), dtype), aligned((size,), dtype))
         over_tiles(compositing.forward, self.params, self.lists, self.frame, self.pixels)
         self._slot_start: np.ndarray | None = None
 
@@ -94,7 +94,7 @@ class Raster:
         """(n + 1,) where each splat's entries begin among the slots of the sums; drops the entries that no pixel reaches."""
         if self._slot_start is None:
             per_tile = np.diff(self.lists.start)
-            tile_rows, lanes = compositing.TILE_ROWS, self.plane[1] // self.frame.columns
+            tile_rows, lanes = formulas.TILE_ROWS, self.plane[1] // self.frame.columns
             stops = self.pixels.stop.reshape(-1, tile_rows, self.frame.columns, lanes).max(axis=(1, 3)).reshape(-1)
             reached = np.minimum(per_tile, stops).astype(np.int64)
             self.lists, self._slot_start = binning.reached_lists(self.lists, reached, len(self.splats))
@@ -149,7 +149,7 @@ class Adjoint:
     def __init__(self, raster: Raster, cotangent: np.ndarray):
         dtype, n, slot_start = raster.dtype, len(raster.splats), raster.slot_start
         self.cotangent = np.ascontiguousarray(cotangent, dtype).reshape(-1)
-        sums = aligned((slot_start[-1] * compositing.SUMS,), dtype)
+        sums = aligned((slot_start[-1] * formulas.SUMS,), dtype)
         over_tiles(compositing.backward, raster.params, raster.lists, raster.frame, raster.pixels, self.cotangent, sums)
         self.moments, self.gradient = np.empty((n, 3), dtype), np.empty_like(raster.splats)
         over_range(n, packing.reduce_gradient, raster.splats, slot_start, sums, self.moments, self.gradient)
@@ -161,12 +161,12 @@ class Tangent:
     def __init__(self, raster: Raster, directions: np.ndarray):
         self.raster, self.directions = raster, np.ascontiguousarray(directions, np.float64)
         K, dtype, size = directions.shape[1], raster.dtype, raster.frame.size
-        self._packed = aligned((len(directions) * K * compositing.TANGENTS,), dtype)
+        self._packed = aligned((len(directions) * K * formulas.TANGENTS,), dtype)
         over_range(len(directions), packing.pack_tangents, raster.splats, self.directions, self._packed)
         _ = raster.slot_start  # drops the entries that no pixel reaches
         planes, self._transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
         over_tiles(
-            compositing.tangent, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, planes,
+            tangents.tangent, raster.params, self._packed, raster.lists, raster.frame, raster.pixels, planes,
             self._transmittances,
         )  # fmt: skip
         self.planes = planes.reshape(K, 4, *raster.plane)
@@ -178,9 +178,9 @@ class Tangent:
         """
         raster, K = self.raster, self.directions.shape[1]
         slot_start = raster.slot_start
-        sums = aligned((slot_start[-1] * K * compositing.SUMS,), raster.dtype)
+        sums = aligned((slot_start[-1] * K * formulas.SUMS,), raster.dtype)
         over_tiles(
-            compositing.curvature, raster.params, self._packed, raster.lists, raster.frame, raster.pixels,
+            tangents.curvature, raster.params, self._packed, raster.lists, raster.frame, raster.pixels,
             adjoint.cotangent, self._transmittances, np.ascontiguousarray(cotangents, raster.dtype).reshape(-1), sums,
         )  # fmt: skip
         product = np.empty_like(self.directions)

@@ -1,4 +1,4 @@
-"""The compositing kernels on the GPU: `compositing.py`, whose glossary and formulas hold here, in Triton.
+"""The compositing kernels on the GPU: `formulas.py`, whose glossary and formulas hold here, in Triton.
 
 A program is one warp.  It has one tile of 16 x 16 pixels, eight a thread, and goes through the tile's entries one by one:
 
@@ -35,7 +35,7 @@ Deterministic mode reads the 36 bytes (a tangent) of an entry once more.  Around
 
 import triton.language as tl
 
-from splat.raster import compositing
+from splat.raster import formulas
 from splat.raster.cuda_packing import (
     ACROSS,
     ALONG,
@@ -59,14 +59,14 @@ NEVER = tl.constexpr(2**31 - 1)  # the stop index of a pixel that does not stop
 CHUNK = tl.constexpr(16)  # entries between two looks whether all pixels of a tile have stopped
 
 alpha_row, quadratic, along_row, plus, behind_all = twins(
-    compositing.alpha_row, compositing.quadratic, compositing.along_row, compositing.plus, compositing.behind_all
+    formulas.alpha_row, formulas.quadratic, formulas.along_row, formulas.plus, formulas.behind_all
 )
 step_back, step_tangent, step_curvature, row_terms, column_terms = twins(
-    compositing.step_back,
-    compositing.step_tangent,
-    compositing.step_curvature,
-    compositing.row_terms,
-    compositing.column_terms,
+    formulas.step_back,
+    formulas.step_tangent,
+    formulas.step_curvature,
+    formulas.row_terms,
+    formulas.column_terms,
 )
 
 

@@ -2,7 +2,7 @@
 
 A splat is nine numbers: mean x, y; conic a, b, c; opacity; colour.  Tangents carry K vectors side by side: (n, K, 9).
 They and the adjoints are in double precision; the kernels' numbers are in the splat's whitened coordinates (`whitening.py`),
-in which the conic is ROUND times the identity.  There, with S, Su, ... the moments of a splat's entries (`compositing.py`):
+in which the conic is ROUND times the identity.  There, with S, Su, ... the moments of a splat's entries (`formulas.py`):
 
     gradient   mean ROUND (Su, Sv);  a -Suu / 2;  b -Suv;  c -Svv / 2;  opacity S / o;  colour G
     its tangent, with the moments S', ... of the tangent pass
@@ -14,7 +14,7 @@ from math import log2
 
 import numpy as np
 
-from splat.raster.compositing import (
+from splat.raster.formulas import (
     ACROSS,
     ALONG,
     BLUE,
@@ -31,9 +31,8 @@ from splat.raster.compositing import (
     SHEAR,
     SUMS,
     TANGENTS,
-    formula,
-    kernel,
 )
+from splat.raster.jit import formula, kernel
 from splat.raster.simd import select
 from splat.raster.whitening import LOG2_E, ROUND, plain_adjoint, put, whitened, whitening
 

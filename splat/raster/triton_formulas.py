@@ -1,6 +1,6 @@
 """The CPU's formulas, compiled a second time: by Triton, for the GPU.
 
-A formula that is plain arithmetic on numbers (`compositing.formula`) is written once.  Numba compiles it for vectors of
+A formula that is plain arithmetic on numbers (`jit.formula`) is written once.  Numba compiles it for vectors of
 float; `twin` gives the same source to Triton, where a number is a tensor and every other name of it means the functions of
 this module.  Formulas therefore take and give numbers and tuples of numbers, index tuples by constants, and choose by
 `select(condition, x, y)`, which is elementwise there.

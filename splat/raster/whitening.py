@@ -17,7 +17,7 @@ The formulas take and give five numbers, of the mean x, y and the conic a, b, c,
 
 from math import log, sqrt
 
-from splat.raster.compositing import formula
+from splat.raster.jit import formula
 from splat.raster.simd import select
 
 LOG2_E = 1 / log(2)

@@ -22,7 +22,7 @@ from analysis.timing import Timing, interleaved
 from analysis.workloads import Size, random_splats, splat_problem, synthetic_workload
 from figures import bench as figure
 from splat.curvature import SceneObjective
-from splat.raster.compositing import SUMS
+from splat.raster.formulas import SUMS
 from splat.raster.simd import lanes_of
 
 ROOT = Path(__file__).parents[2]

@@ -269,7 +269,9 @@ def test_arguments_that_cannot_be_read_exit_with_2(wrong):
     assert caught.value.code == 2
 
 
-@pytest.mark.parametrize("command", ["sfm", "train", "sweep", "probe", "slice", "compare", "demo", "trajectory", "bench"])
+@pytest.mark.parametrize(
+    "command", ["sfm", "train", "sweep", "probe", "slice", "compare", "demo", "trajectory", "bench"]
+)
 def test_help_says_what_an_option_that_is_left_out_stands_for(command, capsys):
     with pytest.raises(SystemExit):
         main([command, "--help"])

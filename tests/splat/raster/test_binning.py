@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splat.raster.binning import depth_order, heaviest_first, radix_argsort
-from splat.raster.compositing import CAPPED, TILE_ROWS
+from splat.raster.formulas import CAPPED, TILE_ROWS
 from splat.raster.simd import lanes_of
 from tests.splat.random_scenes import DTYPES, NUMPY
 from tests.splat.raster.compositing_cases import CASES, truth

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from splat.raster.compositing import TILE_ROWS
 from splat.raster.cpu import Raster
+from splat.raster.formulas import TILE_ROWS
 from splat.settings import RenderSettings
 from tests.oracles import central_difference
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, NUMPY, relative_error

@@ -8,10 +8,10 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton; install 
 
 import triton.language as tl
 
-from splat.raster import compositing, whitening
+from splat.raster import formulas, whitening
 from splat.raster.triton_formulas import jit, twin, twins
 
-quadratic, dot = twins(compositing.quadratic, compositing.dot)
+quadratic, dot = twins(formulas.quadratic, formulas.dot)
 plain, plain_adjoint = twins(whitening.plain, whitening.plain_adjoint)
 
 
@@ -33,9 +33,9 @@ def test_a_twin_computes_what_its_formula_computes(device, dtype):
     for v in x.tolist():
         W = (v + 1, 0.5 * v, v)
         five = whitening.plain_adjoint.py_func(W, whitening.plain.py_func(W, (v, 2.0, v * v, v, 0.3 * v)))
-        expected.append(compositing.quadratic.py_func(v, five) + compositing.dot.py_func(five, W))
+        expected.append(formulas.quadratic.py_func(v, five) + formulas.dot.py_func(five, W))
     np.testing.assert_allclose(out.cpu(), expected, rtol=16 * torch.finfo(dtype).eps)
 
 
 def test_a_formula_has_one_twin():
-    assert twin(compositing.dot) is dot
+    assert twin(formulas.dot) is dot

@@ -1,0 +1,10 @@
+"""How the CPU's kernels are compiled: where they are kept is said in `kernel_cache.py`, what a vector is in `simd.py`.
+
+`kernel` marks what Python calls, without its lock; `formula` what kernels and other formulas call, inlined.  Division by 0
+gives infinity, and indices are not checked.
+"""
+
+from numba import njit
+
+kernel = njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+formula = njit(cache=True, forceinline=True, error_model="numpy", boundscheck=False)
