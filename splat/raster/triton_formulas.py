@@ -5,7 +5,7 @@ float; `twin` gives the same source to Triton, where a number is a tensor and ev
 this module.  Formulas therefore take and give numbers and tuples of numbers, index tuples by constants, and choose by
 `select(condition, x, y)`, which is elementwise there.
 
-    quadratic, dot = twins(compositing.quadratic, compositing.dot)
+    quadratic, dot = twins(formulas.quadratic, formulas.dot)
 
 `jit` marks kernels and `device` what they call: `triton.jit` too, or with Triton's interpreter (TRITON_INTERPRET=1) the plain
 function, since the interpreter patches its language anew at every call of a jitted one.
