@@ -9,6 +9,9 @@ import torch
 if not torch.cuda.is_available():  # before the first import of triton, which reads it
     os.environ.setdefault("TRITON_INTERPRET", "1")
 
+# the processes of a run share the cores
+torch.set_num_threads(max(1, torch.get_num_threads() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
+
 
 def _real_scene(name: str) -> Path:
     """A folder of the real data: $LANDSCAPE_DATA, else shared/data beside the repository."""
