@@ -8,6 +8,7 @@ import torch
 
 from landscape import ScaledOperator
 from splat.curvature import SceneHessian, SceneObjective
+from splat.gaussians import Gaussians
 from splat.losses import LossSettings
 from splat.metrics import optimiser_units, scene_size, scene_units
 from splat.train import LearningRates
@@ -46,6 +47,34 @@ def test_the_size_of_a_scene_is_its_depth_where_the_views_face_one_way_and_the_c
     around = objective_in_a_world(apart=2.5)
     first, second = (view.camera.centre for view in around.views)
     assert scene_size(around) == pytest.approx(float((first - second).norm()) / 2, rel=1e-12)
+
+
+def test_behind_the_first_camera_there_is_no_depth():
+    facing = objective_in_a_world()
+    near, far = facing.views
+    behind = facing.active.select(torch.arange(4))  # as far behind the first camera as they were before it
+    depth = (behind.means - near.camera.centre) @ near.camera.forward
+    behind.means.sub_(2 * depth[:, None] * near.camera.forward)
+    back = far.camera.centre - 3 * float(depth.max()) * near.camera.forward
+    views = [near, replace(far, camera=replace(far.camera, centre=back, rotation=near.camera.rotation))]
+    both = {name: torch.cat([value, behind.attributes[name]]) for name, value in facing.active.attributes.items()}
+    objective = SceneObjective(Gaussians.pack(both), views, LossSettings("charbonnier"), BACKGROUND)
+    depths = (objective.active.means - near.camera.centre) @ near.camera.forward
+    before = depths[depths > 0].sort().values
+    assert len(before) < len(depths) and scene_size(objective) == float(before[(len(before) - 1) // 2])
+
+
+def test_one_of_three_cameras_that_looks_back_makes_a_scene_no_longer_faced_from_one_side():
+    facing = objective_in_a_world()
+    first, second = facing.views
+    back = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)) @ first.camera.rotation
+    far = first.camera.centre + 5 * first.camera.rotation[0]
+    turned = replace(first, camera=replace(first.camera, rotation=back, centre=far))
+    objective = SceneObjective(facing.active, [first, second, turned], LossSettings("charbonnier"), BACKGROUND)
+    centres = torch.stack([view.camera.centre for view in objective.views])
+    middle = (centres[0] + centres[1] + centres[2]) / 3
+    distances = [float((centre - middle).norm()) for centre in centres]
+    assert scene_size(objective) == pytest.approx(sum(distances) / 3, rel=1e-12)
 
 
 def test_the_optimisers_units_are_its_rates_at_the_first_step():

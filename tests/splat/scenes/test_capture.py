@@ -54,6 +54,7 @@ def test_parallel_cameras_and_cameras_that_look_outwards_have_no_target() -> Non
     assert common_target([camera(ahead, i * DOWN) for i in range(3)]) is None
     assert common_target(orbit((0, 90, 180), outwards=True)) is None
     assert common_target(orbit((0,))) is None
+    assert common_target(orbit((0, 90)) + orbit((180,), outwards=True)) is None  # behind one of them is enough
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import torch
 from folders import CENTRE, FOCAL, NAMES, RGB, SEEN, SIZE, XYZ, intrinsics, require_poses
 from PIL import Image
 
+from splat.scenes.colmap import SMALLEST_RECORD
 from splat.scenes.scene import load_scene
 from splat.scenes.view import pixel_coordinates
 
@@ -40,14 +41,14 @@ def test_a_colmap_model_from_before_rigs_loads_the_same(tmp_path: Path) -> None:
 
 def test_a_track_that_meets_an_image_twice_counts_it_once(tmp_path: Path) -> None:
     model = folders.reconstruction()
-    image = pycolmap.Image("d.png", np.array([[1.0, 1.0], [2.0, 1.0]]), 1, 4)
+    image = pycolmap.Image("0.png", np.array([[1.0, 1.0], [2.0, 1.0]]), 1, 4)
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     track = pycolmap.Track([pycolmap.TrackElement(4, 0), pycolmap.TrackElement(4, 1)])
     model.add_point3D(np.array([9.0, 9.0, 9.0]), track, RGB[0])
     folders.write_colmap(tmp_path, model=model)
-    folders.write_pictures(tmp_path / "images", ("d.png",))
+    folders.write_pictures(tmp_path / "images", ("0.png",))
     scene = load_scene(tmp_path)
-    assert scene.points is not None
+    assert scene.points is not None and scene.names == ("0.png", *NAMES)  # by name, not by number
     last = int((scene.points.xyz[:, 0] == 9).nonzero())
     assert scene.points.sightings(scene.frames)[last] == 1
 
@@ -64,7 +65,14 @@ def test_images_without_a_pose_are_left_out_and_a_model_without_poses_is_refused
         load_scene(tmp_path / "none")
 
 
-@pytest.mark.parametrize("renamed", [("image000.png", "image001.png", "image002.png"), ("a.jpg", "b.jpg", "c.jpg")])
+@pytest.mark.parametrize(
+    "renamed",
+    [
+        ("image000.png", "image001.png", "image002.png"),
+        ("a.jpg", "b.jpg", "c.jpg"),
+        ("a.jpg", "b.jpg", "c.jpg", "0.jpg"),
+    ],
+)
 def test_renamed_images_of_a_colmap_model_are_found(tmp_path: Path, renamed: tuple[str, ...]) -> None:
     folders.write_colmap(tmp_path)
     shutil.rmtree(tmp_path / "images")
@@ -80,9 +88,11 @@ def test_renamed_images_of_a_colmap_model_are_found(tmp_path: Path, renamed: tup
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_a_damaged_colmap_file_is_refused_before_it_can_end_the_process(tmp_path: Path, name: str) -> None:
     folders.write_colmap(tmp_path)
-    (tmp_path / f"sparse/0/{name}.bin").write_bytes(b"no COLMAP file at all")
-    with pytest.raises(ValueError, match=f"{name}.bin promises"):
-        load_scene(tmp_path)
+    byte_short = (2).to_bytes(8, "little") + bytes(2 * SMALLEST_RECORD[name] - 1)
+    for content in (b"no COLMAP file at all", byte_short):
+        (tmp_path / f"sparse/0/{name}.bin").write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name}.bin promises"):
+            load_scene(tmp_path)
 
 
 def test_a_colmap_model_cut_short_inside_is_refused(tmp_path: Path) -> None:

@@ -52,6 +52,10 @@ def test_triangulated_points_are_seen_where_they_fall_in_the_colour_that_is_ther
         assert (there - points.rgb[seen]).abs().mean() < 0.3 * spread
 
 
+def test_two_views_are_enough_to_triangulate_from(views: list[View]) -> None:
+    assert len(triangulated_points(views[:2])) > 30
+
+
 def test_the_same_views_give_the_same_points(points: Points, views: list[View]) -> None:
     again = triangulated_points(views)
     assert torch.equal(again.xyz, points.xyz) and torch.equal(again.rgb, points.rgb)
