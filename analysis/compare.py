@@ -20,6 +20,7 @@ from rich.console import Console
 from analysis.compare_table import Run, compare_table, comparison, frame
 from analysis.drawing import draw
 from analysis.options import CompareOptions, DeviceName, ProbeOptions
+from analysis.overrides import leaves
 from analysis.records import FILE, read_record
 from analysis.report import pictures_in, template_environment
 from analysis.training import CHECKPOINT, METRICS
@@ -114,11 +115,16 @@ def cautions(runs: Sequence[Run]) -> list[str]:
         "held-out views": lambda run: run.checkpoint.scene.test,
         "random background": lambda run: run.checkpoint.training.config.random_background,
         "precision": lambda run: run.data["provenance"].get("dtype"),
-        "probe's settings": lambda run: run.data["provenance"].get("settings"),
         "units of the families": lambda run: [row["unit"] for row in run.data.get("families", [])][:1],
     }
     lines = [f"The {what} are not the same." if what.endswith("s") else f"The {what} is not the same."
              for what, of in settings.items() if any(of(run) != of(runs[0]) for run in runs)]  # fmt: skip
+    found = [leaves(run.data["provenance"].get("settings", {})) for run in runs]
+    lines += [
+        f"The probes were run with different {name}: {', '.join(str(settings.get(name)) for settings in found)}."
+        for name in dict.fromkeys(name for settings in found for name in settings)
+        if any(settings.get(name) != found[0].get(name) for settings in found)
+    ]
     for run in runs:
         failed = [name.replace("_", " ") for name, check in run.data["checks"].items() if check["passed"] is False]
         lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]

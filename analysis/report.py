@@ -83,6 +83,7 @@ def interactive_surface(record: Record) -> go.Figure | None:
             figure.add_surface(
                 x=arrays["x"], y=arrays["y"], z=change.T, name=label, colorscale=colours, opacity=opacity,
                 showscale=name == "loss", showlegend=True, visible=True if name == "loss" else "legendonly",
+                colorbar={"exponentformat": "power", "len": 0.8},
             )  # fmt: skip
     names = [_plain(direction["name"]) for direction in about["directions"]]
     figure.update_layout(

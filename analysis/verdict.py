@@ -44,7 +44,7 @@ def verdict(data: Mapping[str, Any]) -> list[Line]:
         *_of_counts(data["counts"]),
         *_of_skips(data.get("skipped", {})),
         *of_slice(data.get("slice")),
-        *(Line(note, "caution") for note in data.get("notes", ())),
+        *(Line(_sentence(note), "caution") for note in data.get("notes", ())),
     ]
     return sorted(lines, key=lambda line: line.level != "failure")
 
@@ -116,12 +116,12 @@ def _of_anisotropy(family: Mapping[str, Any]) -> list[Line]:
     if saddle and _is_finite(saddle["value"]):
         text = f"The steepest direction up is {quantity(saddle['value'])} times as curved as the steepest down"
         lines.append(Line(f"{text}{_bracket(saddle)}."))
-    elif saddle and _is_finite(saddle["low"]):
+    elif saddle and _is_finite(saddle["low"]) and saddle["low"] > 0:
         text = f"The steepest direction up is at least {quantity(saddle['low'])} times as curved as the steepest down"
         lines.append(Line(f"{text}{_in_brackets(saddle)}."))
     elif saddle:
         lines.append(
-            Line(f"The ratio of the two ends of the spectrum is not defined here{_in_brackets(saddle)}.", "caution")
+            Line(f"The ratio of the two ends of the spectrum is not determined{_in_brackets(saddle)}.", "caution")
         )
     if share and _is_finite(share["value"]):
         lines.append(
@@ -134,11 +134,11 @@ def _of_needles(where: Mapping[str, Any] | None, counts: Mapping[str, int]) -> l
     """The paper's claim that Gaussians with an ill-conditioned projection dominate the steepest directions."""
     if where is None:
         return []
-    share, of_all = where["needles"], where["needle_count"] / counts["visible_gaussians"]
     text = (
-        f"Gaussians with a condition number above 100 are {of_all:.0%} of those in sight and hold {share:.0%} of the "
+        f"The {where['needle_count']:,} of {counts['visible_gaussians']:,} Gaussians in sight with a condition number above "
+        f"100 hold {where['needles']:.0%} of the steepest direction, which is spread over about "
+        f"{quantity(where['participation'])} Gaussians."
     )
-    text += f"steepest direction, which is spread over about {quantity(where['participation'])} Gaussians."
     return [Line(text)]
 
 
@@ -159,7 +159,8 @@ def _of_skips(skipped: Mapping[str, Mapping[str, float]]) -> list[Line]:
     present = {name: skip for name, skip in skipped.items() if skip["count"]}
     order = sorted(present, key=lambda name: -present[name]["seconds_saved"])
     parts = [
-        f"{present[name]['count']:,} {name.replace('_', ' ')} ({present[name]['seconds_saved']:.1f} s)"
+        f"{present[name]['count']:,} {name.replace('_', ' ').replace('gaussian', 'Gaussian')} "
+        f"({present[name]['seconds_saved']:.1f} s)"
         for name in order
     ]
     return [Line(f"Left out, with the time it saved: {', '.join(parts)}.")] if parts else []
@@ -198,6 +199,10 @@ def of_slice(plane: Mapping[str, Any] | None) -> list[Line]:
         share = f"{plane['crossed_points']:,} of the slice's {rendered:,} rendered points"
         lines.append(Line(f"At {share} the order of the splats or the set of visible ones is not the checkpoint's."))
     return lines
+
+
+def _sentence(note: str) -> str:
+    return f"{note[:1].upper()}{note[1:]}" + ("" if note.endswith((".", "!", "?")) else ".")
 
 
 def _is_finite(number: float | None) -> bool:

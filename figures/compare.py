@@ -90,7 +90,7 @@ def draw_densities(records: Records) -> Figure:
         for look, record in zip(_looks(records), records.values(), strict=True):
             spectrum, ends = record.arrays.get("spectrum", {}), record.data["eigenvalues"]
             for axes, sign, end in zip(panels, (-1, 1), ("min", "max"), strict=True):
-                if "nodes" in spectrum:
+                if "nodes" in spectrum and (sign * spectrum["nodes"] > 0).any():
                     axes.step(*beyond(sign * spectrum["nodes"], spectrum["weights"]), where="pre", **look)
                 if sign * (ends[end]["value"] or 0) > 0:
                     axes.axvline(sign * ends[end]["value"], color=look["color"], linestyle=(0, (2, 2)), linewidth=0.6)
@@ -98,7 +98,9 @@ def draw_densities(records: Records) -> Figure:
             axes.set(xscale="log", yscale="log", xlabel="|curvature| (loss per squared parameter unit)")
             axes.set_title(f"Directions that curve {words}", loc="left")
             axes.grid(True)
-        limits = np.array([axes.get_xlim() for axes in panels])
+            if not axes.lines:
+                axes.text(0.5, 0.5, "none found", transform=axes.transAxes, ha="center")
+        limits = np.array([axes.get_xlim() for axes in panels if axes.lines])
         top = limits[:, 1].max()
         for axes in panels:
             axes.set_xlim(max(limits[:, 0].min(), top * 1e-8), top)

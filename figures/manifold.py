@@ -108,8 +108,9 @@ def surface(figure: Figure, place: tuple[int, int, int], landscape: Plane, scale
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_major_locator(MaxNLocator(3))
     axes.tick_params(labelsize=5, pad=-3)
-    axes.set_xlabel(scale.step_label("e₁"), fontsize=6, labelpad=-8)
-    axes.set_ylabel(scale.step_label("e₂"), fontsize=6, labelpad=-8)
+    axes.tick_params(axis="y", pad=-1.5)  # its first tick stands where the last one of x does
+    axes.set_xlabel(scale.step_label("e₁"), fontsize=6, labelpad=-7)
+    axes.set_ylabel(scale.step_label("e₂"), fontsize=6, labelpad=-5)
     axes.set_title(f"{literal(title)}\n{scale.loss_label}", y=0.95)
     axes.view_init(elev=32, azim=-58)
     # the layout does not count the labels of such axes

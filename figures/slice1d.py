@@ -93,7 +93,7 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> Non
     axes.set_xscale("log")
     axes.set_ylim(*_limits(exact, values, bounds))
     axes.set_xlabel(f"step along {along.name}, {along.scale}")
-    axes.set_ylabel("curvature")
+    axes.set_ylabel("curvature (loss per squared step)")
     axes.grid(True)
     axes.set_title("Curvature at finite steps (bars: round-off)", loc="left")
 

@@ -155,7 +155,7 @@ def test_a_run_without_a_record_of_its_checkpoint_is_refused_with_the_command_or
         return 0
 
     monkeypatch.setattr("analysis.probe.run_probe", probe)
-    assert main(["compare", *runs, "--probe"]) == 0 and asked == commands
+    assert main(["compare", *runs, "--probe"]) == 0 and asked == [f"{command} --device auto" for command in commands]
     assert (Path(runs[0]).parents[1] / "compare/compare.csv").exists()
 
 
@@ -163,7 +163,7 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
     assert main(["compare", *runs]) == 0
     assert "not the same" not in capsys.readouterr().out
     data, arrays = synthetic()
-    data["provenance"] |= {"iteration": ITERATIONS, "dtype": "float64"}
+    data["provenance"] |= {"iteration": ITERATIONS, "dtype": "float64", "settings": {"eigen": {"rtol": 0.5}}}
     data["checks"]["symmetry"]["passed"] = False
     with record_folder(Path(runs[1]) / "probe") as partial:
         write_record(partial, data, arrays)
@@ -174,6 +174,7 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
     for part in (
         "The seed is not the same",
         "The precision is not the same",
+        "The probes were run with different eigen.rtol: None, 0.5.",
         "sam/0: the check of symmetry failed",
         "sam/0 was not scored",
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",

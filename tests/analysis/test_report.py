@@ -192,3 +192,15 @@ def test_an_unbounded_ratio_is_given_by_its_bound():
     data, _ = synthetic()
     data["anisotropy"]["saddle"] = {"value": None, "low": 40.0, "high": None, "note": "the small end is not resolved"}
     assert "at least 40.0 times as curved as the steepest down (the small end is not resolved)" in sentences(data)
+    data["anisotropy"]["saddle"]["low"] = 0.0  # which says nothing
+    assert "times as curved" not in sentences(data)
+    assert "is not determined (the small end is not resolved)" in sentences(data)
+
+
+def test_needles_are_counted_and_notes_are_sentences():
+    data, _ = synthetic()
+    data["eigenvalues"]["max"]["lives_on"] = {"needles": 0.78, "needle_count": 1, "participation": 1.8}
+    data["notes"] = ["the slice was left out"]
+    said = sentences(data)
+    assert "The 1 of 9,874 Gaussians in sight with a condition number above 100 hold 78% of the steepest" in said
+    assert "The slice was left out." in said
