@@ -37,10 +37,7 @@ def run_demo(options: DemoOptions) -> int:
         return code
     typed = ["probe", str(checkpoint), "--seconds", str(SECONDS)]
     _announce(console, typed)
-    if code := run_probe(ProbeOptions(checkpoint, seconds=SECONDS), ["landscape", *typed]):
-        return code
-    console.print(f"held-out views as rendered: {out / 'run' / 'test'}", highlight=False, soft_wrap=True)
-    return 0
+    return run_probe(ProbeOptions(checkpoint, seconds=SECONDS), ["landscape", *typed])
 
 
 def _announce(console: Console, arguments: list[str]) -> None:

@@ -44,16 +44,24 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     >>> overridden(TrainConfig(), {"densify.every": "50"}).densify.every
     50
     """
-    own = {field.name for field in fields(config)}
+    own = _settable(TrainConfig)
     for key, value in changes.items():
         path = key.split(".")
+        if path[0] not in own + (of_method := _settable(type(config.method))):
+            raise ValueError(
+                f"expected a setting of the training ({', '.join(own)}) or of the method {config.method.name} "
+                f"({', '.join(of_method) or 'which has none'}), got {key!r}"
+            )
         config = _changed(config, path if path[0] in own else ["method", *path], value, key)
     return config
 
 
+def _settable(kind: type) -> list[str]:
+    return [name for name in get_type_hints(kind) if name != "name"]
+
+
 def _changed(settings: T, path: list[str], value: Any, key: str) -> T:
-    hints = get_type_hints(type(settings))
-    settable = [name for name in hints if name != "name"]
+    hints, settable = get_type_hints(type(settings)), _settable(type(settings))
     if path[0] not in settable:
         raise ValueError(f"expected a setting among {', '.join(settable)}, got {path[0]!r} in {key!r}")
     now = getattr(settings, path[0])

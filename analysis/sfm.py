@@ -21,15 +21,19 @@ NAMED = 5  # photographs without a place that are named
 def run_sfm(options: SfmOptions) -> int:
     """Make the scene and say what came of it; returns the exit code."""
     out = options.out or options.photos.resolve().with_name(f"{options.photos.resolve().name}-scene")
-    with _progress() as progress:
+    progress = _progress()
+    try:
         bars = {stage: progress.add_task(text, start=False, visible=False) for stage, text in STAGES.items()}
 
         def show(stage: Stage, done: int, total: int) -> None:
             if not progress.tasks[bars[stage]].started:
+                progress.start()
                 progress.start_task(bars[stage])
             progress.update(bars[stage], completed=done, total=total, visible=True)
 
         mapped = scene_from_photos(options.photos, out, show)
+    finally:
+        progress.stop()
     _report(mapped, out)
     return 0
 

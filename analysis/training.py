@@ -78,9 +78,13 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         generator = torch.Generator().manual_seed(config.seed)
         start = initial_gaussians(scene, views, 0, generator=generator, source=options.start)
         training = Training.start(start, scene.extent(split.train), config)
+    training.move(device)
+    training.regularizer.begin(
+        training, views
+    )  # refuses views that lack what the method needs, before there is a folder
+    if not options.resume:
         _create_run(out, training, reference, keep_start=along is not None)
 
-    training.move(device)
     console = Console(stderr=True)
     camera = views[0].camera
     console.print(
@@ -256,9 +260,11 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
     }
     write_atomically(out / METRICS, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
     console.print(_table(seen, tested))
-    if tested is None:
-        console.print("no view was held out, so nothing was tested")
-    console.print(f"next: landscape probe {shlex.quote(str(out / CHECKPOINT))}", soft_wrap=True, highlight=False)
+    rendered = (
+        f"renders of the held-out views: {renders}; " if tested else "no view was held out, so nothing was tested; "
+    )
+    for line in (f"{rendered}scores: {out / METRICS}", f"next: landscape probe {shlex.quote(str(out / CHECKPOINT))}"):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def render_name(view: str) -> str:

@@ -62,6 +62,8 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
     tables = []
     for run, folder in zip(runs, folders, strict=True):
         path = folder / RECORDS
+        if not folder.is_dir():
+            raise FileNotFoundError(f"expected the folder of a run, {run} does not exist")
         if not path.is_file():
             raise FileNotFoundError(
                 f"expected {RECORDS} in the run {run}, found none; train with --probe-every, as in "
@@ -73,7 +75,13 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
         name = folder.name if folder == common else folder.relative_to(common).as_posix()
         table.insert(0, "run", name)
         tables.append(table)
-    return pd.concat(tables, ignore_index=True)
+    together = pd.concat(tables, ignore_index=True)
+    if set(together["state"]) == {"skipped"}:
+        raise ValueError(
+            f"expected at least one record that was not skipped, got {len(together)} skipped to stay within --probe-share; "
+            "train with a larger one"
+        )
+    return together
 
 
 def first_and_last(table: pd.DataFrame) -> Table:

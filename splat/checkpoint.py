@@ -187,7 +187,8 @@ def write_atomically(path: Path, content: bytes) -> None:
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint.  FileNotFoundError where there is none; ValueError that says what is wrong with it."""
     if not path.is_file():
-        raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found no such file")
+        found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
+        raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found {found}")
     try:
         with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
             content = torch.load(path, map_location="cpu", weights_only=True)

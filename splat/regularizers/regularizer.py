@@ -68,7 +68,8 @@ class Regularizer:
         self.history: list[Row] = []
 
     def begin(self, training: "Training", views: Sequence[View]) -> None:
-        """Steps are about to be made on these views.  ValueError where they lack what the method needs."""
+        """Steps are about to be made on these views; said once more changes nothing.  ValueError where they lack what the
+        method needs."""
 
     def opacity_gain(self, step: Step) -> Float[Tensor, " n"] | None:
         """Factors on the opacities of this step's render, None for 1."""

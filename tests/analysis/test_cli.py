@@ -109,6 +109,7 @@ def test_the_table_shows_each_held_out_view_and_what_to_do_next(original, tmp_pa
         row = next(line for line in captured.out.splitlines() if name in line)
         assert f"{score['psnr']:.2f}" in row and f"{score['ssim']:.4f}" in row
     assert f"next: landscape probe {out / 'checkpoint.pt'}" in captured.out
+    assert f"renders of the held-out views: {out / 'test'}; scores: {out / 'metrics.json'}" in captured.out
     assert "3 views to train on" in captured.err and f"{ITERATIONS}/{ITERATIONS}" in captured.err
 
 

@@ -41,8 +41,9 @@ def test_each_type_is_read_from_text_and_from_a_plain_value():
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("warmup", "1", "expected a setting among .*warm_up.*, got 'warmup'"),
-        ("name", "sam", "expected a setting among"),
+        ("warmup", "1", "of the training .*iterations.* or of the method stablegs .*warm_up.*, got 'warmup'"),
+        ("probe.gama", "1", "expected a setting among .*gamma.*, got 'gama' in 'probe.gama'"),
+        ("name", "sam", "expected a setting of the training"),
         ("densify", "1", "name of a single setting, as in densify.enabled"),
         ("seed.x", "1", "'seed' to be the last name"),
         ("warm_up", "1.5", "expected a whole number for warm_up, got '1.5'"),
@@ -60,6 +61,11 @@ def test_each_type_is_read_from_text_and_from_a_plain_value():
 def test_what_does_not_fit_is_refused_with_what_was_expected(key, value, message):
     with pytest.raises(ValueError, match=message):
         overridden(STABLE, {key: value})
+
+
+def test_a_method_without_settings_is_said_to_have_none():
+    with pytest.raises(ValueError, match=r"or of the method 3dgs \(which has none\), got 'vsp_weight'"):
+        overridden(TrainConfig(), {"vsp_weight": 0})
 
 
 def test_an_assignment_has_a_key_and_an_equals_sign():

@@ -120,6 +120,12 @@ def test_depth_maps_must_be_there_for_every_training_view(original, tmp_path, ca
     assert f"got none for {chosen}; save it as {missing}" in said and not (tmp_path / "again").exists()
 
 
+def test_a_method_that_lacks_its_depth_maps_is_refused_before_there_is_a_folder(original, tmp_path, capsys):
+    assert train(original, tmp_path / "run", "--method", "fsgs") == 2
+    assert "expected a depth map of every training view for the method fsgs" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_start_can_be_chosen(original, tmp_path, capsys, monkeypatch):
     scene = load_scene(original)
     assert scene.points is not None

@@ -94,7 +94,14 @@ def test_the_command_prints_the_first_and_last_values_and_writes_table_and_pictu
 def test_a_run_without_records_or_named_twice_is_refused_with_what_to_do(tmp_path, capsys):
     kept = run(tmp_path / "kept")
     (tmp_path / "bare").mkdir()
-    for runs, told in (([kept, tmp_path / "bare"], "train with --probe-every"), ([kept, kept], "every run once")):
+    (tmp_path / "brief").mkdir()
+    rows()[:1].to_csv(tmp_path / "brief" / "trajectory.csv", index=False)
+    for runs, told in (
+        ([kept, tmp_path / "bare"], "train with --probe-every"),
+        ([kept, kept], "every run once"),
+        ([kept, tmp_path / "gone"], f"{tmp_path / 'gone'} does not exist"),
+        ([tmp_path / "brief"], "got 1 skipped to stay within --probe-share; train with a larger one"),
+    ):
         assert main(["trajectory", *map(str, runs)]) == 2
         said = capsys.readouterr().err
         assert said.startswith("landscape: expected") and told in said
