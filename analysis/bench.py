@@ -8,7 +8,10 @@ OUT/bench.png     the scaling, drawn by `figures.bench` from bench.csv
 OUT/stress.csv    `landscape bench stress`: errors at the limits of the renderer (`stress`)
 OUT/accuracy.csv  `landscape bench accuracy`: work against true error of every estimator, beside peers (`accuracy`)
 
-Times are minima and medians of repetitions in turns (`timing`); ratios are of minima.  Products are per vector.
+On a GPU (--device cuda) scenes are measured by its kernels, beside gsplat's gradient; the other subjects are the CPU's.
+
+Times are minima and medians of repetitions in turns (`timing`), by the clock of the device (`meters`); ratios are of minima.
+Products are per vector.
 """
 
 from contextlib import ExitStack
@@ -17,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 from rich import box
 from rich.console import Console
 from rich.progress import Progress
@@ -27,8 +31,8 @@ from analysis.accuracy import run_accuracy
 from analysis.bench_reference import ReferenceCost, reference_cost
 from analysis.bench_scene import OPERATIONS, VECTORS, ViewBench, per_vector, scaling
 from analysis.drawing import draw
+from analysis.meters import Meter, bandwidth, meter_of
 from analysis.options import BenchOptions
-from analysis.peak import fma_peak
 from analysis.precision import precision
 from analysis.prototype import prototype_in
 from analysis.provenance import machine
@@ -36,6 +40,7 @@ from analysis.stress import run_stress
 from analysis.timing import Timing, interleaved
 from analysis.workloads import Size, Workload, synthetic_workload, workload_of
 from splat.checkpoint import write_atomically
+from splat.device import by_triton, device_named
 from splat.raster.simd import lanes_of
 from splat.raster.threads import thread_count
 
@@ -50,6 +55,16 @@ HEADINGS = {
     "ratio_of_medians": "of medians",
     "difference": "apart",
 }
+Ratio = tuple[str, str, float]
+# of times: what, to what, at most
+ON_BOTH: tuple[Ratio, ...] = (("block diagonal", "gradient", 3.0), ("linearize", "gradient", 4.0))
+ON_CPU: tuple[Ratio, ...] = (("gradient", "rasterizer", 2.5), ("H v 1", "gradient", 1.6), ("H v 4", "gradient", 1.0))
+ON_GPU: tuple[Ratio, ...] = (
+    ("gradient, atomic", "gsplat", 1.2),
+    ("gradient, autograd", "gsplat", 1.8),
+    ("H v 1", "gradient", 2.0),
+    ("H v 8", "gradient", 1.2),
+)
 PRECISION = 1e-5  # asked for, of H v and of traces, with decisions held equal
 SCALING_SHARE = 3  # scaling is timed with this fraction of the repetitions
 
@@ -66,19 +81,33 @@ def run_bench(options: BenchOptions) -> int:
         raise ValueError(
             f"expected one subject, got a second one, {options.checkpoint}; only accuracy takes a checkpoint"
         )
+    if options.device == "cuda" and options.subject in ("kernels", "stress", "accuracy"):
+        raise ValueError(
+            f"expected a scene, a checkpoint or --sizes for the device cuda, got {options.subject}, which measures the CPU's "
+            "kernels; leave out --device"
+        )
     if options.subject == "stress":
         return run_stress(options)
     if options.subject == "accuracy":
         return run_accuracy(options)
-    options.out.mkdir(parents=True, exist_ok=True)
     console = Console()
-    about = machine(lanes_of(np.float32))
-    console.print(f"{about['cpu']}, {thread_count()} threads, {about['lanes']} lanes of float32", highlight=False)
     if options.subject == "kernels":
+        options.out.mkdir(parents=True, exist_ok=True)
+        console.print(_about(torch.device("cpu")), highlight=False)
         _bench_kernels(options, console)
     else:
-        _bench_scenes(options, console)
+        device = device_named(options.device)
+        options.out.mkdir(parents=True, exist_ok=True)
+        console.print(_about(device), highlight=False)
+        bench_scenes(options, meter_of(device), console)
     return 0
+
+
+def _about(device: torch.device) -> str:
+    about = machine(lanes_of(np.float32))
+    if device.type == "cuda":
+        return f"{torch.cuda.get_device_name(device)}, beside {about['cpu']}"
+    return f"{about['cpu']}, {thread_count()} threads, {about['lanes']} lanes of float32"
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------
@@ -108,13 +137,15 @@ def _bench_kernels(options: BenchOptions, console: Console) -> None:
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 
-def _bench_scenes(options: BenchOptions, console: Console) -> None:
+def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
+    """Scenes on the meter's device."""
     workloads = []
     if options.subject is not None:
         workloads = [workload_of(Path(options.subject), options.images, options.downscale)]
     sizes = options.sizes or (() if workloads else SIZES)
     workloads += [synthetic_workload(Size.parse(text)) for text in sizes]
-    peak = fma_peak()
+    workloads = [workload.to(meter.device) for workload in workloads]
+    ceilings = meter.fma_peak(), bandwidth(meter)
     times, bounds = [], []
     for workload in workloads:
         bench = ViewBench(workload)
@@ -123,20 +154,23 @@ def _bench_scenes(options: BenchOptions, console: Console) -> None:
             f"{bench.view.camera.height} px, {bench.linearized.touched} visible, {bench.linearized.entries} tile entries",
             highlight=False,
         )
-        measured = interleaved({**bench.stages(), **bench.wholes()}, options.repetitions)
+        calls = {**bench.stages(), **bench.wholes(), **bench.peers()}
+        measured = interleaved(calls, options.repetitions, clock=meter.seconds)
         lines = pd.DataFrame(_lines("stages", workload, bench, measured))
         console.print(
             _rich(lines.filter(["stage", "minimum_ms", "median_ms"]), "times of one view; ms, products per vector")
         )
-        console.print(_arithmetic(bench, measured, peak))
+        console.print(_roofline(bench, measured, *ceilings))
         cost = reference_cost(workload) if options.reference else None
-        held = _bounds(workload, bench, measured, cost)
+        held = _bounds(workload, bench, measured, cost, meter)
         console.print(_rich(held.drop(columns="scene"), "asked for"))
+        if bench.lack:
+            console.print(f"no gradient to compare with: {bench.lack}", soft_wrap=True, highlight=False)
         times.append(lines)
         bounds.append(held)
     if options.subject is not None:
         _precision(workloads[0], options.out / "precision.csv", console)
-    times.append(pd.DataFrame(_scaling(workloads[0], max(1, options.repetitions // SCALING_SHARE))))
+    times.append(pd.DataFrame(_scaling(workloads[0], max(1, options.repetitions // SCALING_SHARE), meter)))
     table = pd.concat(times, ignore_index=True)
     _write(table, options.out / "bench.csv", console)
     _write(pd.concat(bounds, ignore_index=True), options.out / "bounds.csv", console)
@@ -168,6 +202,7 @@ def _lines(
         "gaussians": len(workload.gaussians),
         "pixels": camera.width * camera.height,
         "views": 1,
+        "device": workload.gaussians.flat.device.type,
         "threads": thread_count(),
     }
     if study in about:
@@ -178,48 +213,40 @@ def _lines(
     ]
 
 
-def _scaling(workload: Workload, repetitions: int) -> list[dict]:
+def _scaling(workload: Workload, repetitions: int, meter: Meter) -> list[dict]:
     lines = []
     with Progress(console=Console(stderr=True), transient=True) as progress:
         bar = progress.add_task("scaling", total=None)
-        for study, value, times in scaling(workload, repetitions):
+        for study, value, times in scaling(workload, repetitions, meter):
             lines += _lines(study, workload, None, times, value)
             progress.advance(bar)
     return lines
 
 
-def _arithmetic(bench: ViewBench, times: dict[str, Timing], peak: float) -> Table:
-    """How many pairs a second the passes evaluate, and which share of the machine's peak their arithmetic is."""
+def _roofline(bench: ViewBench, times: dict[str, Timing], peak: float, bandwidth: float) -> Table:
+    """How many pairs a second the passes evaluate, and which shares their arithmetic and bytes are of the ceilings."""
     pairs = bench.pairs
     table = pd.DataFrame(
         {
             "pass": name,
             "pairs_per_second_1e9": pairs / times[name].minimum / 1e9,
             "share_of_peak": pairs * OPERATIONS[name] / times[name].minimum / peak,
+            "share_of_bandwidth": bench.bytes_of(name) / times[name].minimum / bandwidth,
         }
         for name in OPERATIONS
     )
-    return _rich(table, f"{pairs / 1e6:.1f} million (pixel, Gaussian) pairs; peak {peak / 1e9:.0f} GFMA/s")
+    ceilings = f"peak {peak / 1e9:.0f} GFMA/s, {bandwidth / 1e9:.0f} GB/s"
+    return _rich(table, f"{pairs / 1e6:.1f} million (pixel, Gaussian) pairs; {ceilings}")
 
 
 def _bounds(
-    workload: Workload, bench: ViewBench, times: dict[str, Timing], reference: ReferenceCost | None
+    workload: Workload, bench: ViewBench, times: dict[str, Timing], reference: ReferenceCost | None, meter: Meter
 ) -> pd.DataFrame:
     """What is asked for as ratios: of times, and of bytes over what the view's size allows."""
-    each, view = per_vector(times), bench.linearized
-    lines = [
-        _ratio(f"{stage} / {unit}", each[stage], each[unit], bound)
-        for stage, unit, bound in (
-            ("gradient", "rasterizer", 2.5),
-            ("H v 1", "gradient", 1.6),
-            ("H v 4", "gradient", 1.0),
-            ("block diagonal", "gradient", 3.0),
-            ("linearize", "gradient", 4.0),
-        )
-    ]
+    view, lines = bench.linearized, ratios(times, by_triton(workload.gaussians.flat))
     kept, allowed = bench.kept(), 1000 * view.touched + 200 * workload.pixels + 24 * view.entries
     lines.append(_line(f"kept linearisation ({kept / 1e6:.1f} MB) / allowance", kept / allowed, 1.0))
-    workspaces = {K: bench.workspace(K) for K in VECTORS}
+    workspaces = {K: bench.workspace(K, meter) for K in VECTORS}
     for K, used in workspaces.items():
         allowed = K * (40 * view.entries + 28 * workload.pixels + 500 * view.touched)
         lines.append(_line(f"workspace of K = {K} ({used / 1e6:.1f} MB) / allowance", used / allowed, 1.0))
@@ -233,14 +260,28 @@ def _bounds(
     return pd.DataFrame({"scene": workload.name, **line} for line in lines)
 
 
-def _ratio(name: str, numerator: Timing, denominator: Timing, bound: float) -> dict:
+def ratios(times: dict[str, Timing], on_gpu: bool) -> list[dict]:
+    """Those of times; nan where there was nothing to compare with."""
+    each = per_vector(times)
+    return [
+        _ratio(f"{stage} / {unit}", each[stage], each.get(unit), bound)
+        for stage, unit, bound in (*(ON_GPU if on_gpu else ON_CPU), *ON_BOTH)
+        if stage in each
+    ]
+
+
+def _ratio(name: str, numerator: Timing, denominator: Timing | None, bound: float) -> dict:
+    if denominator is None:
+        return _line(name, np.nan, bound) | {"of_medians": np.nan}
     return _line(name, numerator.minimum / denominator.minimum, bound) | {
         "of_medians": numerator.median / denominator.median
     }
 
 
 def _line(name: str, measured: float, bound: float, least: bool = False) -> dict:
-    holds = measured >= bound if least else measured <= bound
+    holds: bool | str = bool(measured >= bound if least else measured <= bound)
+    if np.isnan(measured):
+        holds = "not measured"
     return {"what": name, "measured": measured, "asked": f"{'≥' if least else '≤'} {bound:g}", "holds": holds}
 
 

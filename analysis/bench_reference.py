@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from analysis.meters import GpuMeter
 from analysis.workloads import Workload
 from splat.camera import Camera
 from splat.gaussians import Gaussians
@@ -21,7 +22,8 @@ from splat.settings import RenderSettings
 
 @dataclass(frozen=True)
 class ReferenceCost:
-    """Seconds of a gradient, and of an H v with the graph it needs; peak: bytes that the latter added to the process's."""
+    """Seconds of a gradient, and of an H v with the graph it needs; peak: bytes that the latter added to the process's, on a
+    GPU to those of torch's allocator."""
 
     gradient: float
     product: float
@@ -29,13 +31,13 @@ class ReferenceCost:
 
 
 def reference_cost(workload: Workload) -> ReferenceCost:
-    """One gradient and one H v of the first view, with as many threads as here."""
-    view = workload.views[0]
-    arrays = (workload.gaussians.flat.numpy(), view.image.numpy(), workload.background.numpy())
-    settings = (workload.gaussians.sh_degree, view.camera, workload.loss, workload.settings, torch.get_num_threads())
+    """One gradient and one H v of the first view, where its Gaussians are, with as many threads as here."""
+    view, flat = workload.views[0], workload.gaussians.flat
+    arrays = (flat.cpu().numpy(), view.image.numpy(), workload.background.numpy())
+    settings = (workload.gaussians.sh_degree, view.camera, workload.loss, workload.settings)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(_measure, *arrays, *settings).result()
+        return pool.submit(_measure, *arrays, *settings, torch.get_num_threads(), str(flat.device)).result()
 
 
 def _measure(
@@ -47,17 +49,26 @@ def _measure(
     loss: LossSettings,
     settings: RenderSettings,
     threads: int,
+    device: str,
 ) -> ReferenceCost:
     torch.set_num_threads(threads)
-    theta, target = torch.from_numpy(flat).requires_grad_(), torch.from_numpy(image)
+    torch.set_default_device(device)
+    theta, target = torch.from_numpy(flat).to(device).requires_grad_(), torch.from_numpy(image).to(device)
 
     def gradient(create_graph: bool) -> torch.Tensor:
         gaussians = Gaussians(theta, sh_degree)
         rendered = render(gaussians, camera, torch.from_numpy(background), settings, backend="reference").image
         return torch.autograd.grad(photometric_loss(rendered, target, loss), theta, create_graph=create_graph)[0]
 
+    def product() -> None:
+        torch.autograd.grad(gradient(create_graph=True), theta, torch.ones_like(theta))
+
+    if theta.is_cuda:
+        meter = GpuMeter(theta.device)
+        peak = meter.allocated(product)
+        return ReferenceCost(meter.seconds(lambda: gradient(create_graph=False)), meter.seconds(product), peak)
     before, start = _memory()[0], time.perf_counter()
-    torch.autograd.grad(gradient(create_graph=True), theta, torch.ones_like(theta))
+    product()
     peak, middle = _memory()[1] - before, time.perf_counter()
     gradient(create_graph=False)
     return ReferenceCost(time.perf_counter() - middle, middle - start, peak)

@@ -5,128 +5,124 @@
     compositing       forward and backward (with its sums) alone
     gradient          stored parameters to the gradient in them: every stage
     gradient, autograd  the same as a training makes it, through torch
+    gradient, atomic  ... with sums as they come (on a GPU)
+    gsplat            ... by that package's kernels (on a GPU)
     linearize         what `LinearizedView` does once
     H v K             a product with K vectors, per vector
     block diagonal    Hessian blocks of all attributes, one pass
 
+One code for the CPU and for GPUs: where the workload's Gaussians are decides which kernels run, and a `Meter` measures them.
+
 Arithmetic is counted from `raster/formulas.py`: additions, multiplications, fused multiply-adds, divisions and
-minima of one pixel and Gaussian, comparisons and integer operations left out, each worth one fused multiply-add.
+minima of one pixel and Gaussian, comparisons and integer operations left out, each worth one fused multiply-add.  Bytes are
+those that a pass reads and writes for each entry (its splat's 64, its index and slot, 48 a tangent, 36 of sums, written and
+added up) and for each pixel of the image, in single precision; they come from memory or a cache.
 """
 
-import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
+from analysis.bench_passes import Calls, compositing_stages, pairs_of
+from analysis.bench_peer import MissingPeer, gsplat_gradient
+from analysis.meters import Meter
 from analysis.timing import Timing, interleaved
 from analysis.workloads import Workload
-from splat.linearize import LinearizedView, OwnBlocks
-from splat.losses_cpu import ViewLoss, view_loss
-from splat.projection_cpu import attribute_arrays, lens_of, project_adjoint, project_arrays
-from splat.raster import binning, compositing, formulas, packing
-from splat.raster.cpu import Adjoint, Raster, aligned
-from splat.raster.threads import over_range, over_tiles
+from landscape.probes import draw_probes
+from splat.device import by_triton
+from splat.linearize import OwnBlocks, hold
+from splat.losses_cpu import loss_against, view_loss
+from splat.projection_cpu import lens_of
+from splat.raster.functions import held_view, projected, pulled
 from splat.render import render
+from splat.settings import Sums
 
 VECTORS = (1, 4, 8)
 PRODUCTS = tuple(f"H v {K}" for K in VECTORS)
 OPERATIONS = {"forward": 17, "backward + reduce": 30, "J u 1": 25, "tangent of backward 1": 46}
+BYTES = {  # an entry, a pixel
+    "forward": (4 + 64, 24),
+    "backward + reduce": (8 + 64 + 2 * 36, 24),
+    "J u 1": (4 + 64 + 48, 4 + 20),
+    "tangent of backward 1": (8 + 64 + 48 + 2 * 36, 24 + 20),
+}
 
 
 class ViewBench:
-    """One view of a workload, ready to be timed: `calls`, and what they work on."""
+    """One view of a workload, ready to be timed: `calls`, and what they work on.
+
+    lack: why there is no gradient by gsplat to compare with on a GPU.
+    """
 
     def __init__(self, workload: Workload, index: int = 0):
         self.workload, self.view = workload, workload.views[index]
-        flat, camera = workload.gaussians.flat, self.view.camera
+        self.like, camera = workload.gaussians.flat.detach(), self.view.camera
         self.lens = lens_of(camera, workload.settings)
-        self.splats, self.depths, self.drawn = project_arrays(workload.gaussians, self.lens)
-        self.background = workload.background.to(flat).numpy()
-        self.loss = ViewLoss.of(self.view.image, workload.loss, flat.dtype)
+        self.background = workload.background.to(self.like)
+        self.loss = loss_against(self.view.image, workload.loss, self.like)
+        self.projected = projected(workload.gaussians, self.lens)
         self.raster = self._rasterize()
-        self.lists = self.raster.lists
         self.cotangent = self.loss.linearize(self.raster.planes).gradient
         self.adjoint = self.raster.backward(self.cotangent)
         self.linearized = self._linearize()
-        generator = torch.Generator().manual_seed(0)
-        self.vectors = {K: torch.randn(flat.numel(), K, generator=generator, dtype=flat.dtype) for K in VECTORS}
+        generator = torch.Generator(self.like.device).manual_seed(0)
+        vectors = draw_probes(self.like.numel(), max(VECTORS), generator, self.like.dtype)
+        self.vectors = {K: vectors[:, :K].contiguous() for K in VECTORS}
+        self.lack: str | None = None
 
-    def _rasterize(self) -> Raster:
+    def _rasterize(self) -> Any:
         camera, settings = self.view.camera, self.workload.settings
-        return Raster(self.splats, self.depths, self.drawn, self.background, camera.width, camera.height, settings)
+        return held_view(*self.projected, self.background, camera.width, camera.height, settings)
 
-    def _linearize(self) -> LinearizedView:
+    def _linearize(self) -> Any:
         w = self.workload
-        return LinearizedView(w.gaussians, self.view.camera, self.loss, w.background.to(w.gaussians.flat), w.settings)
+        return hold(w.gaussians, self.view.camera, self.loss, self.background, w.settings)
 
-    def _rasterizer(self) -> Adjoint:
+    def _rasterizer(self) -> Any:
         return self._rasterize().backward(self.cotangent)
 
-    def gradient(self) -> np.ndarray:
+    def gradient(self) -> torch.Tensor:
         """Of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
-        splats, depths, drawn = project_arrays(self.workload.gaussians, self.lens)
-        camera = self.view.camera
-        raster = Raster(splats, depths, drawn, self.background, camera.width, camera.height, self.workload.settings)
+        splats, depths, drawn = projected(self.workload.gaussians, self.lens)
+        camera, settings = self.view.camera, self.workload.settings
+        raster = held_view(splats, depths, drawn, self.background, camera.width, camera.height, settings)
         adjoint = raster.backward(self.loss.linearize(raster.planes).gradient)
-        return self._to_parameters(splats, drawn, adjoint.gradient)
+        return self._to_parameters(splats, drawn, adjoint)
 
-    def _to_parameters(self, splats: np.ndarray, drawn: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        gaussians = self.workload.gaussians
-        out = gaussians.with_flat(torch.zeros_like(gaussians.flat))
-        means, log_scales, quats, _logits, sh = attribute_arrays(gaussians)
-        given = (self.lens, means, log_scales, quats, sh, splats, drawn, bar)
-        over_range(len(gaussians), project_adjoint, *given, *attribute_arrays(out))
-        return out.flat.numpy()
+    def _to_parameters(self, splats: torch.Tensor, drawn: torch.Tensor, adjoint: Any) -> torch.Tensor:
+        bar = torch.as_tensor(adjoint.gradient)
+        return pulled(self.workload.gaussians, self.lens, splats, drawn, bar)
 
-    def gradient_by_autograd(self) -> torch.Tensor:
+    def gradient_by_autograd(self, sums: Sums = "ordered") -> torch.Tensor:
         """The same, as a step of a training makes it."""
-        w = self.workload
-        flat = w.gaussians.flat.detach().requires_grad_()
-        image = render(w.gaussians.with_flat(flat), self.view.camera, w.background, w.settings).image
+        w, settings = self.workload, replace(self.workload.settings, sums=sums)
+        flat = self.like.clone().requires_grad_()
+        image = render(w.gaussians.with_flat(flat), self.view.camera, self.background, settings).image
         return torch.autograd.grad(view_loss(image, self.loss), flat)[0]
 
-    def stages(self) -> dict[str, Callable[[], object]]:
+    def stages(self) -> Calls:
         """The parts of a gradient and of a product with one vector, and compositing alone."""
-        w, camera, raster = self.workload, self.view.camera, self.raster
-        n, drawing = len(w.gaussians), (raster.params, raster.lists, raster.frame, raster.pixels)
-        sums = aligned((int(raster.slot_start[-1]) * formulas.SUMS,), raster.dtype)
-        bins = (self.splats, self.depths, self.drawn, camera.width, camera.height, w.settings)
-        adjoint = self.adjoint
-
-        def slots():
-            raster.lists, raster._slot_start = self.lists, None
-            return raster.slot_start
-
-        def forward():
-            over_tiles(compositing.forward, raster.params, self.lists, raster.frame, raster.pixels)
-
-        def backward():
-            over_tiles(compositing.backward, *drawing, adjoint.cotangent, sums)
-            over_range(
-                n, packing.reduce_gradient, self.splats, raster.slot_start, sums, adjoint.moments, adjoint.gradient
-            )
-
-        directions = self.linearized._projection.jvp(self.vectors[1].numpy())
+        w, raster, adjoint = self.workload, self.raster, self.adjoint
+        passes = compositing_stages(w, self.view.camera, self.projected, raster, adjoint)
+        held, (splats, _, drawn) = self.linearized, self.projected
+        directions = held._projection.jvp(self.vectors[1] if by_triton(self.like) else self.vectors[1].numpy())
         tangent = raster.jvp(directions)
-        curved = self.linearized._loss.hvp(tangent.planes)
+        curved = held._loss.hvp(tangent.planes)
         return {
-            "project": lambda: project_arrays(w.gaussians, self.lens),
-            "bin": lambda: binning.bin_splats(*bins),
-            "pack": lambda: over_range(n, packing.pack_splats, self.splats, -8.0, np.inf, np.empty_like(raster.params)),
-            "forward": forward,
-            "slots": slots,
+            "project": lambda: projected(w.gaussians, self.lens),
+            **passes,
             "loss": lambda: self.loss.linearize(raster.planes),
-            "backward + reduce": backward,
-            "project adjoint": lambda: self._to_parameters(self.splats, self.drawn, adjoint.gradient),
-            "compositing": lambda: (forward(), backward()),
+            "project adjoint": lambda: self._to_parameters(splats, drawn, adjoint),
+            "compositing": lambda: (passes["forward"](), passes["backward + reduce"]()),
             "J u 1": lambda: raster.jvp(directions),
-            "loss H v 1": lambda: self.linearized._loss.hvp(tangent.planes),
+            "loss H v 1": lambda: held._loss.hvp(tangent.planes),
             "tangent of backward 1": lambda: tangent.curvature(adjoint, curved),
         }
 
-    def wholes(self) -> dict[str, Callable[[], object]]:
+    def wholes(self) -> Calls:
         """What the ratios are about."""
         products = {f"H v {K}": lambda U=U: self.linearized.hvp(U) for K, U in self.vectors.items()}
         return {
@@ -138,26 +134,34 @@ class ViewBench:
             "block diagonal": self._block_diagonal,
         }
 
+    def peers(self) -> Calls:
+        """On a GPU, gradients to compare with: by the faster sums, and by gsplat where there is one."""
+        if not by_triton(self.like):
+            return {}
+        calls: Calls = {"gradient, atomic": lambda: self.gradient_by_autograd("atomic")}
+        try:
+            calls["gsplat"] = gsplat_gradient(self.workload, self.view, self.loss)
+        except MissingPeer as error:
+            self.lack = str(error)
+        return calls
+
     def _block_diagonal(self) -> OwnBlocks:
         vars(self.linearized._loss).pop("diagonal", None)  # it keeps the loss's share, which is part of the cost
         return self.linearized.block_diagonal()
 
     @property
     def pairs(self) -> int:
-        """(pixel, Gaussian) pairs that a pass evaluates: every lane of every row of every entry that is reached."""
-        _ = self.raster.slot_start  # drops the entries that are not
-        rows = ((self.raster.lists.rows >> 8) & 255) - (self.raster.lists.rows & 255) + 1
-        return int(rows.sum()) * self.raster.plane[1] // self.raster.frame.columns
+        """(pixel, Gaussian) pairs that a pass evaluates."""
+        return pairs_of(self.raster)
 
-    def workspace(self, K: int) -> int:
+    def bytes_of(self, name: str) -> int:
+        """What a pass reads and writes."""
+        an_entry, a_pixel = BYTES[name]
+        return an_entry * self.linearized.entries + a_pixel * self.workload.pixels
+
+    def workspace(self, K: int, meter: Meter) -> int:
         """Bytes that a product with K vectors allocates at most at a time, its result included."""
-        U = self.vectors[K]
-        self.linearized.hvp(U)
-        tracemalloc.start()
-        self.linearized.hvp(U)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return peak
+        return meter.allocated(lambda: self.linearized.hvp(self.vectors[K]))
 
     def kept(self) -> int:
         """Bytes of the arrays that the linearisation holds, the target's included, the Gaussians' not."""
@@ -196,33 +200,35 @@ def powers_of_two(most: int) -> list[int]:
     return sorted({*(2**k for k in range(most.bit_length()) if 2**k <= most), most})
 
 
-def scaling(workload: Workload, repetitions: int) -> Iterator[tuple[str, int, dict[str, Timing]]]:
-    """What grows, to how much, and the times of everything in SCALED: Gaussians, pixels, views, threads."""
+def scaling(workload: Workload, repetitions: int, meter: Meter) -> Iterator[tuple[str, int, dict[str, Timing]]]:
+    """What grows, to how much, and the times of everything in SCALED: Gaussians, pixels, views and, on the CPU, threads."""
     for share in SHARES:
         part = workload.thinned(max(1, round(share * len(workload.gaussians))))
-        yield "gaussians", len(part.gaussians), scaled_times(part, repetitions)
+        yield "gaussians", len(part.gaussians), scaled_times(part, repetitions, meter)
     for factor in FACTORS:
         part = workload.resized(factor)
-        yield "pixels", part.pixels, scaled_times(part, repetitions)
+        yield "pixels", part.pixels, scaled_times(part, repetitions, meter)
     for views in powers_of_two(len(workload.views)):
-        yield "views", views, scaled_times(workload, repetitions, views)
+        yield "views", views, scaled_times(workload, repetitions, meter, views)
+    if by_triton(workload.gaussians.flat):
+        return
     before = torch.get_num_threads()
     try:
         for threads in powers_of_two(before):
             torch.set_num_threads(threads)
-            yield "threads", threads, scaled_times(workload, repetitions)
+            yield "threads", threads, scaled_times(workload, repetitions, meter)
     finally:
         torch.set_num_threads(before)
 
 
-def scaled_times(workload: Workload, repetitions: int, views: int = 1) -> dict[str, Timing]:
+def scaled_times(workload: Workload, repetitions: int, meter: Meter, views: int = 1) -> dict[str, Timing]:
     """The times of everything in SCALED over the first views."""
     benches = [ViewBench(workload, index).wholes() for index in range(views)]
 
     def over_views(name: str) -> Callable[[], object]:
         return lambda: [bench[name]() for bench in benches]
 
-    return interleaved({name: over_views(name) for name in SCALED}, repetitions)
+    return interleaved({name: over_views(name) for name in SCALED}, repetitions, clock=meter.seconds)
 
 
 def per_vector(times: dict[str, Timing]) -> dict[str, Timing]:

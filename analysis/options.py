@@ -241,5 +241,8 @@ class BenchOptions:
     """Folder of images within the scene.  Default: images, else the largest images_K."""
     downscale: float = 1.0
     """Reduce the scene's images further by this factor."""
+    device: DeviceName = "auto"
+    """Where a scene, a checkpoint or a synthetic size is measured.
+    auto: on the GPU where there is one that can be used, else on the CPU."""
     reference: FlagCreatePairsOff[bool] = False
     """Compare with double backward through the torch reference renderer: minutes and gigabytes at full size."""

@@ -22,10 +22,11 @@ from torch import Tensor
 
 from analysis.workloads import Workload
 from splat.gaussians import Gaussians
-from splat.linearize import LinearizedView, rasterize_view
-from splat.losses_cpu import ViewLoss
-from splat.projection_cpu import lens_of, project_arrays
+from splat.linearize import hold, rasterize_view
+from splat.losses_cpu import loss_against
+from splat.projection_cpu import lens_of
 from splat.raster.binning import depth_order
+from splat.raster.functions import projected
 from splat.scenes.view import View
 from splat.settings import RenderSettings
 
@@ -60,7 +61,8 @@ def same_decisions(gaussians: Gaussians, view: View, settings: RenderSettings) -
     """The Gaussians with the same place in the order of depth, drawn, and with the same colour clamps in either precision."""
     found = []
     for dtype in (torch.float32, torch.float64):
-        splats, depths, drawn = project_arrays(gaussians.to(dtype), lens_of(view.camera, settings))
+        there = projected(gaussians.to(dtype), lens_of(view.camera, settings))
+        splats, depths, drawn = (tensor.cpu().numpy() for tensor in there)
         order = depth_order(depths, drawn)
         place = np.full(len(drawn), -1)
         place[order] = np.arange(len(order))
@@ -71,7 +73,7 @@ def same_decisions(gaussians: Gaussians, view: View, settings: RenderSettings) -
 def _cleared(view: View, gaussians: Gaussians, workload: Workload, settings: RenderSettings) -> View:
     """The view with its picture moved away from the image where a residual's sign is in doubt."""
     raster = rasterize_view(gaussians.to(torch.float64), view.camera, workload.background.double(), settings)
-    image = torch.from_numpy(raster.crop(raster.planes[:3]).copy())
+    image = torch.as_tensor(raster.crop(raster.planes[:3])).cpu()
     residual = image - view.image.double()
     side = torch.where(residual < 0, -1.0, 1.0)
     return replace(view, image=(image - side * residual.abs().clamp_min(CLEAR)).float())
@@ -83,7 +85,7 @@ def _compare(
     double = gaussians.to(torch.float64)
     double.quats.div_(double.quats.norm(dim=1, keepdim=True))
     single = double.to(torch.float32)
-    U = torch.randn(len(single.flat), VECTORS, generator=torch.Generator().manual_seed(0))
+    U = torch.randn(len(single.flat), VECTORS, generator=torch.Generator().manual_seed(0)).to(single.flat)
     rough = _derivatives(single, view, workload, settings, U)
     exact = _derivatives(single.to(torch.float64), view, workload, settings, U.double())
     for name in ("image", "gradient"):
@@ -103,8 +105,8 @@ def _derivatives(
     gaussians: Gaussians, view: View, workload: Workload, settings: RenderSettings, U: Tensor
 ) -> dict[str, Any]:
     flat = gaussians.flat
-    loss = ViewLoss.of(view.image, workload.loss, flat.dtype)
-    held = LinearizedView(gaussians, view.camera, loss, workload.background.to(flat), settings)
+    loss = loss_against(view.image, workload.loss, flat)
+    held = hold(gaussians, view.camera, loss, workload.background.to(flat), settings)
     diagonals = held.block_diagonal().diagonals
     traces = {name: (float(part.sum()), float(part.abs().sum())) for name, part in diagonals.items()}
     return {"image": held.image, "gradient": held.gradient, "H v": held.hvp(U), "traces": traces}

@@ -1,4 +1,4 @@
-"""Wall-clock times that can be compared on a machine that others use too.
+"""Times that can be compared on a machine that others use too.
 
 Calls to compare are timed in turns, so that what disturbs one disturbs all; each round runs them in the opposite order of
 the last.  The minimum is the cost on a quiet machine; the median says what to expect, and how quiet the machine was.
@@ -37,8 +37,19 @@ class Timing:
         return Timing(tuple(second / count for second in self.seconds))
 
 
+def wall_clock(call: Callable[[], object]) -> float:
+    """Seconds that a call takes."""
+    time.sleep(PAUSE)
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
 def interleaved(
-    calls: Mapping[Name, Callable[[], object]], repetitions: int, on_round: Callable[[], None] = lambda: None
+    calls: Mapping[Name, Callable[[], object]],
+    repetitions: int,
+    on_round: Callable[[], None] = lambda: None,
+    clock: Callable[[Callable[[], object]], float] = wall_clock,
 ) -> dict[Name, Timing]:
     """Time every call `repetitions` times, in turns, after one call each that is not timed (it may compile)."""
     seconds: dict[Name, list[float]] = {name: [] for name in calls}
@@ -47,9 +58,6 @@ def interleaved(
     names = list(calls)
     for turn in range(repetitions):
         for name in names if turn % 2 == 0 else reversed(names):
-            time.sleep(PAUSE)
-            start = time.perf_counter()
-            calls[name]()
-            seconds[name].append(time.perf_counter() - start)
+            seconds[name].append(clock(calls[name]))
         on_round()
     return {name: Timing(tuple(times)) for name, times in seconds.items()}

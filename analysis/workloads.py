@@ -97,6 +97,10 @@ class Workload:
         """Of one view."""
         return self.views[0].camera.width * self.views[0].camera.height
 
+    def to(self, device: torch.device) -> "Workload":
+        """The Gaussians on a device, where all that is computed of them is then computed; views stay where they are."""
+        return replace(self, gaussians=self.gaussians.with_flat(self.gaussians.flat.to(device)))
+
     def thinned(self, count: int) -> "Workload":
         """A random choice of the Gaussians."""
         chosen = torch.randperm(len(self.gaussians), generator=torch.Generator().manual_seed(0))[:count]

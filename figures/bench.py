@@ -1,4 +1,4 @@
-"""Figure: how time grows with Gaussians, pixels, views and threads, on logarithmic axes, from a recorded bench.csv.
+"""Figure: how time grows with Gaussians, pixels, views and (on the CPU) threads, on logarithmic axes, from a bench.csv.
 
 `python -m figures.bench BENCH/bench.csv` draws it beside the table.  The grey lines have slope 1 (threads: slope -1).
 """
@@ -30,7 +30,10 @@ def draw(table: pd.DataFrame) -> Figure:
         figure = new_figure(3.2)
         panels = figure.subplots(2, 2, sharey=True)
         for axes, (study, label) in zip(panels.flat, LABELS.items(), strict=True):
-            _panel(axes, pd.DataFrame(table[table["study"] == study]), study)
+            lines = pd.DataFrame(table[table["study"] == study])
+            axes.set_visible(not lines.empty)
+            if not lines.empty:
+                _panel(axes, lines, study)
             axes.set_xlabel(label)
         for axes in panels[:, 0]:
             axes.set_ylabel("time (ms)")

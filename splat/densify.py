@@ -98,7 +98,8 @@ class ScreenGradients:
     @torch.no_grad()
     def add(self, gradient: Float[Tensor, "n 2"], splats: Splats, camera: Camera) -> None:
         """Take in dL / d(splats.means) of one render."""
-        half_size = gradient.new_tensor([camera.width / 2, camera.height / 2])
+        half_size = torch.tensor([camera.width / 2, camera.height / 2], dtype=gradient.dtype)
+        half_size = half_size.to(gradient.device, non_blocking=True)
         visible = on_screen(splats, camera)
         self.total += torch.where(visible, (gradient * half_size).norm(dim=1), 0)
         self.renders += visible
@@ -114,7 +115,7 @@ def on_screen(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:
     a, b, c = splats.conics.unbind(-1)
     det = (a * c - b * b).clamp_min(torch.finfo(a.dtype).tiny)  # cancels for needles: the box is then too large
     reach = 3 * torch.stack([c / det, a / det], dim=-1).sqrt()
-    size = reach.new_tensor([camera.width, camera.height])
+    size = torch.tensor([camera.width, camera.height]).to(reach, non_blocking=True)
     inside = (splats.means + reach > 0) & (splats.means - reach < size)
     return splats.drawn & inside.all(dim=-1)
 

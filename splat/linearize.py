@@ -37,7 +37,7 @@ def rasterize_view(
 ) -> Any:
     """Project and composite a view by the kernels where the Gaussians are, without derivatives."""
     gaussians.require_finite()
-    background, size = background.to(gaussians.flat), (camera.width, camera.height)
+    background, size = background.to(gaussians.flat, non_blocking=True), (camera.width, camera.height)
     if by_triton(gaussians.flat):
         from splat.projection_cuda import project
         from splat.raster.cuda import CudaRaster

@@ -29,8 +29,8 @@ class CudaImageLoss:
         self.pixel, self.structural = settings.pixel_weight / count, settings.ssim_weight / count
         numbers = torch.tensor([settings.eps, self.pixel, self.structural], dtype=torch.float64)
         taps = window(torch.float64)
-        self.constants = torch.cat([taps, numbers]).to(image)
-        self.squared = (taps.to(image.dtype) ** 2).to(image)
+        self.constants = torch.cat([taps, numbers]).to(image, non_blocking=True)
+        self.squared = (taps.to(image.dtype) ** 2).to(image, non_blocking=True)
         self.kind, self.ssim = KINDS[settings.pixel], settings.ssim_weight > 0
 
     @property

@@ -50,7 +50,7 @@ def render(
     gaussians.require_finite()
     if background is None:
         background = torch.zeros(3)
-    background = background.to(gaussians.flat)
+    background = background.to(gaussians.flat, non_blocking=True)
     if backend == "reference":
         splats = _gained(project(gaussians, camera, settings), opacity_gain)
         image, alpha, expected = rasterize_reference(splats, background, camera.width, camera.height, settings)

@@ -56,7 +56,7 @@ def last_derivative(values: tuple[Tensor, ...], *sources: Tensor, refusal: str =
     return _Last.apply(refusal, len(values), *values, *sources)  # pyright: ignore[reportReturnType]
 
 
-def _projected(gaussians: Gaussians, lens: Lens) -> tuple[Tensor, Tensor, Tensor]:
+def projected(gaussians: Gaussians, lens: Lens) -> tuple[Tensor, Tensor, Tensor]:
     """Splats (n, 9), depths and which are drawn."""
     if by_triton(gaussians.flat):
         from splat.projection_cuda import project
@@ -66,12 +66,12 @@ def _projected(gaussians: Gaussians, lens: Lens) -> tuple[Tensor, Tensor, Tensor
     return torch.from_numpy(splats), torch.from_numpy(depths), torch.from_numpy(drawn)
 
 
-def _pulled(gaussians: Gaussians, lens: Lens, splats: Tensor, drawn: Tensor, bar: Tensor) -> Tensor:
+def pulled(gaussians: Gaussians, lens: Lens, splats: Tensor, drawn: Tensor, bar: Tensor) -> Tensor:
     """The gradient in the flat vector, given the adjoint of the splats."""
     if by_triton(gaussians.flat):
-        from splat.projection_cuda import project_adjoint as pulled
+        from splat.projection_cuda import project_adjoint as adjoint
 
-        return pulled(gaussians, lens, splats, drawn, bar.double())
+        return adjoint(gaussians, lens, splats, drawn, bar.double())
     gradient = torch.zeros_like(gaussians.flat)
     means, log_scales, quats, _, sh = attribute_arrays(gaussians)
     over_range(
@@ -101,7 +101,7 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, flat: Tensor, sh_degree: int, camera: Camera, settings: RenderSettings):
         gaussians, lens = Gaussians(flat.detach(), sh_degree), lens_of(camera, settings)
-        splats, depths, drawn = _projected(gaussians, lens)
+        splats, depths, drawn = projected(gaussians, lens)
         ctx.held = (sh_degree, lens, splats, drawn)
         ctx.save_for_backward(flat)
         outputs = (*_parts(splats, flat), depths, drawn)
@@ -119,7 +119,7 @@ class _ProjectAdjoint(torch.autograd.Function):
         sh_degree, lens, splats, drawn = held
         ctx.held, ctx.bar = held, _joined(bars)
         ctx.save_for_backward(flat)
-        return _pulled(Gaussians(flat.detach(), sh_degree), lens, splats, drawn, ctx.bar)
+        return pulled(Gaussians(flat.detach(), sh_degree), lens, splats, drawn, ctx.bar)
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):

@@ -41,8 +41,10 @@ def rasterize_reference(
     for top in range(0, height, tile):
         row = []
         for left in range(0, width, tile):
-            xs = torch.arange(left, min(left + tile, width), dtype=centres.dtype) + 0.5
-            ys = torch.arange(top, min(top + tile, height), dtype=centres.dtype) + 0.5
+            xs, ys = (
+                torch.arange(first, min(first + tile, size), dtype=centres.dtype, device=centres.device) + 0.5
+                for first, size in ((left, width), (top, height))
+            )
             low, high = torch.stack([xs[0], ys[0]]), torch.stack([xs[-1], ys[-1]])
             touched = ((centres + reach >= low) & (centres - reach <= high)).all(dim=1)
             row.append(_composite(splats, order[touched], background, xs, ys, settings))
@@ -91,7 +93,7 @@ def _composite(
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     before, after = _transmittances(alpha)
     weight = alpha * before
-    last = after[-1] if len(index) else torch.ones(len(ys), len(xs), dtype=background.dtype)
+    last = after[-1] if len(index) else background.new_ones(len(ys), len(xs))
     colour = torch.einsum("mhw,mc->chw", weight, splats.colours[index]) + last * background[:, None, None]
     depth = torch.einsum("mhw,m->hw", weight, splats.depths[index])
     return torch.cat([colour, (1 - last)[None], depth[None]])

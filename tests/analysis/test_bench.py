@@ -15,6 +15,7 @@ from analysis.bench_kernels import own_stages
 from analysis.bench_reference import reference_cost
 from analysis.bench_scene import SCALED, ViewBench
 from analysis.cli import main
+from analysis.meters import HostMeter, bandwidth
 from analysis.options import BenchOptions
 from analysis.peak import CHAINS, STEPS, fma_peak, multiply_add
 from analysis.prototype import prototype_in
@@ -99,13 +100,13 @@ def test_the_stages_of_the_kernels_leave_what_the_raster_computes():
 def test_the_timed_gradients_are_the_gradient_of_the_view(bench):
     expected = bench.linearized.gradient
     assert expected.norm() > 0
-    for gradient in (torch.from_numpy(bench.gradient()), bench.gradient_by_autograd()):
+    for gradient in (bench.gradient(), bench.gradient_by_autograd()):
         # both sum in the kernels' order; what differs is a rounding or two of the projection's adjoint
         assert (gradient - expected).norm() < 16 * torch.finfo(torch.float32).eps * expected.norm()
 
 
 def test_the_stages_of_a_scene_run_and_leave_the_view_as_it_was(bench):
-    before = bench.gradient().copy()
+    before = bench.gradient()
     for call in {**bench.stages(), **bench.wholes()}.values():
         call()
     np.testing.assert_array_equal(bench.gradient(), before)
@@ -127,7 +128,7 @@ def test_memory_is_that_of_the_arrays(bench):
         least = 4 * K * (SUMS * view.entries + 5 * view._raster.frame.size)
         blocks = 4 * 4 * K * view.gradient.numel()  # the argument, the result and their copies
         objects = 64 * 1024  # Python's own
-        assert least <= bench.workspace(K) <= view.workspace(K) + blocks + objects
+        assert least <= bench.workspace(K, HostMeter()) <= view.workspace(K) + blocks + objects
 
 
 def test_the_reference_is_measured_in_a_process_of_its_own():
@@ -151,6 +152,15 @@ def test_the_kernel_of_the_peak_makes_every_step():
     assert STEPS > 100 and fma_peak(1) > 0
 
 
+def test_the_bandwidth_is_of_what_a_copy_reads_and_writes():
+    class Clock(HostMeter):
+        def seconds(self, call):
+            call()
+            return 0.5
+
+    assert bandwidth(Clock(), 1 << 10) == 2 * (1 << 10) / 0.5
+
+
 def test_a_bench_records_times_bounds_and_a_figure(recorded):
     assert sorted(p.name for p in recorded.iterdir()) == ["bench.csv", "bench.png", "bounds.csv"]
     table, bounds = pd.read_csv(recorded / "bench.csv"), pd.read_csv(recorded / "bounds.csv")
@@ -161,6 +171,7 @@ def test_a_bench_records_times_bounds_and_a_figure(recorded):
         assert {stage for stage, _ in points} == set(SCALED) and len(set(points)) == len(points)
     assert sorted(table.loc[table["study"] == "views", "views"].unique()) == [1, 2, 4]
     stages = table[table["study"] == "stages"]
+    assert set(table["device"]) == {"cpu"} and not {"gsplat", "gradient, atomic"} & set(stages["stage"])
     time, ratio = dict(zip(stages["stage"], stages["minimum_ms"])), dict(zip(bounds["what"], bounds["measured"]))
     assert ratio["H v 4 / gradient"] == pytest.approx(time["H v 4"] / time["gradient"])
     limit = bounds["asked"].str.removeprefix("≤ ").astype(float)
@@ -229,6 +240,7 @@ def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
         (["--sizes", "many"], "GAUSSIANS@WIDTHxHEIGHT"),
         (["nowhere"], "nowhere"),
         (["kernels", "--prototype", "nowhere"], "expected a prototype's"),
+        (["kernels", "--device", "cuda"], "which measures the CPU's kernels; leave out --device"),
     ],
 )
 def test_bad_input_gets_one_sentence(tmp_path, capsys, arguments, message):

@@ -1,20 +1,22 @@
-"""Every kernel of the projection, of the losses and of Adam compiles for GPUs, without a GPU."""
+"""Every kernel of the projection, of the losses, of Adam and of the bench compiles for GPUs, without a GPU."""
 
 from tests.splat.ahead_of_time import compile_kernel, run_as_script
 
-LONG, INTEGERS = ("index",), ("n", "m", "K", "height", "width", "start", "count", "v_stride", "out_stride")
+LONG, INTEGERS = ("index",), ("n", "m", "K", "height", "width", "start", "count", "v_stride", "out_stride", "steps")
 DOUBLES = ("lens", "splats", "bar", "cotangents", "opacity_bar", "distances", "losses")
 
 
 def types(kernel, double: tuple[str, ...] = ()) -> dict[str, str]:
     """Of the parameters by name, with parameters in float32."""
     special = dict.fromkeys(LONG, "*i64") | dict.fromkeys(INTEGERS, "i32") | {"drawn": "*i1"}
+    special |= dict.fromkeys(("a", "b"), "fp32")
     special |= dict.fromkeys((*DOUBLES, *double), "*fp64")
     return {name: special.get(name, "*fp32") for name in kernel.arg_names}
 
 
 def kernels() -> list[tuple]:
     """Every kernel, its parameters that are in double precision beside the usual ones, and its constants."""
+    from analysis import peak_cuda as peak
     from splat import adam_cuda as adam
     from splat import losses_cuda_kernels as losses
     from splat import projection_cuda_kernels as projection
@@ -43,6 +45,7 @@ def kernels() -> list[tuple]:
         (losses.differentiate_pair, (), pixels),
         (losses.finish_pair, (), pixels | ssim),
         (adam._step, ("numbers",), {"BLOCK": 1024, "BETA1": 0.9, "BETA2": 0.999, "EPS": 1e-15, "GRID": 1e-28}),
+        (peak.multiply_add, (), {"BLOCK": peak.BLOCK, "UNROLLED": peak.UNROLLED}),
     ]
     return [(kernel, double, constants | _formulas(kernel)) for kernel, double, constants in found]
 
@@ -53,7 +56,7 @@ def _formulas(kernel) -> dict[str, str]:
 
 def test_every_kernel_of_projection_and_losses_compiles():
     lines = run_as_script(__file__)
-    assert len(lines) == 20
+    assert len(lines) == 21
     for line in lines:
         name, registers, _ = line.split()
         assert 16 <= int(registers) <= 255, name
