@@ -1,10 +1,12 @@
 # make demo   install, train and probe a small synthetic scene
-# make test   install, then ruff, pyright and pytest
-# make setup  the shared first half: an environment in .venv with everything the project needs
+# make test   install, also the developers' tools, then ruff, pyright and pytest
+# make setup  the shared first half: an environment in .venv with everything that the commands need
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+TOOLS := $(VENV)/.tools-installed
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .PHONY: setup demo test clean
 setup: $(STAMP)
@@ -12,14 +14,19 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "expected Python 3.11 or newer, got " + sys.version.split()[0] + "; name one with: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@echo "installing into $(VENV), which takes minutes and about 2.5 GB"
+	$(PIP) torch
+	$(PIP) --editable .
 	@touch $(STAMP)
+
+$(TOOLS): $(STAMP)
+	$(PIP) --editable '.[dev]'
+	@touch $(TOOLS)
 
 demo: setup
 	$(BIN)/landscape demo
 
-test: setup
+test: $(TOOLS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
