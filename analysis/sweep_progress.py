@@ -71,7 +71,7 @@ class SweepProgress:
         words = [
             f"{name} {spent[name].step}" if stage == "train" else f"{name} probe" for name, stage in self.active.items()
         ]
-        state = f"{self.left()} left: {', '.join(words)}"
+        state = f"{self.left()} left{': ' * bool(words)}{', '.join(words)}"
         self._bar.update(self._task, completed=sum(each.step for each in spent.values()), state=state)
 
     def left(self) -> str:

@@ -157,7 +157,7 @@ def _table(summary: pd.DataFrame, title: str, columns: Mapping[str, str]) -> Tab
     table.add_column("n", justify="right")
     known = _known(summary, columns)
     for name in known:
-        table.add_column(columns[name], justify="right")
+        table.add_column(columns[name], justify="right", min_width=max(map(len, columns[name].split())))
     for row in summary.to_dict("records"):
         most = max(int(row[f"{name}_n"]) for name in known)
         table.add_row(row["scene"], row["method"], str(most), *(_cell(row, name, most) for name in known))
