@@ -1,0 +1,69 @@
+"""Nothing of the GPU's path reaches for a tensor on the host, or waits for the device where it need not."""
+
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="the kernels for GPUs need triton")
+
+from splat.curvature import SceneHessian, SceneObjective
+from splat.losses import LossSettings
+from splat.train import Training, train
+from tests.splat.held_scenes import BACKGROUND, two_views
+from tests.splat.placed import Placed
+from tests.splat.random_scenes import random_gaussians, random_like
+from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
+
+pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU, where this fails by itself")
+
+
+def test_what_is_on_the_wrong_side_is_noted(monkeypatch):
+    placed = Placed(monkeypatch)
+    with placed:
+        there, here = placed.on_gpu(torch.ones(3)), torch.ones(3)
+        _ = there * 2.0 + there.new_zeros(3) + here.to(there, non_blocking=True), there[torch.tensor([0])]
+        assert not +placed.mixed and not +placed.waits
+        _ = there + here, there.sum() + here, there.numpy(), float(there.sum()), here.to(there), there.nonzero()
+    assert +placed.mixed == Counter({"add": 2, "numpy": 1})
+    assert +placed.waits == Counter({"_local_scalar_dense": 1, "to": 1, "nonzero": 1})
+
+
+def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_five_times(monkeypatch):
+    views = tiny_views()
+    config = replace(tiny_config(), random_background=False)  # which would compare with another picture every step
+    training = Training.start(tiny_gaussians(6), EXTENT, config)
+    placed = Placed(monkeypatch)
+    monkeypatch.setattr("splat.device.INTERPRETED", True)
+    with placed:
+        training.gaussians = training.gaussians.with_flat(placed.on_gpu(training.gaussians.flat))
+        for name in ("first", "second"):
+            moment = getattr(training.adam, name)
+            setattr(training.adam, name, moment.with_flat(placed.on_gpu(moment.flat)))
+        sums = training.screen_gradients
+        sums.total, sums.renders = placed.on_gpu(sums.total), placed.on_gpu(sums.renders)
+        steps = train(training, views)
+        next(steps)
+        # whether the parameters are finite, the largest scale, how many strips and entries, the loss
+        assert +placed.waits == Counter({"_local_scalar_dense": 5})
+        next(steps)  # with density control
+    assert not +placed.mixed
+
+
+def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait_for_it(monkeypatch):
+    gaussians = random_gaussians(4, 0, logit=1.0, spread=0.4)
+    placed = Placed(monkeypatch)
+    monkeypatch.setattr("splat.device.INTERPRETED", True)
+    with placed:
+        flat = placed.on_gpu(gaussians.flat)
+        views = two_views(16, 12)[:1]
+        objective = SceneObjective(gaussians.with_flat(flat), views, LossSettings(), BACKGROUND, memory=2**30)
+        hessian = SceneHessian(objective)
+        V = placed.on_gpu(random_like((hessian.dim, 2), 1))
+        hessian.apply(V)
+        placed.waits.clear()
+        hessian.apply(V)
+        assert not +placed.waits
+        _ = objective.gradient, objective.block_diagonal(), objective.loss(flat)
+    assert not +placed.mixed
