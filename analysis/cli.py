@@ -52,7 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return run(options, arguments)
     except (ValueError, OSError) as error:
-        print(f"landscape: {' '.join(str(error).split())}", file=sys.stderr)
+        text = str(error)
+        if isinstance(error, OSError) and error.strerror and error.filename:  # the system's own words
+            text = f"cannot use {error.filename}: {error.strerror}"
+        print(f"landscape: {' '.join(text.split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("landscape: interrupted", file=sys.stderr)

@@ -91,6 +91,13 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         f"{scene.name}: {len(views)} views to train on, {len(held_out)} held out, {camera.width} x {camera.height} px, "
         f"{len(training.gaussians)} Gaussians"
     )
+    method = config.method
+    if (warm_up := getattr(method, "warm_up", 0)) >= config.iterations:
+        console.print(
+            f"{method.name} begins after step {warm_up}, which this run does not reach: it is plain 3DGS so far; "
+            f"take more --iterations, or --set warm_up={config.iterations // 2}",
+            style="yellow", soft_wrap=True, highlight=False,
+        )  # fmt: skip
     trajectory = None if along is None else Trajectory(out, training, views, along)
     if not _follow(training, views, out / CHECKPOINT, reference, options.checkpoint_every, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])

@@ -282,6 +282,12 @@ def test_help_says_what_an_option_that_is_left_out_stands_for(command, capsys):
         assert all(method in said for method in METHODS)
 
 
+def test_what_the_system_refuses_is_said_with_the_path(original, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(arguments(original, tmp_path / "file" / "run")) == 2
+    one_sentence(capsys, f"landscape: cannot use {tmp_path / 'file'}", ": Not a directory")
+
+
 def test_help_needs_no_torch():
     program = (
         "import sys, analysis.cli\ntry: analysis.cli.main(['train', '--help'])\nfinally: print('torch' in sys.modules)"

@@ -126,6 +126,13 @@ def test_a_method_that_lacks_its_depth_maps_is_refused_before_there_is_a_folder(
     assert not (tmp_path / "run").exists()
 
 
+def test_a_method_that_begins_after_the_last_step_is_pointed_out(original, tmp_path, capsys):
+    assert train(original, tmp_path / "late", "--method", "stablegs") == 0
+    assert "stablegs begins after step 1000, which this run does not reach" in capsys.readouterr().err
+    assert train(original, tmp_path / "early", "--method", "stablegs", "--set", "warm_up=0") == 0
+    assert "begins after" not in capsys.readouterr().err
+
+
 def test_the_start_can_be_chosen(original, tmp_path, capsys, monkeypatch):
     scene = load_scene(original)
     assert scene.points is not None
