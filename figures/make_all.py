@@ -1,5 +1,6 @@
 """All figures of a recorded probe or slice: `python -m figures.make_all RUN/probe` or `draw_probe(folder)`."""
 
+from functools import partial
 from pathlib import Path
 
 from analysis.records import Record, read_record
@@ -31,7 +32,9 @@ def draw_probe(folder: str | Path, suffix: str = "png") -> list[Path]:
     """
     record = read_record(folder)
     names = recorded_figures(record)
-    return [save(FIGURES[name](record), record.folder / f"{name}.{suffix}") for name in names]
+    begun = {"surface": surface.begin(record)} if "surface" in names else {}  # its renderer works beside the others
+    figures = {name: partial(FIGURES[name], picture=begun[name]) if name in begun else FIGURES[name] for name in names}
+    return [save(draw(record), record.folder / f"{name}.{suffix}") for name, draw in figures.items()]
 
 
 def main() -> None:

@@ -80,9 +80,8 @@ def save(figure: Figure, path: str | Path) -> Path:
     """Write the figure (PNG, PDF or SVG by its suffix) so that `path` is the old file or the whole new one."""
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
-    options: dict[str, Any] = {"pil_kwargs": {"optimize": True}} if path.suffix == ".png" else {}
     with style():
-        figure.savefig(temporary, **options)
+        figure.savefig(temporary)
     temporary.replace(path)
     return path
 

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import matplotlib as mpl
@@ -39,23 +40,30 @@ class RendererMissing(UserWarning):
     """The off-screen renderer does not work on this machine, and matplotlib drew the surface."""
 
 
-def draw(record: Record) -> Figure:
-    """The slice of one record as a surface.  Raises ValueError where none was recorded."""
+def begin(record: Record) -> Future[np.ndarray]:
+    """The renderer's picture of the record's slice, while something else is done; its errors are those of `draw`'s renderer."""
+    pool = ThreadPoolExecutor(1)  # it waits for the renderer's process
+    picture = pool.submit(lambda: _rendered(*_heights(plane(record))))
+    pool.shutdown(wait=False)
+    return picture
+
+
+def draw(record: Record, picture: Future[np.ndarray] | None = None) -> Figure:
+    """The slice of one record as a surface.  Raises ValueError where none was recorded.  picture: begun before."""
     field = plane(record)
     low, high = float(field.change.min()), float(field.change.max())
     span = high - low if high > low else 1.0
     ticks = np.asarray(MaxNLocator(5).tick_values(low, low + span))
     ticks = ticks[(ticks >= low) & (ticks <= low + span)]
-    heights = ((field.change - low) / span).filled(np.nan)
     with style():
         figure = new_figure(2.6)
         try:
-            image = _rendered(heights, (np.asarray(MaxNLocator(LEVELS).tick_values(low, low + span)) - low) / span)
+            image = (begin(record) if picture is None else picture).result()
         except RuntimeError as error:
             warnings.warn(
                 f"matplotlib drew the surface, because the off-screen renderer failed: {error}", RendererMissing, 2
             )
-            image = _drawn_by_matplotlib(heights)
+            image = _drawn_by_matplotlib(_heights(field)[0])
             figure.supxlabel("drawn without the off-screen renderer (not available)", fontsize=6, color=VERMILION)
         axes = figure.subplots()
         axes.imshow(image, extent=(0, 1, 0, 1), interpolation="antialiased")
@@ -68,6 +76,14 @@ def draw(record: Record) -> Figure:
         flat = "" if high > low else "\nthe loss is the same at every point"
         figure.suptitle(f"Curvature along {curvatures}{flat}", fontsize=7)
     return figure
+
+
+def _heights(field: Plane) -> tuple[np.ndarray, np.ndarray]:
+    """The change of the loss from 0 to 1, nan where there is none, and the levels of the contour lines."""
+    low, high = float(field.change.min()), float(field.change.max())
+    span = high - low if high > low else 1.0
+    levels = (np.asarray(MaxNLocator(LEVELS).tick_values(low, low + span)) - low) / span
+    return ((field.change - low) / span).filled(np.nan), levels
 
 
 def _rendered(heights: np.ndarray, levels: np.ndarray) -> np.ndarray:

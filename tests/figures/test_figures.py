@@ -1,6 +1,7 @@
 import math
 import subprocess
 import sys
+import threading
 import warnings
 
 import numpy as np
@@ -181,6 +182,22 @@ def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypat
     with pytest.warns(surface.RendererMissing, match="no OpenGL here"):
         figure = surface.draw(record)
     assert "without the off-screen renderer" in figure.get_supxlabel()
+
+
+def test_the_surface_is_rendered_while_the_other_figures_are_drawn(tmp_path, monkeypatch):
+    record, at_work = recorded(tmp_path / "probe", *synthetic()), threading.Event()
+
+    def rendered(heights, levels):
+        at_work.set()
+        return np.ones((30, 30, 4))
+
+    def first(record):
+        assert at_work.wait(20)
+        return traces.draw(record)
+
+    monkeypatch.setattr(surface, "_rendered", rendered)
+    monkeypatch.setitem(make_all.FIGURES, "traces", first)
+    assert {path.stem for path in make_all.draw_probe(record.folder)} == {"traces", "spectrum", "slice2d", "surface"}
 
 
 def test_pyvista_renders_the_field_where_the_labels_are_put(tmp_path):
