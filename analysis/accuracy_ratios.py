@@ -65,12 +65,19 @@ class Curve:
 def needed(errors: np.ndarray, costs: np.ndarray, goal: float) -> tuple[float, str]:
     """What a method needs for an error, and whether that is exact (""), an upper (">=" of a ratio) or a lower bound ("<=").
 
+    It has an error where none of its costlier settings has a larger one: see `analysis.accuracy`.
+
     >>> errors, costs = np.array([1e-1, 1e-3]), np.array([10.0, 1000.0])
     >>> needed(errors, costs, 1e-2)[0].round(9), needed(errors, costs, 0.5), needed(errors, costs, 1e-9)
     (np.float64(100.0), (10.0, '≥'), (1000.0, '≤'))
+    >>> needed(np.array([1e-2, 1e-1, 1e-3]), np.array([1.0, 10.0, 1000.0]), 1e-2)[0].round(9)  # at 1 by chance
+    np.float64(100.0)
     """
     order = np.argsort(costs)
-    costs, errors = costs[order], np.minimum.accumulate(errors[order])
+    costs, errors = costs[order], errors[order]
+    worst = np.maximum.accumulate(np.where(np.isfinite(errors), errors, 0.0)[::-1])[::-1]
+    # a setting that failed says nothing of the cheaper ones, and costs what it costs for their error
+    errors = np.minimum.accumulate(np.where(np.isfinite(errors), worst, np.inf))
     if goal >= errors[0]:
         return float(costs[0]), "≥" if goal > errors[0] else ""
     if goal < errors[-1]:

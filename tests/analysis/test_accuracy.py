@@ -304,9 +304,13 @@ def test_errors_below_the_round_off_count_as_it():
     assert points(table, {"c": 1e-6})["true_error"].tolist() == [1e-6] * 3
 
 
-def test_errors_only_count_downwards():
-    errors, costs = np.array([1e-1, 1e-3, 1e-2]), np.array([10.0, 100.0, 1000.0])
-    assert needed(errors, costs, 1e-3) == (pytest.approx(100.0), "")
+def test_a_setting_counts_with_the_largest_error_of_the_costlier_ones():
+    costs = np.array([10.0, 100.0, 1000.0])
+    lucky = np.array([1e-1, 1e-3, 1e-2])
+    assert needed(lucky, costs, 1e-2) == (pytest.approx(100.0), "")
+    assert needed(lucky, costs, 1e-3) == (1000.0, "≤")
+    failed = np.array([1e-1, 1e-3, np.inf])  # what failed with more work says nothing of less
+    assert needed(failed, costs, 1e-3) == (pytest.approx(100.0), "")
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
