@@ -3,8 +3,8 @@
     linearise           every view held still
     checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
     traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
-    eigenvalues         Lanczos: the two largest and the smallest
-    power iteration     both ends as the paper takes them
+    eigenvalues         Lanczos from the steepest directions of single Gaussians: the two largest and the smallest
+    power iteration     both ends as the paper takes them; not in a quick probe, whose few products do not take it there
     density             stochastic Lanczos quadrature, for sums and quantiles of |lambda|
     finite probe        the second difference of the loss along the first eigenvector, over a range of steps
     slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
@@ -53,6 +53,7 @@ from landscape.results import Progress
 from splat.curvature import SceneHessian, SceneObjective
 from splat.device import by_triton
 from splat.losses import LossSettings
+from splat.own_directions import steepest_own
 from splat.raster.threads import single_threaded, thread_count
 from splat.traces import exact_traces
 
@@ -70,19 +71,23 @@ class ProbeSettings:
     """How much of everything.
 
     slice_radius: half the slice's side, in curvature units, sqrt(2 rise / lambda); slice_rise: that rise of the loss, as
-    a share of the loss.  probe_steps: of the finite probe, parameter units.  seconds: for all estimators together.
-    memory: GiB for the vectors of a basis.
+    a share of the loss; slice_tolerance: of what lies between its renders, as a share of its range.  probe_steps: of the
+    finite probe, parameter units; noise_points: its renders that tell their noise.  timings: of each product that tells what a
+    skip saves.  seconds: for all estimators together.  memory: GiB for the vectors of a basis.
     """
 
     traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.01, max_probes=128))
     eigen: EigenSettings = field(default_factory=lambda: EigenSettings(largest=2, smallest=1, max_matvecs=150))
-    power: PowerSettings = field(default_factory=lambda: PowerSettings(max_matvecs=40))
+    power: PowerSettings | None = field(default_factory=lambda: PowerSettings(max_matvecs=40))
     density_starts: int = 4
     density_steps: int = 24
     slice_points: int = 41
     slice_radius: float = 3.0
     slice_rise: float = 0.001
+    slice_tolerance: float = 0.01
     probe_steps: tuple[float, ...] = STEPS
+    noise_points: int = NOISE_POINTS
+    timings: int = 3
     seconds: float = 45.0
     memory: float = 2.0
 
@@ -98,15 +103,18 @@ class ProbeSettings:
 
     @classmethod
     def quick(cls) -> "ProbeSettings":
-        """Rough numbers in about a third of the time."""
+        """Numbers to 10% in about a third of the time."""
         return cls(
             traces=TraceSettings(rtol=0.1, max_probes=16),
-            eigen=EigenSettings(largest=2, smallest=1, rtol=1e-2, max_matvecs=60),
-            power=PowerSettings(rtol=1e-2, max_matvecs=10),
+            eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=60),
+            power=None,
             density_starts=2,
-            density_steps=10,
+            density_steps=8,
             slice_points=11,
+            slice_tolerance=0.1,
             probe_steps=STEPS[::5],
+            noise_points=8,
+            timings=1,
             seconds=12.0,
         )
 
@@ -122,7 +130,7 @@ class PlaneSlice:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What was measured; density, finite and plane are None where a note says why.
+    """What was measured; density, finite and plane are None where a note says why, power where it was not asked for.
 
     matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
     of the directions that are not exactly flat.
@@ -134,7 +142,7 @@ class Findings:
     gradient_check: DerivativeCheck
     traces: dict[str, TraceEstimate]
     ends: EigenEnds
-    power: EigenEnds
+    power: EigenEnds | None
     density: SpectralDensity | None
     finite: FiniteProbe | None
     plane: PlaneSlice | None
@@ -159,18 +167,21 @@ def measure(
     with stage("checks") as report:
         operator_check = check_operator(operator, split(generator))
         gradient_check = check_against_gradient(objective, loss, split(generator), report)
-    budget = _Budget(settings.seconds)
+    budget = _Budget(settings)
     streams = {name: split(generator) for name in SHARES}
     with stage("traces") as report:
         allowed = replace(settings.traces, max_seconds=budget.share("traces"))
         traces = exact_traces(objective, streams["traces"], allowed, report)
     with stage("eigenvalues") as report:
         eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
-        basis = _basis(operator, eigen, settings.memory, notes)
-        ends = extreme_eigenpairs(operator, streams["eigenvalues"], replace(eigen, basis=basis), progress=report)
-    with stage("power iteration") as report:
-        each = replace(settings.power, max_seconds=budget.share("power iteration") / 2)
-        power = power_ends(operator, streams["power iteration"], each, report)
+        eigen = replace(eigen, basis=_basis(operator, eigen, settings.memory, notes))
+        start = steepest_own(objective, eigen.largest, eigen.smallest)
+        ends = extreme_eigenpairs(operator, streams["eigenvalues"], eigen, start, report)
+    power = None
+    if settings.power is not None:
+        with stage("power iteration") as report:
+            each = replace(settings.power, max_seconds=budget.share("power iteration") / 2)
+            power = power_ends(operator, streams["power iteration"], each, report)
     with stage("density") as report:
         seconds = budget.share("density")
         active = ActiveSpace(hessian.project, hessian.rank)
@@ -202,8 +213,10 @@ def measure(
 class _Budget:
     """Divides the time that is left among the stages to come, in proportion to their shares."""
 
-    def __init__(self, seconds: float) -> None:
-        self.end, self.to_come = monotonic() + seconds, dict(SHARES)
+    def __init__(self, settings: ProbeSettings) -> None:
+        self.end, self.to_come = monotonic() + settings.seconds, dict(SHARES)
+        if settings.power is None:
+            del self.to_come["power iteration"]
 
     def share(self, stage: str) -> float:
         part = self.to_come[stage] / sum(self.to_come.values())
@@ -284,11 +297,13 @@ def _finite(
     notes: list[str],
 ) -> FiniteProbe | None:
     """Along the first eigenvector; None where its renders, of so many seconds each, would take longer than they may."""
-    if (2 * len(settings.probe_steps) + NOISE_POINTS + 1) * render > max(seconds, SHORTEST):
+    if (2 * len(settings.probe_steps) + settings.noise_points + 1) * render > max(seconds, SHORTEST):
         notes.append("the finite probe was left out: its renders would have taken more than its share of the time")
         return None
     center, vector = objective.active.flat, ends.largest.vectors[:, 0]
-    return finite_probe(objective.evaluate, center, vector, operator, settings.probe_steps, report)
+    return finite_probe(
+        objective.evaluate, center, vector, operator, settings.probe_steps, report, settings.noise_points
+    )
 
 
 def _plane(
@@ -314,7 +329,7 @@ def _plane(
     axes = [symmetric_axis(settings.slice_radius * unit, points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
     workers = 1 if objective.collective or by_triton(center) else thread_count()
-    allowed = SliceSettings(workers=workers, max_seconds=max(seconds, SHORTEST))
+    allowed = SliceSettings(settings.slice_tolerance, workers=workers, max_seconds=max(seconds, SHORTEST))
     evaluate = evaluation(objective, allowed.workers)
     plane = evaluate_slice(evaluate, center, vectors, axes, gradient, operator, allowed, generator, progress=report)
     notes += slice_notes(plane)

@@ -9,13 +9,12 @@ from dataclasses import asdict, replace
 from math import inf, isfinite
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from rich.console import Console
 
-from analysis.family_stage import FamilyOptions, measure_families
 from analysis.family_table import family_table
 from analysis.measurement import ProbeSettings, measure
 from analysis.options import ProbeOptions
@@ -37,6 +36,9 @@ from splat.device import device_named
 from splat.distributed import DistributedObjective
 from splat.raster.simd import lanes_of
 from splat.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from analysis.family_stage import FamilyOptions
 
 CHECK_FAILED = 1
 
@@ -74,12 +76,15 @@ def _run(options: ProbeOptions, command: Sequence[str], device: torch.device, ra
         findings = measure(objective, loss, settings, generator, stages.stage)
         data = probe_data(findings, objective, loss)
         with stages.stage("skips"):
-            skips = product_skips(objective, checkpoint.training.gaussians, findings.matvecs, findings.spared)
+            gaussians, made = checkpoint.training.gaussians, (findings.matvecs, findings.spared)
+            skips = product_skips(objective, gaussians, *made, repetitions=settings.timings)
             skips |= estimator_skips(findings, stages.timing)
             data["skipped"] = {name: skip.record() for name, skip in skips.items()}
         data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
         arrays = probe_arrays(findings)
         if family_options is not None:
+            from analysis.family_stage import measure_families
+
             found = measure_families(objective, checkpoint.training, family_options, split(generator), stages.stage)
             data |= found.record()
             data["notes"] += found.notes
@@ -120,10 +125,12 @@ def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:
     return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=seconds)
 
 
-def _family_options(options: ProbeOptions) -> FamilyOptions | None:
+def _family_options(options: ProbeOptions) -> "FamilyOptions | None":
     """None where no families are asked for; the split control and a metric ask for them too."""
     if not (options.families or options.split_control or options.metric != "parameters"):
         return None
+    from analysis.family_stage import FamilyOptions  # a fifth of a second of imports
+
     return FamilyOptions(options.metric, options.split_control, seconds=options.family_seconds)
 
 

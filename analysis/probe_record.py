@@ -86,8 +86,9 @@ def _eigenvalues(findings: Findings, objective: SceneObjective) -> dict[str, dic
     for name, (pairs, index) in exact.items():
         where = localize(pairs.vectors[:, index], gaussians, needles)
         rows[name] = {**_pair(ends, pairs, index, gaussians.blocks), "lives_on": where.record()}
-    rows["power_max"] = _pair(power, power.largest, 0, gaussians.blocks)
-    rows["power_min"] = _pair(power, power.smallest, 0, gaussians.blocks)
+    if power is not None:
+        rows["power_max"] = _pair(power, power.largest, 0, gaussians.blocks)
+        rows["power_min"] = _pair(power, power.smallest, 0, gaussians.blocks)
     return rows
 
 
@@ -104,15 +105,16 @@ def _quantiles(density: SpectralDensity | None) -> dict[str, dict[str, Any]] | N
 
 
 def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
-    """The family from the Lanczos ends; the literal index is the paper's, from its power iteration."""
+    """The family from the Lanczos ends; the literal index is the paper's, from its power iteration, where that was run."""
     family: dict[str, Any] = anisotropy(findings.ends, findings.density).record()
-    certain, paper = literal(findings.ends), literal(findings.power)
-    note = "by power iteration, as the paper takes it; the bracket is that of Lanczos"
-    if paper.value is None or not certain.low <= paper.value <= certain.high:
-        note = "by power iteration, which did not arrive; the bracket is that of Lanczos"
-    if certain.note not in ("definite", "indefinite"):
-        note += f" ({certain.note})"
-    family["literal"] = {**certain.record(), "value": paper.record()["value"], "note": note}
+    if findings.power is not None:
+        certain, paper = literal(findings.ends), literal(findings.power)
+        note = "by power iteration, as the paper takes it; the bracket is that of Lanczos"
+        if paper.value is None or not certain.low <= paper.value <= certain.high:
+            note = "by power iteration, which did not arrive; the bracket is that of Lanczos"
+        if certain.note not in ("definite", "indefinite"):
+            note += f" ({certain.note})"
+        family["literal"] = {**certain.record(), "value": paper.record()["value"], "note": note}
     left_out = {"value": None, "low": None, "high": None, "note": "needs the spectral density, which was left out"}
     return {**family, **{name: left_out for name in ("share", "effective_rank", "mass_quantile") if name not in family}}
 

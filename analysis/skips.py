@@ -35,11 +35,13 @@ class Skip:
         return {"count": self.count, "seconds_saved": self.seconds}
 
 
-def product_skips(objective: SceneObjective, gaussians: Gaussians, products: int, spared: int) -> dict[str, Skip]:
+def product_skips(
+    objective: SceneObjective, gaussians: Gaussians, products: int, spared: int, repetitions: int = REPETITIONS
+) -> dict[str, Skip]:
     """What every product of the exact Hessian leaves out.
 
     gaussians: those of the checkpoint; products: H v made; spared: products of single views that `SceneHessian` left out.
-    On the GPU nothing is timed against what it leaves out, and nothing returned.
+    repetitions: of each timing.  On the GPU nothing is timed against what it leaves out, and nothing returned.
     """
     if by_triton(objective.active.flat):
         return {}
@@ -59,7 +61,7 @@ def product_skips(objective: SceneObjective, gaussians: Gaussians, products: int
     }
     views = {"": held, **{name: make() for name, make in variants.items() if counts[name]}}
     calls = {name: partial(view.hvp, _vector(view)) for name, view in views.items()}
-    times = {name: time.minimum for name, time in interleaved(calls, REPETITIONS).items()}
+    times = {name: time.minimum for name, time in interleaved(calls, repetitions).items()}
     made = products * objective.counts.views
     skips = {
         name: Skip(count, max(times[name] - times[""], 0.0) * made if count else 0.0) for name, count in counts.items()

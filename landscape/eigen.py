@@ -47,7 +47,9 @@ NEAREST = (
     3e-4  # of the largest value: root of the eps of float32, which a product's rounding stays below in either precision
 )
 PAIRS = 10  # from which it can be told
-WARM_NOISE = 0.01  # share of a random vector in a warm start: an end that the old vectors miss is still found
+WARM_NOISE = (
+    1.0  # length of a random vector beside a given start of unit length: an end that this misses is still found
+)
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ def extreme_eigenpairs(
     """The largest and smallest eigenvalues with vectors and residuals.
 
     start: vectors to begin from (those of an earlier checkpoint, say); the recurrence begins at the sum of their
-    directions with a little noise.  Progress counts matvecs.
+    directions with a random vector of WARM_NOISE of its length.  Progress counts matvecs.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.linspace(-1, 3, 50, dtype=torch.float64)))
@@ -184,11 +186,12 @@ class _Krylov:
             0,
             0.0,
         )  # components that were known before, and the sum of squares that they are off by
-        self.random_start, self.first_cycle = start is None, 0
+        self.random_share, self.first_cycle = 1.0, 0
         first = draw_probes(operator.dim, min(settings.block, self.capacity), generator, operator.dtype)
         self.basis = first.new_empty(self.capacity + settings.block, operator.dim)
         if start is not None:
             first[:, 0] = _mixed(start, first[:, 0])
+            self.random_share = WARM_NOISE / (1 + WARM_NOISE)
         self._append(first.T.contiguous())
         self.foreseen = torch.zeros(0, self.width, dtype=torch.float64)
         self.noise, self.matvecs, self._restarted = nan, 0, False
@@ -321,9 +324,8 @@ class _Krylov:
             pairs = [quantity[part][order] for quantity in (values, residuals, errors)]
             return Eigenpairs(pairs[0], vectors[:, part][:, order], pairs[1], pairs[2], reason)
 
-        beyond = inf
-        if self.random_start:
-            beyond = _beyond(self.operator.dim, self.first_cycle, float(ritz.values[-1] - ritz.values[0]))
+        spread = float(ritz.values[-1] - ritz.values[0])
+        beyond = _beyond(self.operator.dim, self.first_cycle, spread, self.random_share)
         largest, smallest = end(slice(0, s.largest), True), end(slice(s.largest, s.wanted), False)
         spectrum = torch.stack([ritz.values, ritz.residuals])
         noise = self.seen_noise if isnan(self.noise) else self.noise
@@ -367,13 +369,15 @@ def _mixed(start: Tensor, random: Tensor) -> Tensor:
     return total / norm(total) + WARM_NOISE * random / norm(random)
 
 
-def _beyond(n: int, steps: int, spread: float) -> float:
+def _beyond(n: int, steps: int, spread: float, share: float = 1.0) -> float:
     """How far outside the Ritz values the spectrum may reach, with probability 0.99 over a random start.
 
     Kuczynski and Wozniakowski (1992), Theorem 4.2: after m steps the end is missed by more than the share eps of the
-    spectrum's width with probability at most 1.648 sqrt(n) exp(-sqrt(eps) (2 m - 1)).
+    spectrum's width with probability at most 1.648 sqrt(n) exp(-sqrt(eps) (2 m - 1)).  Beside a random vector of this share of
+    the start's length a given one costs a factor of 1 / share: it lengthens the start, and the end's component of the sum is
+    no likelier to be small than that of the random vector alone, whose density is symmetric and falls from 0 on.
     """
     if steps >= n:
         return 0.0
-    eps = (log(2 * 1.648 * sqrt(n) / 0.01) / (2 * steps - 1)) ** 2
+    eps = (log(2 * 1.648 * sqrt(n) / (0.01 * share)) / (2 * steps - 1)) ** 2
     return eps / (1 - 2 * eps) * spread if eps < 0.5 else inf

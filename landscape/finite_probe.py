@@ -80,8 +80,9 @@ def finite_probe(
     operator: SymmetricOperator,
     steps: Sequence[float] = STEPS,
     progress: Progress | None = None,
+    noise_points: int = NOISE_POINTS,
 ) -> FiniteProbe:
-    """Probe along direction, for one matvec and 2 len(steps) + 25 evaluations; loss as for `evaluate_slice`.
+    """Probe along direction, for one matvec and 2 len(steps) + 1 + noise_points evaluations; loss as for `evaluate_slice`.
 
     >>> from landscape.operator import DenseOperator
     >>> found = finite_probe(lambda x: (x**4).sum(), torch.ones(1, dtype=torch.float64), torch.ones(1),
@@ -91,7 +92,7 @@ def finite_probe(
     """
     _require_probe(center, direction, steps)
     origin, v = center.detach().double(), direction.detach().double()
-    done, total, resolution = 0, 2 * len(steps) + 1 + NOISE_POINTS, torch.finfo(torch.float64).eps
+    done, total, resolution = 0, 2 * len(steps) + 1 + noise_points, torch.finfo(torch.float64).eps
 
     def at(step: float) -> tuple[float, object]:
         nonlocal done, resolution
@@ -110,7 +111,7 @@ def finite_probe(
     # theta_i / v_i, weighted by v_i^4: of the parameters that make up the direction
     rounding = torch.finfo(center.dtype).eps * float((origin * v).norm() / v.square().norm())
     spacing = max(steps[0] / CLOSER, ROUNDINGS * rounding)
-    close = [at((k - (NOISE_POINTS - 1) / 2) * spacing)[0] for k in range(NOISE_POINTS)]
+    close = [at((k - (noise_points - 1) / 2) * spacing)[0] for k in range(noise_points)]
     noise = max(evaluation_noise(close), resolution * abs(middle))
     ends = [(at(step), at(-step)) for step in steps]
     d = torch.tensor(steps, dtype=torch.float64)

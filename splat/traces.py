@@ -21,7 +21,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.control import controlled
-from landscape.hutchinson import WIDENING, Looks, TraceSettings
+from landscape.hutchinson import CONFIRMATION, WIDENING, Looks, TraceSettings
 from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, TraceEstimate, t_quantile
 from splat.curvature import SceneObjective
@@ -82,7 +82,9 @@ class _Block:
         self.name, self.dim, self.settings, self.first, self.most = name, dim, settings, first, most
         self.exact, self.mean = known - pixelwise, pixelwise
         self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
-        self.looks, self.open, self.late = Looks(first, most), True, False
+        # a run may end at `first` samples: where the tolerance holds there and held CONFIRMATION earlier
+        look = most if first == most else max(first - CONFIRMATION, LEAST_SAMPLES)
+        self.looks, self.open, self.late = Looks(look, most), True, False
 
     @property
     def count(self) -> int:

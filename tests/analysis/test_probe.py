@@ -262,6 +262,7 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     said = capsys.readouterr()
     data = read_record(run / "probe").data
     assert data["provenance"]["dtype"] == "float32" and data["slice"]["points"] == 121
+    assert set(data["eigenvalues"]) == {"max", "second", "min"} and "power iteration" not in said.out
     for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
         assert f"trace of {label}" in said.out
     for label in ("largest eigenvalue", "smallest eigenvalue", "literal", "saddle", "check: symmetry"):

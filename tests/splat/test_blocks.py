@@ -152,6 +152,14 @@ def test_intervals_of_fixed_and_adaptive_budgets_cover_over_two_hundred_runs(noi
             assert 0.895 <= covered / 200 <= 0.99, (name, settings, most, covered)
 
 
+@pytest.mark.parametrize("fewest", [8, 12])
+def test_a_run_may_end_at_its_fewest_samples_and_never_before(fewest: int) -> None:
+    objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise=0.1)
+    settings = TraceSettings(rtol=0.0, atol=1e9, min_probes=fewest)
+    found = exact_traces(objective, torch.Generator().manual_seed(0), settings)
+    assert {estimate.probes for estimate in found.values()} == {fewest}
+
+
 def test_every_view_draws_signs_of_its_own() -> None:
     """The variance of a sum over two views that are alike is that of one view's doubled, not its fourfold."""
     objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise=0.1)
