@@ -16,7 +16,6 @@ says which.  Time that a stage leaves goes to the later ones.  The numbers depen
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
-from math import isqrt
 from time import monotonic
 
 import torch
@@ -60,6 +59,7 @@ from splat.traces import exact_traces
 GIB = 2**30
 FEWEST_STEPS, FEWEST_POINTS = 8, 5  # of a density and along a side of a slice that are worth their time
 FEWEST_STARTS = 2  # of a density: its spread is an error
+FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
 FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds
 # shares of the time; measured on 8,000 Gaussians in 3 views of 504 x 378 pixels
@@ -320,16 +320,15 @@ def _plane(
     notes: list[str],
 ) -> PlaneSlice | None:
     center, loss_scale = objective.active.flat, settings.slice_rise * value
-    points = _side(settings.slice_points, seconds, render, notes)
     curvatures: Float64[Tensor, 2] = ends.largest.values[:2]
     if loss_scale <= 0 or not curvatures.all():
         notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")
         return None
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
-    axes = [symmetric_axis(settings.slice_radius * unit, points) for unit in (first, second)]
+    axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
     workers = 1 if objective.collective or by_triton(center) else thread_count()
-    allowed = SliceSettings(settings.slice_tolerance, workers=workers, max_seconds=max(seconds, SHORTEST))
+    allowed = _within(settings, seconds, render, workers)
     evaluate = evaluation(objective, allowed.workers)
     plane = evaluate_slice(evaluate, center, vectors, axes, gradient, operator, allowed, generator, progress=report)
     notes += slice_notes(plane)
@@ -355,12 +354,11 @@ def slice_notes(found: Slice) -> list[str]:
     return [f"the slice's interpolation stopped at its {found.reason}, before its error was down to the tolerance"]
 
 
-def _side(points: int, seconds: float, each: float, notes: list[str]) -> int:
-    """The odd number of points along a side: as asked for, or with less time than an adaptive slice takes, such that all of
-    them, at so many seconds a point, stay within the time."""
-    if min(points * points, FEWEST_RENDERS) * each <= seconds:
-        return points
-    side = isqrt(int(seconds / each))
-    side = max(FEWEST_POINTS, side - 1 + side % 2)
-    notes.append(f"the slice took {side} x {side} points instead of {points} x {points}, to stay within its time")
-    return side
+def _within(settings: ProbeSettings, seconds: float, each: float, workers: int) -> SliceSettings:
+    """Adaptive, on all points asked for: with less time than that takes, at so many seconds a render, a quarter of the renders
+    is held out, and refinement decides as often."""
+    points, tolerance, limit = settings.slice_points**2, settings.slice_tolerance, max(seconds, SHORTEST)
+    if min(points, FEWEST_RENDERS) * each <= seconds:
+        return SliceSettings(tolerance, workers=workers, max_seconds=limit)
+    few = max(FEWEST_HELD_OUT, int(seconds / each / 4))
+    return SliceSettings(tolerance, holdout=few, batch=few, workers=workers, max_seconds=limit)
