@@ -34,6 +34,7 @@ from splat.scenes.view import Frame, Picture, Subset
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 UNDISTORTED_HERE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+SMALLEST = 4  # px a side of a reduced picture; smaller ones are a slip of the factor
 INSIDE = 1 - 1e-4  # share of a pixel's footprint that must be; below 1 by more than float32 sums can lose
 Warp = Callable[[Float[Tensor, "c h w"]], Float[Tensor, "c height width"]]
 
@@ -123,6 +124,11 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
     lens = _scaled_to(photo.lens, size, photo)
     pinhole = _pinhole(lens, photo)
     width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
+    if downscale > 1 and min(width, height) < SMALLEST:
+        raise ValueError(
+            f"expected pictures of at least {SMALLEST} px a side, got {width} x {height} px for {photo.name!r} at downscale "
+            f"{downscale:g}; reduce less"
+        )
     fx, fy, cx, cy = pinhole.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     try:
         full = Camera(photo.rotation, photo.centre, fx, fy, cx, cy, pinhole.width, pinhole.height)

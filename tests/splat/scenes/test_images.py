@@ -97,6 +97,12 @@ def test_downscale_rounds_the_size_and_keeps_the_field_of_view(tmp_path: Path) -
     assert camera.fy / camera.height == pytest.approx(FOCAL[1] / SIZE[1], rel=folders.ROUND_OFF)
 
 
+def test_a_downscale_that_leaves_no_picture_is_refused(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)  # 24 x 18 px
+    with pytest.raises(ValueError, match=r"at least 4 px a side, got 4 x 3 px for 'images/a.png' at downscale 6"):
+        load_scene(tmp_path, downscale=6)
+
+
 def test_transparent_pixels_show_the_background_and_never_their_own_colour(tmp_path: Path) -> None:
     folders.write_transforms(tmp_path)
     pixels = np.zeros((SIZE[1], SIZE[0], 4), dtype=np.uint8)
