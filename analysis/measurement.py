@@ -63,7 +63,7 @@ FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
 FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds
 # shares of the time; measured on 8,000 Gaussians in 3 views of 504 x 378 pixels
-SHARES = {"traces": 4.0, "eigenvalues": 4.0, "power iteration": 2.0, "density": 3.0, "finite probe": 1.0, "slice": 4.0}
+SHARES = {"traces": 4.0, "eigenvalues": 4.0, "power iteration": 2.0, "density": 3.0, "finite probe": 2.0, "slice": 4.0}
 
 
 @dataclass(frozen=True)
