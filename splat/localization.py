@@ -103,7 +103,7 @@ def conditions(
     """The condition numbers of every Gaussian's splats, in double precision."""
     gaussians = gaussians.to(torch.float64)
     unblurred = replace(settings, blur=0.0)
-    rendered, bare = (torch.ones(len(gaussians), dtype=torch.float64) for _ in range(2))
+    rendered, bare = (gaussians.flat.new_ones(len(gaussians)) for _ in range(2))
     for camera in cameras:
         shown = on_screen(project(gaussians, camera, settings), camera)
         for worst, how in ((rendered, settings), (bare, unblurred)):

@@ -9,6 +9,7 @@ import torch
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from splat.curvature import SceneHessian, SceneObjective
+from splat.localization import conditions, localize
 from splat.losses import LossSettings
 from splat.train import Training, train
 from tests.splat.held_scenes import BACKGROUND, two_views
@@ -66,4 +67,5 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         hessian.apply(V)
         assert not +placed.waits
         _ = objective.gradient, objective.block_diagonal(), objective.loss(flat)
+        localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
     assert not +placed.mixed
