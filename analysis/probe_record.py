@@ -1,6 +1,7 @@
 """What a probe found as the `data` and `arrays` of a record (the keys are those of `analysis.records`)."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from math import isnan, sqrt
 from typing import Any
 
@@ -105,18 +106,22 @@ def _quantiles(density: SpectralDensity | None) -> dict[str, dict[str, Any]] | N
 
 
 def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
-    """The family from the Lanczos ends; the literal index is the paper's, from its power iteration, where that was run."""
     family: dict[str, Any] = anisotropy(findings.ends, findings.density).record()
     if findings.power is not None:
-        certain, paper = literal(findings.ends), literal(findings.power)
-        note = "by power iteration, as the paper takes it; the bracket is that of Lanczos"
-        if paper.value is None or not certain.low <= paper.value <= certain.high:
-            note = "by power iteration, which did not arrive; the bracket is that of Lanczos"
-        if certain.note not in ("definite", "indefinite"):
-            note += f" ({certain.note})"
-        family["literal"] = {**certain.record(), "value": paper.record()["value"], "note": note}
+        family["literal"] = literal_index(findings.ends, findings.power)
     left_out = {"value": None, "low": None, "high": None, "note": "needs the spectral density, which was left out"}
     return {**family, **{name: left_out for name in ("share", "effective_rank", "mass_quantile") if name not in family}}
+
+
+def literal_index(ends: EigenEnds, power: EigenEnds) -> dict[str, Any]:
+    """The paper's index from its power iteration, where that arrived within what Lanczos is certain of; else Lanczos' own."""
+    certain, paper = literal(ends), literal(power)
+    value, note = paper.value, "by power iteration, as the paper takes it; the bracket is that of Lanczos"
+    if value is None or not certain.low <= value <= certain.high:
+        value, note = certain.value, "by Lanczos: the paper's power iteration did not arrive"
+    if certain.note not in ("definite", "indefinite"):
+        note += f" ({certain.note})"
+    return {**replace(certain, value=value).record(), "note": note}
 
 
 def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> dict[str, Any]:

@@ -100,9 +100,7 @@ class CudaLinearizedView:
 
     def hvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """H U of the view's loss."""
-        tangent = self._tangent(U)
-        cotangents = self._loss.hvp(tangent.planes, out=tangent.planes)
-        return self._projection.pull(tangent.curvature(self._adjoint, cotangents), U.detach())
+        return self._projection.pull(self._curved(U), U.detach())
 
     def ggn(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """G U, the Gauss-Newton part of H U."""
@@ -119,6 +117,11 @@ class CudaLinearizedView:
         images, products = planes[:, :3].double(), self._loss.hvp(planes)[:, :3]
         full = (images * products).sum(dim=(1, 2, 3))
         return full, (images.square() * self._loss.diagonal).sum(dim=(1, 2, 3))
+
+    def _curved(self, U: Tensor) -> Tensor:
+        """The tangent of the splats' adjoint, (n, K, 9); all else that it takes is free again before the result is made."""
+        tangent = self._tangent(U)
+        return tangent.curvature(self._adjoint, self._loss.hvp(tangent.planes, out=tangent.planes))
 
     def _tangent(self, U: Tensor) -> CudaTangent:
         return self._raster.jvp(self._projection.jvp(U.detach()))

@@ -76,7 +76,7 @@ def test_dtu_in_its_own_folders_has_the_cameras_of_its_matrices_and_its_masks(
         np.testing.assert_allclose(camera.centre.numpy(), centre, atol=1e-8)
         np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (*FOCAL, *CENTRE), rtol=1e-11)
     assert [i for i in range(views) if scene.frames[i].view().mask is not None] == list(TEST)
-    assert in_left_half(scene, 1) and in_left_half(load_scene(scene.root, downscale=4), 47)
+    assert in_left_half(scene, 1) and in_left_half(load_scene(scene.root, downscale=2), 47)
 
 
 @pytest.mark.parametrize("scale", [1.0, -1.0, 1e-3, -40.0])
