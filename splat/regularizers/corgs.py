@@ -86,6 +86,7 @@ class CoRegularizer(Regularizer):
             seed = int(torch.randint(2**63 - 1, (), generator=self.generator))
             config = replace(training.config, seed=seed, method=ThreeDGS())
             self.partner = type(training).start(training.gaussians, training.extent, config)
+        self.partner.move(training.gaussians.flat.device)  # one that was restored is on the CPU
 
     def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
         """The first field's; the partner makes its whole step here."""

@@ -54,6 +54,16 @@ def test_with_neither_term_the_first_field_is_that_of_3dgs():
     assert torch.equal(training.gaussians.flat, plain.gaussians.flat)
 
 
+def test_a_partner_that_was_restored_goes_on_where_the_first_field_is():
+    training, regularizer, _ = trained(replace(tiny_config(), method=TOGETHER))
+    training.move(torch.device("meta"))
+    regularizer.begin(training, tiny_views())
+    partner = regularizer.partner
+    assert partner is not None
+    flats = partner.gaussians.flat, partner.adam.first.flat, partner.adam.second.flat, partner.screen_gradients.total
+    assert all(flat.device.type == "meta" for flat in flats)
+
+
 def test_the_fields_are_the_same_until_each_draws_its_own_splits():
     training, regularizer, _ = trained(replace(tiny_config(), method=APART, densify=DensifySettings(enabled=False)))
     assert regularizer.partner is not None and regularizer.partner.step == training.step
