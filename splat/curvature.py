@@ -89,9 +89,8 @@ class SceneObjective:
         gaussians.require_finite()
         flat, degree = gaussians.flat, gaussians.sh_degree if sh_degree is None else sh_degree
         self.views = tuple(views)
-        self.settings = replace(
-            settings, sums="ordered"
-        )  # products are repeatable, however the training's steps were made
+        # products are repeatable, however the training's steps were made
+        self.settings = replace(settings, sums="ordered")
         self.background = flat.new_zeros(3) if background is None else background.to(flat)
         self.couples_pixels = loss.ssim_weight > 0
         self._losses = [loss_against(view.image, loss, flat) for view in views]

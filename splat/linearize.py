@@ -25,10 +25,11 @@ from splat.camera import Camera
 from splat.device import by_triton
 from splat.gaussians import Gaussians
 from splat.losses_cpu import LinearLoss, ViewLoss
-from splat.projection_cpu import lens_of, project_arrays
+from splat.projection_cpu import lens_of
 from splat.projection_linear import Held, Projection, split
 from splat.raster.cpu import Adjoint, Raster
 from splat.raster.formulas import SUMS, TANGENTS, TILE_ROWS
+from splat.raster.functions import held_view, projected
 from splat.settings import RenderSettings
 
 
@@ -37,14 +38,9 @@ def rasterize_view(
 ) -> Any:
     """Project and composite a view by the kernels where the Gaussians are, without derivatives."""
     gaussians.require_finite()
-    background, size = background.to(gaussians.flat, non_blocking=True), (camera.width, camera.height)
-    if by_triton(gaussians.flat):
-        from splat.projection_cuda import project
-        from splat.raster.cuda import CudaRaster
-
-        return CudaRaster(*project(gaussians, lens_of(camera, settings)), background, *size, settings)
-    splats, depths, drawn = project_arrays(gaussians, lens_of(camera, settings))
-    return Raster(splats, depths, drawn, background.numpy(), *size, settings)
+    splats = projected(gaussians, lens_of(camera, settings))
+    background = background.to(gaussians.flat, non_blocking=True)
+    return held_view(*splats, background, camera.width, camera.height, settings)
 
 
 GEOMETRY_COLUMNS = {
