@@ -19,7 +19,6 @@ Where the cap holds, q is constant: only c c is left.
 
 import numpy as np
 
-from splat.raster.compositing import prefetch
 from splat.raster.formulas import (
     CAPPED,
     PARAMS,
@@ -42,7 +41,7 @@ from splat.raster.formulas import (
     store3,
 )
 from splat.raster.jit import formula, kernel
-from splat.raster.simd import broadcast, lanes, load, select, store, store_sums
+from splat.raster.simd import broadcast, lanes, load, prefetch, select, store, store_sums
 from splat.raster.whitening import ROUND, plain_adjoint, put, whitening
 
 AHEAD = 4
