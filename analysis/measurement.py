@@ -103,7 +103,7 @@ class ProbeSettings:
 
     @classmethod
     def quick(cls) -> "ProbeSettings":
-        """Numbers to 10% in about a third of the time."""
+        """Numbers to 10% in less than half of the time."""
         return cls(
             traces=TraceSettings(rtol=0.1, max_probes=16),
             eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=60),
