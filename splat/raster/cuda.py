@@ -213,15 +213,16 @@ class CudaTangent:
         n, K = directions.shape[:2]
         self.planes = raster._empty(K, 4, raster.height, raster.width)
         self._transmittances = raster._empty(K, raster.height, raster.width)
+        self._moves = raster._empty(len(_parts(K)), len(raster._reached), dtype=torch.int32)
         self._packed: list[Tensor] = []
-        for part in _parts(K):
+        for part, moves in zip(_parts(K), self._moves, strict=True):
             size = part.stop - part.start
-            packed = raster._empty(n, size, cuda_packing.TANGENTS)
-            arguments = (raster.splats, self.directions, packed, n, K, part.start, size)
+            packed, moved = raster._empty(n, size, cuda_packing.TANGENTS), raster._empty(n, size, dtype=torch.int8)
+            arguments = (raster.splats, self.directions, packed, moved, n, K, part.start, size)
             launch(cuda_packing.pack_tangents, (*grid(n, BLOCK), size), *arguments, **SPLATS)
             raster._launch(
                 cuda_compositing.tangent, raster.lists.start, raster._reached, raster.lists.splat, raster.params,
-                raster.frame, raster._stop, packed, self.planes[part], self._transmittances[part], K=size,
+                raster.frame, raster._stop, packed, moved, self.planes[part], self._transmittances[part], moves, K=size,
             )  # fmt: skip
             self._packed.append(packed)
 
@@ -232,10 +233,10 @@ class CudaTangent:
         """
         raster, (n, K) = self.raster, self.directions.shape[:2]
         cotangents, product = raster.pad(cotangents), torch.empty_like(self.directions)
-        for packed, part in zip(self._packed, _parts(K), strict=True):
+        for packed, moves, part in zip(self._packed, self._moves, _parts(K), strict=True):
             size = part.stop - part.start
             totals = raster.totals(
-                cuda_compositing.curvature, size, cuda_packing.SUMS, adjoint.cotangent, packed,
+                cuda_compositing.curvature, size, cuda_packing.SUMS, adjoint.cotangent, packed, moves,
                 self._transmittances[part], cotangents[part], K=size,
             )  # fmt: skip
             arguments = (raster.splats, self.directions, adjoint.totals, totals, product, n, K, part.start, size)

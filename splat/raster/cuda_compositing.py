@@ -290,12 +290,29 @@ def tangents_of(tangents, splat, k, K):
     return q, load3(at, 6)
 
 
+@device
+def any_moved(moved, splat_of, first, count, K: tl.constexpr):
+    """Whether any of K tangents moves a splat of a tile's entries; a look at the first few, unless few splats are moved."""
+    k, lane = tl.arange(0, K)[:, None], tl.arange(0, 32)[None, :]
+    done, found = 0, 0
+    while done < count:
+        e = done + lane
+        splat = tl.load(splat_of + first + e, e < count, other=0).to(tl.int64)
+        some = tl.load(moved + splat * K + k, e < count, other=0)
+        found = max_over(max_over(some.to(tl.int32), 1), 0)
+        done = tl.where(found > 0, count, done + 32)
+    return found > 0
+
+
 @jit
 def tangent(
-    order, start, reached, splat_of, params, frame, stop, tangents, planes, transmittances, columns, width, height,
-    K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
+    order, start, reached, splat_of, params, frame, stop, tangents, moved, planes, transmittances, moves, columns, width,
+    height, K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
 ):  # fmt: skip
-    """J u for K tangents: their planes (K, 4, h, w) and the tangents of the final transmittance (K, h, w)."""
+    """J u for K tangents: their planes (K, 4, h, w) and the tangents of the final transmittance (K, h, w).
+
+    moved: (n, K), which splats the tangents move; moves: whether they move any in a tile.  Where none, all is 0.
+    """
     real: tl.constexpr = params.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
     x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
@@ -307,6 +324,9 @@ def tangent(
     T = tl.full((1, HEIGHT, WIDTH), 1.0, real)
     dT = tl.zeros((K, HEIGHT, WIDTH), real)
     red, green, blue = dT, dT, dT
+    some = any_moved(moved, splat_of, first, count, K)
+    tl.store(moves + tile, some.to(tl.int32))
+    count = tl.where(some, count, 0)
     following = tl.load(splat_of + first, count > 0, other=0)
     for k in range(0, count):
         s_index = following
@@ -328,13 +348,13 @@ def tangent(
 
 @jit
 def curvature(
-    order, start, reached, splat_of, slots, params, frame, transmittance, stop, cotangent, tangents, transmittances,
+    order, start, reached, splat_of, slots, params, frame, transmittance, stop, cotangent, tangents, moves, transmittances,
     cotangents, sums, columns, width, height,
     K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
 ):  # fmt: skip
     """The nine sums of the tangent of `backward`, K times nine an entry or, added up, a splat.
 
-    cotangent: g, 4 planes; cotangents: g' of every tangent, (K, 4, h, w); transmittances: as `tangent` left them.
+    cotangent: g, 4 planes; cotangents: g' of every tangent, (K, 4, h, w); moves, transmittances: as `tangent` left them.
     """
     real: tl.constexpr = params.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
@@ -352,7 +372,7 @@ def curvature(
     R = T * behind
     dR = dT * behind + T * behind_all(dg, background)
     tau = dT / T
-    if not (any_lit(g) | any_lit(dg)):
+    if not ((any_lit(g) & (tl.load(moves + tile) != 0)) | any_lit(dg)):
         if not ATOMIC:
             clear_slots(slots, first, count, sums, 9 * K)
         count = 0

@@ -90,15 +90,25 @@ def pack_splats(splats, frame, params, n, BLOCK: tl.constexpr):
 
 
 @jit
-def pack_tangents(splats, directions, tangents, n, K, begin, size, BLOCK: tl.constexpr):
-    """tangents (n, size, 12) of the directions begin, begin + 1, ... of (n, K, 9); a program has one of them."""
+def pack_tangents(splats, directions, tangents, moved, n, K, begin, size, BLOCK: tl.constexpr):
+    """tangents (n, size, 12) of the directions begin, begin + 1, ... of (n, K, 9); a program has one of them.
+
+    moved: (n, size), whether the direction moves the splat.
+    """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
     splat = load_splat(splats, i, inside)
     k = tl.program_id(1)
     at, to = (i.to(tl.int64) * K + begin + k) * 9, (i.to(tl.int64) * size + k) * 12
-    store_six(tangents, to, exponent_tangent(whiten(splat), splat[5], load_six(directions, at, inside)), inside)
+    direction = load_six(directions, at, inside)
+    store_six(tangents, to, exponent_tangent(whiten(splat), splat[5], direction), inside)
     copy_colour(tangents, to, directions, at, inside)
+    some = direction[0] != 0
+    for j in static_range(1, 6):
+        some = some | (direction[j] != 0)
+    for j in static_range(6, 9):
+        some = some | (tl.load(directions + at + j, inside, other=0.0) != 0)
+    tl.store(moved + i.to(tl.int64) * size + k, some.to(tl.int8), inside)
 
 
 @jit

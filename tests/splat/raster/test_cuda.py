@@ -159,6 +159,29 @@ def test_tiles_with_a_cotangent_of_zero_add_nothing(device):
     assert relative_error(products[0] + products[1], whole.curvature[:, :1]) < 1e-13
 
 
+def test_tiles_in_which_no_splat_is_moved_are_left_out(device):
+    expected, raster = truth("tiny equal depths"), raster_of("tiny equal depths", torch.float64, device)
+    assert (
+        raster.lists.start.tolist() == [0, 4, 5] and raster.lists.splat[4] == 3
+    )  # in the second of two tiles that one alone
+    U, dG = expected.U[:, : TOGETHER + 1].to(device), expected.dG[: TOGETHER + 1].to(device)
+    moved, lit = torch.ones(expected.case.n, TOGETHER + 1, 1, device=device), torch.zeros_like(dG)
+    moved[[0, 3]], moved[:, TOGETHER], lit[:TOGETHER, :, :, :16] = 0, 0, 1
+    adjoint = raster.backward(expected.G.to(device))
+
+    def products(U: Tensor, dG: Tensor) -> tuple[Tensor, Tensor]:
+        tangent = raster.jvp(U)
+        return tangent.planes, tangent.curvature(adjoint, dG)
+
+    part, rest = products(moved * U, lit * dG), products((1 - moved) * U, (1 - lit) * dG)
+    whole = results("tiny equal depths", torch.float64, device)
+    for one, other, both in zip(part, rest, (whole.jvp, whole.curvature), strict=True):
+        assert relative_error(one + other, both) < 1e-13
+    raster.params[0], raster.lists.splat[4] = torch.nan, 0  # whoever goes through the second tile comes upon this
+    assert all(torch.equal(*pair) for pair in zip(part, products(moved * U, lit * dG), strict=True))
+    assert all(product.isnan().any() for product in products(U, dG))
+
+
 def test_a_cotangent_that_is_not_a_number_is_not_taken_for_zero(device):
     raster = raster_of("tiny smooth", torch.float64, device)
     cotangent = torch.zeros_like(raster.planes)

@@ -4,7 +4,7 @@ from tests.splat.ahead_of_time import compile_kernel, run_as_script
 
 INTEGERS = (
     "order", "start", "reached", "splat_of", "slots", "stop", "first_column", "count", "strip_rank", "entry_strip",
-    "first_tile", "splat",
+    "first_tile", "splat", "moves",
 )  # fmt: skip
 LONG = ("strip_start", "entry_start", "last")
 DOUBLES = ("frame", "splats", "limits", "directions", "totals", "gradient", "moments", "product")
@@ -16,7 +16,7 @@ REALS = (
 def types(real: str) -> dict[str, str]:
     """The types of the kernels' parameters by name."""
     pointers = dict.fromkeys(INTEGERS, "*i32") | dict.fromkeys(LONG, "*i64") | dict.fromkeys(DOUBLES, "*fp64")
-    return pointers | dict.fromkeys(REALS, f"*{real}") | {"drawn": "*i8"}
+    return pointers | dict.fromkeys(REALS, f"*{real}") | {"drawn": "*i8", "moved": "*i8"}
 
 
 def kernels() -> list[tuple]:
