@@ -79,9 +79,8 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         start = initial_gaussians(scene, views, 0, generator=generator, source=options.start)
         training = Training.start(start, scene.extent(split.train), config)
     training.move(device)
-    training.regularizer.begin(
-        training, views
-    )  # refuses views that lack what the method needs, before there is a folder
+    # refuses views that lack what the method needs, before there is a folder
+    training.regularizer.begin(training, views)
     if not options.resume:
         _create_run(out, training, reference, keep_start=along is not None)
 

@@ -53,11 +53,8 @@ def random_directions(
             f"expected one group number, from 0, for each of {center.numel()} parameters, got {groups.dtype} of shape "
             f"{tuple(groups.shape)}"
         )
-    d, groups = (
-        torch.empty(center.numel(), count, dtype=torch.float64, device=generator.device),
-        groups.to(center.device),
-    )
-    d = d.normal_(generator=generator).to(center.device)
+    d = torch.empty(center.numel(), count, dtype=torch.float64, device=generator.device)
+    d, groups = d.normal_(generator=generator).to(center.device), groups.to(center.device)
     sizes = _lengths(center.detach().double()[:, None], groups) / _lengths(d, groups)
     d *= sizes[groups]
     if not (torch.isfinite(d).all() and d.any()):

@@ -43,12 +43,10 @@ KEEP = 0.6  # share of the basis that a restart keeps
 CHUNK = 1 << 16  # rows of vectors that a restart recombines at a time
 MARGIN = 4.0  # of the noise that the recurrence sees: what it may be in the directions of the wanted vectors
 NEAR = 30.0  # of that noise, from which on it is measured
-NEAREST = (
-    3e-4  # of the largest value: root of the eps of float32, which a product's rounding stays below in either precision
-)
+NEAREST = 3e-4  # of the largest value: root of the eps of float32, which rounding stays below in either precision
 PAIRS = 10  # from which it can be told
 WARM_NOISE = (
-    1.0  # length of a random vector beside a given start of unit length: an end that this misses is still found
+    0.3  # length of a random vector beside a given start of unit length: an end that this misses is still found
 )
 
 
@@ -182,10 +180,8 @@ class _Krylov:
         self.T = torch.zeros(self.capacity, self.capacity, dtype=torch.float64)
         self.size, self.width, self.scale = 0, 0, 1.0
         self.coupling = torch.zeros(0, 0, dtype=torch.float64)
-        self.pairs, self.surprise = (
-            0,
-            0.0,
-        )  # components that were known before, and the sum of squares that they are off by
+        # components that were known before, and the sum of squares that they are off by
+        self.pairs, self.surprise = 0, 0.0
         self.random_share, self.first_cycle = 1.0, 0
         first = draw_probes(operator.dim, min(settings.block, self.capacity), generator, operator.dtype)
         self.basis = first.new_empty(self.capacity + settings.block, operator.dim)

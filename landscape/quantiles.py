@@ -89,9 +89,8 @@ def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: flo
     beneath = least.mean(dim=0) - margin * least.std(dim=0) > 0  # t is certainly too low, up to the next of the grid
     beyond = most.mean(dim=0) + margin * most.std(dim=0) <= 0  # certainly high enough
     totals = density.rest * torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64) + known.sum()
-    floor = (
-        p * float(totals.mean() - margin * totals.std()) / density.dim
-    )  # n eigenvalues up to t add up to n t at most
+    # n eigenvalues up to t add up to n t at most
+    floor = p * float(totals.mean() - margin * totals.std()) / density.dim
     low = float(grid[int(beneath.long().cumprod(0).sum().clamp_max(len(grid) - 1))])
     last = int(beyond.long().flip(0).cumprod(0).sum())
     high = float(grid[-last]) if last else inf

@@ -87,9 +87,8 @@ def _composite(
     """One tile, (5, h, w): colour, alpha, depth."""
     alpha = _alphas(splats, index, xs, ys, settings)
     before, after = _transmittances(alpha)
-    running = (
-        (after >= settings.transmittance_min).cumprod(0).bool()
-    )  # the first splat that would pass the floor ends it
+    # the first splat that would pass the floor ends it
+    running = (after >= settings.transmittance_min).cumprod(0).bool()
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     before, after = _transmittances(alpha)
     weight = alpha * before
