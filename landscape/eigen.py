@@ -45,9 +45,7 @@ MARGIN = 4.0  # of the noise that the recurrence sees: what it may be in the dir
 NEAR = 30.0  # of that noise, from which on it is measured
 NEAREST = 3e-4  # of the largest value: root of the eps of float32, which rounding stays below in either precision
 PAIRS = 10  # from which it can be told
-WARM_NOISE = (
-    0.3  # length of a random vector beside a given start of unit length: an end that this misses is still found
-)
+WARM_NOISE = 1.0  # length of a random vector beside a start of unit length: an end that this misses is still found
 
 
 @dataclass(frozen=True)
