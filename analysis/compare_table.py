@@ -19,7 +19,7 @@ from analysis.overrides import leaves
 from analysis.quantities import PLACES, SCORES, measured, quantity
 from analysis.verdict import attribute_name
 from splat.checkpoint import Checkpoint
-from splat.regularizers.methods import MethodSettings
+from splat.regularizers.regularizer import Method
 
 FAMILIES = "families"  # a section that only the page and the file show
 
@@ -111,7 +111,7 @@ def _families(runs: Sequence[Run]) -> Iterable[Row]:
                 yield Row(FAMILIES, "  split control", factors)
 
 
-def _method(method: MethodSettings) -> Entry:
+def _method(method: Method) -> Entry:
     """Its name, and beneath it the settings that are not the published ones.
 
     >>> from splat.regularizers.stablegs import StableGS

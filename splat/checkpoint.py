@@ -10,7 +10,8 @@ written whole or not at all.  The same training gives the same bytes.  Keys (p p
     adam                {"first": (p,), "second": (p,), "updates": int}
     screen_gradients    {"total": (n,), "renders": (n,)}
     generator, order    state of the random generator, uint8; views still to come in this epoch
-    regularizer         state of the method's regularizer, see `splat/regularizers/regularizer.py`
+    regularizer         state of the method's regularizer, see `splat/regularizers/regularizer.py`; of a training in it, the
+                        keys from `step` to `config`
     config              `TrainConfig` as nested plain types
     scene               `SceneReference` as plain types
 """
@@ -32,8 +33,8 @@ from torch import Tensor
 from splat.adam import Adam
 from splat.densify import ScreenGradients
 from splat.gaussians import Gaussians
-from splat.regularizers.methods import ThreeDGS
-from splat.regularizers.regularizer import Regularizer
+from splat.regularizers.methods import METHODS
+from splat.regularizers.regularizer import Method, Regularizer, ThreeDGS
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split
 from splat.start import Source
@@ -142,7 +143,10 @@ def training_state(training: Training) -> dict[str, Any]:
         },
         "generator": training.generator.get_state(),
         "order": training.order,
-        "regularizer": training.regularizer.state(),
+        "regularizer": {
+            key: training_state(value) if isinstance(value, Training) else value
+            for key, value in training.regularizer.state().items()
+        },
         "config": asdict(training.config),
     }
 
@@ -276,9 +280,15 @@ def _tensor(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype) -
     return value
 
 
+def _is_training(value: Any) -> bool:
+    return isinstance(value, dict) and "regularizer" in value
+
+
 def _restore(regularizer: Regularizer, state: dict) -> None:
     try:
-        regularizer.restore(state)
+        regularizer.restore(
+            {key: restored_training(value) if _is_training(value) else value for key, value in state.items()}
+        )
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"'regularizer' is not the state of its method ({error})") from None
 
@@ -309,14 +319,12 @@ def _dataclass(kind: type[T], content: dict, where: str) -> T:
 
 
 def _nested(hint: Any, value: Any, where: str) -> type | None:
-    """The dataclass that a value is of, of several the one of its name; None where no dataclass is expected."""
-    kinds = [kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and is_dataclass(kind)]
-    if len(kinds) < 2:
-        return next(iter(kinds), None)
+    """The dataclass that a value is of, a method's by its name; None where no dataclass is expected."""
+    if hint is not Method:
+        return hint if isinstance(hint, type) and is_dataclass(hint) else None
     name = value.get("name") if isinstance(value, dict) else value
-    for kind in kinds:
-        if get_type_hints(kind)["name"] == Literal[name]:
-            return kind
+    if isinstance(name, str) and name in METHODS:
+        return METHODS[name]
     raise ValueError(f"'{where}' has the unknown name {name!r}")
 
 

@@ -29,8 +29,7 @@ from splat.gaussians import Gaussians
 from splat.losses import LossSettings
 from splat.losses_cpu import ViewLoss, loss_against
 from splat.photometric import Photometric, photometric
-from splat.regularizers.methods import MethodSettings, ThreeDGS
-from splat.regularizers.regularizer import Regularizer, Step
+from splat.regularizers.regularizer import Method, Regularizer, Step, ThreeDGS
 from splat.scenes.view import View
 from splat.settings import RenderSettings
 
@@ -74,7 +73,7 @@ class TrainConfig:
     rates: LearningRates = field(default_factory=LearningRates)
     densify: DensifySettings = field(default_factory=DensifySettings)
     render: RenderSettings = field(default_factory=RenderSettings)
-    method: MethodSettings = field(default_factory=ThreeDGS)
+    method: Method = field(default_factory=ThreeDGS)
 
     def __post_init__(self) -> None:
         if self.iterations < 1:

@@ -21,7 +21,7 @@ size.  A step costs two of 3DGS and two renders at the pseudo-view.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -37,9 +37,7 @@ from splat.regularizers.regularizer import Method, Regularizer, Step, ThreeDGS
 from splat.regularizers.viewpoint_probe import slerp
 from splat.render import render
 from splat.scenes.view import View
-
-if TYPE_CHECKING:
-    from splat.train import Training
+from splat.train import Training
 
 
 @dataclass(frozen=True)
@@ -81,11 +79,11 @@ class CoRegularizer(Regularizer):
         self.settings = settings
         self.partner: Training | None = None
 
-    def begin(self, training: "Training", views: Sequence[View]) -> None:
+    def begin(self, training: Training, views: Sequence[View]) -> None:
         if self.partner is None:
             seed = int(torch.randint(2**63 - 1, (), generator=self.generator))
             config = replace(training.config, seed=seed, method=ThreeDGS())
-            self.partner = type(training).start(training.gaussians, training.extent, config)
+            self.partner = Training.start(training.gaussians, training.extent, config)
         self.partner.move(training.gaussians.flat.device)  # one that was restored is on the CPU
 
     def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
@@ -124,15 +122,13 @@ class CoRegularizer(Regularizer):
                 each.follow(_pruned(each.gaussians, stays))
 
     def state(self) -> dict[str, Any]:
-        from splat.checkpoint import training_state  # which knows this method
-
-        return {**super().state(), "partner": self.partner and training_state(self.partner)}
+        return {**super().state(), "partner": self.partner}
 
     def restore(self, state: dict[str, Any]) -> None:
-        from splat.checkpoint import restored_training
-
         super().restore(state)
-        self.partner = state["partner"] and restored_training(state["partner"])
+        if not isinstance(state["partner"], Training | None):
+            raise ValueError("'partner' is no training")
+        self.partner = state["partner"]
 
 
 def pseudo_view(cameras: Sequence[Camera], noise: float, generator: torch.Generator) -> Camera:

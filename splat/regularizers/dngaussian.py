@@ -19,7 +19,7 @@ Not here: its neural colours, its penalties on shape, scale and opacity, and its
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, log
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -31,9 +31,7 @@ from splat.regularizers.depth_prior import DepthKind, prior, require_kind, requi
 from splat.regularizers.regularizer import Method, Regularizer, Step
 from splat.render import render_depth
 from splat.scenes.view import View
-
-if TYPE_CHECKING:
-    from splat.train import Training
+from splat.train import Training
 
 HARD = log(0.95 / 0.05)
 EPS = 0.01
@@ -79,7 +77,7 @@ class DNRegularizer(Regularizer):
         super().__init__(seed)
         self.settings = settings
 
-    def begin(self, training: "Training", views: Sequence[View]) -> None:
+    def begin(self, training: Training, views: Sequence[View]) -> None:
         require_maps(views, self.settings.name)
 
     def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:

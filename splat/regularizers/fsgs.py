@@ -24,7 +24,7 @@ the score, which only the code does.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -38,9 +38,7 @@ from splat.regularizers.depth_prior import DepthKind, prior, require_kind, requi
 from splat.regularizers.regularizer import Method, Regularizer, Step
 from splat.render import render_depth
 from splat.scenes.view import View
-
-if TYPE_CHECKING:
-    from splat.train import Training
+from splat.train import Training
 
 MIDAS = 200.0
 
@@ -86,7 +84,7 @@ class FSGSRegularizer(Regularizer):
         super().__init__(seed)
         self.settings = settings
 
-    def begin(self, training: "Training", views: Sequence[View]) -> None:
+    def begin(self, training: Training, views: Sequence[View]) -> None:
         if self.settings.depth_weight:
             require_maps(views, self.settings.name)
 

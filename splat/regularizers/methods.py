@@ -15,12 +15,10 @@ from splat.regularizers.dngaussian import DNGaussian
 from splat.regularizers.dropgaussian import DropGaussian
 from splat.regularizers.dropoutgs import DropoutGS
 from splat.regularizers.fsgs import FSGS
-from splat.regularizers.regularizer import ThreeDGS
+from splat.regularizers.regularizer import Method, ThreeDGS
 from splat.regularizers.sam import SAM
 from splat.regularizers.stablegs import StableGS
 
-MethodSettings = ThreeDGS | StableGS | SAM | DropGaussian | DropoutGS | FSGS | DNGaussian | CoRGS
-
-METHODS: dict[str, type[MethodSettings]] = {
+METHODS: dict[str, type[Method]] = {
     method.name: method for method in (ThreeDGS, StableGS, SAM, DropGaussian, DropoutGS, FSGS, DNGaussian, CoRGS)
 }

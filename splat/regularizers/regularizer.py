@@ -20,13 +20,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.camera import Camera
+from splat.densify import Densified
 from splat.gaussians import Gaussians
 from splat.losses_cpu import ViewLoss
 from splat.photometric import Photometric
 from splat.scenes.view import View
 
 if TYPE_CHECKING:
-    from splat.densify import Densified
     from splat.train import TrainConfig, Training
 
 Row = dict[str, Any]
@@ -79,14 +79,14 @@ class Regularizer:
         """What the optimiser descends.  base: the sampled view's loss and gradient, in the parameters of step.gaussians."""
         return base.gradient
 
-    def follow(self, change: "Densified") -> None:
+    def follow(self, change: Densified) -> None:
         """The Gaussians were replaced."""
 
     def after(self, step: Step) -> None:
         """The step is whole: update and density control are done."""
 
     def state(self) -> dict[str, Any]:
-        """Tensors and plain types, from which `restore` makes a new one of the same settings go on to the same bits."""
+        """Tensors, plain types and trainings: `restore` makes a new one of the same settings go on from it to the same bits."""
         return {"generator": self.generator.get_state(), "history": self.history}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -97,7 +97,9 @@ class Regularizer:
 
 @dataclass(frozen=True)
 class Method:
-    """Settings of a method: a frozen dataclass with a `name`, from which its regularizer is made."""
+    """Settings of a method, from which its regularizer is made.  name: of its own, as in `methods.METHODS`."""
+
+    name: str = ""
 
     def regularizer(self, seed: int) -> Regularizer:
         return Regularizer(seed)

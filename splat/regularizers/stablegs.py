@@ -17,7 +17,7 @@ loss of weight 0; viewpoints that see nothing; the edges where nothing turns abo
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -43,9 +43,7 @@ from splat.render import render, render_depth
 from splat.scenes.capture import capture_geometry
 from splat.scenes.view import View
 from splat.traces import exact_traces
-
-if TYPE_CHECKING:
-    from splat.train import Training
+from splat.train import Training
 
 # of the coupling between pixels: on a trained scene an error of 1% of the traces, seldom 10%; rho takes the root
 SAMPLES = 4
@@ -92,7 +90,7 @@ class StableRegularizer(Regularizer):
         self.magnitudes: dict[str, Magnitude] = {}
         self.normals: list[Tensor] = []
 
-    def begin(self, training: "Training", views: Sequence[View]) -> None:
+    def begin(self, training: Training, views: Sequence[View]) -> None:
         if self.settings.vsp_weight:
             self.geometry = capture_geometry([view.camera for view in views])
 
@@ -107,9 +105,8 @@ class StableRegularizer(Regularizer):
             step.gaussians, base.gradient, step.camera, base.splats, self.magnitudes, settings.probe, self.generator
         )
         poses = self._poses(step)
-        if (
-            not self.magnitudes
-        ):  # the probed copy is the original: its gradient is known, and both agree from everywhere
+        # without magnitudes the probed copy is the original: its gradient is known, and both agree from everywhere
+        if not self.magnitudes:
             return (1 + settings.asp_weight) * base.gradient
         total = base.gradient.clone()
         if settings.asp_weight:

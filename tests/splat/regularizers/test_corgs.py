@@ -54,6 +54,13 @@ def test_with_neither_term_the_first_field_is_that_of_3dgs():
     assert torch.equal(training.gaussians.flat, plain.gaussians.flat)
 
 
+def test_a_state_whose_partner_is_no_training_is_refused():
+    regularizer = CoRGS().regularizer(0)
+    regularizer.restore(regularizer.state())
+    with pytest.raises(ValueError, match="'partner' is no training"):
+        regularizer.restore({**regularizer.state(), "partner": {"step": 1}})
+
+
 def test_a_partner_that_was_restored_goes_on_where_the_first_field_is():
     training, regularizer, _ = trained(replace(tiny_config(), method=TOGETHER))
     training.move(torch.device("meta"))
