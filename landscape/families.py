@@ -54,13 +54,11 @@ def families(
     settings: FamilySettings = FamilySettings(),
     parts: Sequence[str] | None = None,
     active: Mapping[str, ActiveSpace] | None = None,
-    known: Mapping[str, Family] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Family]:
     """The family of each part: "all" and every block by default; a block without rows is left out.
 
-    active: what a known null space leaves of a part.  known: parts that are there already, and are handed on.  Every part has
-    random numbers of its own, whatever the others need.
+    active: what a known null space leaves of a part.  Every part has random numbers of its own, whatever the others need.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([4.0, -1.0, 2.0, 1.0]).double()), {"a": slice(0, 2), "b": slice(2, 4)})
@@ -75,9 +73,6 @@ def families(
     results: dict[str, Family] = {}
     for name in names:
         stream = split(generator)
-        if known and name in known:
-            results[name] = known[name]
-            continue
         part = operator if name == WHOLE else RestrictedOperator(operator, name)
         if part.dim == 0:
             continue

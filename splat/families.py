@@ -1,46 +1,25 @@
-"""The anisotropy family of a scene: of all attributes together and of each, for the Hessian or for Gauss-Newton.
+"""What is left out of the anisotropy family of a scene, of all attributes together and of each (`landscape.families`).
 
-Left out of each part as exactly null (`null_space.py`): the lengths of the quaternions, SH directions that no view sees and,
+Exactly null (`null_space.py`): the lengths of the quaternions, SH directions that no view sees and,
 of Gauss-Newton as a whole, all that no view sees.  In another metric (`metrics.py`) the operator is D P H P D, and what is not
 null is the space of all D P x.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from landscape.density import ActiveSpace
-from landscape.families import WHOLE, Family, FamilySettings, families
-from landscape.operator import ScaledOperator
-from landscape.results import Progress
+from landscape.families import WHOLE
 from splat.curvature import SceneHessian
-
-BUDGET = FamilySettings()
-
-
-def scene_families(
-    hessian: SceneHessian,
-    generator: torch.Generator,
-    settings: FamilySettings = BUDGET,
-    parts: Sequence[str] | None = None,
-    known: Mapping[str, Family] | None = None,
-    progress: Progress | None = None,
-    scale: Float[Tensor, " p"] | None = None,
-) -> dict[str, Family]:
-    """The family of "all" and of each attribute (see `landscape.families`); hessian: exact, or its Gauss-Newton part.
-
-    scale: D, above 0; 1 by default.
-    """
-    operator = hessian if scale is None else ScaledOperator(hessian, scale)
-    return families(operator, generator, settings, parts, active_spaces(hessian, scale), known, progress)
 
 
 def active_spaces(hessian: SceneHessian, scale: Float[Tensor, " p"] | None = None) -> dict[str, ActiveSpace]:
-    """What the exact null space leaves of the whole and of each attribute.
+    """What the exact null space leaves of the whole and of each attribute.  hessian: exact, or its Gauss-Newton part.
 
-    Of Gauss-Newton's attributes, what it leaves of the Hessian's: they may be flat along more.
+    scale: D, above 0; 1 by default.  Of Gauss-Newton's attributes, what it leaves of the Hessian's: they may be flat along more.
     """
     if hessian.keep_null:
         return {}
