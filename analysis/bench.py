@@ -156,7 +156,7 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
         )
         calls = {**bench.stages(), **bench.wholes(), **bench.peers()}
         measured = interleaved(calls, options.repetitions, clock=meter.seconds)
-        lines = pd.DataFrame(_lines("stages", workload, bench, measured))
+        lines = pd.DataFrame(_lines("stages", workload, measured))
         console.print(
             _rich(lines.filter(["stage", "minimum_ms", "median_ms"]), "times of one view; ms, products per vector")
         )
@@ -191,9 +191,7 @@ def _precision(workload: Workload, path: Path, console: Console) -> None:
     _write(table, path, console)
 
 
-def _lines(
-    study: str, workload: Workload, bench: ViewBench | None, times: dict[str, Timing], value: int = 0
-) -> list[dict]:
+def _lines(study: str, workload: Workload, times: dict[str, Timing], value: int = 0) -> list[dict]:
     """Lines of bench.csv; value: how much of what the study scales."""
     camera = workload.views[0].camera
     about = {
@@ -218,7 +216,7 @@ def _scaling(workload: Workload, repetitions: int, meter: Meter) -> list[dict]:
     with Progress(console=Console(stderr=True), transient=True) as progress:
         bar = progress.add_task("scaling", total=None)
         for study, value, times in scaling(workload, repetitions, meter):
-            lines += _lines(study, workload, None, times, value)
+            lines += _lines(study, workload, times, value)
             progress.advance(bar)
     return lines
 

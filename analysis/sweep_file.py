@@ -71,7 +71,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Cells in the order in which they run; probe: whether each is probed, and how.  methods, scenes: in the file's order."""
+    """Cells in the order in which they run; probe: whether each is probed, and how.  scenes: in the file's order."""
 
     file: Path
     out: Path
@@ -84,10 +84,6 @@ class Sweep:
     @property
     def scenes(self) -> list[str]:
         return list(dict.fromkeys(cell.scene for cell in self.cells))
-
-    @property
-    def methods(self) -> list[str]:
-        return list(dict.fromkeys(cell.method for cell in self.cells))
 
 
 def read_sweep(file: Path, out: Path | None = None, probe: bool = False) -> Sweep:

@@ -7,7 +7,6 @@ null is the space of all D P x.
 
 from collections.abc import Callable
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,7 +18,9 @@ from splat.curvature import SceneHessian
 def active_spaces(hessian: SceneHessian, scale: Float[Tensor, " p"] | None = None) -> dict[str, ActiveSpace]:
     """What the exact null space leaves of the whole and of each attribute.  hessian: exact, or its Gauss-Newton part.
 
-    scale: D, above 0; 1 by default.  Of Gauss-Newton's attributes, what it leaves of the Hessian's: they may be flat along more.
+    scale: D, above 0; 1 by default.
+
+    Of Gauss-Newton's attributes, what it leaves of the Hessian's: they may be flat along more.
     """
     if hessian.keep_null:
         return {}

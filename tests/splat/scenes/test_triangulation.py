@@ -13,7 +13,6 @@ from splat.scenes.splits import split_scene
 from splat.scenes.triangulation import triangulated_points
 from splat.scenes.view import Points, View, pixel_coordinates
 
-THRESHOLD = 4.0  # px of reprojection error that COLMAP allows a point
 SHARP = 1.0  # px within which nearly all features lie
 
 
