@@ -9,6 +9,7 @@ unit length first: the image does not change, and the trace of their block, whic
 """
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from operator import add
@@ -24,10 +25,12 @@ from splat.linearize import LinearizedView, OwnBlocks, hold, order_of, rasterize
 from splat.losses import LossSettings
 from splat.losses_cpu import loss_against
 from splat.null_space import RowSpace, seen_harmonics, seen_parameters
+from splat.recording import CudaGraphs, Recordings
 from splat.scenes.view import View
 from splat.settings import RenderSettings
 
 MOST_VECTORS = 8  # beyond it a block of vectors gains no more: it has left the second-level cache
+RECORDED = 1 << 28  # bytes of workspace, up to which a GPU has made a view's product before its kernels are launched
 
 
 def free_memory(device: torch.device) -> int:
@@ -123,6 +126,12 @@ class SceneObjective:
             seen |= touches(rasterize_view(gaussians, view.camera, self.background, self.settings))
         return seen
 
+    def of_views(self, count: int) -> "SceneObjective":
+        """The mean over the first so many views alone; what is held still is shared."""
+        part = copy(self)
+        part.views, part._losses = self.views[:count], self._losses[:count]
+        return part
+
     collective = False  # whether processes share the views, and so have to call every method together, one at a time
 
     @property
@@ -189,6 +198,13 @@ class SceneObjective:
             if index < kept and index not in self._kept:
                 self._kept[index] = self.linearize(index)
             yield self._kept[index] if index < kept else self.linearize(index)
+
+    def recordable(self, vectors: int) -> bool:
+        """Whether products with so many vectors are worth a recording: of views on a GPU, all kept, and small."""
+        plan = self.memory_plan
+        if self.active.flat.device.type != "cuda" or plan.kept < plan.views:
+            return False
+        return self._kept[0].workspace(min(vectors, plan.vectors)) <= RECORDED
 
     def linearize(self, index: int, gaussians: Gaussians | None = None) -> LinearizedView:
         """A view held still at the active Gaussians or, for comparison, at others; nothing is kept."""
@@ -276,6 +292,17 @@ class SceneHessian:
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         require_vectors(V, self.dim)
         home, V = V.device, self.project(V.to(self.objective.active.flat.device))
+        spared = self.spared
+        total = self._recordings(self._sum, V) if self.objective.recordable(V.shape[1]) else self._sum(V)
+        self.passes += V.shape[1] * len(self.objective.views) - (self.spared - spared)
+        return self.project(self.objective.mean(total)).to(home)
+
+    @cached_property
+    def _recordings(self) -> Recordings:
+        return Recordings(CudaGraphs(self.objective.active.flat.device))
+
+    def _sum(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+        """The views' products, added up."""
         total = torch.zeros_like(V, dtype=self.dtype)
         at_once = self.objective.memory_plan.vectors
         for view in self.objective.linearized:
@@ -284,6 +311,5 @@ class SceneHessian:
                 if not view.concerns(some):
                     self.spared += some.shape[1]
                     continue
-                self.passes += some.shape[1]
                 total[:, start : start + at_once] += view.ggn(some) if self.gauss_newton else view.hvp(some)
-        return self.project(self.objective.mean(total)).to(home)
+        return total

@@ -5,7 +5,8 @@ asked for its like; EITHER where it was made on a device by name, since that of 
 
     mixed    operations on GPU and HOST, kernels' arguments and numpy() on the wrong side; what torch allows is left out:
              copies, single numbers, indices on the host
-    waits    numbers that the host reads, sizes that depend on values, copies that block
+    waits    numbers that the host reads, sizes that depend on values, copies that block, indices that come from the host
+    brought  copies from the host, whether or not they block
 """
 
 from collections import Counter
@@ -27,6 +28,12 @@ ACROSS = {"copy_", "_to_copy", *INDEXED}
 KERNELS = ("raster.cuda_binning", "raster.cuda", "projection_cuda", "losses_cuda", "adam_cuda")
 
 
+def waits_for_values(func: Any, args: Any) -> bool:
+    """Whether an operation on a GPU's tensors waits for it, to give the host a number or a tensor of which one is the size."""
+    name = func._schema.name.removeprefix("aten::")
+    return name in READS or (name in INDEXED and any(each is not None and each.dtype == torch.bool for each in args[1]))
+
+
 class _Named(TorchFunctionMode):
     """Whether the function that was called last was given a device: those that it calls are given one always."""
 
@@ -38,11 +45,11 @@ class _Named(TorchFunctionMode):
 
 
 class Placed(TorchDispatchMode):
-    """Notes while it is entered: `mixed` and `waits`, names of operations with their numbers."""
+    """Notes while it is entered: `mixed`, `waits` and `brought`, names of operations with their numbers."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch):
         super().__init__()
-        self.mixed, self.waits = Counter[str](), Counter[str]()
+        self.mixed, self.waits, self.brought = Counter[str](), Counter[str](), Counter[str]()
         self._labels: dict[int, str] = {}
         self._kept: list[Any] = []  # storages, lest another takes a freed one's place
         self._within, self._named = False, _Named()
@@ -78,9 +85,11 @@ class Placed(TorchDispatchMode):
         arrays = {self._label(each) for each in inputs if each.dim()}
         if GPU in labels and HOST in arrays and name not in ACROSS:
             self.mixed[name] += 1
-        masks = name in INDEXED and any(each is not None and each.dtype == torch.bool for each in args[1])
-        if labels & {GPU, EITHER} and (name in READS or masks):
+        brought = name in INDEXED and HOST in {self._label(each) for each in args[1] if each is not None}
+        if labels & {GPU, EITHER} and (waits_for_values(func, args) or brought):
             self.waits[name] += 1
+        if brought or (name == "copy_" and self._label(args[0]) == GPU and self._label(args[1]) == HOST):
+            self.brought[name] += 1
         made = func(*args, **kwargs)
         unknown = (
             self._named.found or torch._C._current_graph_task_id() >= 0
@@ -115,8 +124,9 @@ class Placed(TorchDispatchMode):
         target = EITHER if like is None and named else None if like is None else self._label(like)
         if target is None or target == self._label(made):
             return made
-        if target == GPU and not kwargs.get("non_blocking"):
-            self.waits["to"] += 1
+        if target == GPU:
+            self.brought["to"] += 1
+            self.waits["to"] += not kwargs.get("non_blocking")
         return self._moved(made, target)
 
     def _moved(self, tensor: Tensor, label: str) -> Tensor:
@@ -133,6 +143,7 @@ class Placed(TorchDispatchMode):
 
     def _new_tensor(self, tensor: Tensor, made: Tensor, args: tuple, kwargs: dict) -> Tensor:
         self.waits["new_tensor"] += self._label(tensor) == GPU
+        self.brought["new_tensor"] += self._label(tensor) == GPU
         return self._moved(made, self._label(tensor) or HOST)
 
     def _launch(self, original: Callable) -> Callable:

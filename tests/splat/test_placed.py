@@ -25,10 +25,12 @@ def test_what_is_on_the_wrong_side_is_noted(monkeypatch):
     with placed:
         there, here = placed.on_gpu(torch.ones(3)), torch.ones(3)
         _ = there * 2.0 + there.new_zeros(3) + here.to(there, non_blocking=True), there[torch.tensor([0])]
-        assert not +placed.mixed and not +placed.waits
+        assert not +placed.mixed and +placed.waits == Counter({"index": 1})
+        placed.waits.clear()
         _ = there + here, there.sum() + here, there.numpy(), float(there.sum()), here.to(there), there.nonzero()
     assert +placed.mixed == Counter({"add": 2, "numpy": 1})
     assert +placed.waits == Counter({"_local_scalar_dense": 1, "to": 1, "nonzero": 1})
+    assert +placed.brought == Counter({"to": 2, "index": 1})
 
 
 def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_five_times(monkeypatch):
@@ -63,9 +65,9 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         hessian = SceneHessian(objective)
         V = placed.on_gpu(random_like((hessian.dim, 2), 1))
         hessian.apply(V)
-        placed.waits.clear()
+        placed.waits.clear(), placed.brought.clear()
         hessian.apply(V)
-        assert not +placed.waits
+        assert not +placed.waits and not +placed.brought  # so that they can be recorded
         _ = objective.gradient, objective.block_diagonal(), objective.loss(flat)
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
     assert not +placed.mixed

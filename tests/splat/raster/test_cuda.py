@@ -163,22 +163,23 @@ def test_tiles_in_which_no_splat_is_moved_are_left_out(device):
     expected, raster = truth("tiny equal depths"), raster_of("tiny equal depths", torch.float64, device)
     assert (
         raster.lists.start.tolist() == [0, 4, 5] and raster.lists.splat[4] == 3
-    )  # in the second of two tiles that one alone
+    )  # it alone is in the second of two tiles
     U, dG = expected.U[:, : TOGETHER + 1].to(device), expected.dG[: TOGETHER + 1].to(device)
-    moved, lit = torch.ones(expected.case.n, TOGETHER + 1, 1, device=device), torch.zeros_like(dG)
-    moved[[0, 3]], moved[:, TOGETHER], lit[:TOGETHER, :, :, :16] = 0, 0, 1
+    moved, lit = torch.ones_like(U), torch.ones_like(dG)
+    moved[[0, 3]], moved[:, 0], moved[:, TOGETHER, :6], lit[..., 16:] = 0, 0, 0, 0
     adjoint = raster.backward(expected.G.to(device))
 
     def products(U: Tensor, dG: Tensor) -> tuple[Tensor, Tensor]:
         tangent = raster.jvp(U)
         return tangent.planes, tangent.curvature(adjoint, dG)
 
-    part, rest = products(moved * U, lit * dG), products((1 - moved) * U, (1 - lit) * dG)
+    part, rest = products(moved * U, dG), products((1 - moved) * U, 0 * dG)
     whole = results("tiny equal depths", torch.float64, device)
     for one, other, both in zip(part, rest, (whole.jvp, whole.curvature), strict=True):
         assert relative_error(one + other, both) < 1e-13
+    within = products(moved * U, lit * dG)
     raster.params[0], raster.lists.splat[4] = torch.nan, 0  # whoever goes through the second tile comes upon this
-    assert all(torch.equal(*pair) for pair in zip(part, products(moved * U, lit * dG), strict=True))
+    assert all(torch.equal(*pair) for pair in zip(within, products(moved * U, lit * dG), strict=True))
     assert all(product.isnan().any() for product in products(U, dG))
 
 
