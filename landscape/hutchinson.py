@@ -100,14 +100,14 @@ class TraceSettings:
 class Looks:
     """When an adaptive run looks at its error, and whether it may then stop.  next: the number of probes at the next look."""
 
-    def __init__(self, first: int, most: int) -> None:
-        self.next, self._most, self._confirming = first, most, False
+    def __init__(self, first: int, most: int, confirmation: int = CONFIRMATION) -> None:
+        self.next, self._most, self._confirmation, self._confirming = first, most, confirmation, False
 
     def end(self, probes: int, reached: bool) -> bool:
         """Whether the run ends with this look, at which the error asked for was reached or not."""
         if probes == self._most or (reached and self._confirming):
             return True
-        self.next = min(probes + CONFIRMATION if reached else ceil(GROWTH * probes), self._most)
+        self.next = min(probes + self._confirmation if reached else ceil(GROWTH * probes), self._most)
         self._confirming = reached
         return False
 

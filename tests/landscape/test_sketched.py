@@ -96,6 +96,17 @@ def test_an_adaptive_run_stops_at_its_tolerance(method):
         assert estimate.half_width <= 0.05 * estimate.value
 
 
+def test_xtrace_believes_an_error_only_if_it_was_small_enough_one_test_vector_before():
+    def run(seed: int, most: int):
+        settings = TraceSettings(rtol=0.1, method="xtrace", max_probes=most)
+        return estimate_traces(DenseOperator(POWER), generator(seed), settings)["all"]
+
+    for seed in range(20):
+        estimate = run(seed, 100)
+        before = run(seed, 2 * (estimate.probes - 1))
+        assert estimate.reason == before.reason == "tolerance" and before.probes == estimate.probes - 1
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_single_precision_products_give_the_trace_to_single_precision(method):
     values = np.where(np.arange(N) < 5, 1.0, 0.0)
