@@ -174,7 +174,8 @@ class Trajectory:
 
     def _generator(self) -> torch.Generator:
         sequence = np.random.SeedSequence([self.training.config.seed, self.training.step])
-        return torch.Generator().manual_seed(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))
+        device = self.training.gaussians.flat.device
+        return torch.Generator(device).manual_seed(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))
 
     def _start(self, objective: SceneObjective) -> Tensor | None:
         """The last record's eigenvectors on the Gaussians that are now in sight; None where nothing of them is left."""
@@ -185,7 +186,7 @@ class Trajectory:
 
     def keep(self) -> None:
         """Write the vectors for the checkpoint that is about to be saved."""
-        step, vectors = self.training.step, [vector.flat.numpy() for vector in self.vectors]
+        step, vectors = self.training.step, [vector.flat.cpu().numpy() for vector in self.vectors]
         degree = self.vectors[0].sh_degree if vectors else 0
         partial = self.run / f".trajectory-{step}.partial.npz"
         np.savez(partial, vectors=np.stack(vectors) if vectors else np.empty((0, 0)), sh_degree=degree)
@@ -274,8 +275,9 @@ def _read_vectors(run: Path, training: Training) -> list[Gaussians]:
     path = run / f"trajectory-{training.step}.npz"
     if not path.is_file():
         return []
+    like = training.gaussians.flat
     with np.load(path, allow_pickle=False) as kept:
-        vectors = [Gaussians(torch.from_numpy(flat), int(kept["sh_degree"])) for flat in kept["vectors"]]
+        vectors = [Gaussians(torch.from_numpy(flat).to(like), int(kept["sh_degree"])) for flat in kept["vectors"]]
     return [vector for vector in vectors if len(vector) == len(training.gaussians)]
 
 
@@ -284,4 +286,4 @@ def _compile(training: Training, views: Sequence[View]) -> None:
     seen = training.config.objective(training.gaussians, views).mask.nonzero()[:8, 0]
     objective = training.config.objective(training.gaussians.select(seen), views)
     least = TrajectorySettings(1, eigen=EigenSettings(max_matvecs=10), density_steps=FEWEST_STEPS)
-    measure(objective, torch.Generator().manual_seed(0), least)
+    measure(objective, torch.Generator(training.gaussians.flat.device).manual_seed(0), least)

@@ -82,7 +82,7 @@ def lanczos(
     for j in range(steps):
         for i in running:
             basis[i, j] = remainders[i]
-        products = operator.apply(basis[running, j].T.contiguous()).T
+        products = operator.apply(torch.stack([basis[i, j] for i in running], dim=1)).T
         for i, product in zip(list(running), products, strict=True):
             w = product.clone()[None]
             length = norm(w)

@@ -16,6 +16,8 @@ from splat.densify import Densified
 from splat.gaussians import ATTRIBUTES, Gaussians
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from splat.train import Training
+from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians
 
 STEPS, EVERY = 40, 10
 TIMES = ["seconds", "time_share"]
@@ -201,3 +203,20 @@ def test_options_out_of_range_are_refused(scene, tmp_path, capsys, option, value
     assert main([*arguments(scene, "refused", "--probe-every", "5"), option, value]) == 2
     assert f"expected {option[2:].replace('-', '_')}" in capsys.readouterr().err
     assert not (scene.parent / "refused").exists()
+
+
+def test_the_vectors_of_a_run_on_a_gpu_are_kept_on_the_host_and_restored_to_the_device(tmp_path, monkeypatch):
+    pytest.importorskip("triton", reason="the kernels for GPUs need triton")
+    from tests.splat.placed import Placed
+
+    monkeypatch.setattr("analysis.trajectory._compile", lambda training, views: None)
+    training = Training.start(tiny_gaussians(6), EXTENT, tiny_config())
+    placed = Placed(monkeypatch)
+    with placed:
+        training.gaussians = training.gaussians.with_flat(placed.on_gpu(training.gaussians.flat))
+        trajectory = Trajectory(tmp_path, training, [], TrajectorySettings(EVERY))
+        trajectory.vectors = [training.gaussians]
+        trajectory.keep()
+        (restored,) = Trajectory(tmp_path, training, [], TrajectorySettings(EVERY)).vectors
+        assert torch.equal(restored.flat, training.gaussians.flat)
+    assert not +placed.mixed

@@ -83,10 +83,12 @@ class Placed(TorchDispatchMode):
         inputs = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
         labels = {self._label(each) for each in inputs}
         arrays = {self._label(each) for each in inputs if each.dim()}
-        if GPU in labels and HOST in arrays and name not in ACROSS:
+        put = name in INDEXED and len(args) > 2 and args[2].dim() and self._label(args[2]) == HOST
+        if GPU in labels and HOST in arrays and (put or name not in ACROSS):
             self.mixed[name] += 1
-        brought = name in INDEXED and HOST in {self._label(each) for each in args[1] if each is not None}
-        if labels & {GPU, EITHER} and (waits_for_values(func, args) or brought):
+        there = labels & {GPU, EITHER}
+        brought = there and name in INDEXED and HOST in {self._label(each) for each in args[1] if each is not None}
+        if brought or (there and waits_for_values(func, args)):
             self.waits[name] += 1
         if brought or (name == "copy_" and self._label(args[0]) == GPU and self._label(args[1]) == HOST):
             self.brought[name] += 1

@@ -8,6 +8,8 @@ import torch
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
+from landscape.lanczos import lanczos
+from landscape.operator import DenseOperator
 from splat.curvature import SceneHessian, SceneObjective
 from splat.localization import conditions, localize
 from splat.losses import LossSettings
@@ -27,9 +29,10 @@ def test_what_is_on_the_wrong_side_is_noted(monkeypatch):
         _ = there * 2.0 + there.new_zeros(3) + here.to(there, non_blocking=True), there[torch.tensor([0])]
         assert not +placed.mixed and +placed.waits == Counter({"index": 1})
         placed.waits.clear()
+        there[there > 0] = here
         _ = there + here, there.sum() + here, there.numpy(), float(there.sum()), here.to(there), there.nonzero()
-    assert +placed.mixed == Counter({"add": 2, "numpy": 1})
-    assert +placed.waits == Counter({"_local_scalar_dense": 1, "to": 1, "nonzero": 1})
+    assert +placed.mixed == Counter({"add": 2, "numpy": 1, "index_put_": 1})
+    assert +placed.waits == Counter({"_local_scalar_dense": 1, "to": 1, "nonzero": 1, "index_put_": 1})
     assert +placed.brought == Counter({"to": 2, "index": 1})
 
 
@@ -71,3 +74,17 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         _ = objective.gradient, objective.block_diagonal(), objective.loss(flat)
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
     assert not +placed.mixed
+
+
+def test_lanczos_waits_three_times_a_step_and_brings_nothing_to_the_device(monkeypatch):
+    A = random_like((20, 20), 1)
+    placed = Placed(monkeypatch)
+    with placed:
+        operator, starts = DenseOperator(placed.on_gpu(A + A.T)), placed.on_gpu(random_like((20, 1), 2))
+        waits = []
+        for steps in (2, 3):
+            placed.waits.clear()
+            lanczos(operator, starts, steps)
+            waits.append(+placed.waits)
+    assert waits[1] - waits[0] == Counter({"_local_scalar_dense": 2, "cpu": 1})  # two lengths, and a row of T
+    assert not +placed.mixed and not +placed.brought
