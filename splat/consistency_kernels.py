@@ -16,7 +16,7 @@ Four blurs in and four out, where a loss against each image as the other's targe
 """
 
 from splat.losses import C1, C2
-from splat.losses_kernels import CENTRE, pixel_slope
+from splat.losses_formulas import CENTRE, pixel_slope
 from splat.raster.jit import formula, kernel
 from splat.raster.simd import lanes, load, store
 from splat.window_kernels import (

@@ -2,7 +2,7 @@
 and value and gradients of the consistency of two images.
 
 Planes are padded as in `raster/cpu.py`; only the first three are read, and the padding of an output is 0.  The formulas are in
-`losses_kernels.py` and `consistency_kernels.py`.
+`losses_formulas.py` and `consistency_kernels.py`.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,8 @@ from torch import Tensor
 from splat.consistency_kernels import consistency_rows
 from splat.device import by_triton
 from splat.losses import LossSettings, window
-from splat.losses_kernels import CHARBONNIER, L1, L2, diagonal_rows, gradient_rows, product_rows, value_rows
+from splat.losses_formulas import CHARBONNIER, L1, L2
+from splat.losses_kernels import diagonal_rows, gradient_rows, product_rows, value_rows
 from splat.raster.cpu import aligned
 from splat.raster.formulas import TILE_ROWS
 from splat.raster.functions import last_derivative
@@ -156,6 +157,10 @@ class LinearLoss:
     def bytes(self) -> int:
         """Memory of what is held, the target's included, the image's not."""
         return self.loss.target.nbytes + self.loss._target_moments.nbytes + self.gradient.nbytes
+
+    def workspace(self, vectors: int) -> int:
+        """Bytes that `hvp` takes beside its result and a few rows a thread, for however many tangents."""
+        return self.gradient[:3].nbytes
 
     @cached_property
     def diagonal(self) -> np.ndarray:

@@ -12,7 +12,7 @@ from triton import cdiv
 
 from splat import losses_cuda_kernels as kernels
 from splat.losses import LossSettings, window
-from splat.losses_kernels import CHARBONNIER, L1, L2, SECONDS
+from splat.losses_formulas import CHARBONNIER, L1, L2, SECONDS
 from splat.raster.triton_formulas import INTERPRETED, launch
 
 KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
@@ -177,6 +177,10 @@ class CudaLinearLoss:
         """Memory of what is held, the target's included."""
         held = (self.gradient, self._residual, self._second, self._blurred, self.loss.target, self.loss.moments)
         return sum(tensor.nbytes for tensor in held)
+
+    def workspace(self, vectors: int) -> int:
+        """Bytes that `hvp` of so many tangents takes beside its result: two times nine blurred planes each."""
+        return vectors * 18 * self.gradient[0].nbytes
 
     @cached_property
     def diagonal(self) -> Float[Tensor, "3 h w"]:

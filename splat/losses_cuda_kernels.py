@@ -1,6 +1,6 @@
 """The losses on the GPU: kernels over the values of an image, each thread one pixel of one channel.
 
-The formulas of a pixel are those of `losses_kernels.py` and `consistency_kernels.py`, run by `traced.py`.  A sweep of the CPU
+The formulas of a pixel are those of `losses_formulas.py` and `consistency_kernels.py`, run by `traced.py`.  A sweep of the CPU
 is here up to four kernels, with the fields between them in memory: products blurred along the rows; blurred down the columns
 and differentiated; that blurred along the rows; down the columns, and the result.  Sums over the window have the CPU's order.
 
@@ -15,22 +15,22 @@ place along the grid's second axis.
 import triton
 import triton.language as tl
 
-from splat import consistency_kernels, losses_kernels
+from splat import consistency_kernels, losses_formulas
 from splat.losses import WINDOW
-from splat.losses_kernels import seconds_of, similarity, slopes_of
+from splat.losses_formulas import seconds_of, similarity, slopes_of
 from splat.raster.triton_formulas import device
 from splat.traced import digest, traced
 
 EPS, PIXEL, STRUCTURAL = tl.constexpr(WINDOW), tl.constexpr(WINDOW + 1), tl.constexpr(WINDOW + 2)
 REACH = tl.constexpr(WINDOW // 2)
-CENTRE = tl.constexpr(losses_kernels.CENTRE)
-SECONDS = tl.constexpr(losses_kernels.SECONDS)
+CENTRE = tl.constexpr(losses_formulas.CENTRE)
+SECONDS = tl.constexpr(losses_formulas.SECONDS)
 
-pixel_slope = traced(losses_kernels.pixel_slope)
-pixel_curvature = traced(losses_kernels.pixel_curvature)
-spread = traced(losses_kernels.spread)
-bent = traced(losses_kernels.bent)
-own_bend = traced(losses_kernels.own_bend)
+pixel_slope = traced(losses_formulas.pixel_slope)
+pixel_curvature = traced(losses_formulas.pixel_curvature)
+spread = traced(losses_formulas.spread)
+bent = traced(losses_formulas.bent)
+own_bend = traced(losses_formulas.own_bend)
 pair_slopes = traced(consistency_kernels.pair_slopes)
 
 
