@@ -33,7 +33,7 @@ from analysis.timing import Timing, interleaved
 from analysis.workloads import Workload
 from landscape.probes import draw_probes
 from splat.device import by_triton
-from splat.linearize import OwnBlocks, hold
+from splat.linearize import LinearizedView, OwnBlocks
 from splat.losses_cpu import loss_against, view_loss
 from splat.projection_cpu import lens_of
 from splat.raster.functions import held_view, projected, pulled
@@ -79,7 +79,7 @@ class ViewBench:
 
     def _linearize(self) -> Any:
         w = self.workload
-        return hold(w.gaussians, self.view.camera, self.loss, self.background, w.settings)
+        return LinearizedView(w.gaussians, self.view.camera, self.loss, self.background, w.settings)
 
     def _rasterizer(self) -> Any:
         return self._rasterize().backward(self.cotangent)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from analysis.workloads import Workload
 from splat.gaussians import Gaussians
-from splat.linearize import hold, rasterize_view
+from splat.linearize import LinearizedView, rasterize_view
 from splat.losses_cpu import loss_against
 from splat.projection_cpu import lens_of
 from splat.raster.binning import depth_order
@@ -106,7 +106,7 @@ def _derivatives(
 ) -> dict[str, Any]:
     flat = gaussians.flat
     loss = loss_against(view.image, workload.loss, flat)
-    held = hold(gaussians, view.camera, loss, workload.background.to(flat), settings)
+    held = LinearizedView(gaussians, view.camera, loss, workload.background.to(flat), settings)
     diagonals = held.block_diagonal().diagonals
     traces = {name: (float(part.sum()), float(part.abs().sum())) for name, part in diagonals.items()}
     return {"image": held.image, "gradient": held.gradient, "H v": held.hvp(U), "traces": traces}

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from landscape.operator import require_vectors
 from splat.gaussians import Gaussians
-from splat.linearize import LinearizedView, OwnBlocks, hold, order_of, rasterize_view, touches
+from splat.linearize import LinearizedView, OwnBlocks, rasterize_view, touches
 from splat.losses import LossSettings
 from splat.losses_cpu import loss_against
 from splat.null_space import RowSpace, seen_harmonics, seen_parameters
@@ -152,7 +152,7 @@ class SceneObjective:
         for view, loss in zip(self.views, self._losses, strict=True):
             raster = rasterize_view(self.active.with_flat(flat), view.camera, self.background, self.settings)
             total += loss.value(raster.planes)
-            pieces.append(order_of(raster))
+            pieces.append(raster.order)
         return float(self.mean(torch.tensor(total, dtype=torch.float64))), self.joined(hash(tuple(pieces)))
 
     def loss(self, flat: Float[Tensor, " p"]) -> float:
@@ -209,7 +209,7 @@ class SceneObjective:
     def linearize(self, index: int, gaussians: Gaussians | None = None) -> LinearizedView:
         """A view held still at the active Gaussians or, for comparison, at others; nothing is kept."""
         camera, at = self.views[index].camera, self.active if gaussians is None else gaussians
-        return hold(at, camera, self._losses[index], self.background, self.settings)
+        return LinearizedView(at, camera, self._losses[index], self.background, self.settings)
 
     @cached_property
     def gradient(self) -> Float[Tensor, " p"]:

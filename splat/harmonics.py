@@ -16,8 +16,6 @@ Y2A, Y2B, Y2C = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi)), sqrt(15 / (16 * pi))  
 Y3A, Y3B, Y3C = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(21 / (32 * pi))  # |m| = 3, 2, 1
 Y3D = sqrt(7 / (16 * pi))  # m = 0
 
-BAND_OF_COEFFICIENT = (0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3)
-
 
 def harmonics(direction: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
     """The (degree + 1)^2 basis functions at unit directions."""

@@ -109,6 +109,10 @@ class CudaProjection:
         block = _block(128 // wide)
         return (cdiv(self._index.numel(), block), cdiv(vectors, wide)), block, wide
 
+    def concerns(self, block: Float[Tensor, "p k"]) -> bool:
+        """True: to look whether a vector moves any of the Gaussians that matter would be to wait for the device."""
+        return True
+
     def jvp(self, block: Float[Tensor, "p k"]) -> Float64[Tensor, "n k 9"]:
         """P' U."""
         vectors = block.shape[1]

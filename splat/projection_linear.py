@@ -4,10 +4,11 @@ Per Gaussian that matters, the Jacobian of the map from its stored parameters to
 first-order adjoint of its splat.  SH enters the colour linearly: its derivatives are the harmonics at the view direction and
 their slope in the mean, so a Gaussian needs 179 numbers, not a dense 9 x 59 and 59 x 59.
 
-Tangents and adjoints of the stored parameters are (parameters of a Gaussian..., K) per attribute: `split` makes such views
-of a (p, K) block laid out like the flat vector.  Splats are (n, 9), tangents of splats (n, K, 9): `raster/packing.py`.
+Tangents and adjoints of the stored parameters are (n, parameters of a Gaussian..., K) per attribute: views of a (p, K) block
+that is laid out like the flat vector.  Splats are (n, 9), tangents of splats (n, K, 9): `raster/packing.py`.
 """
 
+from math import prod
 from typing import NamedTuple
 
 import numpy as np
@@ -44,16 +45,6 @@ class Held(NamedTuple):
     colour_bar: np.ndarray
     visible: np.ndarray
     colour_slope: np.ndarray
-
-
-def split(block: np.ndarray, n: int, sh_degree: int) -> tuple[np.ndarray, ...]:
-    """Views of a (p, K) block laid out like the flat vector: (n, 3, K), (n, 3, K), (n, 4, K), (n, K), (n, k, 3, K)."""
-    views, start = [], 0
-    for shape in attribute_shapes(n, sh_degree).values():
-        size = int(np.prod(shape))
-        views.append(block[start : start + size].reshape(*shape, block.shape[1]))
-        start += size
-    return tuple(views)
 
 
 @formula
@@ -290,7 +281,8 @@ class Projection:
 
     def __init__(self, gaussians: Gaussians, lens: Lens, splats: np.ndarray, bar: np.ndarray, index: np.ndarray):
         means, log_scales, quats, _logits, sh = attribute_arrays(gaussians)
-        self.n, self.sh_degree, m = len(gaussians), gaussians.sh_degree, index.size
+        self.n, self.sh_degree, self.parameters = len(gaussians), gaussians.sh_degree, gaussians.flat.numel()
+        m = index.size
 
         def empty(*shape: int) -> np.ndarray:
             return np.empty((m, *shape), means.dtype)
@@ -306,18 +298,37 @@ class Projection:
         """Memory of what is held per Gaussian in sight."""
         return sum(array.nbytes for array in self.held[3:])
 
+    def concerns(self, block: np.ndarray) -> bool:
+        """Whether a vector of a block (p, K) moves any of the Gaussians that matter."""
+        return any(part[self.held.index].any() for part in self._split(block))
+
     def jvp(self, block: np.ndarray) -> np.ndarray:
         """P' U: (n, K, 9) from a block (p, K) of tangents of the stored parameters."""
         out = np.zeros((self.n, block.shape[1], 9))
-        over_range(self.held.index.size, push_forward, self.held, *split(block, self.n, self.sh_degree), out)
+        over_range(self.held.index.size, push_forward, self.held, *self._split(block), out)
         return out
 
-    def pull(self, cotangents: np.ndarray, block: np.ndarray | None, out: np.ndarray) -> None:
-        """Add P'^T cotangents, and (a . P'') block where a block (p, K) is given, to out (p, K)."""
-        tangents = split(out if block is None else block, self.n, self.sh_degree)
-        outputs = split(out, self.n, self.sh_degree)
+    def pull(self, cotangents: np.ndarray, block: np.ndarray | None) -> np.ndarray:
+        """P'^T cotangents (p, K) from (n, K, 9), plus (a . P'') block where a block (p, K) is given."""
+        out = np.zeros((self.parameters, cotangents.shape[1]), self.held.jacobian.dtype)
+        outputs = self._split(out)
+        tangents = outputs if block is None else self._split(block)
         over_range(self.held.index.size, pull_back, self.held, block is not None, cotangents, *tangents, *outputs)
+        return out
 
-    def add_blocks(self, own: np.ndarray, curved: bool, geometry: np.ndarray, sh: np.ndarray) -> None:
-        """Add the blocks of splats, own (m, 9, 9), to blocks of stored parameters: `chain_blocks`."""
+    def blocks(self, own: np.ndarray, curved: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The blocks of splats, own (m, 9, 9), in stored parameters: `chain_blocks`."""
+        dtype = self.held.jacobian.dtype
+        geometry = np.zeros((self.n, GEOMETRY + 1, GEOMETRY + 1), dtype)
+        sh = np.zeros((self.n, (self.sh_degree + 1) ** 2, 3), dtype)
         over_range(self.held.index.size, chain_blocks, self.held, own, curved, geometry, sh)
+        return geometry, sh
+
+    def _split(self, block: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Views of a (p, K) block laid out like the flat vector: (n, 3, K), (n, 3, K), (n, 4, K), (n, K), (n, k, 3, K)."""
+        block, views, start = np.ascontiguousarray(block), [], 0
+        for shape in attribute_shapes(self.n, self.sh_degree).values():
+            size = prod(shape)
+            views.append(block[start : start + size].reshape(*shape, block.shape[1]))
+            start += size
+        return tuple(views)

@@ -72,7 +72,7 @@ def pixels_within(centre, reach, size):
 
 
 @formula
-def rows_in_strip(splat, level, det, ex, ey, left, right):
+def rows_in_strip(splat, level, det, ey, left, right):
     """Lowest and highest y, relative to the mean, of a bounded ellipse in the strip left <= x <= right (relative too)."""
     b, c = splat[3], splat[4]
     x_top = -b * ey / splat[2]  # where the ellipse is highest; it is lowest at -x_top
@@ -90,7 +90,7 @@ def rows_of_strip(splat, ellipse, column, tile, width, height):
     mx, my = splat[0] - 0.5, splat[1] - 0.5
     x0, x1 = pixels_within(mx, ex, width)
     left, right = max(column * tile, x0) - mx, min(column * tile + tile - 1, x1) - mx
-    low, high = rows_in_strip(splat, level, det, ex, ey, left, right)
+    low, high = rows_in_strip(splat, level, det, ey, left, right)
     bounded = level < inf
     return pixels_within(select(bounded, my + (low + high) / 2, my), select(bounded, (high - low) / 2, inf), height)
 

@@ -31,8 +31,8 @@ class Raster:
 
     splats: (n, 9), finite, kept in double precision; depths: (n,) positive where drawn, in the precision of the pixels;
     background: (3,).  With transmittance_min = 0 a pixel still
-    stops at LEAST_TRANSMITTANCE, an error of the image far beneath round-off.  listed: how many entries the tile lists had
-    before those that no pixel reaches were dropped.
+    stops at LEAST_TRANSMITTANCE, an error of the image far beneath round-off.  entries: how many the tile lists had before
+    those that no pixel reaches were dropped.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Raster:
         dtype, n = self.dtype, len(splats)
         lanes = lanes_of(dtype)
         self.lists = binning.bin_splats(splats, depths, drawn, width, height, settings)
-        self.listed = self.lists.splat.size
+        self.entries = self.lists.splat.size
         columns, tile_rows = -(-width // lanes), -(-height // formulas.TILE_ROWS)
         self.plane = (tile_rows * formulas.TILE_ROWS, columns * lanes)
         size = self.plane[0] * self.plane[1]
@@ -101,10 +101,39 @@ class Raster:
         return self._slot_start
 
     @property
+    def order(self) -> int:
+        """Which splats each tile draws, in which order: the same number for the same lists."""
+        return hash(self.lists.splat.tobytes())
+
+    @property
+    def entries_reached(self) -> int:
+        """How many entries some pixel reaches."""
+        return int(self.slot_start[-1])
+
+    @property
+    def touched(self) -> np.ndarray:
+        """The splats that have entries that some pixel reaches."""
+        return np.flatnonzero(np.diff(self.slot_start))
+
+    def dark_tiles(self, adjoint: "Adjoint", curvature: np.ndarray) -> int:
+        """How many tiles with entries have no slope and no curvature (as in `own_blocks`) in any pixel."""
+        rows, lanes = formulas.TILE_ROWS, self.plane[1] // self.frame.columns
+        planes = np.concatenate([adjoint.cotangent.reshape(4, *self.plane), curvature])
+        lit = (planes != 0).reshape(len(planes), -1, rows, self.frame.columns, lanes).any(axis=(0, 2, 4)).reshape(-1)
+        _ = self.slot_start  # drops the entries that no pixel reaches
+        return int(((np.diff(self.lists.start) > 0) & ~lit).sum())
+
+    @property
     def bytes(self) -> int:
         """Memory of what is held."""
         held = (self.splats, self.params, *self.lists, *self.pixels, self.slot_start)
         return sum(array.nbytes for array in held)
+
+    def workspace(self, vectors: int) -> int:
+        """Bytes that `jvp` and `curvature` of so many directions take, directions and result included."""
+        n, pixels = len(self.splats), 5 * self.frame.size
+        each = self.dtype.itemsize * (pixels + formulas.SUMS * self.entries_reached + formulas.TANGENTS * n)
+        return vectors * (each + 2 * 9 * 8 * n)
 
     def backward(self, cotangent: np.ndarray) -> "Adjoint":
         """The gradient in the splats from padded cotangent planes (4, ...)."""
@@ -153,6 +182,11 @@ class Adjoint:
         over_tiles(compositing.backward, raster.params, raster.lists, raster.frame, raster.pixels, self.cotangent, sums)
         self.moments, self.gradient = np.empty((n, 3), dtype), np.empty_like(raster.splats)
         over_range(n, packing.reduce_gradient, raster.splats, slot_start, sums, self.moments, self.gradient)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of what is held beside the cotangent."""
+        return self.gradient.nbytes + self.moments.nbytes
 
 
 class Tangent:

@@ -96,6 +96,13 @@ class CudaRaster:
         return len(self.lists.splat)
 
     @property
+    def order(self) -> int:
+        """Which splats each tile draws, in which order: the same number for the same lists."""
+        splat = self.lists.splat.long()
+        mixed = (splat + 1) * 0x1E3779B97F4A7C15 ^ torch.arange(len(splat), device=self.device) * 0x3F58476D1CE4E5B9
+        return int(((mixed ^ (mixed >> 31)) * 0x14D049BB133111EB).sum())
+
+    @property
     def slots(self) -> Slots:
         """Where the sums of the entries go that some pixel reaches."""
         if self._slots is None:
@@ -123,6 +130,12 @@ class CudaRaster:
         tensors = [self.splats, self.params, *self.lists, self.planes, self._transmittance, self._stop, self._reached]
         tensors += self._slots or ()
         return sum(tensor.nbytes for tensor in tensors)
+
+    def workspace(self, vectors: int) -> int:
+        """Bytes that `jvp` and `curvature` of so many directions take, directions and result included."""
+        n, pixels, item = len(self.splats), 5 * self.height * self.width, self.dtype.itemsize
+        each = item * (pixels + cuda_packing.SUMS * self.entries + cuda_packing.TANGENTS * n)
+        return vectors * (each + (2 * 9 + cuda_packing.SUMS) * 8 * n)
 
     def crop(self, planes: Float[Tensor, "*planes h w"]) -> Float[Tensor, "*planes h w"]:
         """The planes themselves: they have no padding here."""
@@ -199,6 +212,11 @@ class CudaAdjoint:
         self.gradient = torch.empty_like(raster.splats)
         arguments = (raster.splats, self.totals, self.gradient, n)
         launch(cuda_packing.reduce_gradient, grid(n, BLOCK), *arguments, **SPLATS)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of what is held beside the cotangent."""
+        return self.gradient.nbytes + self.totals.nbytes
 
     @property
     def moments(self) -> Float[Tensor, "n 3"]:

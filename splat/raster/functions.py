@@ -6,7 +6,6 @@ create_graph=True)` followed by another `grad` costs two tangent passes, not a t
 
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,7 +24,7 @@ from splat.settings import RenderSettings
 PARTS = (2, 3, 1, 3)  # mean, conic, opacity, colour in a splat of nine numbers
 
 
-def _parts(splats: np.ndarray | Tensor, like: Tensor) -> tuple[Tensor, ...]:
+def _parts(splats: Any, like: Tensor) -> tuple[Tensor, ...]:
     """The four attributes of splats (n, 9) as tensors in the precision of another; opacity (n,)."""
     means, conics, opacities, colours = torch.as_tensor(splats).to(like.dtype).split(PARTS, dim=1)
     return means.contiguous(), conics.contiguous(), opacities.reshape(-1), colours.contiguous()
@@ -56,6 +55,11 @@ def last_derivative(values: tuple[Tensor, ...], *sources: Tensor, refusal: str =
     return _Last.apply(refusal, len(values), *values, *sources)  # pyright: ignore[reportReturnType]
 
 
+def native(tensor: Tensor) -> Any:
+    """A tensor as the kernels where it is take it: as an array on the CPU."""
+    return tensor.detach() if by_triton(tensor) else tensor.detach().numpy()
+
+
 def projected(gaussians: Gaussians, lens: Lens) -> tuple[Tensor, Tensor, Tensor]:
     """Splats (n, 9), depths and which are drawn."""
     if by_triton(gaussians.flat):
@@ -81,20 +85,24 @@ def pulled(gaussians: Gaussians, lens: Lens, splats: Tensor, drawn: Tensor, bar:
     return gradient
 
 
+def held_projection(gaussians: Gaussians, lens: Lens, splats: Any, bar: Any, index: Any) -> Any:
+    """The projection held still where the Gaussians are: `Projection` in arrays, or `CudaProjection` in tensors."""
+    if not by_triton(gaussians.flat):
+        return Projection(gaussians, lens, splats, bar, index)
+    from splat.projection_cuda import CudaProjection
+
+    return CudaProjection(gaussians, lens, splats, bar, index)
+
+
 def _pushed_and_curved(
     gaussians: Gaussians, lens: Lens, splats: Tensor, drawn: Tensor, bar: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Of one direction in the flat vector, P' u (n, 9) and (bar . P'') u."""
-    if by_triton(gaussians.flat):
-        from splat.projection_cuda import CudaProjection
-
-        projection = CudaProjection(gaussians, lens, splats, bar.double(), drawn.nonzero()[:, 0])
-        tangents = projection.jvp(direction[:, None])
-        return tangents[:, 0], projection.pull(torch.zeros_like(tangents), direction[:, None])[:, 0]
-    projection = Projection(gaussians, lens, splats.numpy(), bar.numpy(), np.flatnonzero(drawn.numpy()))
-    tangents, product = projection.jvp(direction.numpy()[:, None]), torch.zeros_like(gaussians.flat)
-    projection.pull(np.zeros_like(tangents), direction.numpy()[:, None], product.numpy()[:, None])
-    return torch.from_numpy(tangents[:, 0]), product
+    index, u = drawn.nonzero()[:, 0], native(direction[:, None])
+    projection = held_projection(gaussians, lens, native(splats), native(bar.double()), native(index))
+    tangents = torch.as_tensor(projection.jvp(u))
+    product = torch.as_tensor(projection.pull(native(torch.zeros_like(tangents)), u))
+    return tangents[:, 0], product[:, 0]
 
 
 class _Project(torch.autograd.Function):
@@ -143,11 +151,6 @@ def held_view(
     return CudaRaster(splats, depths, drawn, background, width, height, settings)
 
 
-def _native(raster: Any, tensor: Tensor) -> Any:
-    """A tensor as a held view takes it."""
-    return tensor.detach().numpy() if isinstance(raster, Raster) else tensor.detach()
-
-
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, raster: Any, *splats: Tensor) -> Tensor:
@@ -164,15 +167,15 @@ class _RasterizeAdjoint(torch.autograd.Function):
     @staticmethod
     def forward(ctx, raster: Any, cotangent: Tensor, *splats: Tensor):
         ctx.raster = raster
-        ctx.adjoint = raster.backward(raster.pad(_native(raster, cotangent)))
+        ctx.adjoint = raster.backward(raster.pad(native(cotangent)))
         ctx.save_for_backward(cotangent, *splats)
         return _parts(ctx.adjoint.gradient, cotangent)
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
         raster = ctx.raster
-        tangent = raster.jvp(_native(raster, _joined(outputs)[:, None]))
-        product = tangent.curvature(ctx.adjoint, _native(raster, torch.zeros_like(torch.as_tensor(tangent.planes))))
+        tangent = raster.jvp(native(_joined(outputs)[:, None]))
+        product = tangent.curvature(ctx.adjoint, native(torch.zeros_like(torch.as_tensor(tangent.planes))))
         values = (torch.as_tensor(raster.crop(tangent.planes[0])).clone(), *_parts(product[:, 0], outputs[0]))
         return None, *last_derivative(values, *ctx.saved_tensors, *outputs)
 

@@ -8,7 +8,7 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from splat.curvature import SceneHessian, SceneObjective
 from splat.gaussians import Gaussians
-from splat.linearize import hold
+from splat.linearize import LinearizedView
 from splat.losses import LossSettings
 from splat.losses_cpu import loss_against
 from splat.render import Backend, render
@@ -53,7 +53,9 @@ def test_gradient_and_products_of_a_view_on_the_gpu_are_those_of_the_specificati
     view, U = views()[0], random_like((scene(dtype).flat.numel(), vectors), 1).float()
     gradient, products = gradient_and_products(scene(torch.float64), [view], LOSS, U.double())
     gaussians = on(scene(dtype), gpu)
-    held = hold(gaussians, view.camera, loss_against(view.image, LOSS, gaussians.flat), BACKGROUND, RenderSettings())
+    held = LinearizedView(
+        gaussians, view.camera, loss_against(view.image, LOSS, gaussians.flat), BACKGROUND, RenderSettings()
+    )
     assert max(errors_by_block(held.gradient.cpu(), gradient, gaussians.blocks).values()) < DERIVATIVE[dtype]
     hvp = held.hvp(U.to(gpu, dtype))
     assert max(errors_by_block(hvp.cpu(), products, gaussians.blocks).values()) < DERIVATIVE[dtype]
@@ -67,7 +69,7 @@ def test_all_that_a_view_on_the_gpu_gives_is_what_one_on_the_cpu_gives(device, m
 
     def everything(gaussians: Gaussians) -> list[Tensor]:
         loss = loss_against(view.image, LOSS, gaussians.flat)
-        held = hold(gaussians, view.camera, loss, BACKGROUND, RenderSettings())
+        held = LinearizedView(gaussians, view.camera, loss, BACKGROUND, RenderSettings())
         own, coarse = held.block_diagonal(), held.block_diagonal(gauss_newton=True)
         u = U.to(gaussians.flat)
         found = [

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splat.camera import Camera
 from splat.gaussians import Gaussians
-from splat.harmonics import BAND_OF_COEFFICIENT, harmonics
+from splat.harmonics import harmonics
 from splat.projection import Splats, project, rotation_matrices
 from splat.projection_cpu import attribute_arrays, lens_of, project_adjoint, project_arrays
 from splat.projection_linear import GEOMETRY, Projection
@@ -122,7 +122,6 @@ def test_harmonics_are_those_of_legendre_with_the_condon_shortley_phase():
     directions /= directions.norm(dim=1, keepdim=True)
     for degree in range(4):
         assert relative_error(harmonics(directions, degree), real_harmonics(directions.numpy(), degree)) < 1e-14
-    assert tuple(l for l in range(4) for _ in range(2 * l + 1)) == BAND_OF_COEFFICIENT
 
 
 def test_rotations_do_not_depend_on_a_quaternions_length_or_sign():
@@ -180,21 +179,15 @@ def test_jacobian_and_curvature_are_those_of_the_specification(degree, dtype):
     pushed = torch.from_numpy(projection.jvp(U))
     errors = errors_by_block(pushed.permute(2, 0, 1), expected.pushed.permute(2, 0, 1), SPLAT_BLOCKS)
     assert max(errors.values()) < DERIVATIVE[dtype], errors
-    out = np.zeros_like(U)
-    projection.pull(C, U, out)
-    errors = errors_by_block(torch.from_numpy(out), expected.pulled, gaussians.blocks)
+    errors = errors_by_block(torch.from_numpy(projection.pull(C, U)), expected.pulled, gaussians.blocks)
     assert max(errors.values()) < DERIVATIVE[dtype], errors
-    projection.pull(C, U, out)
-    assert relative_error(out, 2 * expected.pulled) < DERIVATIVE[dtype]  # it adds to what is there
 
 
 @each_dtype
 def test_pulling_back_without_directions_is_the_transpose_of_pushing_forward(dtype):
     projection, _ = held(3, dtype)
     U, C = truth(3).U.to(dtype).numpy(), truth(3).C.to(dtype).numpy()
-    pulled = np.zeros_like(U)
-    projection.pull(C, None, pulled)
-    there, back = (projection.jvp(U) * C).astype(np.float64), (pulled * U).astype(np.float64)
+    there, back = (projection.jvp(U) * C).astype(np.float64), (projection.pull(C, None) * U).astype(np.float64)
     eps = 30 * float(np.finfo(NUMPY[dtype]).eps)
     assert abs(there.sum() - back.sum()) < eps * (np.linalg.norm(there) + np.linalg.norm(back))
 
@@ -225,8 +218,7 @@ def test_jacobian_and_curvature_agree_with_finite_differences():
 
     projection = Projection(gaussians, lens, splats(0.0), bar, np.arange(len(gaussians)))
     U = direction.numpy()[:, None]
-    curvature = np.zeros_like(U)
-    projection.pull(np.zeros((len(gaussians), 1, 9)), U, curvature)
+    curvature = projection.pull(np.zeros((len(gaussians), 1, 9)), U)
     # step^4 = 1e-12 times a fifth derivative, and round-off 1e-16 / step
     assert relative_error(projection.jvp(U)[:, 0], central_difference(splats, 1e-3)) < 1e-9
     assert relative_error(curvature[:, 0], central_difference(gradient, 1e-3)) < 1e-9
