@@ -1,39 +1,61 @@
 """What a machine with a GPU is to be asked, in a few minutes: does it agree with the CPU, and how fast is it?
 
-    python -m analysis.gpu_check RUN/checkpoint.pt          both, on the checkpoint's training views
-    python -m analysis.gpu_check 500k@1600x1060             the ratios alone, on a synthetic scene of that size
+    python -m analysis.gpu_check                            every part, on synthetic scenes
+    python -m analysis.gpu_check RUN/checkpoint.pt          training from that checkpoint, and agreement there, too
+    python -m analysis.gpu_check --only ratios probe        some parts
 
-Agreement: relative differences, the GPU's loss, gradient, H v and traces against the CPU's, all in the checkpoint's precision.
-Ratios: those that `landscape bench --device cuda` is held to, which also says what they are made of.  How long a whole probe
-takes, `landscape probe --device cuda` says.
+    agreement    relative differences of the GPU's loss, gradient, H v and traces from the CPU's, in single precision
+    recordings   products as CUDA graphs against the same launched kernel by kernel: to the last bit, and how much faster
+    ratios       those that `landscape bench --device cuda` is held to, which also says what they are made of
+    probe        seconds of `landscape probe` on 500,000 Gaussians in 24 views
+    training     minutes of 10,000 steps of StableGS with all viewpoints in 3 views, at the pace of two hundred
+    checkpoint   agreement at the checkpoint
+
+Every part is a process with a limit of its own, lest one that fails, or hangs, takes the others along: a kernel that reads
+beyond its memory leaves no GPU to the process that launched it.  A part's table is printed and written when it ends.
 """
 
+import json
+import subprocess
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+import tempfile
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import inf, isinf
 from pathlib import Path
+from time import perf_counter
 
 import torch
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from analysis.bench import ON_BOTH, ON_GPU
+from analysis.bench import LARGEST, ON_BOTH, ON_GPU
 from analysis.bench_scene import ViewBench, per_vector
-from analysis.meters import meter_of
+from analysis.meters import Meter, meter_of
 from analysis.timing import interleaved
-from analysis.workloads import Size, Workload, synthetic_workload, workload_of
+from analysis.workloads import Size, Workload, synthetic_checkpoint, synthetic_workload, workload_of
 from landscape.probes import draw_probes
+from splat.checkpoint import write_atomically
 from splat.curvature import SceneHessian, SceneObjective
+from splat.densify import DensifySettings
 from splat.device import device_named
+from splat.recording import CALLS
+from splat.regularizers.stablegs import StableGS
+from splat.scenes.synthetic import SyntheticSettings
 from splat.traces import LEAST_SAMPLES, exact_traces
+from splat.train import TrainConfig, Training, train
 
 REPETITIONS = 10
+STEPS, PAPERS_MINUTES = 10_000, 13.0
+FIRST, MEASURED = 10, 200  # steps: not timed, since kernels are compiled; timed
+SECONDS = 540.0  # for all parts together
 
 
 @dataclass(frozen=True)
 class Check:
-    """A number and what it should not exceed; None: nothing to compare it with, for this reason."""
+    """A number and what it should not exceed; None: nothing to compare it with, for this reason; infinite: it failed."""
 
     name: str
     value: float | None
@@ -43,6 +65,9 @@ class Check:
     @property
     def holds(self) -> bool | None:
         return None if self.value is None else self.value <= self.bound
+
+
+# --- parts ------------------------------------------------------------------------------------------------------------
 
 
 def agreement(workload: Workload, device: torch.device) -> list[Check]:
@@ -69,8 +94,28 @@ def agreement(workload: Workload, device: torch.device) -> list[Check]:
     return [Check(name, float(value), 1e-6 if name == "loss" else 1e-5) for name, value in differences.items()]
 
 
-def speed(workload: Workload, device: torch.device) -> list[Check]:
-    """The ratios of the first view."""
+def recordings(workload: Workload, meter: Meter) -> list[Check]:
+    """The last of a few products, which is recorded, against the same launched kernel by kernel."""
+    w, checks = workload.to(meter.device), []
+    objective = SceneObjective(w.gaussians, w.views, w.loss, w.background, w.settings)
+    hessian, generator = SceneHessian(objective, keep_null=True), torch.Generator(meter.device).manual_seed(0)
+    for vectors in (1, 8):
+        if not objective.recordable(vectors):
+            checks.append(Check(f"H v {vectors}, recorded", None, 0.0, "not recorded here"))
+            continue
+        blocks = [draw_probes(hessian.dim, vectors, generator, hessian.dtype) for _ in range(CALLS + 1)]
+        differences = [(hessian.apply(V) - objective.mean(hessian._sum(V))).abs().max() for V in blocks]
+        V = blocks[-1]
+        calls = {"recorded": lambda V=V: hessian.apply(V), "launched": lambda V=V: hessian._sum(V)}
+        times = interleaved(calls, REPETITIONS, clock=meter.seconds)
+        ratio = times["recorded"].minimum / times["launched"].minimum
+        checks.append(Check(f"H v {vectors}, recorded - launched", float(max(differences)), 0.0))
+        checks.append(Check(f"H v {vectors}, seconds recorded / launched", ratio, 1.0))
+    return checks
+
+
+def ratios(workload: Workload, device: torch.device) -> list[Check]:
+    """Of times of the first view."""
     bench = ViewBench(workload.to(device))
     times = interleaved({**bench.wholes(), **bench.peers()}, REPETITIONS, clock=meter_of(device).seconds)
     return checks_of({name: time.minimum for name, time in per_vector(times).items()}, bench.lack)
@@ -84,26 +129,126 @@ def checks_of(seconds: dict[str, float], lack: str | None) -> list[Check]:
     ]
 
 
+def probe(settings: SyntheticSettings, device: torch.device, *options: str) -> list[Check]:
+    """The command's seconds, from the checkpoint to the pictures."""
+    from analysis.cli import main as command
+
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoint = synthetic_checkpoint(settings, Path(folder))
+        start = perf_counter()
+        code = command(["probe", str(checkpoint), "--device", device.type, *options])
+        seconds = perf_counter() - start
+    return [
+        Check("exit code", code, 0),
+        Check(f"{settings.gaussians} Gaussians, {settings.views} views, s", seconds, 60.0),
+    ]
+
+
+def training(workload: Workload, device: torch.device, first: int = FIRST, measured: int = MEASURED) -> list[Check]:
+    """The minutes that all steps take at the pace of a few, without density control."""
+    degree = workload.gaussians.sh_degree
+    config = TrainConfig(STEPS, sh_degree=degree, sh_degree_every=1, loss=workload.loss, render=workload.settings)
+    config = replace(config, method=StableGS(warm_up=0), densify=DensifySettings(enabled=False))
+    views, state = list(workload.views[:3]), Training.start(workload.gaussians, 1.0, config)
+    state.move(device)
+    state.regularizer.begin(state, views)
+    steps = train(state, views)
+    for _ in range(first):
+        next(steps)
+    start = perf_counter()
+    for _ in range(measured):
+        next(steps)  # reads the loss, and so ends when the device has
+    minutes = (perf_counter() - start) / measured * STEPS / 60
+    name = f"{STEPS} steps of StableGS, {len(workload.gaussians)} Gaussians, {len(views)} views, minutes"
+    return [Check(name, minutes, PAPERS_MINUTES)]
+
+
+def _small() -> Workload:
+    return synthetic_workload(Size(2000, 200, 150))
+
+
+def _like_fern() -> Workload:
+    return synthetic_workload(Size(10_000, 504, 378))
+
+
+Part = tuple[float, Callable[[torch.device, Path | None], list[Check]]]
+PARTS: dict[str, Part] = {  # seconds at most, and what is asked, of a checkpoint where one is given
+    "agreement": (180, lambda device, path: agreement(_small(), device)),
+    "recordings": (90, lambda device, path: recordings(_like_fern(), meter_of(device))),
+    "ratios": (150, lambda device, path: ratios(synthetic_workload(Size.parse(LARGEST)), device)),
+    "probe": (240, lambda device, path: probe(SyntheticSettings(500_000, 24, 1600, 1060, sh_degree=3), device)),
+    "training": (90, lambda device, path: training(workload_of(path) if path else _like_fern(), device)),
+    "checkpoint": (180, lambda device, path: agreement(workload_of(path), device) if path else []),
+}
+
+
+# --- one after the other ----------------------------------------------------------------------------------------------
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table; 1 where something does not hold."""
-    (path,) = sys.argv[1:] if arguments is None else arguments
+    """Print the tables; 1 where something does not hold."""
+    options = _options(sys.argv[1:] if arguments is None else arguments)
     device = device_named("cuda")
-    if Path(path).exists():
-        workload = workload_of(Path(path))
-        checks = agreement(workload, device) + speed(workload, device)
-    else:
-        workload = synthetic_workload(Size.parse(path))
-        checks = speed(workload, device)
-    Console().print(table(workload.name, checks))
-    return int(any(check.holds is False for check in checks))
+    if options.into:
+        checks = PARTS[options.only[0]][1](device, options.checkpoint)
+        options.into.write_text(json.dumps([asdict(check) for check in checks]))
+        return 0
+    again = [sys.executable, "-m", "analysis.gpu_check", *([str(options.checkpoint)] if options.checkpoint else [])]
+    chosen = options.only or [name for name in PARTS if name != "checkpoint" or options.checkpoint]
+    commands = {name: (PARTS[name][0], [*again, "--only", name]) for name in chosen}
+    found = in_turn(commands, options.out, options.seconds, Console())
+    return int(any(check.holds is False for checks in found.values() for check in checks))
+
+
+def _options(arguments: Sequence[str]) -> Namespace:
+    parser = ArgumentParser("python -m analysis.gpu_check")
+    parser.add_argument("checkpoint", nargs="?", type=Path, help="RUN/checkpoint.pt")
+    parser.add_argument("--only", nargs="+", default=[], choices=PARTS, metavar="PART", help=", ".join(PARTS))
+    parser.add_argument(
+        "--out", type=Path, default=Path("gpu_check.json"), help="what was found, written after every part"
+    )
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="for all parts together")
+    parser.add_argument("--into", type=Path, help="work on one part in this process, and write its numbers there")
+    return parser.parse_args(arguments)
+
+
+def in_turn(
+    commands: Mapping[str, tuple[float, list[str]]], out: Path, seconds: float, console: Console
+) -> dict[str, list[Check]]:
+    """What each part finds, whose command takes --into FILE; a limit and a command each, and seconds for all together."""
+    end, found = perf_counter() + seconds, {}
+    for name, (limit, command) in commands.items():
+        console.rule(name)
+        start = perf_counter()
+        found[name] = _found(name, command, min(limit, end - start))
+        console.print(table(f"{name}, {perf_counter() - start:.0f} s", found[name]))
+        lines = {part: [asdict(check) for check in checks] for part, checks in found.items()}
+        write_atomically(out, json.dumps(lines, indent=1).encode())
+    return found
+
+
+def _found(name: str, command: list[str], limit: float) -> list[Check]:
+    if limit <= 0:
+        return [Check(name, None, 0.0, "no time was left")]
+    with tempfile.TemporaryDirectory() as folder:
+        into = Path(folder) / "checks.json"
+        try:
+            code = subprocess.run([*command, "--into", str(into)], timeout=limit).returncode
+        except subprocess.TimeoutExpired:
+            return [Check(name, inf, 0.0, f"not done in {limit:.0f} s")]
+        if code or not into.is_file():
+            return [Check(name, inf, 0.0, f"failed with exit code {code}, see above")]
+        return [Check(**line) for line in json.loads(into.read_text())]
 
 
 def table(name: str, checks: Sequence[Check]) -> Table:
     result = Table("", "found", "at most", "", title=name)
     for check in checks:
-        value = "-" if check.value is None else f"{check.value:.2g}"
-        words = {None: check.reason, True: "holds", False: "[red]does not hold[/red]"}
-        result.add_row(check.name, value, f"{check.bound:g}", words[check.holds])
+        value = "-" if check.value is None or isinf(check.value) else f"{check.value:.2g}"
+        words = {None: check.reason, True: "holds", False: "[red]does not hold[/red]"}[check.holds]
+        if check.value is not None and isinf(check.value):
+            words = f"[red]{check.reason}[/red]"
+        result.add_row(check.name, value, f"{check.bound:g}", words)
     return result
 
 

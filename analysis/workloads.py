@@ -10,15 +10,17 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.checkpoint import load_checkpoint
+from splat.checkpoint import SceneReference, load_checkpoint, save_checkpoint
 from splat.gaussians import Gaussians
 from splat.losses import LossSettings
 from splat.scenes.scene import load_scene
 from splat.scenes.splits import split_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.view import View
+from splat.scenes.write import write_transforms_scene
 from splat.settings import RenderSettings
 from splat.start import gaussians_from_points
+from splat.train import TrainConfig, Training
 
 TANGENTS = (1, 4)
 BACKGROUND = (0.1, 0.2, 0.3)
@@ -119,11 +121,26 @@ def _resized(view: View, factor: float) -> View:
 
 def synthetic_workload(size: Size) -> Workload:
     """Four views of the synthetic scene, whose Gaussians have lost their exact colours, so that the loss is not at 0."""
-    settings = SyntheticSettings(size.count, 4, size.width, size.height, sh_degree=3)
-    made, generator = synthetic_scene(settings), torch.Generator().manual_seed(0)
-    gaussians = made.truth.select(torch.arange(len(made.truth)), 3)
-    gaussians.sh.add_(0.1 * torch.randn(gaussians.sh.shape, generator=generator))
-    return Workload(f"synthetic {size}", gaussians, tuple(made.scene.load()), made.scene.background)
+    made = synthetic_scene(SyntheticSettings(size.count, 4, size.width, size.height, sh_degree=3))
+    return Workload(f"synthetic {size}", _discoloured(made.truth), tuple(made.scene.load()), made.scene.background)
+
+
+def synthetic_checkpoint(settings: SyntheticSettings, folder: Path) -> Path:
+    """The scene in a folder, and a checkpoint of a training on all its views that begins at its discoloured Gaussians."""
+    made, path = synthetic_scene(settings), folder / "run" / "checkpoint.pt"
+    write_transforms_scene(made.scene, folder / "scene")
+    scene = load_scene(folder / "scene")
+    split = split_scene(scene, train=scene.names)
+    training = Training.start(_discoloured(made.truth), scene.extent(split.train), TrainConfig(sh_degree=3))
+    path.parent.mkdir()
+    save_checkpoint(path, training, SceneReference.to(scene, path, split, None, 1.0))
+    return path
+
+
+def _discoloured(gaussians: Gaussians) -> Gaussians:
+    gaussians = gaussians.select(torch.arange(len(gaussians)), 3)
+    gaussians.sh.add_(0.1 * torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(0)))
+    return gaussians
 
 
 def workload_of(path: Path, images: str | None = None, downscale: float = 1.0) -> Workload:

@@ -1,16 +1,24 @@
 """The checks for a machine with a GPU, at toy size: without one, by Triton's interpreter."""
 
+import json
+import sys
+
 import pytest
 import torch
 from rich.console import Console
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
-from analysis.gpu_check import Check, agreement, checks_of, main, table
+from analysis.gpu_check import Check, agreement, checks_of, in_turn, main, probe, recordings, table, training
+from analysis.meters import HostMeter
 from analysis.workloads import Workload
+from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
+from splat.recording import Recordings
+from splat.scenes.synthetic import SyntheticSettings
 from tests.splat.held_scenes import two_views
 from tests.splat.random_scenes import random_gaussians
+from tests.splat.tiny import tiny_gaussians, tiny_views
 
 
 def toy(dtype: torch.dtype = torch.float32) -> Workload:
@@ -31,6 +39,56 @@ def test_a_device_agrees_with_the_cpu(device, monkeypatch):
     checks = agreement(toy(torch.float64), device)  # in single precision so few Gaussians' traces cancel
     assert [check.name for check in checks][:3] == ["loss", "gradient", "H v"] and len(checks) == 8
     assert all(check.holds for check in checks), checks
+
+
+@pytest.mark.parametrize("off", [0.0, 1.0])
+def test_recorded_products_are_held_against_launched_ones(off, monkeypatch):
+    def capture(call):
+        result = call()
+        return result, lambda: result.copy_(call() + off)
+
+    monkeypatch.setattr(SceneObjective, "recordable", lambda self, vectors: vectors == 8)
+    monkeypatch.setattr(SceneHessian, "_recordings", Recordings(capture))
+    alone, difference, ratio = recordings(toy(), HostMeter())
+    assert alone.value is None and alone.reason == "not recorded here"
+    assert difference.name == "H v 8, recorded - launched" and difference.value == pytest.approx(off, rel=1e-4)
+    assert difference.holds == (off == 0) and ratio.value is not None and ratio.value > 0
+
+
+def test_a_training_is_timed_at_its_pace():
+    views = tuple(tiny_views())
+    (check,) = training(Workload("tiny", tiny_gaussians(sh_degree=1), views, torch.zeros(3)), torch.device("cpu"), 1, 2)
+    assert check.value is not None and check.value > 0 and check.bound == 13 and "12 Gaussians, 3 views" in check.name
+
+
+def test_a_probe_is_timed_from_its_checkpoint_on(monkeypatch):
+    monkeypatch.setattr("analysis.recording.draw", lambda module, target: [])
+    settings = SyntheticSettings(60, 4, 16, 12)
+    code, seconds = probe(settings, torch.device("cpu"), "--quick", "--seconds", "0.1", "--slice-points", "5")
+    assert code == Check("exit code", 0, 0) and seconds.value is not None and 0 < seconds.value < 600
+
+
+def test_a_part_that_fails_or_hangs_leaves_the_others_as_they_are(tmp_path):
+    checks = [{"name": "loss", "value": 1e-7, "bound": 1e-6, "reason": None}]
+    say = f"import sys; open(sys.argv[-1], 'w').write({json.dumps(checks)!r})"
+    commands = {
+        "crash": (60.0, [sys.executable, "-c", "import os; os._exit(3)"]),
+        "hang": (0.5, [sys.executable, "-c", "import time; time.sleep(60)"]),
+        "silent": (60.0, [sys.executable, "-c", ""]),
+        "good": (60.0, [sys.executable, "-c", say]),
+    }
+    console = Console(width=100, record=True)
+    found = in_turn(commands, tmp_path / "found.json", 60.0, console)
+    assert {name: checks[0].holds for name, checks in found.items()} == {
+        "crash": False, "hang": False, "silent": False, "good": True,
+    }  # fmt: skip
+    assert found["good"] == [Check("loss", 1e-7, 1e-6)]
+    text = console.export_text()
+    assert "failed with exit code 3" in text and "not done in 0 s" in text and "holds" in text
+    written = json.loads((tmp_path / "found.json").read_text())
+    assert list(written) == list(commands) and written["good"] == checks
+    late = in_turn({"good": commands["good"]}, tmp_path / "late.json", 0.0, console)
+    assert late == {"good": [Check("good", None, 0.0, "no time was left")]}
 
 
 def test_times_are_held_against_what_is_asked_of_them_and_what_has_no_peer_is_said(capsys):
