@@ -54,13 +54,11 @@ class ActiveCounts:
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """What a memory budget decides.  bytes; kept of views stay linearised, the others are rebuilt for every product.
+    """What a memory budget decides: kept of views stay linearised, the others are rebuilt for every product.
 
     vectors: how many vectors a product takes at a time.
     """
 
-    budget: int
-    bytes_per_view: int
     kept: int
     views: int
     vectors: int
@@ -188,7 +186,7 @@ class SceneObjective:
         per_vector = max(first.workspace(2) - first.workspace(1), 1)
         more = min(max(spare // first.bytes, 0), len(self.views) - 1)
         vectors = 1 + max(spare - more * first.bytes, 0) // per_vector
-        return MemoryPlan(self._memory, first.bytes, 1 + int(more), len(self.views), int(min(vectors, MOST_VECTORS)))
+        return MemoryPlan(1 + int(more), len(self.views), int(min(vectors, MOST_VECTORS)))
 
     @property
     def linearized(self) -> Iterator[LinearizedView]:

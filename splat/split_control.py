@@ -58,8 +58,9 @@ def halves(opacity: Float64[Tensor, " n"]) -> tuple[Float64[Tensor, " n"], Float
     >>> [round(v, 4) for v in (x / torch.tensor([1e-6, 0.5])).tolist()], [round(v, 4) for v in k.tolist()]
     ([0.5, 0.5711], [1.0, 1.0703])
     """
-    ratio, sharpness = (np.interp(opacity.numpy(), KNOTS, column) for column in _table().T)
-    return opacity * torch.from_numpy(ratio), torch.from_numpy(sharpness)
+    at, table = opacity.cpu().numpy(), _table().T
+    ratio, sharpness = (torch.from_numpy(np.interp(at, KNOTS, column)).to(opacity.device) for column in table)
+    return opacity * ratio, sharpness
 
 
 def _error(unknowns: np.ndarray, o: float) -> float:
