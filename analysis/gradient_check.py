@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from landscape import DerivativeCheck, check_gradient
+from landscape import DerivativeCheck, ProjectedOperator, check_gradient
 from landscape.checks import ROUND_OFFS
 from landscape.results import Progress
 from splat.curvature import SceneHessian, SceneObjective
@@ -33,10 +33,16 @@ STEPS = (1e-10, 3e-10, 3e-11)  # per parameter; means in units of their spread
 
 
 def check_against_gradient(
-    objective: SceneObjective, loss: LossSettings, generator: torch.Generator, progress: Progress | None = None
+    hessian: SceneHessian,
+    loss: LossSettings,
+    generator: torch.Generator,
+    progress: Progress | None = None,
+    views: int | None = None,
 ) -> DerivativeCheck:
-    """The relative error of H v for one random v.  loss: the objective's."""
-    operator, double = SceneHessian(objective), objective.active.to(torch.float64)
+    """The relative error of H v for one random v.  loss: the objective's.  views: of the first so many alone; None: of all."""
+    objective = hessian.objective if views is None else hessian.objective.of_views(views)
+    operator = ProjectedOperator(SceneHessian(objective, keep_null=True), hessian.project)
+    double = objective.active.to(torch.float64)
     background, settings = objective.background.double(), objective.settings
     direction = operator.project(_direction(objective, generator)[:, None])[:, 0]
     losses = [loss_against(view.image, loss, double.flat) for view in objective.views]

@@ -1,6 +1,6 @@
 """What `landscape probe` measures at one point of a scene's loss, stage by stage.
 
-    linearise           every view held still
+    linearise           every view held still, every Gaussian's own block of H, a first render
     checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
     traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
     eigenvalues         Lanczos from the steepest directions of single Gaussians: the two largest and the smallest
@@ -9,8 +9,9 @@
     finite probe        the second difference of the loss along the first eigenvector, over a range of steps
     slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
 
-The estimators stop at their tolerance, at their budget of products, or when their share of the time is spent; each result
-says which.  Time that a stage leaves goes to the later ones.  The numbers depend on the seed alone unless time ran out.
+Every kernel has worked once when the checks are done: what follows compiles nothing.  The estimators stop at their
+tolerance, at their budget of products, or when their share of the time is spent; each result says which.  Time that a stage
+leaves goes to the later ones.  The numbers depend on the seed alone unless time ran out.
 """
 
 from collections.abc import Callable, Hashable
@@ -57,8 +58,10 @@ from splat.raster.threads import single_threaded, thread_count
 from splat.traces import exact_traces
 
 GIB = 2**30
-FEWEST_STEPS, FEWEST_POINTS = 8, 5  # of a density and along a side of a slice that are worth their time
-FEWEST_STARTS = 2  # of a density: its spread is an error
+FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density and along a side of a slice that are worth their time
+FEWEST_STARTS = (
+    3  # of a density: with a spread of two degrees of freedom its interval is a third of what it is with one
+)
 FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
 FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds
@@ -70,13 +73,18 @@ SHARES = {"traces": 4.0, "eigenvalues": 4.0, "power iteration": 2.0, "density": 
 class ProbeSettings:
     """How much of everything.
 
-    slice_radius: half the slice's side, in curvature units, sqrt(2 rise / lambda); slice_rise: that rise of the loss, as
-    a share of the loss; slice_tolerance: of what lies between its renders, as a share of its range.  probe_steps: of the
-    finite probe, parameter units; noise_points: its renders that tell their noise.  timings: of each product that tells what a
-    skip saves.  seconds: for all estimators together.  memory: GiB for the vectors of a basis.
+    checked_vectors, checked_views: of the self-checks; None: all views.  trace_samples: just so many; None: until `traces` is
+    met.  slice_radius: half the slice's side, in curvature units, sqrt(2 rise / lambda); slice_rise: that rise of the loss,
+    as a share of the loss; slice_tolerance: of what lies between its renders, as a share of its range; slice_holdout: renders
+    that judge it.  probe_steps: of the finite probe, parameter units; noise_points: its renders that tell their noise.
+    timings: of each product that tells what a skip saves; 0: it is not told.  seconds: for all estimators together.  memory:
+    GiB for the vectors of a basis.
     """
 
+    checked_vectors: int = 4
+    checked_views: int | None = None
     traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.01, max_probes=128))
+    trace_samples: int | None = None
     eigen: EigenSettings = field(default_factory=lambda: EigenSettings(largest=2, smallest=1, max_matvecs=150))
     power: PowerSettings | None = field(default_factory=lambda: PowerSettings(max_matvecs=40))
     density_starts: int = 4
@@ -85,6 +93,7 @@ class ProbeSettings:
     slice_radius: float = 3.0
     slice_rise: float = 0.001
     slice_tolerance: float = 0.01
+    slice_holdout: int = 30
     probe_steps: tuple[float, ...] = STEPS
     noise_points: int = NOISE_POINTS
     timings: int = 3
@@ -103,18 +112,22 @@ class ProbeSettings:
 
     @classmethod
     def quick(cls) -> "ProbeSettings":
-        """Numbers to 10% in less than half of the time."""
+        """Numbers to 10% in a quarter of the time."""
         return cls(
-            traces=TraceSettings(rtol=0.1, max_probes=16),
-            eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=60),
+            checked_vectors=2,
+            checked_views=1,
+            traces=TraceSettings(rtol=0.1),
+            trace_samples=6,
+            eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, noise=0.3, max_matvecs=60),
             power=None,
-            density_starts=2,
-            density_steps=8,
+            density_starts=3,
+            density_steps=4,
             slice_points=11,
             slice_tolerance=0.1,
+            slice_holdout=8,
             probe_steps=STEPS[::5],
             noise_points=8,
-            timings=1,
+            timings=0,
             seconds=12.0,
         )
 
@@ -164,19 +177,21 @@ def measure(
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
         gradient = _linearised_gradient(objective, report)
+        own = objective.block_diagonal()
+        value, render = _rendered(objective)
     with stage("checks") as report:
-        operator_check = check_operator(operator, split(generator))
-        gradient_check = check_against_gradient(objective, loss, split(generator), report)
+        operator_check = check_operator(operator, split(generator), settings.checked_vectors)
+        gradient_check = check_against_gradient(hessian, loss, split(generator), report, settings.checked_views)
     budget = _Budget(settings)
     streams = {name: split(generator) for name in SHARES}
     with stage("traces") as report:
         allowed = replace(settings.traces, max_seconds=budget.share("traces"))
-        traces = exact_traces(objective, streams["traces"], allowed, report)
+        traces = exact_traces(objective, streams["traces"], allowed, report, samples=settings.trace_samples, own=own)
     with stage("eigenvalues") as report:
         eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
         eigen = replace(eigen, basis=_basis(operator, eigen, settings.memory, notes))
-        start = steepest_own(objective, eigen.largest, eigen.smallest)
-        ends = extreme_eigenpairs(operator, streams["eigenvalues"], eigen, start, report)
+        start, timed = steepest_own(objective, own, eigen.largest, eigen.smallest), CountingOperator(operator)
+        ends = extreme_eigenpairs(timed, streams["eigenvalues"], eigen, start, report)
     power = None
     if settings.power is not None:
         with stage("power iteration") as report:
@@ -185,9 +200,9 @@ def measure(
     with stage("density") as report:
         seconds = budget.share("density")
         active = ActiveSpace(hessian.project, hessian.rank)
-        density = _density(operator, active, streams["density"], settings, seconds, report, notes)
+        each = timed.seconds / timed.matvecs
+        density = _density(operator, active, streams["density"], settings, seconds, each, report, notes)
     with stage("finite probe") as report:
-        value, render = _rendered(objective)
         finite = _finite(objective, operator, ends, settings, budget.share("finite probe"), render, report, notes)
     with stage("slice") as report:
         seconds, stream = budget.share("slice"), streams["slice"]
@@ -254,15 +269,14 @@ def _density(
     generator: torch.Generator,
     settings: ProbeSettings,
     seconds: float,
+    each: float,
     report: Progress,
     notes: list[str],
 ) -> SpectralDensity | None:
-    """As many steps as time and memory allow, from fewer start vectors where they are few; None where they are too few."""
+    """As many steps as time and memory allow at so many seconds a product, from fewer start vectors where they are few; None
+    where they are too few."""
     starts, steps = settings.density_starts, settings.density_steps
     room = vectors_within(operator, settings.memory)
-    start = monotonic()
-    operator.apply(torch.ones(operator.dim, starts, dtype=operator.dtype))
-    each = (monotonic() - start) / starts
     if seconds < FEWEST_STEPS * starts * each:
         starts = min(starts, FEWEST_STARTS)
     steps = int(min(steps, seconds / (starts * each), room))
@@ -359,6 +373,6 @@ def _within(settings: ProbeSettings, seconds: float, each: float, workers: int) 
     is held out, and refinement decides as often."""
     points, tolerance, limit = settings.slice_points**2, settings.slice_tolerance, max(seconds, SHORTEST)
     if min(points, FEWEST_RENDERS) * each <= seconds:
-        return SliceSettings(tolerance, workers=workers, max_seconds=limit)
-    few = max(FEWEST_HELD_OUT, int(seconds / each / 4))
+        return SliceSettings(tolerance, settings.slice_holdout, workers=workers, max_seconds=limit)
+    few = min(settings.slice_holdout, max(FEWEST_HELD_OUT, int(seconds / each / 4)))
     return SliceSettings(tolerance, holdout=few, batch=few, workers=workers, max_seconds=limit)

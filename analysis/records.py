@@ -66,7 +66,7 @@ slice             null, or:
     note
 counts*           gaussians*, visible_gaussians*, parameters*, active_parameters*, sh_degree_stored*, sh_degree_active*,
                   views*; any further integer under a name that says what was counted
-skipped           what the scene did not need (`analysis.skips`) -> count, seconds_saved (measured, not reproducible)
+skipped           what the scene did not need (`analysis.skips`) -> count, seconds_saved (measured, not reproducible; null: not)
 checks*           e.g. symmetry, repeatability, finite_difference, finiteness, each with:
     value*, bound*    what was measured and what it must not exceed
     passed*           true, false, or null where the check could not run (see note)

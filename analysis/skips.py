@@ -22,16 +22,17 @@ from splat.linearize import LinearizedView, rasterize_view
 from splat.raster.binning import reached_lists
 
 REPETITIONS = 3
+NOT_CONCERNED = "products_of_views_not_concerned"
 
 
 @dataclass(frozen=True)
 class Skip:
-    """count: of what was left out, over all views; seconds: saved in the whole probe."""
+    """count: of what was left out, over all views; seconds: saved in the whole probe, None where that was not measured."""
 
     count: int
-    seconds: float
+    seconds: float | None
 
-    def record(self) -> dict[str, int | float]:
+    def record(self) -> dict[str, int | float | None]:
         return {"count": self.count, "seconds_saved": self.seconds}
 
 
@@ -41,33 +42,35 @@ def product_skips(
     """What every product of the exact Hessian leaves out.
 
     gaussians: those of the checkpoint; products: H v made; spared: products of single views that `SceneHessian` left out.
-    repetitions: of each timing.  On the GPU nothing is timed against what it leaves out, and nothing returned.
+    repetitions: of each timing; with 0 nothing is timed.  On the GPU nothing is timed against what it leaves out, and nothing
+    returned.
     """
     if by_triton(objective.active.flat):
         return {}
     active, stored = objective.active, objective.counts.sh_degree
-    held = objective.linearize(0)
     counts = {
         "gaussians_out_of_sight": len(gaussians) - len(active),
         "sh_bands_not_in_use": (stored + 1) ** 2 - (active.sh_degree + 1) ** 2,
         "entries_behind_opaque_fronts": objective.total(sum(view.entries_behind for view in objective.linearized)),
         "tiles_of_zero_cotangent": objective.total(sum(view.dark_tiles for view in objective.linearized)),
     }
+    spared = objective.total(spared)
+    if not repetitions:
+        return {name: Skip(count, None) for name, count in (*counts.items(), (NOT_CONCERNED, spared))}
     variants: dict[str, Callable[[], LinearizedView]] = {
         "gaussians_out_of_sight": lambda: objective.linearize(0, gaussians.select(_all(gaussians), active.sh_degree)),
         "sh_bands_not_in_use": lambda: objective.linearize(0, active.select(_all(active), stored)),
         "entries_behind_opaque_fronts": lambda: _with_every_entry(objective),
         "tiles_of_zero_cotangent": lambda: _with_every_tile(objective),
     }
-    views = {"": held, **{name: make() for name, make in variants.items() if counts[name]}}
+    views = {"": objective.linearize(0), **{name: make() for name, make in variants.items() if counts[name]}}
     calls = {name: partial(view.hvp, _vector(view)) for name, view in views.items()}
     times = {name: time.minimum for name, time in interleaved(calls, repetitions).items()}
     made = products * objective.counts.views
     skips = {
         name: Skip(count, max(times[name] - times[""], 0.0) * made if count else 0.0) for name, count in counts.items()
     }
-    spared = objective.total(spared)
-    return {**skips, "products_of_views_not_concerned": Skip(spared, spared * times[""])}
+    return {**skips, NOT_CONCERNED: Skip(spared, spared * times[""])}
 
 
 def estimator_skips(findings: Findings, seconds: Mapping[str, float]) -> dict[str, Skip]:

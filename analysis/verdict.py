@@ -154,16 +154,16 @@ def _of_finite_probe(probe: Mapping[str, Any] | None) -> list[Line]:
     return [Line(f"{text}{quantity(far)} at ±{quantity(probe['steps'][-1])}.")]
 
 
-def _of_skips(skipped: Mapping[str, Mapping[str, float]]) -> list[Line]:
+def _of_skips(skipped: Mapping[str, Mapping[str, Any]]) -> list[Line]:
     """What was left out, the largest saving first."""
     present = {name: skip for name, skip in skipped.items() if skip["count"]}
-    order = sorted(present, key=lambda name: -present[name]["seconds_saved"])
-    parts = [
-        f"{present[name]['count']:,} {name.replace('_', ' ').replace('gaussian', 'Gaussian')} "
-        f"({present[name]['seconds_saved']:.1f} s)"
-        for name in order
-    ]
-    return [Line(f"Left out, with the time it saved: {', '.join(parts)}.")] if parts else []
+    order = sorted(present, key=lambda name: -(present[name]["seconds_saved"] or 0.0))
+    parts = []
+    for name in order:
+        count, seconds = present[name]["count"], present[name]["seconds_saved"]
+        saved = "" if seconds is None else f" ({seconds:.1f} s)"
+        parts.append(f"{count:,} {name.replace('_', ' ').replace('gaussian', 'Gaussian')}{saved}")
+    return [Line(f"Left out, with the time it saved where that was measured: {', '.join(parts)}.")] if parts else []
 
 
 def _of_counts(counts: Mapping[str, int]) -> list[Line]:

@@ -12,6 +12,7 @@ whose singular value is beneath TOLERANCE of the largest are null.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -31,9 +32,16 @@ class RowSpace:
     basis: Float[Tensor, "n r d"]
     rank: Int[Tensor, " n"]
 
+    @cached_property
+    def _partial(self) -> tuple[Int[Tensor, " m"], Float[Tensor, "m r d"]]:
+        """The Gaussians that have null components, and their bases: with low SH degrees few have any."""
+        index = torch.nonzero(self.rank < self.basis.shape[2])[:, 0]
+        return index, self.basis[index]
+
     def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         """x without its null components."""
-        return self.basis.mT @ (self.basis @ x)
+        index, basis = self._partial
+        return x.index_copy(0, index, basis.mT @ (basis @ x[index]))
 
     def scaled(self, scale: Float[Tensor, "n d"]) -> "RowSpace":
         """The space of all D x, D = diag(scale) > 0 and x in this space."""

@@ -7,24 +7,25 @@ eigenvalue of fern (8,000 Gaussians, 3 views) to 10%; from more of them than pai
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from splat.curvature import SceneObjective
-from splat.linearize import GEOMETRY_COLUMNS
+from splat.linearize import GEOMETRY_COLUMNS, OwnBlocks
 
 CHUNK = 65_536  # Gaussians at a time
 
 
-def steepest_own(objective: SceneObjective, largest: int, smallest: int) -> Float[Tensor, "p k"]:
+def steepest_own(objective: SceneObjective, own: OwnBlocks, largest: int, smallest: int) -> Float[Tensor, "p k"]:
     """Unit vectors: of the largest eigenvalues of the Gaussians' own blocks, descending, and of the smallest, ascending."""
-    blocks, quats = objective.block_diagonal().geometry, objective.active.quats
-    parts = [_pairs(blocks[i : i + CHUNK], quats[i : i + CHUNK])[0] for i in range(0, len(blocks), CHUNK)]
-    values = torch.cat(parts).flatten()
+    blocks, quats = own.geometry, objective.active.quats
+    chunks = [slice(i, i + CHUNK) for i in range(0, len(blocks), CHUNK)]
+    values = torch.cat([torch.linalg.eigvalsh(_crosswise(blocks[i], quats[i])[0]) for i in chunks]).flatten()
     top = values.topk(min(largest, len(values))).indices
     bottom = values.topk(min(smallest, len(values)), largest=False).indices
     chosen, columns = torch.cat([top, bottom]) // blocks.shape[1], torch.cat([top, bottom]) % blocks.shape[1]
-    vectors = _pairs(blocks[chosen], quats[chosen])[1]
+    across, P = _crosswise(blocks[chosen], quats[chosen])
+    vectors = P @ torch.linalg.eigh(across).eigenvectors
     result = objective.active.flat.new_zeros(objective.active.flat.numel(), len(chosen))
     for k, (gaussian, column) in enumerate(zip(chosen.tolist(), columns.tolist(), strict=True)):
         for name, part in GEOMETRY_COLUMNS.items():
@@ -33,10 +34,11 @@ def steepest_own(objective: SceneObjective, largest: int, smallest: int) -> Floa
     return result
 
 
-def _pairs(blocks: Float[Tensor, "n 11 11"], quats: Float[Tensor, "n 4"]) -> tuple[Tensor, Tensor]:
-    """Eigenvalues (n, 11), ascending, and vectors, the quaternions' lengths projected out."""
+def _crosswise(
+    blocks: Float[Tensor, "n 11 11"], quats: Float[Tensor, "n 4"]
+) -> tuple[Float64[Tensor, "n 11 11"], Float64[Tensor, "n 11 11"]]:
+    """P B P and P, which projects the quaternions' lengths out."""
     turns = GEOMETRY_COLUMNS["quats"]
     P = torch.eye(blocks.shape[1], dtype=torch.float64, device=blocks.device).repeat(len(blocks), 1, 1)
     P[:, turns, turns] -= quats[:, :, None].double() * quats[:, None, :].double()
-    values, vectors = torch.linalg.eigh(P @ blocks.double() @ P)
-    return values, P @ vectors
+    return P @ blocks.double() @ P, P

@@ -26,6 +26,7 @@ from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, TraceEstimate, t_quantile
 from splat.curvature import SceneObjective
 from splat.gaussians import ATTRIBUTES
+from splat.linearize import OwnBlocks
 
 ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
 LEAST_SAMPLES = 4  # a mean, a slope, and a spread of two degrees of freedom
@@ -39,16 +40,19 @@ def exact_traces(
     progress: Progress | None = None,
     names: Sequence[str] = ATTRIBUTES,
     samples: int | None = None,
+    own: OwnBlocks | None = None,
 ) -> dict[str, TraceEstimate]:
     """The trace of the named attributes' blocks of H, on the complement of the quaternions' radial directions.
 
     settings: rtol, atol, confidence, the numbers of samples and max_seconds count; the distribution is always random signs.
     samples: just so many, at least LEAST_SAMPLES, whatever the settings say: for rough values, as a training needs them.
+    own: the objective's `block_diagonal`, where it is known already.
     """
     if samples is not None and samples < LEAST_SAMPLES:
         raise ValueError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
     quats = objective.active.quats
-    known = {name: value for name, value in objective.block_diagonal().traces(quats).items() if name in names}
+    own = objective.block_diagonal() if own is None else own
+    known = {name: value for name, value in own.traces(quats).items() if name in names}
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
     if not objective.couples_pixels:

@@ -4,7 +4,7 @@ import torch
 
 from landscape.checks import check_gradient, check_objective, check_operator
 from landscape.objective import ObjectiveHessian
-from landscape.operator import DenseOperator, ScaledOperator
+from landscape.operator import CountingOperator, DenseOperator, ScaledOperator
 from tests.oracles import symmetric_matrix
 
 N = 60
@@ -54,6 +54,11 @@ def test_noise_that_changes_from_matvec_to_matvec_is_measured():
     # the difference of two noisy products, of 60 entries each
     assert check.noise == pytest.approx(2**0.5 * 1e-4, rel=4 / (2 * N) ** 0.5)
     assert not check.passed
+
+
+def test_the_check_costs_one_product_more_than_it_has_vectors():
+    operator = CountingOperator(DenseOperator(A))
+    assert check_operator(operator, generator(), vectors=3).matvecs == operator.matvecs == 4
 
 
 def test_products_that_are_not_linear_fail():

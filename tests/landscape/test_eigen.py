@@ -231,6 +231,16 @@ def test_a_warm_start_needs_fewer_products():
     assert torch.allclose(warm.largest.values, again.largest.values, rtol=1e-6, atol=0)
 
 
+def test_the_shorter_the_random_part_of_a_good_start_the_fewer_the_products():
+    H = operator("indefinite")
+    found = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-6))
+    start = torch.cat([found.largest.vectors, found.smallest.vectors], dim=1)
+    runs = [extreme_eigenpairs(H, generator(), EigenSettings(noise=noise), start) for noise in (1.0, 1e-1, 1e-3)]
+    assert runs[0].matvecs > runs[1].matvecs > runs[2].matvecs
+    with pytest.raises(ValueError, match="noise > 0"):
+        EigenSettings(noise=0.0)
+
+
 @pytest.mark.parametrize("spectrum", ["gaps", "cluster", "dense"])
 def test_over_many_seeds_the_reported_ends_are_the_ends(spectrum):
     """At the default tolerance, which a dense end may be missed by a little more than."""

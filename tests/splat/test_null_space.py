@@ -6,6 +6,7 @@ from torch import Tensor
 
 from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
+from splat.null_space import RowSpace
 from splat.scenes.view import View
 from tests.splat.random_scenes import random_camera, random_gaussians
 
@@ -69,3 +70,15 @@ def test_the_projector_is_orthogonal(gauss_newton: bool) -> None:
     assert float((P - P.T).abs().max()) < 1e-10
     assert float((P @ P - P).abs().max()) < 1e-10
     assert float(P.diagonal().sum()) == pytest.approx(operator.rank, abs=1e-6)
+
+
+def test_what_is_seen_whole_is_left_as_it_is_bit_for_bit() -> None:
+    rows = torch.randn(5, 3, 3, generator=torch.Generator().manual_seed(0))
+    rows[1, 2], rows[4, 1:] = 0.0, 0.0  # two that are seen in part
+    basis = torch.linalg.qr(rows.mT).Q.mT * (rows.norm(dim=2, keepdim=True) > 0)
+    space = RowSpace(basis, (basis.norm(dim=2) > 0.5).sum(dim=1))
+    x = torch.randn(5, 3, 2, generator=torch.Generator().manual_seed(1))
+    kept = space.project(x)
+    assert torch.equal(kept[[0, 2, 3]], x[[0, 2, 3]])
+    assert torch.allclose(kept, basis.mT @ (basis @ x), atol=1e-6)
+    assert all(float((kept[i] - x[i]).norm()) > 0.1 for i in (1, 4))

@@ -26,7 +26,7 @@ def test_the_curvature_along_them_is_the_largest_and_least_of_any_gaussian_alone
         rows = torch.cat([torch.arange(k) + objective.blocks[name].start + i * k for name, k in widths.items()])
         values.append(torch.linalg.eigvalsh(dense[rows][:, rows]))
     values = torch.cat(values).sort().values
-    V = steepest_own(objective, 3, 2)
+    V = steepest_own(objective, objective.block_diagonal(), 3, 2)
     assert torch.allclose(V.norm(dim=0), torch.ones(5, dtype=V.dtype))
     assert torch.allclose(H.project(V), V, atol=1e-12)
     found = (V * H.apply(V)).sum(dim=0)
@@ -37,7 +37,9 @@ def test_the_curvature_along_them_is_the_largest_and_least_of_any_gaussian_alone
 def test_lanczos_needs_fewer_products_from_them(objective):
     H, settings = SceneHessian(objective), EigenSettings(2, 1, rtol=1e-2)
     cold = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings)
-    warm = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings, steepest_own(objective, 2, 1))
+    warm = extreme_eigenpairs(
+        H, torch.Generator().manual_seed(0), settings, steepest_own(objective, objective.block_diagonal(), 2, 1)
+    )
     assert warm.matvecs < cold.matvecs
     for pairs, others in ((cold.largest, warm.largest), (cold.smallest, warm.smallest)):
         assert torch.allclose(pairs.values, others.values, rtol=1e-2)
