@@ -203,9 +203,8 @@ def test_as_a_torch_function_it_has_the_derivatives_of_the_cpu(device, monkeypat
     splats = expected.splats.to(device)
     drawn = (expected.depths.to(device), expected.drawn.to(device))
     found = []
-    for make in (functions.held_view, CudaRaster):
-        monkeypatch.setattr(functions, "held_view", make)
-        where = device if make is CudaRaster else torch.device("cpu")
+    for where, interpreted in ((torch.device("cpu"), False), (device, device.type == "cpu")):
+        monkeypatch.setattr("splat.device.INTERPRETED", interpreted)
         parts = [part.to(where).requires_grad_() for part in splats.split((2, 3, 1, 3), dim=1)]
         shown = Splats(parts[0], parts[1], parts[2][:, 0], parts[3], *(tensor.to(where) for tensor in drawn))
         image, alpha = functions.rasterize_by_kernel(
