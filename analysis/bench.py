@@ -168,6 +168,8 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
             console.print(f"no gradient to compare with: {bench.lack}", soft_wrap=True, highlight=False)
         times.append(lines)
         bounds.append(held)
+        for tables, name in ((times, "bench.csv"), (bounds, "bounds.csv")):  # what comes next may fail
+            write_atomically(options.out / name, pd.concat(tables, ignore_index=True).to_csv(index=False).encode())
     if options.subject is not None:
         _precision(workloads[0], options.out / "precision.csv", console)
     times.append(pd.DataFrame(_scaling(workloads[0], max(1, options.repetitions // SCALING_SHARE), meter)))
