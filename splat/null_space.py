@@ -22,7 +22,6 @@ from splat.projection_linear import GEOMETRY, Held
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
 CHUNK = 4096  # Gaussians at a time
-POLISH = 3  # a Gram matrix leaves rows near the tolerance skewed by up to 1e-2; the error is squared each time
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +45,8 @@ class RowSpace:
     def scaled(self, scale: Float[Tensor, "n d"]) -> "RowSpace":
         """The space of all D x, D = diag(scale) > 0 and x in this space."""
         directions = torch.linalg.qr((self.basis.double() * scale[:, None].double()).mT).Q.mT
-        held = (
-            torch.arange(self.basis.shape[1], device=self.basis.device) < self.rank[:, None]
-        )  # the padding is at the end
+        # the padding is at the end
+        held = torch.arange(self.basis.shape[1], device=self.basis.device) < self.rank[:, None]
         return RowSpace(torch.where(held[:, :, None], directions, 0.0).to(self.basis.dtype), self.rank)
 
 
