@@ -48,7 +48,7 @@ def power_iteration(
     """
     v = draw_probes(operator.dim, 1, generator, operator.dtype)[:, 0]
     deadline, epsilon = monotonic() + settings.max_seconds, torch.finfo(operator.dtype).eps
-    step, reason = 0, None
+    step = 0
     while True:
         v /= norm(v)
         step += 1
