@@ -33,6 +33,7 @@ from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.power import PowerSettings, power_ends
 from landscape.results import Bracket, EigenEnds
 from landscape.trace import PAPER, TraceSettings, estimate_traces
+from splat.own_directions import steepest_own
 from splat.traces import ONE_PERCENT, exact_traces
 
 Origin = Literal["default", "own", "peer"]
@@ -136,7 +137,11 @@ def _exact(text: str, settings: TraceSettings, origin: Origin = "own") -> Method
 
 
 def end_methods() -> Iterator[Method]:
-    yield _lanczos("rtol 0.001", EigenSettings(), "default")
+    yield _lanczos("rtol 0.001", EigenSettings(), "default", lambda case: case.objective is None)
+    yield _lanczos("rtol 0.001", EigenSettings(), applies=lambda case: case.objective is not None)
+    yield Method(
+        "ends", "Lanczos from own blocks", "rtol 0.001", _from_own_blocks, "default", lambda c: c.objective is not None
+    )
     for rtol in TOLERANCES:
         yield _lanczos(f"rtol {rtol:g}", EigenSettings(rtol=rtol))
     yield _lanczos("basis 20", EigenSettings(basis=20))
@@ -146,12 +151,25 @@ def end_methods() -> Iterator[Method]:
         yield Method("ends", "power iteration, shifted", f"rtol {rtol:g}", _power(power))
 
 
-def _lanczos(text: str, settings: EigenSettings, origin: Origin = "own") -> Method:
+def _lanczos(
+    text: str,
+    settings: EigenSettings,
+    origin: Origin = "own",
+    applies: Callable[[Case], bool] = lambda case: True,
+) -> Method:
     def run(_: Case, operator: Meter, seed: int) -> list[Answer]:
         return end_answers(extreme_eigenpairs(operator, generator(seed), settings))
 
     name = "Lanczos, both ends"
-    return Method("ends", name if settings.block == 1 else f"{name}, in blocks", text, run, origin)
+    return Method("ends", name if settings.block == 1 else f"{name}, in blocks", text, run, origin, applies)
+
+
+def _from_own_blocks(case: Case, operator: Meter, seed: int) -> list[Answer]:
+    """As `landscape probe` does it."""
+    assert case.objective is not None
+    start = steepest_own(case.objective, case.objective.block_diagonal(), 1, 1)
+    operator.charge(PASS)
+    return end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
 
 
 def _power(settings: PowerSettings) -> Callable[[Case, Meter, int], list[Answer]]:
