@@ -36,7 +36,7 @@ from splat.device import by_triton
 from splat.linearize import LinearizedView, OwnBlocks
 from splat.losses_cpu import loss_against, view_loss
 from splat.projection_cpu import lens_of
-from splat.raster.functions import held_view, projected, pulled
+from splat.raster.functions import held_raster, projected, pulled
 from splat.render import render
 from splat.settings import Sums
 
@@ -75,7 +75,7 @@ class ViewBench:
 
     def _rasterize(self) -> Any:
         camera, settings = self.view.camera, self.workload.settings
-        return held_view(*self.projected, self.background, camera.width, camera.height, settings)
+        return held_raster(*self.projected, self.background, camera.width, camera.height, settings)
 
     def _linearize(self) -> Any:
         w = self.workload
@@ -88,7 +88,7 @@ class ViewBench:
         """Of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
         splats, depths, drawn = projected(self.workload.gaussians, self.lens)
         camera, settings = self.view.camera, self.workload.settings
-        raster = held_view(splats, depths, drawn, self.background, camera.width, camera.height, settings)
+        raster = held_raster(splats, depths, drawn, self.background, camera.width, camera.height, settings)
         adjoint = raster.backward(self.loss.linearize(raster.planes).gradient)
         return self._to_parameters(splats, drawn, adjoint)
 

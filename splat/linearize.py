@@ -28,7 +28,7 @@ from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.projection_cpu import lens_of
 from splat.projection_linear import Held
-from splat.raster.functions import held_projection, held_view, native, projected
+from splat.raster.functions import held_projection, held_raster, native, projected
 from splat.settings import RenderSettings
 
 
@@ -39,7 +39,7 @@ def rasterize_view(
     gaussians.require_finite()
     splats = projected(gaussians, lens_of(camera, settings))
     background = background.to(gaussians.flat, non_blocking=True)
-    return held_view(*splats, background, camera.width, camera.height, settings)
+    return held_raster(*splats, background, camera.width, camera.height, settings)
 
 
 def touches(raster: Any) -> Bool[Tensor, " n"]:

@@ -2,6 +2,8 @@
 
 The backward of each is a function of its own, whose backward runs the tangent kernels: `torch.autograd.grad(...,
 create_graph=True)` followed by another `grad` costs two tangent passes, not a trace through the compositing loop.
+
+`projected`, `pulled`, `held_projection` and `held_raster` alone decide which kernels these are: those where the Gaussians are.
 """
 
 from typing import Any
@@ -139,7 +141,7 @@ class _ProjectAdjoint(torch.autograd.Function):
         return product, None, *parts
 
 
-def held_view(
+def held_raster(
     splats: Tensor, depths: Tensor, drawn: Tensor, background: Tensor, width: int, height: int, settings: RenderSettings
 ) -> Any:
     """A view held still where its splats (n, 9) are: `cpu.Raster` in arrays, or `cuda.CudaRaster` in tensors."""
@@ -190,6 +192,6 @@ def rasterize_by_kernel(
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
     """Colour and accumulated alpha of `reference.rasterize_reference`, by the kernels, where the splats are."""
     parts = (splats.means, splats.conics, splats.opacities, splats.colours)
-    raster = held_view(_joined(parts), splats.depths.detach(), splats.drawn, background, width, height, settings)
+    raster = held_raster(_joined(parts), splats.depths.detach(), splats.drawn, background, width, height, settings)
     planes = _Rasterize.apply(raster, *parts)
     return planes[:3], planes[3]  # pyright: ignore
