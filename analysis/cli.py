@@ -78,9 +78,12 @@ def run(options: Options, arguments: Sequence[str]) -> int:
 
             return run_sweep(options)
         case ProbeOptions():
-            from analysis.probe import run_probe
+            from analysis.drawing import drawing
 
-            return run_probe(options, ["landscape", *arguments])
+            with drawing("make_all", *(["--without", "surface"] if options.quick else [])) as drawn:
+                from analysis.probe import run_probe
+
+                return run_probe(options, ["landscape", *arguments], drawn)
         case SliceOptions():
             from analysis.slicing import run_slice
 

@@ -7,19 +7,46 @@ renderer that ends its process (VTK does, where OpenGL is missing) cannot take a
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+Draw = Callable[[Path], list[str]]
+"""Draws into a folder; returns what it warned of.  Raises RuntimeError with its words if it failed."""
+
+
+@contextmanager
+def drawing(module: str, *options: str) -> Iterator[Draw]:
+    """`python -m figures.MODULE OPTIONS` of a folder that is named later: the process loads its libraries meanwhile."""
+    command = [sys.executable, "-m", f"figures.{module}", *options]
+    process = subprocess.Popen(
+        [*command, "-"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=module_environment(),
+    )
+
+    def draw(target: Path) -> list[str]:
+        said = [line for line in process.communicate(str(target))[1].splitlines() if line.strip()]
+        if process.returncode:
+            again = " ".join([*command, str(target)])
+            raise RuntimeError(f"drawing failed; draw again with: {again}\n" + "\n".join(said))
+        return [line.split("Warning: ", 1)[1] for line in said if "Warning: " in line]
+
+    try:
+        yield draw
+    finally:  # without a folder there is nothing to draw
+        process.kill()
+        process.communicate()
 
 
 def draw(module: str, target: Path) -> list[str]:
-    """Run `python -m figures.MODULE TARGET`; returns what it warned of.  Raises RuntimeError with its words if it failed."""
-    command = [sys.executable, "-m", f"figures.{module}", str(target)]
-    done = subprocess.run(command, capture_output=True, text=True, env=module_environment())
-    said = [line for line in done.stderr.splitlines() if line.strip()]
-    if done.returncode:
-        raise RuntimeError(f"drawing failed; draw again with: {' '.join(command)}\n" + "\n".join(said))
-    return [line.split("Warning: ", 1)[1] for line in said if "Warning: " in line]
+    """Run `python -m figures.MODULE TARGET`, as `Draw` does."""
+    with drawing(module) as drawn:
+        return drawn(target)
 
 
 def module_environment() -> dict[str, str]:

@@ -6,8 +6,10 @@ The operator is the exact Hessian of the training loss over the training views, 
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from importlib import import_module
 from math import inf, isfinite
 from pathlib import Path
+from threading import Thread
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from analysis.drawing import Draw
 from analysis.family_table import family_table
 from analysis.measurement import ProbeSettings, measure
 from analysis.options import ProbeOptions
@@ -22,8 +25,6 @@ from analysis.probe_record import probe_arrays, probe_data
 from analysis.provenance import provenance
 from analysis.recording import write_with_pictures
 from analysis.records import FILE, PROBE, record_folder, require_replaceable
-from analysis.report import FILE as REPORT
-from analysis.report import write_report
 from analysis.skips import estimator_skips, product_skips
 from analysis.stages import Stages
 from analysis.tables import probe_table
@@ -41,19 +42,22 @@ if TYPE_CHECKING:
     from analysis.family_stage import FamilyOptions
 
 CHECK_FAILED = 1
+WITHOUT_SURFACE = "the picture of the slice as a surface was left out; python -m figures.surface {} draws it"
 
 
-def run_probe(options: ProbeOptions, command: Sequence[str] = ()) -> int:
-    """Probe the checkpoint; returns the exit code.  command: as typed, for the record.
+def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
+    """Probe the checkpoint; returns the exit code.  command: as typed, for the record; drawn: see `write_with_pictures`.
 
     Started by torchrun, the processes share the views, and the first one writes.
     """
     device = device_named(options.device)
     with torchrun_ranks(device) as ranks:
-        return _run(options, command, device, ranks)
+        return _run(options, command, drawn, device, ranks)
 
 
-def _run(options: ProbeOptions, command: Sequence[str], device: torch.device, ranks: Ranks | None) -> int:
+def _run(
+    options: ProbeOptions, command: Sequence[str], drawn: Draw | None, device: torch.device, ranks: Ranks | None
+) -> int:
     out = options.out or options.checkpoint.parent / "probe"
     settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
     if ranks is not None and family_options is not None:
@@ -90,9 +94,14 @@ def _run(options: ProbeOptions, command: Sequence[str], device: torch.device, ra
             data["notes"] += found.notes
             data["provenance"]["families"] = asdict(family_options)
             arrays["families"] = found.arrays()
+        if options.quick:
+            data["notes"].append(WITHOUT_SURFACE.format(out))
         if writes:
             with record_folder(out) as folder:
-                write_with_pictures(folder, data, arrays, PROBE, stages, start)
+                Thread(target=import_module, args=["analysis.report"]).start()  # while the pictures are drawn
+                write_with_pictures(folder, data, arrays, PROBE, stages, start, drawn)
+                from analysis.report import write_report
+
                 write_report(folder)
     if writes:
         _conclude(data, out)
@@ -173,5 +182,5 @@ def _conclude(data: dict[str, Any], out: Path) -> None:
         if line.level != "fact":
             console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False)
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-    console.print(f"{data['timing']['total']:.1f} s; open {out / REPORT}", soft_wrap=True, highlight=False)
+    console.print(f"{data['timing']['total']:.1f} s; open {out / 'report.html'}", soft_wrap=True, highlight=False)
     console.print(f"pictures: {pictures}; numbers: {FILE}, in {out}", soft_wrap=True, highlight=False)

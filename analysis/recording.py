@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.drawing import draw
+from analysis.drawing import Draw, draw
 from analysis.records import Kind, write_record
 from analysis.stages import Stages
 
@@ -19,13 +19,17 @@ def write_with_pictures(
     kind: Kind,
     stages: Stages,
     start: float,
+    drawn: Draw | None = None,
 ) -> None:
-    """Write the record into `folder`, draw its pictures, and add to data how long all took since `start` and what was said."""
+    """Write the record into `folder`, draw its pictures, and add to data how long all took since `start` and what was said.
+
+    drawn: draws the pictures, where `drawing` has begun with it.
+    """
     data["timing"] = {"total": perf_counter() - start}
     write_record(folder, data, arrays, kind)
     with stages.stage("pictures"):
         try:
-            data["notes"] += draw("make_all", folder)
+            data["notes"] += draw("make_all", folder) if drawn is None else drawn(folder)
         except RuntimeError as error:  # the numbers stand without pictures
             data["notes"].append(" ".join(str(error).split()))
     # the pictures are drawn from the record; only now is it known how long they took

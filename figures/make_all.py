@@ -1,5 +1,8 @@
 """All figures of a recorded probe or slice: `python -m figures.make_all RUN/probe` or `draw_probe(folder)`."""
 
+import argparse
+from collections.abc import Collection
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -24,22 +27,32 @@ def recorded_figures(record: Record) -> tuple[str, ...]:
     return tuple(name for name in FIGURES if known[name])
 
 
-def draw_probe(folder: str | Path, suffix: str = "png") -> list[Path]:
-    """Draw every figure that the record in `folder` has the numbers for into it; returns the files.
+def draw_probe(
+    folder: str | Path, suffix: str = "png", without: Collection[str] = (), processes: int = 1
+) -> list[Path]:
+    """Draw every figure that the record in `folder` has the numbers for into it, but for some; returns the files.
 
-    Warns with `figures.surface.RendererMissing` where the surface had to be drawn without the off-screen renderer.
-    Raises FileNotFoundError or ValueError for a folder that holds no readable record.
+    processes: that draw at a time.  Warns with `figures.surface.RendererMissing` where the surface had to be drawn without the
+    off-screen renderer.  Raises FileNotFoundError or ValueError for a folder that holds no readable record.
     """
     record = read_record(folder)
-    names = recorded_figures(record)
-    begun = {"surface": surface.begin(record)} if "surface" in names else {}  # its renderer works beside the others
-    figures = {name: partial(FIGURES[name], picture=begun[name]) if name in begun else FIGURES[name] for name in names}
-    return [save(draw(record), record.folder / f"{name}.{suffix}") for name, draw in figures.items()]
+    names = [name for name in recorded_figures(record) if name not in without]
+    draw = partial(_draw, record.folder, suffix)
+    if processes == 1:
+        return [draw(name) for name in names]
+    with ProcessPoolExecutor(processes) as pool:
+        return list(pool.map(draw, names))
+
+
+def _draw(folder: Path, suffix: str, name: str) -> Path:
+    return save(FIGURES[name](read_record(folder)), folder / f"{name}.{suffix}")
 
 
 def main() -> None:
-    """`python -m figures.make_all RUN/probe`"""
-    folder_script(draw_probe, "all figures of a recorded probe", "probe")
+    """`python -m figures.make_all RUN/probe [--without surface]`"""
+    options = argparse.ArgumentParser(add_help=False)
+    options.add_argument("--without", choices=FIGURES, action="append", default=[], help="a figure to leave out")
+    folder_script(partial(draw_probe, processes=len(FIGURES)), "all figures of a recorded probe", "probe", [options])
 
 
 if __name__ == "__main__":

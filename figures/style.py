@@ -7,7 +7,7 @@ uniform map cividis.  Figures are made without pyplot, so drawing has no global 
 import argparse
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -123,14 +123,23 @@ def script(draw: Callable[[Record], Figure], name: str) -> None:
     folder_script(drawn, f"the figure {name} of a recorded probe", "probe")
 
 
-def folder_script(draw: Callable[[Path, str], list[Path]], what: str, command: str) -> None:
-    """A command line that draws into a folder of `landscape COMMAND` and prints the files."""
-    parser = argparse.ArgumentParser(description=f"Draw {what} into its folder.")
-    parser.add_argument("folder", type=Path, help=f"a folder written by `landscape {command}`")
+def folder_script(
+    draw: Callable[..., list[Path]], what: str, command: str, options: Sequence[argparse.ArgumentParser] = ()
+) -> None:
+    """A command line that draws into a folder of `landscape COMMAND` and prints the files.
+
+    draw(folder, suffix, ...): with what the options parse, by name.
+    """
+    parser = argparse.ArgumentParser(description=f"Draw {what} into its folder.", parents=options)
+    parser.add_argument("folder", help=f"a folder written by `landscape {command}`; -: the one named on standard input")
     parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
-    arguments = parser.parse_args()
+    arguments = vars(parser.parse_args())
+    folder, suffix = arguments.pop("folder"), arguments.pop("format")
+    folder = sys.stdin.readline().rstrip("\n") if folder == "-" else folder
+    if not folder:  # who was to name it has ended
+        return
     try:
-        paths = draw(arguments.folder, arguments.format)
+        paths = draw(Path(folder), suffix, **arguments)
     except (FileNotFoundError, ValueError) as error:
         print(error, file=sys.stderr)
         sys.exit(2)

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import matplotlib as mpl
@@ -40,16 +39,8 @@ class RendererMissing(UserWarning):
     """The off-screen renderer does not work on this machine, and matplotlib drew the surface."""
 
 
-def begin(record: Record) -> Future[np.ndarray]:
-    """The renderer's picture of the record's slice, while something else is done; its errors are those of `draw`'s renderer."""
-    pool = ThreadPoolExecutor(1)  # it waits for the renderer's process
-    picture = pool.submit(lambda: _rendered(*_heights(plane(record))))
-    pool.shutdown(wait=False)
-    return picture
-
-
-def draw(record: Record, picture: Future[np.ndarray] | None = None) -> Figure:
-    """The slice of one record as a surface.  Raises ValueError where none was recorded.  picture: begun before."""
+def draw(record: Record) -> Figure:
+    """The slice of one record as a surface.  Raises ValueError where none was recorded."""
     field = plane(record)
     low, high = float(field.change.min()), float(field.change.max())
     span = high - low if high > low else 1.0
@@ -58,7 +49,7 @@ def draw(record: Record, picture: Future[np.ndarray] | None = None) -> Figure:
     with style():
         figure = new_figure(2.6)
         try:
-            image = (begin(record) if picture is None else picture).result()
+            image = _rendered(*_heights(field))
         except RuntimeError as error:
             warnings.warn(
                 f"matplotlib drew the surface, because the off-screen renderer failed: {error}", RendererMissing, 2

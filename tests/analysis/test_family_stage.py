@@ -74,7 +74,7 @@ def split(objective: SceneObjective, checkpoint: Checkpoint) -> FamilyFindings:
 @pytest.fixture(scope="module")
 def record(path: Path) -> Record:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("analysis.recording.draw", lambda module, target: [])
+        patch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(lambda target: []))
         command = ["probe", str(path), "--split-control", "--metric", "optimiser", *QUICK]
         assert main([*command, "--out", str(path.parent / "recorded")]) == 0
     return read_record(path.parent / "recorded")
@@ -209,7 +209,7 @@ def test_a_family_whose_small_end_is_not_resolved_is_given_by_its_bound(record):
 
 
 def test_the_families_leave_the_other_numbers_as_they_are(path, record, monkeypatch, capsys):
-    monkeypatch.setattr("analysis.recording.draw", lambda module, target: [])
+    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(lambda target: []))
     assert main(["probe", str(path), *QUICK, "--out", str(path.parent / "plain")]) == 0
     plain = read_record(path.parent / "plain")
     assert "families" not in plain.data and "split_control" not in plain.data and "families" not in plain.arrays

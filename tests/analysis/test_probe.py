@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,7 +70,7 @@ def record(run) -> Record:
 @pytest.fixture
 def no_pictures(monkeypatch):
     """For tests of the numbers alone."""
-    monkeypatch.setattr("analysis.recording.draw", lambda module, target: [])
+    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(lambda target: []))
 
 
 @pytest.fixture(scope="module")
@@ -276,6 +277,13 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     data = read_record(run / "probe").data
     assert data["provenance"]["dtype"] == "float32" and data["slice"]["points"] == 121
     assert set(data["eigenvalues"]) == {"max", "second", "min"} and "power iteration" not in said.out
+    # what it left out is said, in the record and aloud
+    assert any("surface was left out" in note for note in data["notes"]) and "surface was left out" in " ".join(
+        said.out.split()
+    )
+    skips = data["skipped"]
+    assert skips["entries_behind_opaque_fronts"]["seconds_saved"] is None
+    assert skips["gaussians_out_of_sight"]["count"] == data["counts"]["skipped_gaussians"]
     for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
         assert f"trace of {label}" in said.out
     for label in ("largest eigenvalue", "smallest eigenvalue", "literal", "saddle", "check: symmetry"):
@@ -378,19 +386,19 @@ def test_a_probe_that_is_killed_leaves_the_old_record_whole(run, record, tmp_pat
 
 
 def test_an_interrupted_probe_writes_nothing(run, tmp_path, monkeypatch):
-    def interrupt(module, target):
+    def interrupt(target):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("analysis.recording.draw", interrupt)
+    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(interrupt))
     assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 130
     assert list(tmp_path.iterdir()) == []
 
 
 def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
-    def fail(module, target):
+    def fail(target):
         raise RuntimeError("drawing failed: no fonts")
 
-    monkeypatch.setattr("analysis.recording.draw", fail)
+    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(fail))
     assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 0
     assert "drawing failed: no fonts" in read_record(tmp_path / "probe").data["notes"]
     assert "Drawing failed: no fonts." in (tmp_path / "probe" / "report.html").read_text()

@@ -1,7 +1,6 @@
 import math
 import subprocess
 import sys
-import threading
 import warnings
 
 import numpy as np
@@ -10,6 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from PIL import Image
 
+from analysis.drawing import module_environment
 from analysis.records import Record, read_record, record_folder, write_record
 from figures import make_all, slice2d, spectrum, surface, traces
 from figures.plane import plane
@@ -184,20 +184,15 @@ def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypat
     assert "without the off-screen renderer" in figure.get_supxlabel()
 
 
-def test_the_surface_is_rendered_while_the_other_figures_are_drawn(tmp_path, monkeypatch):
-    record, at_work = recorded(tmp_path / "probe", *synthetic()), threading.Event()
-
-    def rendered(heights, levels):
-        at_work.set()
-        return np.ones((30, 30, 4))
-
-    def first(record):
-        assert at_work.wait(20)
-        return traces.draw(record)
-
-    monkeypatch.setattr(surface, "_rendered", rendered)
-    monkeypatch.setitem(make_all.FIGURES, "traces", first)
-    assert {path.stem for path in make_all.draw_probe(record.folder)} == {"traces", "spectrum", "slice2d", "surface"}
+def test_the_command_draws_the_folder_named_on_its_standard_input_and_nothing_without_a_name(tmp_path):
+    folder = recorded(tmp_path / "probe", *synthetic()).folder
+    command = [sys.executable, "-m", "figures.make_all", "--without", "surface", "--without", "slice2d", "-"]
+    for said, names in (("", []), (f"{folder}\n", ["spectrum.png", "traces.png"])):
+        done = subprocess.run(command, input=said, capture_output=True, text=True, env=module_environment(), check=True)
+        assert done.stderr == "" and sorted(path.name for path in folder.glob("*.png")) == names
+    by_processes = {path.name: path.read_bytes() for path in folder.glob("*.png")}
+    alone = make_all.draw_probe(folder, without=["surface", "slice2d"])  # by this process
+    assert {path.name: path.read_bytes() for path in alone} == by_processes
 
 
 def test_pyvista_renders_the_field_where_the_labels_are_put(tmp_path):
