@@ -67,10 +67,8 @@ class Shape:
         if len(kinds) > 2:
             raise ValueError(f"expected one or two directions, got {' and '.join(kinds)}; slice again for the others")
         if ("line" in kinds) != other:
-            given, advice = (
-                ("no other checkpoint", "name it") if not other else ("one more checkpoint", "add --along line")
-            )
-            raise ValueError(f"expected two checkpoints for a line and one otherwise, got {given}; {advice}")
+            given = "one more checkpoint; add --along line" if other else "no other checkpoint; name it"
+            raise ValueError(f"expected two checkpoints for a line and one otherwise, got {given}")
         most = 2 if len(kinds) == 2 or set(kinds) <= PLANES else 1
         wanted = most if dimension is None else dimension
         if wanted > most or (wanted == 1 and len(kinds) == 2):

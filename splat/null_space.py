@@ -96,10 +96,7 @@ def _jacobian_rows(views: Sequence[Held], start: int, stop: int, bands: int) -> 
         i, at = index[here] - start, 9 * m
         geometry = torch.as_tensor(held.jacobian)[here].double()
         harmonic = torch.as_tensor(held.harmonic)[here, :bands].double()
-        slope, visible = (
-            torch.as_tensor(held.colour_slope)[here].double(),
-            torch.as_tensor(held.visible)[here].double(),
-        )
+        slope, visible = (torch.as_tensor(part)[here].double() for part in (held.colour_slope, held.visible))
         rows[i, at : at + 5, :GEOMETRY] = geometry
         rows[i, at + 5, GEOMETRY] = 1.0
         for c in range(3):

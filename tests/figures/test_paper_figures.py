@@ -63,9 +63,8 @@ def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
     across, along = figure.axes[-2:]
     assert across.get_xlim() == along.get_xlim()
     start, first, second = (np.ptp(np.asarray(line.get_xdata())) for line in across.lines)
-    assert first / start == pytest.approx(3) and second / first == pytest.approx(
-        3
-    )  # a curvature unit is 1 / sqrt(lambda)
+    # a curvature unit is 1 / sqrt(lambda)
+    assert first / start == pytest.approx(3) and second / first == pytest.approx(3)
 
 
 def test_the_index_is_the_recorded_one_of_each_run(runs):

@@ -16,9 +16,8 @@ N = 40
 BLOCKS = {"a": slice(0, 25), "b": slice(25, N)}
 PART = torch.from_numpy(symmetric_matrix(1 / np.arange(1.0, N + 1), seed=0))
 REST = torch.from_numpy(symmetric_matrix(0.02 * np.linspace(-1, 1, N), seed=1))
-UNEVEN = torch.diag(
-    torch.linspace(0.5, 1.5, N, dtype=torch.float64)
-)  # K is like H to different degrees in different rows
+# K is like H to different degrees in different rows
+UNEVEN = torch.diag(torch.linspace(0.5, 1.5, N, dtype=torch.float64))
 H = UNEVEN @ PART @ UNEVEN + REST
 
 

@@ -29,9 +29,8 @@ def partly_hidden() -> tuple[Gaussians, Tensor]:
     gaussians.opacity_logits[2] = -7.0
     hidden = torch.zeros(30, dtype=torch.bool)
     hidden[:3] = True
-    gaussians.means[3:7] = torch.tensor(
-        [0.0, 0.0, 2.0], dtype=torch.float64
-    )  # four walls over the whole of both images
+    # four walls over the whole of both images
+    gaussians.means[3:7] = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
     gaussians.log_scales[3:7] = 3.0
     gaussians.opacity_logits[3:7] = 8.0
     gaussians.means[7:12, 2] = 9.0

@@ -69,11 +69,8 @@ def test_value_gradient_and_hessian_products_are_those_of_the_specification(loss
     ("settings", "logit"), [(OPAQUE, 4.0), (SMOOTH, 0.0), (RenderSettings(gradient_through_cap=True), 6.0)]
 )
 def test_every_kind_of_threshold_is_held_as_the_specification_holds_it(settings, logit):
-    gaussians, view, loss = (
-        random_gaussians(60, 1, logit=logit, spread=0.8),
-        two_views()[1],
-        LossSettings("charbonnier"),
-    )
+    gaussians, view = random_gaussians(60, 1, logit=logit, spread=0.8), two_views()[1]
+    loss = LossSettings("charbonnier")
     U = random_like((gaussians.flat.numel(), 2), 1)
     gradient, products = gradient_and_products(gaussians, [view], loss, U, settings)
     held = hold(gaussians, view, loss, settings=settings)

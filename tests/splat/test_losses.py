@@ -147,10 +147,8 @@ def test_near_a_fit_of_a_smooth_picture_ssim_keeps_its_digits_in_float32():
     y, x = torch.meshgrid(torch.linspace(0, 3, 60), torch.linspace(0, 2, 80), indexing="ij")
     target = torch.stack([0.7 + 0.2 * torch.sin(x + c) * torch.cos(y) for c in range(3)])
     generator = torch.Generator().manual_seed(0)
-    image, v = (
-        target + 0.01 * torch.randn(target.shape, generator=generator),
-        torch.randn(3, 60, 80, generator=generator),
-    )
+    image = target + 0.01 * torch.randn(target.shape, generator=generator)
+    v = torch.randn(3, 60, 80, generator=generator)
     found = []
     for dtype in DTYPES:
         loss = ViewLoss.of(target, LossSettings(ssim_weight=1.0), dtype)

@@ -245,9 +245,8 @@ def test_conics_of_needles_keep_their_digits(dtype):
         )  # fmt: skip
         a, b, c = np.linalg.inv(covariance)[[0, 0, 1], [0, 1, 1]]
         kappas.append(np.linalg.cond(covariance))
-        bound = (
-            1e-6 if dtype == torch.float32 else 1e-15 * kappas[-1] + 1e-12
-        )  # the oracle's own inverse loses kappa digits
+        # the oracle's own inverse loses kappa digits
+        bound = 1e-6 if dtype == torch.float32 else 1e-15 * kappas[-1] + 1e-12
         assert np.abs((splats[i, 2:5] - [a, b, c]) / [a, np.sqrt(a * c), c]).max() < bound
     assert max(kappas) > 1e6 and min(kappas) < 10
 

@@ -171,9 +171,8 @@ def test_quaternions_turn_by_the_exponential_map_of_rotations():
 def test_the_product_of_quaternions_is_hamiltons_and_turns_in_the_gaussians_own_frame():
     p, q = random_like((50, 4), 0), random_like((50, 4), 1)
     product = hamilton(p, q)
-    assert torch.allclose(
-        product, (Quaternion(p) * Quaternion(q)).data, rtol=0, atol=20 * ROUND_OFF
-    )  # entries up to 20
+    # entries up to 20
+    assert torch.allclose(product, (Quaternion(p) * Quaternion(q)).data, rtol=0, atol=20 * ROUND_OFF)
     both = quaternion_to_rotation_matrix(p) @ quaternion_to_rotation_matrix(q)
     assert torch.allclose(rotation_matrices(product), both, rtol=0, atol=ROUND_OFF)
 
@@ -255,10 +254,8 @@ def test_the_highest_band_is_probed_twice_as_far_as_the_lowest(sh_degree, weight
 
 def test_opacities_step_uphill_by_rho_and_stay_where_the_gradient_is_zero():
     gaussians, gradient = scene()
-    step, g = (
-        step_of(probe(gaussians, gradient), gaussians).opacity_logits,
-        gaussians.with_flat(gradient).opacity_logits,
-    )
+    step = step_of(probe(gaussians, gradient), gaussians).opacity_logits
+    g = gaussians.with_flat(gradient).opacity_logits
     assert torch.allclose(step[5:], RHO["opacity_logits"] * g[5:].sign(), rtol=0, atol=ROUND_OFF)
     assert g[5:].all() and not step[:5].any()
 

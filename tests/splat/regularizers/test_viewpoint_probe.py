@@ -279,11 +279,8 @@ def test_the_neighbour_is_the_nearest_in_viewing_direction_not_in_place() -> Non
 
 def test_a_roll_is_no_distance_and_among_parallel_axes_the_nearest_in_place_is_taken() -> None:
     ahead = camera(turned(0, 0, 0))
-    rolled, near, other = (
-        camera(turned(0, 0, 3), (5, 0, 0)),
-        camera(turned(0, 0, 0), (1, 0, 0)),
-        camera(turned(0, 0.1, 0)),
-    )
+    rolled, near = camera(turned(0, 0, 3), (5, 0, 0)), camera(turned(0, 0, 0), (1, 0, 0))
+    other = camera(turned(0, 0.1, 0))
     assert nearest_camera([ahead, other, rolled], 0) == 2
     assert nearest_camera([ahead, rolled, near], 0) == 2 and nearest_camera([ahead, near, rolled], 0) == 1
 

@@ -103,9 +103,8 @@ def test_level_cameras_tell_what_is_down_however_they_stand(azimuths: tuple[floa
     down = capture_geometry(cameras).down
     assert down.norm().item() == pytest.approx(1, rel=1e-12)
     if len(azimuths) == 1:  # a single camera knows no other down than its own
-        assert down.tolist() == pytest.approx(
-            cameras[0].rotation[1].tolist(), abs=1e6 * 2e-16 * 4
-        )  # solved at condition 1e6
+        # solved at condition 1e6
+        assert down.tolist() == pytest.approx(cameras[0].rotation[1].tolist(), abs=1e6 * 2e-16 * 4)
     else:
         # what is left of the horizontal: at most tan 50, times the ridge over the right axes' least second moment
         assert float((down - turn @ DOWN).norm()) < 1.2 * 1e-6 / 0.01
