@@ -21,8 +21,8 @@ def multiply_add(values, a, b, steps, BLOCK: tl.constexpr, UNROLLED: tl.constexp
     """x <- a x + b, `steps` times."""
     at = values + tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     x = tl.load(at)
-    for _ in range(0, steps // UNROLLED):
-        for _ in static_range(UNROLLED):
+    for _turn in range(0, steps // UNROLLED):
+        for _step in static_range(UNROLLED):  # a name of its own: older versions of Triton take it for the outer one
             x = fma(x, a, b)
     tl.store(at, x)
 

@@ -195,7 +195,8 @@ def traced(function: Callable) -> Callable:
         return _tensors(python(*(_numbers(argument, semantic) for argument in arguments)))
 
     call.__triton_builtin__ = True
-    call.signature = inspect.signature(call, follow_wrapped=False)
+    # Triton gives _semantic to those that have it in their signature, which older versions look up as Python does
+    call.signature = call.__signature__ = inspect.signature(call, follow_wrapped=False)
     return call
 
 

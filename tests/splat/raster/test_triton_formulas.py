@@ -1,5 +1,7 @@
 """A formula of the CPU gives Triton the numbers that it gives Python."""
 
+import inspect
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ import triton.language as tl
 
 from splat.raster import formulas, whitening
 from splat.raster.triton_formulas import jit, twin, twins
+from splat.traced import traced
 
 quadratic, dot = twins(formulas.quadratic, formulas.dot)
 plain, plain_adjoint = twins(whitening.plain, whitening.plain_adjoint)
@@ -39,3 +42,9 @@ def test_a_twin_computes_what_its_formula_computes(device, dtype):
 
 def test_a_formula_has_one_twin():
     assert twin(formulas.dot) is dot
+
+
+def test_a_traced_formula_asks_triton_for_the_compiler_by_either_way_of_reading_signatures():
+    call = traced(whitening.plain)
+    assert "_semantic" in inspect.signature(call).parameters  # Triton 3.6
+    assert "_semantic" in call.signature.parameters  # Triton 3.9
