@@ -43,7 +43,7 @@ def draw(runs: Sequence[Path]) -> Figure:
             if i == 0:
                 across.set_ylabel(scale.loss_label)
             else:
-                figure.colorbar(filled, ax=figure.axes[1], label=scale.loss_label, shrink=0.9)
+                figure.colorbar(filled, ax=[figure.axes[1], figure.axes[5]], label=scale.loss_label, shrink=0.9)
         handles = [Line2D([], [], color=BLACK, label="along e₁")]
         handles.append(Line2D([], [], color=BLACK, linestyle="--", label="along e₂"))
         figure.legend(handles=handles, loc="outside lower center", ncols=2)

@@ -114,7 +114,7 @@ def surface(figure: Figure, place: tuple[int, int, int], landscape: Plane, scale
     axes.set_title(f"{literal(title)}\n{scale.loss_label}", y=0.95)
     axes.view_init(elev=32, azim=-58)
     # the layout does not count the labels of such axes
-    axes.set_box_aspect(None, zoom=0.8)  # pyright: ignore[reportArgumentType]
+    axes.set_box_aspect(None, zoom=0.72)  # pyright: ignore[reportArgumentType]
 
 
 def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
