@@ -114,7 +114,7 @@ class ProbeOptions:
     strict: FlagCreatePairsOff[bool] = False
     """Exit with 1 if a self-check fails; the record is written all the same."""
     quick: FlagCreatePairsOff[bool] = False
-    """Numbers to 10% instead of 1% in less than half of the time, without the power iteration."""
+    """Numbers to 10% instead of 1% in a third of the time, without power iteration, finite probe and surface.png."""
     seconds: Unset[float] = None
     """Time for the estimators together; what a stage did not reach in its share is said.  inf: no limit.
     Default: 45, with --quick 12."""
