@@ -30,6 +30,7 @@ RESULTS, SUMMARY, PROBE = "results.csv", "summary.csv", "probe"
 TRAINING = SCORES | {"gaussians": "Gaussians", "wall_ratio": "time ×", "cpu_ratio": "CPU time ×"}
 DECIMALS = PLACES | {"gaussians": 0, "wall_ratio": 2, "cpu_ratio": 2}
 SPLIT = "split_"
+ACROSS = 3  # quantities in a table, each with its deviation: as many as 80 columns hold beside scene and method
 
 
 def write_results(sweep: Sweep, statuses: Mapping[str, str]) -> pd.DataFrame:
@@ -138,7 +139,12 @@ def tables(summary: pd.DataFrame) -> list[Table]:
         "anisotropy": indices,
         "what splitting every Gaussian in two multiplies the anisotropy by": split,
     }
-    return [_table(summary, title, columns) for title, columns in parts.items() if _known(summary, columns)]
+    found = []
+    for title, columns in parts.items():
+        known = _known(summary, columns)
+        groups = [known[i : i + ACROSS] for i in range(0, len(known), ACROSS)]
+        found += [_table(summary, title, {name: columns[name] for name in group}) for group in groups]
+    return found
 
 
 def _columns(summary: pd.DataFrame, prefix: str) -> list[str]:
@@ -151,16 +157,15 @@ def _known(summary: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
 
 
 def _table(summary: pd.DataFrame, title: str, columns: Mapping[str, str]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=title)
     table.add_column("scene", no_wrap=True)
     table.add_column("method", no_wrap=True)
     table.add_column("n", justify="right")
-    known = _known(summary, columns)
-    for name in known:
-        table.add_column(columns[name], justify="right", min_width=max(map(len, columns[name].split())))
+    for title in columns.values():
+        table.add_column(title, justify="right", no_wrap=True)
     for row in summary.to_dict("records"):
-        most = max(int(row[f"{name}_n"]) for name in known)
-        table.add_row(row["scene"], row["method"], str(most), *(_cell(row, name, most) for name in known))
+        most = max(int(row[f"{name}_n"]) for name in columns)
+        table.add_row(row["scene"], row["method"], str(most), *(_cell(row, name, most) for name in columns))
     return table
 
 

@@ -114,8 +114,16 @@ class Checkpoint:
         """
         reference = self.scene
         folder = reference.find(path) if scene is None else scene
-        found = load_scene(folder, reference.images, reference.downscale, self.training.config.background)
-        found.select(reference.test)
+        try:
+            found = load_scene(folder, reference.images, reference.downscale, self.training.config.background)
+            found.select([*reference.train, *reference.test])
+        except (ValueError, FileNotFoundError) as error:
+            if scene is None or not folder.is_dir():
+                raise
+            name = Path(reference.absolute).name
+            raise ValueError(
+                f"expected the training's scene {name} in {folder}, got another or a part: {error}"
+            ) from None
         for frame, size in zip(found.select(reference.train), reference.sizes, strict=True):
             if [frame.camera.width, frame.camera.height] != size:
                 raise ValueError(

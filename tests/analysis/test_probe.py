@@ -281,6 +281,7 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     assert any("surface was left out" in note for note in data["notes"]) and "surface was left out" in " ".join(
         said.out.split()
     )
+    assert data["finite_probe"] is None and "the finite probe was left out" in data["notes"]
     skips = data["skipped"]
     assert skips["entries_behind_opaque_fronts"]["seconds_saved"] is None
     assert skips["gaussians_out_of_sight"]["count"] == data["counts"]["skipped_gaussians"]
@@ -350,6 +351,10 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys):
     refused(capsys, [str(path)], "not one or is damaged")
     shutil.copy(run / "checkpoint.pt", path)
     refused(capsys, [str(path), "--scene", str(tmp_path / "nowhere")], "does not exist")
+    write_transforms_scene(synthetic_scene(replace(SCENE, views=2)).scene, tmp_path / "other")
+    refused(
+        capsys, [str(path), "--scene", str(tmp_path / "other")], f"the training's scene still in {tmp_path / 'other'}"
+    )
     refused(capsys, [str(path), "--slice-points", "4"], "odd number")
     refused(capsys, [str(path), "--seconds", "0"], "seconds")
     (copy / "probe").mkdir()

@@ -1,5 +1,6 @@
 """Sweeps: what a file stands for, what is refused, and that stopping, crashing and starting again lose and repeat nothing."""
 
+import io
 import json
 import os
 import re
@@ -13,6 +14,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import tyro
+from rich.console import Console
 
 from analysis.cli import main
 from analysis.options import TrainOptions
@@ -292,6 +294,25 @@ def test_mean_deviation_and_ratio_are_taken_over_the_seeds_of_a_method():
     )
     (table,) = tables(summary)
     assert [list(column.cells) for column in table.columns][3] == ["11.50 ± 2.12", "20.00", "7.00"]
+
+
+def test_no_cell_of_the_tables_is_wrapped_or_cut_in_80_columns():
+    names = ["psnr", "ssim", "lpips", "gaussians", "wall_ratio", "cpu_ratio", "trace_means", "trace_sh", "lambda_max"]
+    sizes = {"psnr": 20.0, "ssim": 0.6, "lpips": 0.3, "wall_ratio": 3.4, "cpu_ratio": 3.4}
+    parts = (("mean", 1.0), ("std", 0.7), ("n", 3))
+    row = {
+        f"{name}_{what}": value * (1 if what == "n" else sizes.get(name, 45000.0))
+        for name in names
+        for what, value in parts
+    }
+    summary = pd.DataFrame([{"scene": "garden", "method": "attribute-probes", **row}])
+    printed = io.StringIO()
+    for table in tables(summary):
+        Console(width=80, file=printed).print(table)
+    text = printed.getvalue()
+    assert max(map(len, text.splitlines())) <= 80 and "…" not in text
+    lines = [line for line in text.splitlines() if "garden" in line]
+    assert sum(line.count(" ± ") for line in lines) == len(names) == text.count(" ± ") - text.count("mean ± standard")
 
 
 def test_the_time_left_follows_the_pace_of_each_method(folder, tmp_path):
