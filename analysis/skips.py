@@ -42,11 +42,9 @@ def product_skips(
     """What every product of the exact Hessian leaves out.
 
     gaussians: those of the checkpoint; products: H v made; spared: products of single views that `SceneHessian` left out.
-    repetitions: of each timing; with 0 nothing is timed.  On the GPU nothing is timed against what it leaves out, and nothing
-    returned.
+    repetitions: of each timing; with 0, and on the GPU, nothing is timed.  There, products also leave out the tiles in which
+    their vectors move nothing, which is not counted.
     """
-    if by_triton(objective.active.flat):
-        return {}
     active, stored = objective.active, objective.counts.sh_degree
     counts = {
         "gaussians_out_of_sight": len(gaussians) - len(active),
@@ -55,7 +53,7 @@ def product_skips(
         "tiles_of_zero_cotangent": objective.total(sum(view.dark_tiles for view in objective.linearized)),
     }
     spared = objective.total(spared)
-    if not repetitions:
+    if not repetitions or by_triton(active.flat):
         return {name: Skip(count, None) for name, count in (*counts.items(), (NOT_CONCERNED, spared))}
     variants: dict[str, Callable[[], LinearizedView]] = {
         "gaussians_out_of_sight": lambda: objective.linearize(0, gaussians.select(_all(gaussians), active.sh_degree)),

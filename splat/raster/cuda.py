@@ -124,6 +124,12 @@ class CudaRaster:
         count = torch.zeros(len(self.splats), dtype=torch.int32, device=self.device)
         return count.index_add_(0, self.lists.splat, kept.to(torch.int32)).nonzero()[:, 0]
 
+    def dark_tiles(self, adjoint: "CudaAdjoint", curvature: Float[Tensor, "3 h w"]) -> int:
+        """How many tiles with entries have neither cotangent nor curvature anywhere; reads their number back."""
+        lit = ((adjoint.cotangent != 0).any(0) | (curvature != 0).any(0)).float()
+        tiles = torch.nn.functional.max_pool2d(lit[None], (HEIGHT, WIDTH), ceil_mode=True).flatten()
+        return int(((self._reached > 0) & (tiles == 0)).sum())
+
     @property
     def bytes(self) -> int:
         """Memory of what is held."""

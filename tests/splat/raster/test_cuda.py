@@ -152,6 +152,8 @@ def test_tiles_with_a_cotangent_of_zero_add_nothing(device):
     gradients, products = [], []
     for part in (lit, 1 - lit):
         adjoint = raster.backward(part * expected.G.to(device))
+        curvature = (1 - part).expand(3, -1, -1)
+        assert (raster.dark_tiles(adjoint, 0 * curvature), raster.dark_tiles(adjoint, curvature)) == (1, 0)
         gradients.append(adjoint.gradient)
         products.append(tangent.curvature(adjoint, part * expected.dG[:1].to(device)))
     assert min(gradient.abs().max() for gradient in gradients) > 0
