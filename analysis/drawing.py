@@ -30,11 +30,8 @@ def drawing(module: str, *options: str) -> Iterator[Draw]:
     )
 
     def draw(target: Path) -> list[str]:
-        said = [line for line in process.communicate(str(target))[1].splitlines() if line.strip()]
-        if process.returncode:
-            again = " ".join([*command, str(target)])
-            raise RuntimeError(f"drawing failed; draw again with: {again}\n" + "\n".join(said))
-        return [line.split("Warning: ", 1)[1] for line in said if "Warning: " in line]
+        said = process.communicate(str(target))[1]
+        return _warnings([*command, str(target)], process.returncode, said)
 
     try:
         yield draw
@@ -44,9 +41,17 @@ def drawing(module: str, *options: str) -> Iterator[Draw]:
 
 
 def draw(module: str, target: Path) -> list[str]:
-    """Run `python -m figures.MODULE TARGET`, as `Draw` does."""
-    with drawing(module) as drawn:
-        return drawn(target)
+    """Run `python -m figures.MODULE TARGET`, a folder or a file; as `Draw` does."""
+    command = [sys.executable, "-m", f"figures.{module}", str(target)]
+    done = subprocess.run(command, capture_output=True, text=True, env=module_environment())
+    return _warnings(command, done.returncode, done.stderr)
+
+
+def _warnings(command: list[str], returncode: int, said: str) -> list[str]:
+    lines = [line for line in said.splitlines() if line.strip()]
+    if returncode:
+        raise RuntimeError(f"drawing failed; draw again with: {' '.join(command)}\n" + "\n".join(lines))
+    return [line.split("Warning: ", 1)[1] for line in lines if "Warning: " in line]
 
 
 def module_environment() -> dict[str, str]:
