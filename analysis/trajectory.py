@@ -143,7 +143,9 @@ class Trajectory:
             row["seconds"] = perf_counter() - start
         row["time_share"] = (spent + row["seconds"]) / trained
         self.rows.append(row)
-        write_atomically(self.run / RECORDS, pd.DataFrame(self.rows, columns=COLUMNS).to_csv(index=False).encode())
+        # as objects: a whole number stays one beside a row that has none, as it does in rows read again
+        table = pd.DataFrame(self.rows, columns=COLUMNS, dtype=object)
+        write_atomically(self.run / RECORDS, table.to_csv(index=False).encode())
 
     def _expected(self, step: float) -> float:
         """Seconds that the next record takes at least, where a step takes so many."""

@@ -156,6 +156,8 @@ def test_what_does_not_fit_is_skipped_and_time_that_ends_a_record_is_said(run, a
     trajectory.after_step(1e6)
     assert trajectory.rows[-1]["state"] == "whole"
     assert list(rows(tmp_path)["state"]) == ["skipped", "cut", "skipped", "whole"]
+    counts = pd.read_csv(tmp_path / "trajectory.csv", dtype=str)["visible_gaussians"]
+    assert counts.iloc[-1].isdigit()  # beside rows that have none
 
 
 def test_vectors_follow_their_gaussians_and_new_ones_begin_at_zero(at_the_end, tmp_path):
