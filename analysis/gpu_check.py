@@ -186,9 +186,13 @@ PARTS: dict[str, Part] = {  # seconds at most, and what is asked, of a checkpoin
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the tables; 1 where something does not hold."""
+    """Print the tables; 1 where something does not hold, 2 where there is no GPU to ask."""
     options = _options(sys.argv[1:] if arguments is None else arguments)
-    device = device_named("cuda")
+    try:
+        device = device_named("cuda")
+    except ValueError as error:
+        print(f"gpu_check: {error}", file=sys.stderr)
+        return 2
     if options.into:
         checks = PARTS[options.only[0]][1](device, options.checkpoint)
         options.into.write_text(json.dumps([asdict(check) for check in checks]))
