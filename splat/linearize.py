@@ -132,7 +132,7 @@ class LinearizedView:
 
     @property
     def dark_tiles(self) -> int:
-        """How many tiles with entries are left out of products, on the CPU: the loss has neither slope nor curvature there."""
+        """How many tiles with entries are left out of products: the loss has neither slope nor curvature there."""
         return self._raster.dark_tiles(self._adjoint, self._loss.diagonal)
 
     @property
