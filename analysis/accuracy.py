@@ -21,7 +21,7 @@ oracle would.
 
 **Which defaults the figures support** (products, seeds as below).
 
-    traces       method "auto": a sketch on the power law (26 products for 1.5%, Hutchinson's 100 for 5%; 0.98 of the best
+    traces       method "auto": a sketch on the power law (26 products for 1.7%, Hutchinson's 100 for 5%; 1.06 of the best
                  peer's) and at rank 5 (13, exact; 1.08), Hutchinson on the others.  There three peers run the same estimator,
                  whose mean square error, 2 p_2 / m, is known: the default needs 0.98 +- 0.08 (clustered), 1.08 +- 0.10
                  (indefinite) and 0.88 +- 0.06 (flat) of its m, over 300 seeds.  Ratios of this table, from tens of seeds and
@@ -40,11 +40,11 @@ oracle would.
 
 **Which they do not.**  The quadrature's 6 x 32 against fewer and shorter runs is open: its errors differ by less than seeds
 do.  Where all eigenvalues have one sign, sum |lambda| is the trace: no step beyond the first makes it better, only start
-vectors do, and 6 x 32 takes 0.5 to 8 times the peer's work (flat, 3.8 in the middle).  Mass quantiles of clustered and
-indefinite spectra have the discretisation error of the rules, 8 to 13% after 192 products, ours as the peer's (ratios 0.99 and
-0.75); that 2 x 12 come to 4% is chance.  The scene far from its fit takes 0.99 of the products of a peer that is told how many
+vectors do, and 6 x 32 takes 0.5 to 5 times the peer's work (flat, 2.7 in the middle).  Mass quantiles of clustered and
+indefinite spectra have the discretisation error of the rules, 8 to 10% after 192 products, ours as the peer's (ratios 1.00 and
+0.85); that 2 x 12 come to 4% is chance.  The scene far from its fit takes 0.98 of the products of a peer that is told how many
 both of its ends need, where 0.85 is asked: a Krylov method without that knowledge has nothing left to save.  Near the fit it is
-0.57 (0.42 to 0.85).
+0.53 (0.45 to 0.86).
 """
 
 from collections.abc import Iterator, Sequence
