@@ -80,7 +80,7 @@ def run(options: Options, arguments: Sequence[str]) -> int:
         case ProbeOptions():
             from analysis.drawing import drawing
 
-            with drawing("make_all", *(["--without", "surface"] if options.quick else [])) as drawn:
+            with drawing("make_all", *options.pictures) as drawn:
                 from analysis.probe import run_probe
 
                 return run_probe(options, ["landscape", *arguments], drawn)

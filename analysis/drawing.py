@@ -40,9 +40,9 @@ def drawing(module: str, *options: str) -> Iterator[Draw]:
         process.communicate()
 
 
-def draw(module: str, target: Path) -> list[str]:
-    """Run `python -m figures.MODULE TARGET`, a folder or a file; as `Draw` does."""
-    command = [sys.executable, "-m", f"figures.{module}", str(target)]
+def draw(module: str, target: Path, *options: str) -> list[str]:
+    """Run `python -m figures.MODULE OPTIONS TARGET`, a folder or a file; as `Draw` does."""
+    command = [sys.executable, "-m", f"figures.{module}", *options, str(target)]
     done = subprocess.run(command, capture_output=True, text=True, env=module_environment())
     return _warnings(command, done.returncode, done.stderr)
 

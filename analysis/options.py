@@ -136,6 +136,11 @@ class ProbeOptions:
     family_seconds: float = 1800.0
     """Time for the families together, beside SECONDS.  inf: no limit."""
 
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """What `figures.make_all` is told, beside the folder."""
+        return ("--without", "surface") if self.quick else ()
+
 
 @dataclass(frozen=True)
 class SliceOptions:

@@ -99,7 +99,7 @@ def _run(
         if writes:
             with record_folder(out) as folder:
                 Thread(target=import_module, args=["analysis.report"]).start()  # while the pictures are drawn
-                write_with_pictures(folder, data, arrays, PROBE, stages, start, drawn)
+                write_with_pictures(folder, data, arrays, PROBE, stages, start, drawn, options.pictures)
                 from analysis.report import write_report
 
                 write_report(folder)
@@ -174,6 +174,8 @@ def _provenance(
 
 def _conclude(data: dict[str, Any], out: Path) -> None:
     """The table, what was not reached or failed, and the files to open."""
+    from analysis.report import FILE as REPORT
+
     console = Console()
     console.print(probe_table(data))
     if "families" in data:
@@ -182,5 +184,5 @@ def _conclude(data: dict[str, Any], out: Path) -> None:
         if line.level != "fact":
             console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False)
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-    console.print(f"{data['timing']['total']:.1f} s; open {out / 'report.html'}", soft_wrap=True, highlight=False)
+    console.print(f"{data['timing']['total']:.1f} s; open {out / REPORT}", soft_wrap=True, highlight=False)
     console.print(f"pictures: {pictures}; numbers: {FILE}, in {out}", soft_wrap=True, highlight=False)

@@ -17,7 +17,8 @@ import torch
 
 from analysis.cli import main
 from analysis.measurement import SHARES, ProbeSettings
-from analysis.probe import scene_objective
+from analysis.options import ProbeOptions
+from analysis.probe import run_probe, scene_objective
 from analysis.probe_record import literal_index
 from analysis.records import Record, read_record
 from landscape import DenseOperator, PowerSettings, extreme_eigenpairs, power_ends
@@ -292,6 +293,15 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     assert str(run / "probe" / "report.html") in said.out and "probe.json" in said.out
     for stage in ("traces", "eigenvalues", "slice"):
         assert stage in said.err
+
+
+def test_a_quick_probe_leaves_the_same_pictures_out_whoever_starts_their_drawing(run, tmp_path, monkeypatch):
+    begun, drawn = [], []
+    monkeypatch.setattr("analysis.drawing.drawing", lambda *told: begun.append(told) or nullcontext(lambda target: []))
+    assert main(["probe", str(run / "checkpoint.pt"), "--quick", "--out", str(tmp_path / "command")]) == 0
+    monkeypatch.setattr("analysis.recording.draw", lambda module, target, *told: drawn.append((module, *told)) or [])
+    assert run_probe(ProbeOptions(run / "checkpoint.pt", quick=True, out=tmp_path / "function")) == 0
+    assert begun == drawn == [("make_all", "--without", "surface")]
 
 
 def test_a_budget_that_ends_is_said_and_what_was_reached_is_recorded(run, tmp_path, capsys, no_pictures):
