@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Collection
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -37,15 +38,17 @@ def draw_probe(
     """
     record = read_record(folder)
     names = [name for name in recorded_figures(record) if name not in without]
-    draw = partial(_draw, record.folder, suffix)
+    # what the processes are handed: no figure shows the eigenvectors, by far the largest
+    used = {group: arrays for group, arrays in record.arrays.items() if group != "eigenvectors"}
+    draw = partial(_draw, replace(record, arrays=used), suffix)
     if processes == 1:
         return [draw(name) for name in names]
     with ProcessPoolExecutor(processes) as pool:
         return list(pool.map(draw, names))
 
 
-def _draw(folder: Path, suffix: str, name: str) -> Path:
-    return save(FIGURES[name](read_record(folder)), folder / f"{name}.{suffix}")
+def _draw(record: Record, suffix: str, name: str) -> Path:
+    return save(FIGURES[name](record), record.folder / f"{name}.{suffix}")
 
 
 def main() -> None:
