@@ -27,9 +27,10 @@ def draw(runs: Sequence[Path]) -> Figure:
     with style():
         figure = new_figure(7.4)
         figure.set_figwidth(WIDTH)
+        maps = [figure.add_subplot(4, 2, 3 + i) for i in range(len(runs))]
         for i, (run, name, landscape) in enumerate(zip(runs, names, landscapes, strict=True)):
             surface(figure, (4, 2, 1 + i), landscape, scale, name)
-            filled = contours(figure.add_subplot(4, 2, 3 + i), landscape, scale)
+            filled = contours(maps[i], landscape, scale)
             across = figure.add_subplot(4, 2, 5 + i)
             section(across, landscape, scale, 0, color=COLOURS[i])
             section(across, landscape, scale, 1, color=COLOURS[i], linestyle="--")
@@ -43,7 +44,7 @@ def draw(runs: Sequence[Path]) -> Figure:
             if i == 0:
                 across.set_ylabel(scale.loss_label)
             else:
-                figure.colorbar(filled, ax=[figure.axes[1], figure.axes[5]], label=scale.loss_label, shrink=0.9)
+                figure.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9)
         handles = [Line2D([], [], color=BLACK, label="along e₁")]
         handles.append(Line2D([], [], color=BLACK, linestyle="--", label="along e₂"))
         figure.legend(handles=handles, loc="outside lower center", ncols=2)
