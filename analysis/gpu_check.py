@@ -104,9 +104,9 @@ def recordings(workload: Workload, meter: Meter) -> list[Check]:
             checks.append(Check(f"H v {vectors}, recorded", None, 0.0, "not recorded here"))
             continue
         blocks = [draw_probes(hessian.dim, vectors, generator, hessian.dtype) for _ in range(CALLS + 1)]
-        differences = [(hessian.apply(V) - objective.mean(hessian._sum(V))).abs().max() for V in blocks]
+        differences = [(hessian.apply(V) - objective.mean(hessian.launched(V))).abs().max() for V in blocks]
         V = blocks[-1]
-        calls = {"recorded": lambda V=V: hessian.apply(V), "launched": lambda V=V: hessian._sum(V)}
+        calls = {"recorded": lambda V=V: hessian.apply(V), "launched": lambda V=V: hessian.launched(V)}
         times = interleaved(calls, REPETITIONS, clock=meter.seconds)
         ratio = times["recorded"].minimum / times["launched"].minimum
         checks.append(Check(f"H v {vectors}, recorded - launched", float(max(differences)), 0.0))

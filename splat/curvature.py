@@ -128,6 +128,7 @@ class SceneObjective:
         """The mean over the first so many views alone; what is held still is shared."""
         part = copy(self)
         part.views, part._losses = self.views[:count], self._losses[:count]
+        part.__dict__.pop("gradient", None)  # that of all views
         return part
 
     collective = False  # whether processes share the views, and so have to call every method together, one at a time
@@ -291,7 +292,7 @@ class SceneHessian:
         require_vectors(V, self.dim)
         home, V = V.device, self.project(V.to(self.objective.active.flat.device))
         spared = self.spared
-        total = self._recordings(self._sum, V) if self.objective.recordable(V.shape[1]) else self._sum(V)
+        total = self._recordings(self.launched, V) if self.objective.recordable(V.shape[1]) else self.launched(V)
         self.passes += V.shape[1] * len(self.objective.views) - (self.spared - spared)
         return self.project(self.objective.mean(total)).to(home)
 
@@ -299,8 +300,8 @@ class SceneHessian:
     def _recordings(self) -> Recordings:
         return Recordings(CudaGraphs(self.objective.active.flat.device))
 
-    def _sum(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-        """The views' products, added up."""
+    def launched(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+        """The views' products, added up; not recorded."""
         total = torch.zeros_like(V, dtype=self.dtype)
         at_once = self.objective.memory_plan.vectors
         for view in self.objective.linearized:
