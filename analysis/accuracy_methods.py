@@ -76,6 +76,14 @@ def generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+def _is_scene(case: Case) -> bool:
+    return case.objective is not None
+
+
+def _is_matrix(case: Case) -> bool:
+    return case.objective is None
+
+
 def own_methods(budgets: tuple[int, ...] = BUDGETS) -> Iterator[Method]:
     """All of them; the library's defaults are marked."""
     yield from trace_methods(budgets)
@@ -88,7 +96,7 @@ def own_methods(budgets: tuple[int, ...] = BUDGETS) -> Iterator[Method]:
 
 
 def trace_methods(budgets: tuple[int, ...]) -> Iterator[Method]:
-    yield _traces("chosen by its probes", "rtol 0.05", TraceSettings(), "default", lambda case: case.objective is None)
+    yield _traces("chosen by its probes", "rtol 0.05", TraceSettings(), "default", _is_matrix)
     for rtol in (0.2, 0.1):
         yield _traces("chosen by its probes", f"rtol {rtol:g}", TraceSettings(rtol=rtol))
     for rtol in (0.2, 0.1, 0.05):
@@ -130,18 +138,16 @@ def _exact(text: str, settings: TraceSettings, origin: Origin = "own") -> Method
         operator.charge(passes * PASS + JACOBIAN * sum(x.matvecs for x in found.values()))
         return [Answer(part, x.value, x.standard_error, x.low, x.high) for part, x in found.items()]
 
-    return Method("traces", "exact pass, sampled coupling", text, run, origin, lambda case: case.objective is not None)
+    return Method("traces", "exact pass, sampled coupling", text, run, origin, _is_scene)
 
 
 # --- both ends --------------------------------------------------------------------------------------------------------
 
 
 def end_methods() -> Iterator[Method]:
-    yield _lanczos("rtol 0.001", EigenSettings(), "default", lambda case: case.objective is None)
-    yield _lanczos("rtol 0.001", EigenSettings(), applies=lambda case: case.objective is not None)
-    yield Method(
-        "ends", "Lanczos from own blocks", "rtol 0.001", _from_own_blocks, "default", lambda c: c.objective is not None
-    )
+    yield _lanczos("rtol 0.001", EigenSettings(), "default", _is_matrix)
+    yield _lanczos("rtol 0.001", EigenSettings(), applies=_is_scene)
+    yield Method("ends", "Lanczos from own blocks", "rtol 0.001", _from_own_blocks, "default", _is_scene)
     for rtol in TOLERANCES:
         yield _lanczos(f"rtol {rtol:g}", EigenSettings(rtol=rtol))
     yield _lanczos("basis 20", EigenSettings(basis=20))
@@ -237,9 +243,7 @@ def diagonal_methods() -> Iterator[Method]:
         known = torch.zeros_like(values) if not case.objective.couples_pixels else torch.full_like(values, inf)
         return [Answer("all", values, known, values - known, values + known)]
 
-    yield Method(
-        "diagonal", "own blocks, no coupling", "one pass", own_blocks, applies=lambda c: c.objective is not None
-    )
+    yield Method("diagonal", "own blocks, no coupling", "one pass", own_blocks, applies=_is_scene)
 
 
 def block_diagonal(case: Case) -> Float64[Tensor, " n"]:

@@ -60,9 +60,7 @@ from splat.traces import exact_traces
 
 GIB = 2**30
 FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density and along a side of a slice that are worth their time
-FEWEST_STARTS = (
-    3  # of a density: with a spread of two degrees of freedom its interval is a third of what it is with one
-)
+FEWEST_STARTS = 3  # of a density: a spread of two degrees of freedom has a third of the interval that one has
 FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
 FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds

@@ -161,8 +161,8 @@ def _table(summary: pd.DataFrame, title: str, columns: Mapping[str, str]) -> Tab
     table.add_column("scene", no_wrap=True)
     table.add_column("method", no_wrap=True)
     table.add_column("n", justify="right")
-    for title in columns.values():
-        table.add_column(title, justify="right", no_wrap=True)
+    for heading in columns.values():
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in summary.to_dict("records"):
         most = max(int(row[f"{name}_n"]) for name in columns)
         table.add_row(row["scene"], row["method"], str(most), *(_cell(row, name, most) for name in columns))

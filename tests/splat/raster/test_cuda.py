@@ -163,9 +163,8 @@ def test_tiles_with_a_cotangent_of_zero_add_nothing(device):
 
 def test_tiles_in_which_no_splat_is_moved_are_left_out(device):
     expected, raster = truth("tiny equal depths"), raster_of("tiny equal depths", torch.float64, device)
-    assert (
-        raster.lists.start.tolist() == [0, 4, 5] and raster.lists.splat[4] == 3
-    )  # it alone is in the second of two tiles
+    # it alone is in the second of two tiles
+    assert raster.lists.start.tolist() == [0, 4, 5] and raster.lists.splat[4] == 3
     U, dG = expected.U[:, : TOGETHER + 1].to(device), expected.dG[: TOGETHER + 1].to(device)
     moved, lit = torch.ones_like(U), torch.ones_like(dG)
     moved[[0, 3]], moved[:, 0], moved[:, TOGETHER, :6], lit[..., 16:] = 0, 0, 0, 0
