@@ -33,7 +33,7 @@ from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.power import PowerSettings, power_ends
 from landscape.results import Bracket, EigenEnds
 from landscape.trace import PAPER, TraceSettings, estimate_traces
-from splat.own_directions import steepest_own
+from splat.own_directions import OwnDirections
 from splat.traces import ONE_PERCENT, exact_traces
 
 Origin = Literal["default", "own", "peer"]
@@ -147,7 +147,7 @@ def _exact(text: str, settings: TraceSettings, origin: Origin = "own") -> Method
 def end_methods() -> Iterator[Method]:
     yield _lanczos("rtol 0.001", EigenSettings(), "default", _is_matrix)
     yield _lanczos("rtol 0.001", EigenSettings(), applies=_is_scene)
-    yield Method("ends", "Lanczos from own blocks", "rtol 0.001", _from_own_blocks, "default", _is_scene)
+    yield Method("ends", "Davidson, own blocks", "rtol 0.001", _from_own_blocks, "default", _is_scene)
     for rtol in TOLERANCES:
         yield _lanczos(f"rtol {rtol:g}", EigenSettings(rtol=rtol))
     yield _lanczos("basis 20", EigenSettings(basis=20))
@@ -173,9 +173,10 @@ def _lanczos(
 def _from_own_blocks(case: Case, operator: Meter, seed: int) -> list[Answer]:
     """As `landscape probe` does it."""
     assert case.objective is not None
-    start = steepest_own(case.objective, case.objective.block_diagonal(), 1, 1)
-    operator.charge(PASS)
-    return end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
+    own = case.objective.own_blocks()
+    known = OwnDirections(case.objective, *own)
+    operator.charge(PASS * sum(blocks is not None for blocks in own))
+    return end_answers(extreme_eigenpairs(operator, generator(seed), start=known.starts(1, 1), approximation=known))
 
 
 def _power(settings: PowerSettings) -> Callable[[Case, Meter, int], list[Answer]]:

@@ -54,7 +54,7 @@ from landscape.results import Progress
 from splat.curvature import SceneHessian, SceneObjective
 from splat.device import by_triton
 from splat.losses import LossSettings
-from splat.own_directions import steepest_own
+from splat.own_directions import OwnDirections
 from splat.raster.threads import single_threaded, thread_count
 from splat.traces import exact_traces
 
@@ -175,7 +175,7 @@ def measure(
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
         gradient = _linearised_gradient(objective, report)
-        own = objective.block_diagonal()
+        own = objective.own_blocks()
         value, render = _rendered(objective)
     with stage("checks") as report:
         operator_check = check_operator(operator, split(generator), settings.checked_vectors)
@@ -188,8 +188,9 @@ def measure(
     with stage("eigenvalues") as report:
         eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
         eigen = replace(eigen, basis=_basis(operator, eigen, settings.memory, notes))
-        start, timed = steepest_own(objective, own, eigen.largest, eigen.smallest), CountingOperator(operator)
-        ends = extreme_eigenpairs(timed, streams["eigenvalues"], eigen, start, report)
+        known, timed = OwnDirections(objective, *own), CountingOperator(operator)
+        start = known.starts(eigen.largest, eigen.smallest)
+        ends = extreme_eigenpairs(timed, streams["eigenvalues"], eigen, start, report, known)
     power = None
     if settings.power is not None:
         with stage("power iteration") as report:

@@ -221,6 +221,10 @@ class SceneObjective:
         total = reduce(add, parts)
         return OwnBlocks(self.mean(total.geometry), self.mean(total.sh))
 
+    def own_blocks(self) -> tuple[OwnBlocks, OwnBlocks | None]:
+        """Own blocks of the Hessian and, where the loss couples pixels, of what it is pixel by pixel alone."""
+        return self.block_diagonal(), self.block_diagonal(gauss_newton=True) if self.couples_pixels else None
+
 
 class SceneHessian:
     """H of L, or its Gauss-Newton part, on the complement of its exact null space (`null_space.py`): P H P.

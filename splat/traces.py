@@ -40,26 +40,26 @@ def exact_traces(
     progress: Progress | None = None,
     names: Sequence[str] = ATTRIBUTES,
     samples: int | None = None,
-    own: OwnBlocks | None = None,
+    own: tuple[OwnBlocks, OwnBlocks | None] | None = None,
 ) -> dict[str, TraceEstimate]:
     """The trace of the named attributes' blocks of H, on the complement of the quaternions' radial directions.
 
     settings: rtol, atol, confidence, the numbers of samples and max_seconds count; the distribution is always random signs.
     samples: just so many, at least LEAST_SAMPLES, whatever the settings say: for rough values, as a training needs them.
-    own: the objective's `block_diagonal`, where it is known already.
+    own: the objective's `own_blocks`, where they are known already.
     """
     if samples is not None and samples < LEAST_SAMPLES:
         raise ValueError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
     quats = objective.active.quats
-    own = objective.block_diagonal() if own is None else own
-    known = {name: value for name, value in own.traces(quats).items() if name in names}
+    whole, coupled = objective.own_blocks() if own is None else own
+    known = {name: value for name, value in whole.traces(quats).items() if name in names}
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
-    if not objective.couples_pixels:
+    if coupled is None:
         return {
             name: TraceEstimate.exact(name, sizes[name], value, settings.confidence) for name, value in known.items()
         }
-    pixelwise = objective.block_diagonal(gauss_newton=True).traces(quats)
+    pixelwise = coupled.traces(quats)
     first, most = (samples, samples) if samples else (settings.min_probes, settings.max_probes)
     blocks = [_Block(name, sizes[name], known[name], pixelwise[name], settings, first, most) for name in known]
     deadline = monotonic() + settings.max_seconds

@@ -1,14 +1,15 @@
-"""The steepest directions of single Gaussians: their curvatures are the scene's, and Lanczos is quicker from them."""
+"""The steepest directions of single Gaussians: their curvatures are the scene's, and lead to its ends."""
 
 import pytest
 import torch
 
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from splat.curvature import SceneHessian, SceneObjective
+from splat.linearize import GEOMETRY_COLUMNS
 from splat.losses import LossSettings
-from splat.own_directions import steepest_own
+from splat.own_directions import OwnDirections
 from tests.splat.held_scenes import BACKGROUND, two_views
-from tests.splat.random_scenes import random_gaussians
+from tests.splat.random_scenes import random_gaussians, random_like
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def test_the_curvature_along_them_is_the_largest_and_least_of_any_gaussian_alone
         rows = torch.cat([torch.arange(k) + objective.blocks[name].start + i * k for name, k in widths.items()])
         values.append(torch.linalg.eigvalsh(dense[rows][:, rows]))
     values = torch.cat(values).sort().values
-    V = steepest_own(objective, objective.block_diagonal(), 3, 2)
+    V = OwnDirections(objective, *objective.own_blocks()).steepest(3, 2)
     assert torch.allclose(V.norm(dim=0), torch.ones(5, dtype=V.dtype))
     assert torch.allclose(H.project(V), V, atol=1e-12)
     found = (V * H.apply(V)).sum(dim=0)
@@ -34,12 +35,62 @@ def test_the_curvature_along_them_is_the_largest_and_least_of_any_gaussian_alone
     assert torch.allclose(found, expected, rtol=1e-8, atol=1e-10 * float(values.abs().max()))
 
 
-def test_lanczos_needs_fewer_products_from_them(objective):
-    H, settings = SceneHessian(objective), EigenSettings(2, 1, rtol=1e-2)
-    cold = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings)
-    warm = extreme_eigenpairs(
-        H, torch.Generator().manual_seed(0), settings, steepest_own(objective, objective.block_diagonal(), 2, 1)
+@pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
+def test_functions_of_the_blocks_are_those_of_the_dense_hessians_own_blocks(ssim_weight):
+    gaussians = random_gaussians(12, 1, logit=1.0)
+    objective = SceneObjective(gaussians, two_views(), LossSettings(ssim_weight=ssim_weight), BACKGROUND)
+    own, pixelwise = objective.own_blocks()
+    known, n = OwnDirections(objective, own, pixelwise), len(objective.active)
+    V = random_like((objective.active.flat.numel(), 3), 2).to(objective.active.flat)
+    found = known.function(lambda x: 1 / (30 - x) ** 2, V)
+    share = {"means": 0.9, "log_scales": 0.3, "quats": 0.8, "opacity_logits": 0.3}
+    for i in range(n):
+        rows = torch.cat(
+            [
+                torch.arange(part.stop - part.start) + objective.blocks[name].start + i * (part.stop - part.start)
+                for name, part in GEOMETRY_COLUMNS.items()
+            ]
+        )
+        block = own.geometry[i].double().clone()
+        if pixelwise is not None:
+            for a, rows_a in GEOMETRY_COLUMNS.items():
+                for b, rows_b in GEOMETRY_COLUMNS.items():
+                    left_out = 1 - (share[a] * share[b]) ** 0.5
+                    block[rows_a, rows_b] -= left_out * pixelwise.geometry[i, rows_a, rows_b].double()
+        P, turns = torch.eye(11, dtype=torch.float64), GEOMETRY_COLUMNS["quats"]
+        P[turns, turns] -= torch.outer(objective.active.quats[i], objective.active.quats[i]).double()
+        inverse = torch.linalg.inv(30 * torch.eye(11, dtype=torch.float64) - P @ block @ P)
+        assert torch.allclose(found[rows].double(), P @ inverse @ inverse @ V[rows].double(), rtol=1e-6, atol=1e-9)
+    sh = own.sh.double() if pixelwise is None else own.sh.double() - 0.8 * pixelwise.sh.double()
+    expected = V[objective.blocks["sh"]].double() / (30 - sh.flatten()[:, None]) ** 2
+    assert torch.allclose(found[objective.blocks["sh"]].double(), expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
+def test_davidsons_method_takes_half_the_passes_with_them_for_the_same_pairs(ssim_weight):
+    """A pass takes several vectors; on so few Gaussians, all over each other, the vectors are not fewer."""
+    objective = SceneObjective(
+        random_gaussians(40, 1, logit=1.0), two_views(), LossSettings(ssim_weight=ssim_weight), BACKGROUND
     )
-    assert warm.matvecs < cold.matvecs
-    for pairs, others in ((cold.largest, warm.largest), (cold.smallest, warm.smallest)):
-        assert torch.allclose(pairs.values, others.values, rtol=1e-2)
+    passes = []
+
+    class Watched(SceneHessian):
+        def apply(self, V):
+            passes.append(V.shape[1])
+            return super().apply(V)
+
+    H, settings = Watched(objective), EigenSettings(2, 1, rtol=1e-3)
+    known = OwnDirections(objective, *objective.own_blocks())
+    cold = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings)
+    apart = len(passes)
+    led = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings, known.starts(2, 1), None, known)
+    assert len(passes) - apart <= apart / 2 and sum(passes) == led.matvecs + cold.matvecs
+    for pairs, others in ((cold.largest, led.largest), (cold.smallest, led.smallest)):
+        assert others.reason == "tolerance" and torch.allclose(pairs.values, others.values, rtol=2e-3)
+
+
+def test_starts_are_more_than_the_wanted_pairs_at_the_ends_that_are_wanted(objective):
+    known = OwnDirections(objective, *objective.own_blocks())
+    assert torch.equal(known.starts(2, 1), known.steepest(4, 3)) and torch.equal(
+        known.starts(0, 1), known.steepest(0, 3)
+    )
