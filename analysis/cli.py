@@ -8,6 +8,8 @@
 Every subcommand imports what it needs when it runs, so that `landscape --help` does not wait for torch.
 """
 
+import atexit
+import gc
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -37,6 +39,17 @@ Options = (
     | Annotated[TrajectoryOptions, tyro.conf.subcommand("trajectory")]
     | Annotated[BenchOptions, tyro.conf.subcommand("bench")]
 )
+
+
+def command() -> int:
+    """`main` in a process of its own.
+
+    The libraries' objects live as long as the process: to look for garbage among them takes half a second, as they are loaded
+    and at the end.
+    """
+    gc.set_threshold(100_000)
+    atexit.register(gc.freeze)
+    return main()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -107,4 +120,4 @@ def run(options: Options, arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command())

@@ -44,7 +44,7 @@ def draw_probe(
     if processes == 1:
         return [draw(name) for name in names]
     with ProcessPoolExecutor(processes) as pool:
-        return list(pool.map(draw, names))
+        return list(pool.map(draw, reversed(names)))[::-1]  # the slow ones first
 
 
 def _draw(record: Record, suffix: str, name: str) -> Path:

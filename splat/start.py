@@ -19,9 +19,9 @@ from math import log, sqrt
 from typing import Literal
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from splat.camera import Camera
@@ -89,7 +89,7 @@ def gaussians_from_points(
 
 def _neighbour_distances(xyz: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Root mean square distance to the three nearest other points."""
-    distances, _ = KDTree(xyz.numpy()).query(xyz.numpy(), k=NEIGHBOURS + 1)
+    distances, _ = scipy.spatial.KDTree(xyz.numpy()).query(xyz.numpy(), k=NEIGHBOURS + 1)
     scales = torch.from_numpy(np.sqrt(np.square(distances[:, 1:]).mean(axis=1)))
     median = float(scales.median())
     if not median > 0:

@@ -23,9 +23,9 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, Literal
 
+import scipy
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from splat.camera import Camera
@@ -156,7 +156,7 @@ def disagreement(step: Step, partner: Gaussians, pose: Camera) -> tuple[Float[Te
 
 def confirmed(gaussians: Gaussians, others: Gaussians, distance: float) -> Bool[Tensor, " n"]:
     """Which Gaussians have one of the others within this distance."""
-    nearest, _ = KDTree(others.means.double().numpy()).query(gaussians.means.double().numpy())
+    nearest, _ = scipy.spatial.KDTree(others.means.double().numpy()).query(gaussians.means.double().numpy())
     return torch.as_tensor(nearest) <= distance
 
 

@@ -26,9 +26,9 @@ from dataclasses import dataclass
 from math import inf
 from typing import Literal
 
+import scipy
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from splat.densify import Densified
@@ -142,7 +142,7 @@ def unpool(gaussians: Gaussians, extent: float, settings: FSGS) -> Densified:
     everyone = torch.arange(n)
     source = destination = everyone[:0]
     if k:
-        distances, nearest = map(torch.as_tensor, KDTree(means).query(means, k=k + 1))
+        distances, nearest = map(torch.as_tensor, scipy.spatial.KDTree(means).query(means, k=k + 1))
         distances, nearest = distances[:, 1:], nearest[:, 1:]  # the nearest is the Gaussian itself
         wide = distances.mean(dim=1) > settings.threshold * extent
         wide &= gaussians.log_scales.exp().amax(dim=1) > settings.large * extent

@@ -24,9 +24,9 @@ from dataclasses import dataclass, replace
 from math import cos, pi, radians, sin
 from typing import Literal
 
+import scipy
 import torch
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from splat.camera import Camera, look_at
@@ -128,7 +128,7 @@ def slerp(first: Float[Tensor, "3 3"], second: Float[Tensor, "3 3"], t: float) -
 
     Half a turn apart both ways are equally short; which one is taken is SciPy's choice, always the same.
     """
-    vector = Rotation.from_matrix((first.T @ second).numpy()).as_rotvec()
+    vector = scipy.spatial.transform.Rotation.from_matrix((first.T @ second).numpy()).as_rotvec()
     return first @ _exp(t * torch.from_numpy(vector))
 
 
@@ -161,4 +161,4 @@ def _on_shell(geometry: CaptureGeometry, gauss: Float[Tensor, "3"]) -> tuple[Flo
 
 def _exp(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The rotation by |vector| radians about it."""
-    return torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_matrix()).to(vector.dtype)
+    return torch.from_numpy(scipy.spatial.transform.Rotation.from_rotvec(vector.numpy()).as_matrix()).to(vector.dtype)

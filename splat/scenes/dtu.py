@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import scipy
 import torch
-from scipy.linalg import rq
 
 from splat.scenes.images import Photo, image_header
 
@@ -66,7 +66,7 @@ def read_dtu(root: Path) -> list[Photo]:
 
 def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """K (upper triangular, positive diagonal, K_33 = 1), R (a rotation) and c of a matrix s K [R | -R c], any s."""
-    calibration, rotation = rq(matrix[:, :3])
+    calibration, rotation = scipy.linalg.rq(matrix[:, :3])
     signs = np.sign(np.diag(calibration))
     calibration, rotation = calibration * signs, signs[:, None] * rotation
     if np.linalg.det(rotation) < 0:  # s < 0
