@@ -147,7 +147,7 @@ def _exact(text: str, settings: TraceSettings, origin: Origin = "own") -> Method
 def end_methods() -> Iterator[Method]:
     yield _lanczos("rtol 0.001", EigenSettings(), "default", _is_matrix)
     yield _lanczos("rtol 0.001", EigenSettings(), applies=_is_scene)
-    yield Method("ends", "Davidson, own blocks", "rtol 0.001", _from_own_blocks, "default", _is_scene)
+    yield Method("ends", "led by own blocks", "rtol 0.001", _from_own_blocks, "default", _is_scene)
     for rtol in TOLERANCES:
         yield _lanczos(f"rtol {rtol:g}", EigenSettings(rtol=rtol))
     yield _lanczos("basis 20", EigenSettings(basis=20))
@@ -171,12 +171,16 @@ def _lanczos(
 
 
 def _from_own_blocks(case: Case, operator: Meter, seed: int) -> list[Answer]:
-    """As `landscape probe` does it."""
+    """As `landscape probe` does it, which has the pixelwise part from the traces: here it is paid for where it is used."""
     assert case.objective is not None
-    own = case.objective.own_blocks()
-    known = OwnDirections(case.objective, *own)
-    operator.charge(PASS * sum(blocks is not None for blocks in own))
-    return end_answers(extreme_eigenpairs(operator, generator(seed), start=known.starts(1, 1), approximation=known))
+    own = case.objective.block_diagonal()
+    start, known = OwnDirections(case.objective, own).lead(1, 1)
+    operator.charge(PASS)
+    if known is not None and case.objective.couples_pixels:
+        pixelwise = case.objective.block_diagonal(gauss_newton=True)
+        start, known = OwnDirections(case.objective, own, pixelwise).lead(1, 1)
+        operator.charge(PASS)
+    return end_answers(extreme_eigenpairs(operator, generator(seed), start=start, approximation=known))
 
 
 def _power(settings: PowerSettings) -> Callable[[Case, Meter, int], list[Answer]]:

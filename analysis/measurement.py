@@ -188,8 +188,8 @@ def measure(
     with stage("eigenvalues") as report:
         eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
         eigen = replace(eigen, basis=_basis(operator, eigen, settings.memory, notes))
-        known, timed = OwnDirections(objective, *own), CountingOperator(operator)
-        start = known.starts(eigen.largest, eigen.smallest)
+        start, known = OwnDirections(objective, *own).lead(eigen.largest, eigen.smallest)
+        timed = CountingOperator(operator)
         ends = extreme_eigenpairs(timed, streams["eigenvalues"], eigen, start, report, known)
     power = None
     if settings.power is not None:

@@ -7,7 +7,7 @@ from landscape.eigen import EigenSettings, extreme_eigenpairs
 from splat.curvature import SceneHessian, SceneObjective
 from splat.linearize import GEOMETRY_COLUMNS
 from splat.losses import LossSettings
-from splat.own_directions import OwnDirections
+from splat.own_directions import APART, OwnDirections
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import random_gaussians, random_like
 
@@ -83,14 +83,21 @@ def test_davidsons_method_takes_half_the_passes_with_them_for_the_same_pairs(ssi
     known = OwnDirections(objective, *objective.own_blocks())
     cold = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings)
     apart = len(passes)
-    led = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings, known.starts(2, 1), None, known)
+    led = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings, known.steepest(4, 3), None, known)
     assert len(passes) - apart <= apart / 2 and sum(passes) == led.matvecs + cold.matvecs
     for pairs, others in ((cold.largest, led.largest), (cold.smallest, led.smallest)):
         assert others.reason == "tolerance" and torch.allclose(pairs.values, others.values, rtol=2e-3)
 
 
-def test_starts_are_more_than_the_wanted_pairs_at_the_ends_that_are_wanted(objective):
+def test_davidsons_method_is_for_ends_of_unlike_magnitude_with_more_starts_than_pairs(objective):
     known = OwnDirections(objective, *objective.own_blocks())
-    assert torch.equal(known.starts(2, 1), known.steepest(4, 3)) and torch.equal(
-        known.starts(0, 1), known.steepest(0, 3)
-    )
+    ratio = float(known.values.max() / known.values.min().abs())
+    assert 1 / APART < ratio < APART
+    start, followed = known.lead(2, 1)
+    assert followed is None and torch.equal(start, known.steepest(2, 1))
+    known.values = torch.where(known.values > 0, known.values * 2 * APART / ratio, known.values)
+    start, followed = known.lead(2, 1)
+    assert followed is known and torch.equal(start, known.steepest(4, 3))
+    for largest, smallest in ((0, 1), (1, 0)):
+        start, followed = known.lead(largest, smallest)
+        assert followed is None and start.shape[1] == 1
