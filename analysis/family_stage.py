@@ -26,13 +26,14 @@ from torch import Tensor
 
 from analysis.measurement import Stage, basis_within, vectors_within
 from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
-from landscape.families import WHOLE
+from landscape.families import WHOLE, Lead
 from landscape.operator import SymmetricOperator
 from landscape.probes import split
 from landscape.results import Progress
 from splat.curvature import SceneHessian, SceneObjective
 from splat.families import active_spaces
 from splat.metrics import Metric, optimiser_units, scene_size, scene_units
+from splat.own_directions import OwnDirections
 from splat.split_control import SplitControl, split_control
 from splat.train import Training
 
@@ -227,9 +228,18 @@ def _of_operator(
             report(done, len(names), state)
 
         dim = hessian.dim if name == WHOLE else hessian.blocks[name].stop - hessian.blocks[name].start
-        found.append((name, dim, families(operator, stream, settings, [name], spaces, progress=say)[name]))
+        leads = {WHOLE: _lead(hessian)} if name == WHOLE and scale is None else None
+        found.append((name, dim, families(operator, stream, settings, [name], spaces, say, leads)[name]))
     report(len(names), len(names), "done")
     return found
+
+
+def _lead(hessian: SceneHessian) -> Lead:
+    """The Gaussians' own blocks lead to the ends of the whole, in the parameters as they are."""
+    own, pixelwise = hessian.objective.own_blocks()
+    if hessian.gauss_newton:
+        own = hessian.objective.block_diagonal(gauss_newton=True) if pixelwise is None else pixelwise
+    return Lead(*OwnDirections(hessian.objective, own, pixelwise).lead(1, 1))
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int) -> float:

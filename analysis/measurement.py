@@ -3,7 +3,7 @@
     linearise           every view held still, every Gaussian's own block of H, a first render
     checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
     traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
-    eigenvalues         Lanczos from the steepest directions of single Gaussians: the two largest and the smallest
+    eigenvalues         the two largest and the smallest, led by the blocks of single Gaussians (`splat.own_directions`)
     power iteration     both ends as the paper takes them; not in a quick probe, whose few products do not take it there
     density             stochastic Lanczos quadrature, for sums and quantiles of |lambda|
     finite probe        the second difference of the loss along the first eigenvector, over a range of steps; not in a quick
@@ -257,14 +257,16 @@ def vectors_within(operator: SymmetricOperator, memory: float) -> int:
 
 
 def basis_within(eigen: EigenSettings, room: int) -> int:
-    """How many vectors Lanczos may keep where there is room for so many; as many as it needs at least."""
+    """How many vectors the search for the ends may keep where there is room for so many; as many as it needs at least."""
     return min(eigen.basis, max(eigen.wanted + 3 * eigen.block, room))
 
 
 def _basis(operator: CountingOperator, eigen: EigenSettings, memory: float, notes: list[str]) -> int:
     basis = basis_within(eigen, vectors_within(operator, memory))
     if basis < eigen.basis:
-        notes.append(f"Lanczos kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB")
+        notes.append(
+            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB"
+        )
     return basis
 
 

@@ -114,11 +114,11 @@ def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
 
 
 def literal_index(ends: EigenEnds, power: EigenEnds) -> dict[str, Any]:
-    """The paper's index from its power iteration, where that arrived within what Lanczos is certain of; else Lanczos' own."""
-    certain, paper = literal(ends), literal(power)
-    value, note = paper.value, "by power iteration, as the paper takes it; the bracket is that of Lanczos"
+    """The paper's index from its power iteration, where that arrived within the certain bracket; else that of the ends."""
+    certain, paper, method = literal(ends), literal(power), ends.method.capitalize()
+    value, note = paper.value, f"by power iteration, as the paper takes it; the bracket is that of {method}"
     if value is None or not certain.low <= value <= certain.high:
-        value, note = certain.value, "by Lanczos: the paper's power iteration did not arrive"
+        value, note = certain.value, f"by {method}: the paper's power iteration did not arrive"
     if certain.note not in ("definite", "indefinite"):
         note += f" ({certain.note})"
     return {**replace(certain, value=value).record(), "note": note}

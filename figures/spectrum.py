@@ -1,4 +1,4 @@
-"""Figure: the Ritz values of the Lanczos run, which are the operator's eigenvalues seen through so many products.
+"""Figure: the Ritz values of the search for the ends, the operator's eigenvalues seen through so many products.
 
 Above, value against rank on a symmetric logarithmic axis (linear within the band about 0), bars: residual norms, within
 each of which lies a true eigenvalue.  Filled: the residual is under a tenth of the value.  The ends are written out.

@@ -1,18 +1,21 @@
 """The anisotropy family of a whole operator and of every block on its diagonal (one attribute of a scene, say).
 
 A block's operator is E^T H E: a product with it costs a product with H.  So the budget of a block is small by default: about a
-hundred products.  What it does not resolve shows in the brackets, as `>= ...` where that is the small end.  Every run starts
-from random vectors: what the whole's eigenvectors have in a block saves a tenth of the products, but may hide its own end.
+hundred products.  What it does not resolve shows in the brackets, as `>= ...` where that is the small end.  Runs start from
+random vectors where nothing else leads: what the whole's eigenvectors have in a block saves a tenth of the products, but may
+hide its own end.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from landscape.anisotropy import anisotropy
 from landscape.density import ActiveSpace, spectral_density
-from landscape.eigen import EigenSettings, extreme_eigenpairs
+from landscape.eigen import Approximation, EigenSettings, extreme_eigenpairs
 from landscape.operator import RestrictedOperator, SymmetricOperator
 from landscape.probes import split
 from landscape.results import Anisotropy, EigenEnds, Progress, SpectralDensity
@@ -28,6 +31,14 @@ class FamilySettings:
     starts: int = 3
     steps: int = 16
     batch: int = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Lead:
+    """Where the search for both ends begins, and what it follows (see `extreme_eigenpairs`)."""
+
+    start: Float[Tensor, "n k"] | None = None
+    approximation: Approximation | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +66,12 @@ def families(
     parts: Sequence[str] | None = None,
     active: Mapping[str, ActiveSpace] | None = None,
     progress: Progress | None = None,
+    leads: Mapping[str, Lead] | None = None,
 ) -> dict[str, Family]:
     """The family of each part: "all" and every block by default; a block without rows is left out.
 
-    active: what a known null space leaves of a part.  Every part has random numbers of its own, whatever the others need.
+    active: what a known null space leaves of a part; leads: to its ends.  Every part has random numbers of its own, whatever
+    the others need.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([4.0, -1.0, 2.0, 1.0]).double()), {"a": slice(0, 2), "b": slice(2, 4)})
@@ -76,7 +89,9 @@ def families(
         part = operator if name == WHOLE else RestrictedOperator(operator, name)
         if part.dim == 0:
             continue
-        results[name] = family(part, stream, settings, (active or {}).get(name), _named(progress, name))
+        results[name] = family(
+            part, stream, settings, (active or {}).get(name), _named(progress, name), (leads or {}).get(name, Lead())
+        )
     return results
 
 
@@ -86,11 +101,12 @@ def family(
     settings: FamilySettings = FamilySettings(),
     active: ActiveSpace | None = None,
     progress: Progress | None = None,
+    lead: Lead = Lead(),
 ) -> Family:
-    """The family of one operator; active: what its known null space leaves."""
+    """The family of one operator; active: what its known null space leaves; lead: to its ends."""
     rank = operator.dim if active is None else active.rank
     eigen = settings.eigen if rank >= settings.eigen.wanted else EigenSettings(1, 0, rtol=settings.eigen.rtol)
-    ends = extreme_eigenpairs(operator, generator, eigen, progress=progress)
+    ends = extreme_eigenpairs(operator, generator, eigen, lead.start, progress, lead.approximation)
     if eigen.smallest == 0:  # one direction: both ends are the same
         ends = EigenEnds(ends.largest, ends.largest, ends.method, ends.matvecs, ends.beyond, ends.noise, ends.ritz)
     starts, steps, batch = settings.starts, settings.steps, settings.batch

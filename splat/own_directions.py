@@ -65,7 +65,7 @@ class OwnDirections:
         chosen = torch.cat([top, bottom])
         geometry = self._like.new_zeros(*self.values.shape, len(chosen))
         gaussians, columns = chosen // self.values.shape[1], chosen % self.values.shape[1]
-        geometry[gaussians, :, torch.arange(len(chosen))] = self.vectors[gaussians, :, columns]
+        geometry[gaussians, :, torch.arange(len(chosen), device=chosen.device)] = self.vectors[gaussians, :, columns]
         return self._joined(geometry, self._like.new_zeros(*self.sh.shape, len(chosen)))
 
     def lead(self, largest: int, smallest: int) -> tuple[Float[Tensor, "p k"], "OwnDirections | None"]:

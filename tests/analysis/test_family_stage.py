@@ -16,11 +16,12 @@ from analysis.family_table import family_lines
 from analysis.probe import scene_objective
 from analysis.records import Record, read_record
 from analysis.report import render_report
-from landscape import Bracket, EigenSettings, FamilySettings
+from landscape import Bracket, EigenSettings, FamilySettings, families
 from splat.adam import Adam
 from splat.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
 from splat.densify import ScreenGradients
+from splat.own_directions import OwnDirections
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.split_control import split_in_two
@@ -217,6 +218,23 @@ def test_the_families_leave_the_other_numbers_as_they_are(path, record, monkeypa
         assert plain.data[key] == record.data[key]
     assert "Anisotropy by attribute" not in (plain.folder / "report.html").read_text(encoding="utf-8")
     assert "Anisotropy by attribute" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("metric", ["parameters", "scene"])
+def test_in_the_parameters_as_they_are_the_own_blocks_lead_to_the_ends_of_the_whole(
+    objective, checkpoint, metric, monkeypatch
+):
+    seen = []
+    monkeypatch.setattr("analysis.family_stage.families", lambda *given: seen.append(given) or families(*given))
+    found(objective, checkpoint, metric=metric)
+    for operator, _, _, (block,), _, _, leads in seen:
+        if block != "all" or metric != "parameters":
+            assert leads is None
+            continue
+        whole, pixelwise = objective.own_blocks()
+        known = OwnDirections(objective, pixelwise if operator.gauss_newton else whole, pixelwise)
+        assert torch.equal(leads["all"].start, known.lead(1, 1)[0])
+    assert {block for _, _, _, (block,), *_ in seen} > {"all", "means"}
 
 
 def test_time_that_runs_out_is_said(objective, checkpoint):

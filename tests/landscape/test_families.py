@@ -3,7 +3,7 @@ import torch
 
 from landscape.density import ActiveSpace
 from landscape.eigen import EigenSettings
-from landscape.families import FamilySettings, families, family
+from landscape.families import FamilySettings, Lead, families, family
 from landscape.operator import CountingOperator, DenseOperator, ProjectedOperator
 from tests.landscape.spectra import N, eigenvalues, generator, operator
 
@@ -76,3 +76,19 @@ def test_progress_names_the_part_and_unknown_parts_are_refused():
     assert seen and all(state.startswith("b: ") for state in seen)
     with pytest.raises(ValueError, match="parts out of all, a, b, none, got 'c'"):
         families(blocked(), generator(), parts=["c"])
+
+
+def test_a_part_is_led_to_its_ends_and_the_others_have_the_numbers_that_they_have_without():
+    H = DenseOperator(torch.diag(torch.logspace(-3, 2, N, dtype=torch.float64)), BLOCKS)
+
+    class Itself:
+        def function(self, f, V):
+            return f(H.matrix.diagonal())[:, None] * V
+
+    lead = Lead(torch.eye(N, dtype=torch.float64)[:, [0, N - 1]], Itself())
+    led, alone = families(H, generator(), leads={"all": lead}), families(H, generator())
+    assert led["all"].ends.method == "davidson" and alone["all"].ends.method == "lanczos"
+    assert led["all"].ends.matvecs < alone["all"].ends.matvecs
+    assert float(led["all"].ends.smallest.values[0]) == pytest.approx(1e-3, rel=1e-2)
+    for part in ("a", "b"):
+        assert led[part].record() == alone[part].record()
