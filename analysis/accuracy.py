@@ -29,9 +29,11 @@ oracle would.
                  of the best peer's work at equal error, and no error at all without SSIM
     both ends    one Lanczos run to 1e-3 with a basis of 64: looser saves two to four products, other bases and blocks
                  nothing.  It needs the steps that no Krylov method does without, 0.98 to 1.03 of those of a peer that is told
-                 how many (0.11 on the power law), as it reads the noise of products from their asymmetry.  On scenes it
-                 begins at the steepest own blocks, whose pass it pays: 38 and 45 products of fern at 504 x 378 (2,000 steps,
-                 8,000 Gaussians) where random starts take 56 and 54; on small scenes 17 for 24 (near the fit), 20 for 19 (far)
+                 how many (0.11 on the power law), as it reads the noise of products from their asymmetry.  On scenes the
+                 Gaussians' own blocks lead, and their passes are paid.  Where the ends are of like magnitude a recurrence
+                 begins at the steepest: on small scenes 17 products for 24 (near the fit), 20 for 19 (far).  Elsewhere
+                 Davidson's method: fern at 504 x 378 (2,000 steps, 8,000 Gaussians) in 34 products and 18 passes over the
+                 pixels where a recurrence from the steepest takes 49 in 48, 3DGS at 43,000 Gaussians 45 in 26 for 82 in 79
     diagonal     method "auto": 0.76 of XDiag's products on the power law, 21 in all and exact at rank 5, random signs elsewhere
     quadrature   eigenvalues that start vectors find in common are counted: on the power law a tenth of the error in all three
                  sums, at rank 5 exact after 18 products (half the peer's), clustered 0.4 to 0.65 of the error in the first two
