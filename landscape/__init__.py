@@ -11,8 +11,8 @@ from landscape.density import ActiveSpace, absolute_sum, spectral_density
 from landscape.diagonal import DiagonalEstimate, GroupSums, estimate_diagonal
 from landscape.directions import gradient_direction, groups_of, line_between, orthonormal, random_directions
 from landscape.distributed import DistributedOperator, Ranks
-from landscape.eigen import EigenSettings, extreme_eigenpairs
-from landscape.families import Family, FamilySettings, families, family
+from landscape.eigen import Approximation, EigenSettings, extreme_eigenpairs
+from landscape.families import Family, FamilySettings, Lead, families, family
 from landscape.finite_probe import FiniteProbe, finite_probe
 from landscape.lanczos import LanczosFactorization, lanczos
 from landscape.objective import ObjectiveHessian
@@ -46,6 +46,7 @@ __all__ = [
     "PAPER",
     "ActiveSpace",
     "Anisotropy",
+    "Approximation",
     "Bracket",
     "CountingOperator",
     "DenseOperator",
@@ -60,6 +61,7 @@ __all__ = [
     "FiniteProbe",
     "GroupSums",
     "LanczosFactorization",
+    "Lead",
     "ObjectiveHessian",
     "OperatorCheck",
     "PartlyKnown",
