@@ -3,7 +3,7 @@
 Q is orthonormal and T = Q^T H Q known; T y = lambda y gives the Ritz pair (lambda, v = Q y) with the residual r = H v - lambda
 v.  How Q grows and where r comes from is left to `krylov` and `davidson`.
 
-**What is seen of a product's noise.**  By symmetry a product H q_j has components q_i .  H q_j that are known already.  Each
+**What is seen of a product's noise.**  By symmetry a product H q_j has components q_i . H q_j that are known already.  Each
 is off by q_i . e_j - e_i . q_j, e the noise of a product: its rounding, or whatever else sets it off.  Where one of the two
 vectors is a random one it sees noise as random vectors do, 2 |e|^2 / n in the mean square.  MARGIN of this |e| is added to the
 |r| reported, or of the round-off that a product of this precision has at best, eps |lambda|_max.  No product is spent on the
@@ -296,7 +296,7 @@ class Subspace(ABC):
                 reason = "tolerance" if reached[part].all() else "noise floor"
             order = torch.argsort(values[part], descending=descending)
             pairs = [quantity[part][order] for quantity in (values, residuals, errors)]
-            return Eigenpairs(pairs[0], vectors[:, part][:, order], pairs[1], pairs[2], reason)
+            return Eigenpairs(pairs[0], turned(vectors[:, part][:, order]), pairs[1], pairs[2], reason)
 
         largest, smallest = end(slice(0, s.largest), True), end(slice(s.largest, s.wanted), False)
         spectrum = torch.stack([ritz.values, self.all_residuals(ritz)])
@@ -327,6 +327,13 @@ def rayleigh(
         values.append(value)
         residuals.append(norm(w.double() - value * v.double()) / length)
     return torch.tensor(values, dtype=torch.float64), torch.tensor(residuals, dtype=torch.float64)
+
+
+def turned(vectors: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """The columns with the sign that makes their largest entry positive, so that slices along them look alike from run to
+    run."""
+    peaks = vectors.gather(0, vectors.abs().argmax(dim=0, keepdim=True)) if vectors.numel() else vectors[:1]
+    return torch.where(peaks < 0, -vectors, vectors)
 
 
 def unit_columns(start: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:

@@ -55,6 +55,7 @@ def test_residuals_are_those_of_the_vectors_returned_and_vectors_are_orthonormal
         rounding = 10 * unit * float(H.matrix.norm())
         assert ((residuals - pairs.residuals).abs() <= rounding).all()
         assert (V.T @ V - torch.eye(len(pairs))).abs().max() < N * unit
+        assert (V.amax(dim=0) == V.abs().amax(dim=0)).all()  # the sign is that of the largest entry
         if pairs.reason == "tolerance":
             assert (pairs.residuals <= SETTINGS[case].rtol * pairs.values.abs()).all()
 
