@@ -330,8 +330,7 @@ def rayleigh(
 
 
 def turned(vectors: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """The columns with the sign that makes their largest entry positive, so that slices along them look alike from run to
-    run."""
+    """The columns with their largest entries positive, so that slices along them look alike from run to run."""
     peaks = vectors.gather(0, vectors.abs().argmax(dim=0, keepdim=True)) if vectors.numel() else vectors[:1]
     return torch.where(peaks < 0, -vectors, vectors)
 
