@@ -33,7 +33,7 @@ from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.power import PowerSettings, power_ends
 from landscape.results import Bracket, EigenEnds
 from landscape.trace import PAPER, TraceSettings, estimate_traces
-from splat.own_directions import OwnDirections
+from splat.own_directions import SPARE, OwnDirections
 from splat.traces import ONE_PERCENT, exact_traces
 
 Origin = Literal["default", "own", "peer"]
@@ -178,7 +178,8 @@ def _from_own_blocks(case: Case, operator: Meter, seed: int) -> list[Answer]:
     operator.charge(PASS)
     if known is not None and case.objective.couples_pixels:
         pixelwise = case.objective.block_diagonal(gauss_newton=True)
-        start, known = OwnDirections(case.objective, own, pixelwise).lead(1, 1)
+        known = OwnDirections(case.objective, own, pixelwise)
+        start = known.steepest(1 + SPARE, 1 + SPARE)
         operator.charge(PASS)
     return end_answers(extreme_eigenpairs(operator, generator(seed), start=start, approximation=known))
 

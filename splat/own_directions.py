@@ -27,7 +27,7 @@ from splat.raster.threads import over_range
 
 COUPLING = {"means": 0.9, "log_scales": 0.3, "quats": 0.8, "opacity_logits": 0.3, "sh": 0.2}
 SPARE = 2  # starts at each end beside one for each wanted pair
-APART = 50.0  # the ratio of two ends from which a recurrence needs more passes and time than Davidson's method
+APART = 30.0  # the ratio of two ends from which a recurrence needs more passes and time than Davidson's method
 CHUNK = 65_536  # Gaussians at a time
 
 
