@@ -235,11 +235,13 @@ def _of_operator(
 
 
 def _lead(hessian: SceneHessian) -> Lead:
-    """The Gaussians' own blocks lead to the ends of the whole, in the parameters as they are."""
-    own, pixelwise = hessian.objective.own_blocks()
+    """The Gaussians' own blocks lead to the ends of the whole Hessian, in the parameters as they are.
+
+    Not to those of Gauss-Newton: where its blocks are singular they lead into the null space, which is left out.
+    """
     if hessian.gauss_newton:
-        own = hessian.objective.block_diagonal(gauss_newton=True) if pixelwise is None else pixelwise
-    return Lead(*OwnDirections(hessian.objective, own, pixelwise).lead(1, 1))
+        return Lead()
+    return Lead(*OwnDirections(hessian.objective, *hessian.objective.own_blocks()).lead(1, 1))
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int) -> float:

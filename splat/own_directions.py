@@ -16,6 +16,7 @@ views) to 10% then take 21 products in 7 passes over the pixels instead of 26 in
 """
 
 from collections.abc import Callable
+from math import inf
 
 import torch
 from jaxtyping import Float, Float64
@@ -35,7 +36,7 @@ class OwnDirections:
     """An `Approximation` of the scene's Hessian.
 
     own: of the Hessian; pixelwise: of its Gauss-Newton part, where the loss couples pixels.  values: (n, 11), of the blocks,
-    ascending; vectors: (n, 11, 11), theirs, in columns; sh: (n, k * 3), the diagonal.
+    ascending; vectors: (n, 11, 11), theirs, in columns, 0 for a quaternion's length; sh: (n, k * 3), the diagonal.
     """
 
     def __init__(self, objective: SceneObjective, own: OwnBlocks, pixelwise: OwnBlocks | None = None):
@@ -59,9 +60,10 @@ class OwnDirections:
 
     def steepest(self, largest: int, smallest: int) -> Float[Tensor, "p k"]:
         """Unit vectors: of the largest eigenvalues of all blocks but colours', descending, and of the smallest, ascending."""
-        values = self.values.flatten()
-        top = values.topk(min(largest, len(values))).indices
-        bottom = values.topk(min(smallest, len(values)), largest=False).indices
+        length = self.vectors.norm(dim=1) < 0.5  # of the quaternion, which has no curvature and is left out
+        values, most = self.values.masked_fill(length, inf).flatten(), int((~length).sum())
+        bottom = values.topk(min(smallest, most), largest=False).indices
+        top = values.masked_fill(length.flatten(), -inf).topk(min(largest, most)).indices
         chosen = torch.cat([top, bottom])
         geometry = self._like.new_zeros(*self.values.shape, len(chosen))
         gaussians, columns = chosen // self.values.shape[1], chosen % self.values.shape[1]

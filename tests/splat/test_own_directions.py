@@ -5,7 +5,7 @@ import torch
 
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from splat.curvature import SceneHessian, SceneObjective
-from splat.linearize import GEOMETRY_COLUMNS
+from splat.linearize import GEOMETRY_COLUMNS, OwnBlocks
 from splat.losses import LossSettings
 from splat.own_directions import APART, OwnDirections
 from tests.splat.held_scenes import BACKGROUND, two_views
@@ -87,6 +87,16 @@ def test_davidsons_method_takes_half_the_passes_with_them_for_the_same_pairs(ssi
     assert len(passes) - apart <= apart / 2 and sum(passes) == led.matvecs + cold.matvecs
     for pairs, others in ((cold.largest, led.largest), (cold.smallest, led.smallest)):
         assert others.reason == "tolerance" and torch.allclose(pairs.values, others.values, rtol=2e-3)
+
+
+def test_blocks_that_curve_up_alone_do_not_lead_along_the_quaternions_lengths(objective):
+    n, k = len(objective.active), objective.active.sh.shape[1]
+    flat = objective.active.flat
+    eye = torch.eye(11, dtype=flat.dtype).repeat(n, 1, 1)
+    known = OwnDirections(objective, OwnBlocks(eye, flat.new_ones(n, k, 3)))
+    V = known.steepest(2, 3)
+    assert torch.allclose(V.norm(dim=0), torch.ones(5, dtype=V.dtype))
+    assert torch.allclose(SceneHessian(objective).project(V), V, atol=1e-12)
 
 
 def test_davidsons_method_is_for_ends_of_unlike_magnitude_with_more_starts_than_pairs(objective):
