@@ -29,10 +29,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.lanczos import norm, orthogonalise
+from landscape.lanczos import norm, orthogonalise, unit_columns
 from landscape.operator import SymmetricOperator
 from landscape.probes import draw_probes
-from landscape.subspace import CHUNK, EigenSettings, Goal, Ritz, Subspace, unit_columns
+from landscape.subspace import CHUNK, EigenSettings, Goal, Ritz, Subspace, recombine
 
 CHAIN = 6  # products with the random vector's successors
 CLOSEST = 0.1  # of |lambda|: what the approximation may be off by
@@ -50,7 +50,7 @@ class Davidson(Subspace):
     """Grows by the corrections of the open pairs.  Of `settings.basis` half is for the products.
 
     images: H times the rows of the basis.  vectors, residuals: v and r of the latest wanted pairs and guards, as rows.
-    chain: how many vectors it has; while it grows its newest is the last row.
+    rounds: products so far; for CHAIN of them the last row is the newest of the chain.
     """
 
     method = "davidson"
@@ -68,33 +68,30 @@ class Davidson(Subspace):
         if start is not None:
             room = settings.max_matvecs - settings.wanted - 2 - first.shape[1]
             first = torch.cat([start.reshape(operator.dim, -1)[:, :room].to(first), first], dim=1)
-        most = settings.wanted + 2 + 1
+        most = settings.wanted + 2 + 1  # and guards and chain
         capacity = max(settings.basis // 2, 2 * most, first.shape[1])
         super().__init__(operator, generator, settings, capacity, most, first.shape[1])
         self._random = first.shape[1] - 1
         self.approximation, self.images = approximation, torch.empty_like(self.basis)
         self.vectors = self.residuals = self.basis[:0]
-        self._restarted, self.chain = False, 0
+        self.rounds = 0
         self.append(unit_columns(first).T.contiguous(), 1.0)
 
     def expand(self, near_noise: bool) -> None:
         old, new = self.size, self.size + self.width
         self.images[old:new] = self.products(near_noise)
         components = (self.basis[:new] @ self.images[old:new].T).double().cpu()
-        if old and not self._restarted:
+        if old and not self.restarted:
             foreseen = (self.basis[old:new] @ self.images[self._random]).double().cpu()
             self.surprise += float((components[self._random] - foreseen).square().sum())
             self.pairs += self.width
-        self.T[:old, old:new] = components[:old]
-        self.T[old:new, :old] = components[:old].T
-        self.T[old:new, old:new] = (components[old:] + components[old:].T) / 2
-        self.size, self.width = new, 0
-        self.chain += 1
+        self.project(components)
+        self.rounds += 1
 
     def ritz(self) -> Ritz:
         m, s = self.size, self.settings
         values, coordinates = torch.linalg.eigh(self.T[:m, :m])
-        largest, smallest = list(range(m - 1, m - 1 - s.largest, -1)), list(range(s.smallest))
+        largest, smallest = self.outermost()
         next_to = [m - 1 - s.largest] * (s.largest > 0) + [s.smallest] * (s.smallest > 0)
         guards = [i for i in dict.fromkeys(next_to) if s.smallest <= i < m - s.largest]
         chosen = largest + smallest + guards
@@ -110,18 +107,18 @@ class Davidson(Subspace):
         chosen = {index: row for row, index in enumerate(ritz.wanted + ritz.guards)}
         targets = ritz.open(goal) or (ritz.wanted if self.certain else [])
         rows = [self._correction(ritz, index, chosen[index]) for index in targets]
-        if self.chain < CHAIN:
+        if self.rounds < CHAIN:
             following = self.images[self.size - 1]
             rows.append(following / (norm(following) or 1.0))
         rows = torch.stack(rows)
         if self.size + len(rows) > self.capacity:
-            self._restart(ritz)
+            recombine(self.images, self.restart(ritz, self.capacity - self.most))
         orthogonalise(rows, self.basis[: self.size])
         self.append(rows, 1.0)
 
     @property
     def certain(self) -> bool:
-        return self.chain >= CHAIN or self.size == self.operator.dim
+        return self.rounds >= CHAIN
 
     def _correction(self, ritz: Ritz, index: int, row: int) -> Float[Tensor, " n"]:
         """t of a pair, of unit length; 0 where r is."""
@@ -136,15 +133,6 @@ class Davidson(Subspace):
         Mr, Mv = self.approximation.function(inverse, torch.stack([r, v], dim=1)).T
         t = Mr - (v @ Mr) / (v @ Mv) * Mv
         return t / (norm(t) or 1.0)
-
-    def _restart(self, ritz: Ritz) -> None:
-        kept = self.kept(self.capacity - self.most)
-        combination = ritz.coordinates[:, kept].T
-        self.recombine(self.basis, combination)
-        self.recombine(self.images, combination)
-        self.T.zero_()
-        self.T[: len(kept), : len(kept)] = torch.diag(ritz.values[kept])
-        self.size, self._restarted = len(kept), True
 
     def remainders(self, ritz: Ritz) -> Float[Tensor, "n k"]:
         return self.residuals[: len(ritz.wanted)].T

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.lanczos import norm, orthogonalise
+from landscape.lanczos import norm, orthogonalise, unit_columns
 from landscape.operator import SymmetricOperator
 from landscape.probes import draw_probes
-from landscape.subspace import EigenSettings, Goal, Ritz, Subspace, unit_columns
+from landscape.subspace import EigenSettings, Goal, Ritz, Subspace
 
 
 class Krylov(Subspace):
@@ -29,7 +29,7 @@ class Krylov(Subspace):
         first = draw_probes(operator.dim, min(settings.block, operator.dim), generator, operator.dtype)
         super().__init__(operator, generator, settings, settings.basis, settings.block, first.shape[1])
         self.scale, self.coupling = 1.0, torch.zeros(0, 0, dtype=torch.float64)
-        self.random_share, self.first_cycle, self._restarted = 1.0, 0, False
+        self.random_share, self.first_cycle = 1.0, 0
         if start is not None:
             first[:, 0] = _mixed(start, first[:, 0], settings.noise)
             self.random_share = settings.noise / (1 + settings.noise)
@@ -43,33 +43,26 @@ class Krylov(Subspace):
         components = orthogonalise(W, self.basis[:new])
         self.surprise += float((components[:old] - self.foreseen).square().sum())
         self.pairs += self.foreseen.numel()
-        self.T[:new, old:new] = components
-        self.T[old:new, :new] = components.T
-        self.T[old:new, old:new] = (components[old:] + components[old:].T) / 2
-        self.size = new
+        self.project(components)
         self.coupling = self.append(W, self.scale)
         self.foreseen = torch.zeros(new, self.width, dtype=torch.float64)
         self.foreseen[old:] = self.coupling.T
-        self.first_cycle += not self._restarted
+        self.first_cycle += not self.restarted
 
     def ritz(self) -> Ritz:
-        m, s = self.size, self.settings
+        m = self.size
         values, coordinates = torch.linalg.eigh(self.T[:m, :m])
         residuals = torch.linalg.vector_norm(self.coupling @ coordinates[m - self.coupling.shape[1] :], dim=0)
-        largest, smallest = list(range(m - 1, m - 1 - s.largest, -1)), list(range(s.smallest))
-        return Ritz(values, coordinates, residuals, largest, smallest, [])
+        return Ritz(values, coordinates, residuals, *self.outermost())
 
     def aim(self, ritz: Ritz, goal: Goal) -> None:
         """A recurrence has no choice."""
         if self.size + self.width <= self.capacity:
             return
-        kept = self.kept(self.capacity - 2 * self.settings.block)
-        self.recombine(self.basis, ritz.coordinates[:, kept].T)
-        self.basis[len(kept) : len(kept) + self.width] = self.basis[self.size : self.size + self.width].clone()
-        self.T.zero_()
-        self.T[: len(kept), : len(kept)] = torch.diag(ritz.values[kept])
-        self.foreseen = (self.coupling @ ritz.coordinates[self.size - self.coupling.shape[1] :, kept]).T
-        self.size, self._restarted = len(kept), True
+        following = self.basis[self.size : self.size + self.width].clone()
+        kept = self.restart(ritz, self.capacity - 2 * self.settings.block)
+        self.basis[self.size : self.size + self.width] = following
+        self.foreseen = kept[:, kept.shape[1] - self.coupling.shape[1] :] @ self.coupling.T
 
     def remainders(self, ritz: Ritz) -> Float[Tensor, "n k"]:
         last = ritz.coordinates[self.size - self.coupling.shape[1] : self.size, ritz.wanted]

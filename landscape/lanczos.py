@@ -43,6 +43,14 @@ def norm(vector: Tensor) -> float:
     return float(torch.linalg.vector_norm(vector, dtype=torch.float64))
 
 
+def unit_columns(vectors: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """The directions of start vectors.  ValueError where one is 0 or not finite."""
+    lengths = torch.linalg.vector_norm(vectors, dim=0, dtype=torch.float64)
+    if not ((lengths > 0) & torch.isfinite(lengths)).all():
+        raise ValueError(f"expected finite start vectors that are not zero, got lengths {lengths.tolist()}")
+    return vectors / lengths.to(vectors.dtype)
+
+
 def is_dust(length: float, scale: float, dtype: torch.dtype) -> bool:
     """Whether a remainder this long is the round-off of orthogonalising vectors of length `scale`."""
     return length <= 10 * torch.finfo(dtype).eps * scale
@@ -69,15 +77,11 @@ def lanczos(
     n, k = starts.shape
     if steps < 1:
         raise ValueError(f"expected at least one Lanczos step, got {steps}")
-    lengths = [norm(start) for start in starts.T]
-    if not all(0 < length < torch.inf for length in lengths):
-        raise ValueError(f"expected finite start vectors that are not zero, got lengths {lengths}")
+    units = unit_columns(starts)
     steps = min(steps, n)
     basis = starts.new_empty(k, steps, n, dtype=operator.dtype)
     T = torch.zeros(k, steps, steps, dtype=torch.float64)
-    remainders = torch.stack([start / length for start, length in zip(starts.T, lengths, strict=True)]).to(
-        operator.dtype
-    )
+    remainders = units.T.to(operator.dtype).contiguous()
     sizes, running = [0] * k, list(range(k))
     for j in range(steps):
         for i in running:

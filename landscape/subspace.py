@@ -21,7 +21,7 @@ seen of it: from there on steps might be made in vain.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf, isnan, nan, sqrt
 
 import torch
@@ -108,7 +108,7 @@ class Ritz:
     residuals: Float64[Tensor, " m"]
     largest: list[int]
     smallest: list[int]
-    guards: list[int]
+    guards: list[int] = field(default_factory=list)
 
     @property
     def wanted(self) -> list[int]:
@@ -162,7 +162,7 @@ class Subspace(ABC):
         rows = self.capacity + max(most, first)
         self.basis = torch.empty(rows, operator.dim, dtype=operator.dtype, device=generator.device)
         self.T = torch.zeros(self.capacity, self.capacity, dtype=torch.float64)
-        self.size, self.width, self.matvecs, self.noise = 0, 0, 0, nan
+        self.size, self.width, self.matvecs, self.noise, self.restarted = 0, 0, 0, nan, False
         # components that were known before, and the sum of squares that they are off by
         self.pairs, self.surprise = 0, 0.0
 
@@ -222,6 +222,19 @@ class Subspace(ABC):
             )
         return W
 
+    def project(self, components: Float64[Tensor, "new width"]) -> None:
+        """T has the rows that came next too, given q_i . H q_j of all rows with these."""
+        old, self.size = self.size, len(components)
+        new = slice(old, self.size)
+        self.T[: self.size, new] = components
+        self.T[new, : self.size] = components.T
+        self.T[new, new] = (components[old:] + components[old:].T) / 2
+
+    def outermost(self) -> tuple[list[int], list[int]]:
+        """Which Ritz values are the wanted ones of the upper end, descending, and of the lower one, ascending."""
+        settings, last = self.settings, self.size - 1
+        return list(range(last, last - settings.largest, -1)), list(range(settings.smallest))
+
     def append(self, W: Float[Tensor, "b n"], scale: float) -> Float64[Tensor, "next b"]:
         """Orthonormal rows after the first `size` that span the rows of W, orthogonal to these; B with W^T = next^T B.
 
@@ -250,8 +263,8 @@ class Subspace(ABC):
             self.width += 1
         return B[: self.width]
 
-    def kept(self, most: int) -> list[int]:
-        """The Ritz pairs that a restart keeps: the share KEEP of the memory, but the wanted ones at least.
+    def restart(self, ritz: Ritz, most: int) -> Float64[Tensor, "kept size"]:
+        """Go on from Ritz pairs: the share KEEP of the memory, at most so many, but the wanted ones.  Returns coordinates.
 
         Those beyond come from both ends evenly, whichever end is still open: those of its own end speed it up where
         the spectrum is dense there, those of the other end where that one reaches far.
@@ -259,14 +272,13 @@ class Subspace(ABC):
         settings = self.settings
         keep = max(settings.wanted, min(int(self.capacity * KEEP), most))
         top = settings.largest + (keep - settings.wanted) // 2
-        return list(range(keep - top)) + list(range(self.size - top, self.size))
-
-    def recombine(self, rows: Float[Tensor, "m n"], combination: Float64[Tensor, "keep size"]) -> None:
-        """The first rows become these combinations of the first `size`, in place."""
-        C = combination.to(rows)
-        for first in range(0, rows.shape[1], CHUNK):
-            columns = slice(first, first + CHUNK)
-            rows[: len(C), columns] = C @ rows[: self.size, columns]
+        kept = list(range(keep - top)) + list(range(self.size - top, self.size))
+        combination = ritz.coordinates[:, kept].T
+        recombine(self.basis, combination)
+        self.T.zero_()
+        self.T[:keep, :keep] = torch.diag(ritz.values[kept])
+        self.size, self.restarted = keep, True
+        return combination
 
     def measured(self, ritz: Ritz, budget: StopReason, converged: bool) -> tuple[EigenEnds, bool]:
         """The wanted pairs with residuals by the operator itself, and whether more steps would make them better."""
@@ -316,6 +328,14 @@ class Subspace(ABC):
         return torch.tensor([norm(signs[i] * known[:, i] + unknown) for i in range(len(signs))], dtype=torch.float64)
 
 
+def recombine(rows: Float[Tensor, "m n"], combination: Float64[Tensor, "kept size"]) -> None:
+    """The first rows become these combinations of the first `size`, in place."""
+    C = combination.to(rows)
+    for first in range(0, rows.shape[1], CHUNK):
+        columns = slice(first, first + CHUNK)
+        rows[: len(C), columns] = C @ rows[: C.shape[1], columns]
+
+
 def rayleigh(
     operator: SymmetricOperator, vectors: Float[Tensor, "n k"]
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
@@ -331,13 +351,5 @@ def rayleigh(
 
 def turned(vectors: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     """The columns with their largest entries positive, so that slices along them look alike from run to run."""
-    peaks = vectors.gather(0, vectors.abs().argmax(dim=0, keepdim=True)) if vectors.numel() else vectors[:1]
+    peaks = vectors.gather(0, vectors.abs().argmax(dim=0, keepdim=True))
     return torch.where(peaks < 0, -vectors, vectors)
-
-
-def unit_columns(start: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """The columns' directions.  ValueError where a column is 0 or not finite."""
-    lengths = torch.linalg.vector_norm(start, dim=0)
-    if not ((lengths > 0) & torch.isfinite(lengths)).all():
-        raise ValueError(f"expected finite start vectors that are not zero, got lengths {lengths.tolist()}")
-    return start / lengths
