@@ -68,8 +68,8 @@ class Davidson(Subspace):
         if start is not None:
             room = settings.max_matvecs - settings.wanted - 2 - first.shape[1]
             first = torch.cat([start.reshape(operator.dim, -1)[:, :room].to(first), first], dim=1)
-        most = settings.wanted + 2 + 1  # and guards and chain
-        capacity = max(settings.basis // 2, 2 * most, first.shape[1])
+        most = _most(settings)
+        capacity = max(settings.basis // 2, first.shape[1])
         super().__init__(operator, generator, settings, capacity, most, first.shape[1])
         self._random = first.shape[1] - 1
         self.approximation, self.images = approximation, torch.empty_like(self.basis)
@@ -116,6 +116,11 @@ class Davidson(Subspace):
         orthogonalise(rows, self.basis[: self.size])
         self.append(rows, 1.0)
 
+    @staticmethod
+    def fits(settings: EigenSettings) -> bool:
+        """Whether its least number of vectors, each with its product, stays within the memory budget."""
+        return settings.basis >= 4 * _most(settings)
+
     @property
     def certain(self) -> bool:
         return self.rounds >= CHAIN
@@ -146,3 +151,8 @@ class Davidson(Subspace):
 
     def beyond(self, ritz: Ritz) -> float:
         return 0.0 if self.size == self.operator.dim else inf
+
+
+def _most(settings: EigenSettings) -> int:
+    """Rows that come next at most: for the wanted pairs, two guards and the chain."""
+    return settings.wanted + 2 + 1

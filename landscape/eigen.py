@@ -33,7 +33,7 @@ def extreme_eigenpairs(
 
     start: vectors to begin from (those of an earlier checkpoint, say); a recurrence begins at the sum of their directions with
     a random vector of settings.noise of its length, Davidson's method at each of them and a random one.  approximation: of the
-    operator, for Davidson's method.  Progress counts matvecs.
+    operator, for Davidson's method, where settings.basis has room for it.  Progress counts matvecs.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.linspace(-1, 3, 50, dtype=torch.float64)))
@@ -45,7 +45,7 @@ def extreme_eigenpairs(
     if settings.wanted > n:
         raise ValueError(f"expected at most {n} eigenpairs of an operator with {n} rows, got {settings.wanted}")
     space: Subspace
-    if approximation is None:
+    if approximation is None or not Davidson.fits(settings):
         space = Krylov(operator, generator, settings, start)
     else:
         space = Davidson(operator, generator, settings, approximation, start)

@@ -46,7 +46,7 @@ def solve(H, settings, approximation=None, start=None, seed=0, progress=None):
 
 SETTINGS = {
     "one pair": EigenSettings(rtol=1e-3),
-    "with restarts": EigenSettings(2, 2, rtol=1e-6, basis=24, max_matvecs=4000),
+    "with restarts": EigenSettings(2, 2, rtol=1e-6, basis=28, max_matvecs=4000),
     "whole basis": EigenSettings(2, 3, rtol=1e-8, basis=1000),
     "one end": EigenSettings(0, 2, rtol=1e-5),
 }
@@ -169,6 +169,13 @@ def test_restarts_keep_the_memory():
     assert space.basis.shape == space.images.shape and space.basis.shape[0] <= 12 + 6
     ends = solve(H, settings)
     assert ends.largest.reason == ends.smallest.reason == "tolerance" and ends.matvecs > 5 * 24
+
+
+def test_a_memory_without_room_for_the_products_is_a_recurrences():
+    H = operator("indefinite")
+    for basis, method in ((23, "lanczos"), (24, "davidson")):
+        ends = solve(H, EigenSettings(2, 1, rtol=1e-2, basis=basis, max_matvecs=4000))
+        assert ends.method == method and ends.largest.reason == "tolerance"
 
 
 def test_noise_ends_the_run_where_more_work_would_not_help():
