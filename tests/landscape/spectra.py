@@ -32,3 +32,22 @@ def eigenvalues(dense):
 
 def generator(seed=0):
     return torch.Generator().manual_seed(seed)
+
+
+class Noisy(DenseOperator):
+    """Products that are off by so much, for a unit vector, and never twice alike."""
+
+    def __init__(self, matrix, noise, seed=1):
+        super().__init__(matrix)
+        self.noise, self.source = noise, generator(seed)
+
+    def apply(self, V):
+        off = torch.randn(V.shape, generator=self.source, dtype=V.dtype) * V.norm(dim=0)
+        return super().apply(V) + self.noise / self.dim**0.5 * off
+
+
+class Broken(DenseOperator):
+    """Products that are not finite."""
+
+    def apply(self, V):
+        return V / 0

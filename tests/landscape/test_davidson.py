@@ -9,7 +9,7 @@ import torch
 from landscape.davidson import Davidson
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.operator import CountingOperator, DenseOperator
-from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
+from tests.landscape.spectra import SPECTRA, Broken, N, Noisy, eigenvalues, generator, operator
 from tests.oracles import symmetric_matrix
 
 
@@ -179,15 +179,8 @@ def test_a_memory_without_room_for_the_products_is_a_recurrences():
 
 
 def test_noise_ends_the_run_where_more_work_would_not_help():
-    source = generator(1)
-
-    class Noisy(DenseOperator):
-        def apply(self, V):
-            exact = super().apply(V)
-            return exact + 1e-6 / N**0.5 * torch.randn(V.shape, generator=source, dtype=V.dtype) * V.norm(dim=0)
-
     H = operator("indefinite")
-    ends = solve(Noisy(H.matrix), EigenSettings(rtol=1e-9))
+    ends = solve(Noisy(H.matrix, 1e-6), EigenSettings(rtol=1e-9))
     exact = solve(H, EigenSettings(rtol=1e-6))
     assert ends.matvecs <= exact.matvecs + 10
     for pairs in (ends.largest, ends.smallest):
@@ -231,10 +224,6 @@ def test_the_same_seed_gives_the_same_pairs_bit_for_bit_and_progress_counts():
 
 
 def test_what_cannot_be_is_refused():
-    class Broken(DenseOperator):
-        def apply(self, V):
-            return V / 0
-
     with pytest.raises(ValueError, match="finite products"):
         solve(Broken(torch.eye(5)), EigenSettings())
     with pytest.raises(ValueError, match="start vectors that are not zero"):

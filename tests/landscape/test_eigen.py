@@ -6,7 +6,7 @@ import torch
 
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.operator import CountingOperator, DenseOperator
-from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
+from tests.landscape.spectra import SPECTRA, Broken, N, Noisy, eigenvalues, generator, operator
 
 SETTINGS = {
     "one pair": EigenSettings(rtol=1e-3),
@@ -120,14 +120,7 @@ def test_float32_stops_at_its_noise_floor_and_says_so():
 
 
 def test_the_noise_of_a_product_ends_the_run_where_more_work_would_not_help():
-    source = generator(1)
-
-    class Noisy(DenseOperator):
-        def apply(self, V):
-            exact = super().apply(V)
-            return exact + 1e-6 / N**0.5 * torch.randn(V.shape, generator=source, dtype=V.dtype) * V.norm(dim=0)
-
-    ends = extreme_eigenpairs(Noisy(operator("indefinite").matrix), generator(), EigenSettings(rtol=1e-9))
+    ends = extreme_eigenpairs(Noisy(operator("indefinite").matrix, 1e-6), generator(), EigenSettings(rtol=1e-9))
     # to 1e-6 it takes as many steps without the noise; here one vector more measures it, and both pairs their residuals
     exact = extreme_eigenpairs(operator("indefinite"), generator(), EigenSettings(rtol=1e-6))
     assert ends.matvecs <= exact.matvecs + 3
@@ -312,10 +305,6 @@ def test_progress_counts_matvecs_up_to_the_budget():
 
 
 def test_products_that_are_not_finite_are_an_error():
-    class Broken(DenseOperator):
-        def apply(self, V):
-            return V / 0
-
     with pytest.raises(ValueError, match="finite products"):
         extreme_eigenpairs(Broken(torch.eye(5)), generator())
 

@@ -3,7 +3,7 @@ import torch
 
 from landscape.operator import CountingOperator, DenseOperator
 from landscape.power import PowerSettings, power_ends, power_iteration
-from tests.landscape.spectra import eigenvalues, generator, operator
+from tests.landscape.spectra import Broken, eigenvalues, generator, operator
 
 
 @pytest.mark.parametrize("name", ["power law", "both tails", "clustered", "negative", "multiple"])
@@ -53,9 +53,5 @@ def test_bad_power_settings_are_refused():
 
 
 def test_products_that_are_not_finite_are_an_error():
-    class Broken(DenseOperator):
-        def apply(self, V):
-            return V / 0
-
     with pytest.raises(ValueError, match="finite products"):
         power_iteration(Broken(torch.eye(5)), generator())
