@@ -33,7 +33,7 @@ from landscape.results import Progress
 from splat.curvature import SceneHessian, SceneObjective
 from splat.families import active_spaces
 from splat.metrics import Metric, optimiser_units, scene_size, scene_units
-from splat.own_directions import OwnDirections
+from splat.own_directions import SPARE, OwnDirections
 from splat.split_control import SplitControl, split_control
 from splat.train import Training
 
@@ -228,20 +228,29 @@ def _of_operator(
             report(done, len(names), state)
 
         dim = hessian.dim if name == WHOLE else hessian.blocks[name].stop - hessian.blocks[name].start
-        leads = {WHOLE: _lead(hessian)} if name == WHOLE and scale is None else None
+        leads = {name: _lead(hessian, name, scale)}
         found.append((name, dim, families(operator, stream, settings, [name], spaces, say, leads)[name]))
     report(len(names), len(names), "done")
     return found
 
 
-def _lead(hessian: SceneHessian) -> Lead:
-    """The Gaussians' own blocks lead to the ends of the whole Hessian, in the parameters as they are.
+def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:
+    """Where the Gaussians' own blocks know the ends of the whole, or of an attribute, to lie.
 
-    Not to those of Gauss-Newton: where its blocks are singular they lead into the null space, which is left out.
+    Both of the Hessian's whole and of rotations; the largest alone of positions, whose least curvatures several Gaussians make
+    together, and of Gauss-Newton, which has a null space for its smallest.  Neither of the other attributes, of which SSIM
+    leaves a twentieth of what the pixels say, or all of it.
     """
-    if hessian.gauss_newton:
+    if name not in (WHOLE, "means", "quats"):
         return Lead()
-    return Lead(*OwnDirections(hessian.objective, *hessian.objective.own_blocks()).lead(1, 1))
+    objective = hessian.objective
+    own, pixelwise = objective.own_blocks
+    if hessian.gauss_newton:
+        own = pixelwise or objective.block_diagonal(gauss_newton=True)
+    known = OwnDirections(objective, own, pixelwise, None if name == WHOLE else name, scale)
+    if hessian.gauss_newton or name == "means":
+        return Lead(known.steepest(1 + SPARE, 0))
+    return Lead(*known.lead(1, 1))
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int) -> float:

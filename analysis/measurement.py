@@ -175,7 +175,7 @@ def measure(
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
         gradient = _linearised_gradient(objective, report)
-        own = objective.own_blocks()
+        own = objective.own_blocks
         value, render = _rendered(objective)
     with stage("checks") as report:
         operator_check = check_operator(operator, split(generator), settings.checked_vectors)
@@ -184,7 +184,7 @@ def measure(
     streams = {name: split(generator) for name in SHARES}
     with stage("traces") as report:
         allowed = replace(settings.traces, max_seconds=budget.share("traces"))
-        traces = exact_traces(objective, streams["traces"], allowed, report, samples=settings.trace_samples, own=own)
+        traces = exact_traces(objective, streams["traces"], allowed, report, samples=settings.trace_samples)
     with stage("eigenvalues") as report:
         eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
         eigen = replace(eigen, basis=_basis(operator, eigen, settings.memory, notes))

@@ -128,7 +128,8 @@ class SceneObjective:
         """The mean over the first so many views alone; what is held still is shared."""
         part = copy(self)
         part.views, part._losses = self.views[:count], self._losses[:count]
-        part.__dict__.pop("gradient", None)  # that of all views
+        for name in ("gradient", "own_blocks"):  # those of all views
+            part.__dict__.pop(name, None)
         return part
 
     collective = False  # whether processes share the views, and so have to call every method together, one at a time
@@ -221,6 +222,7 @@ class SceneObjective:
         total = reduce(add, parts)
         return OwnBlocks(self.mean(total.geometry), self.mean(total.sh))
 
+    @cached_property
     def own_blocks(self) -> tuple[OwnBlocks, OwnBlocks | None]:
         """Own blocks of the Hessian and, where the loss couples pixels, of what it is pixel by pixel alone."""
         return self.block_diagonal(), self.block_diagonal(gauss_newton=True) if self.couples_pixels else None

@@ -33,25 +33,41 @@ CHUNK = 65_536  # Gaussians at a time
 
 
 class OwnDirections:
-    """An `Approximation` of the scene's Hessian.
+    """An `Approximation` of the scene's Hessian, or of its block of one attribute but colours; in a metric, of D H D.
 
-    own: of the Hessian; pixelwise: of its Gauss-Newton part, where the loss couples pixels.  values: (n, 11), of the blocks,
-    ascending; vectors: (n, 11, 11), theirs, in columns, 0 for a quaternion's length; sh: (n, k * 3), the diagonal.
+    own: of the Hessian, or of its Gauss-Newton part; pixelwise: of that part, where the loss couples pixels.  attribute: all by
+    default; scale: D, above 0, 1 by default.  values: (n, w), of the blocks, ascending; vectors: (n, w, w), theirs, in columns,
+    0 for a quaternion's length; sh: (n, m), the diagonal of the colours, none for one attribute.
     """
 
-    def __init__(self, objective: SceneObjective, own: OwnBlocks, pixelwise: OwnBlocks | None = None):
-        self._blocks, self._like = objective.blocks, objective.active.flat
+    def __init__(
+        self,
+        objective: SceneObjective,
+        own: OwnBlocks,
+        pixelwise: OwnBlocks | None = None,
+        attribute: str | None = None,
+        scale: Float[Tensor, " p"] | None = None,
+    ):
+        self._like, n = objective.active.flat, len(objective.active)
+        D = objective.active.with_flat(torch.ones_like(self._like) if scale is None else scale)
+        units = torch.cat([getattr(D, name).reshape(n, -1) for name in GEOMETRY_COLUMNS], dim=1)
+        radial = torch.zeros_like(units)
+        radial[:, GEOMETRY_COLUMNS["quats"]] = objective.active.quats
         geometry, sh = (own.geometry, own.sh) if pixelwise is None else _softened(own, pixelwise)
-        self.sh: Float[Tensor, "n m"] = sh.flatten(1)
-        n, width = geometry.shape[:2]
-        self.values: Float64[Tensor, "n 11"] = geometry.new_empty(n, width, dtype=torch.float64)
-        self.vectors: Float[Tensor, "n 11 11"] = torch.empty_like(geometry)
-        quats = objective.active.quats
+        self.sh: Float[Tensor, "n m"] = (sh * D.sh.square()).flatten(1)
+        self._blocks, self._columns = objective.blocks, GEOMETRY_COLUMNS
+        if attribute is not None:
+            columns, self.sh = GEOMETRY_COLUMNS[attribute], self.sh[:, :0]
+            units, radial, geometry = units[:, columns], radial[:, columns], geometry[:, columns, columns]
+            rows, self._columns = units.numel(), {attribute: slice(0, units.shape[1])}
+            self._blocks = {attribute: slice(0, rows), "sh": slice(rows, rows)}
+        self.values: Float64[Tensor, "n w"] = torch.empty_like(units, dtype=torch.float64)
+        self.vectors: Float[Tensor, "n w w"] = torch.empty_like(geometry, memory_format=torch.contiguous_format)
 
         def decompose(first: int, last: int) -> None:
             for i in range(first, last, CHUNK):
                 rows = slice(i, min(i + CHUNK, last))
-                self.values[rows], self.vectors[rows] = _decomposed(geometry[rows], quats[rows])
+                self.values[rows], self.vectors[rows] = _decomposed(geometry[rows], radial[rows], units[rows])
 
         if geometry.device.type == "cpu":  # torch itself takes one thread for a batch
             over_range(n, decompose)
@@ -86,14 +102,14 @@ class OwnDirections:
         """f(D) V, where V is."""
         home, V = V.device, V.to(self._like)
         n, k = len(self.values), V.shape[1]
-        geometry = torch.cat([V[self._blocks[name]].reshape(n, -1, k) for name in GEOMETRY_COLUMNS], dim=1)
+        geometry = torch.cat([V[self._blocks[name]].reshape(n, -1, k) for name in self._columns], dim=1)
         geometry = self.vectors @ (f(self.values).to(V)[:, :, None] * (self.vectors.mT @ geometry))
-        return self._joined(geometry, f(self.sh)[:, :, None] * V[self._blocks["sh"]].view(n, -1, k)).to(home)
+        return self._joined(geometry, f(self.sh)[:, :, None] * V[self._blocks["sh"]].view(*self.sh.shape, k)).to(home)
 
-    def _joined(self, geometry: Float[Tensor, "n 11 k"], sh: Float[Tensor, "n m k"]) -> Float[Tensor, "p k"]:
-        """Vectors laid out as the scene's parameters."""
-        result = self._like.new_empty(len(self._like), geometry.shape[2])
-        for name, columns in GEOMETRY_COLUMNS.items():
+    def _joined(self, geometry: Float[Tensor, "n w k"], sh: Float[Tensor, "n m k"]) -> Float[Tensor, "p k"]:
+        """Vectors laid out as the scene's parameters, or the attribute's."""
+        result = self._like.new_empty(self.values.numel() + self.sh.numel(), geometry.shape[2])
+        for name, columns in self._columns.items():
             result[self._blocks[name]] = geometry[:, columns].reshape(-1, geometry.shape[2])
         result[self._blocks["sh"]] = sh.reshape(-1, geometry.shape[2])
         return result
@@ -109,16 +125,14 @@ def _softened(own: OwnBlocks, pixelwise: OwnBlocks) -> tuple[Float[Tensor, "n 11
 
 
 def _decomposed(
-    blocks: Float[Tensor, "n 11 11"], quats: Float[Tensor, "n 4"]
-) -> tuple[Float64[Tensor, "n 11"], Float64[Tensor, "n 11 11"]]:
-    """Eigenvalues and vectors of P B P, where P projects the quaternions' lengths out."""
-    turns, q = GEOMETRY_COLUMNS["quats"], quats.double()[:, :, None]
+    blocks: Float[Tensor, "n w w"], radial: Float[Tensor, "n w"], units: Float[Tensor, "n w"]
+) -> tuple[Float64[Tensor, "n w"], Float64[Tensor, "n w w"]]:
+    """Eigenvalues and vectors of D P B P D, where P projects the quaternions' lengths out."""
+    r, d = radial.double()[:, :, None], units.double()[:, :, None]
+    values, vectors = torch.linalg.eigh(d * _across(r, _across(r, blocks.double()).mT) * d.mT)
+    return values, _across(torch.nn.functional.normalize(r / d, dim=1), vectors)
 
-    def across(B: Float64[Tensor, "n 11 11"]) -> Float64[Tensor, "n 11 11"]:
-        """P B."""
-        B = B.clone()
-        B[:, turns] -= q * (q * B[:, turns]).sum(dim=1, keepdim=True)
-        return B
 
-    values, vectors = torch.linalg.eigh(across(across(blocks.double()).mT))
-    return values, across(vectors)
+def _across(r: Float64[Tensor, "n w 1"], B: Float64[Tensor, "n w w"]) -> Float64[Tensor, "n w w"]:
+    """B without what it has along the unit vectors r."""
+    return B - r * (r * B).sum(dim=1, keepdim=True)

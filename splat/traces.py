@@ -26,7 +26,6 @@ from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, TraceEstimate, t_quantile
 from splat.curvature import SceneObjective
 from splat.gaussians import ATTRIBUTES
-from splat.linearize import OwnBlocks
 
 ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
 LEAST_SAMPLES = 4  # a mean, a slope, and a spread of two degrees of freedom
@@ -40,18 +39,16 @@ def exact_traces(
     progress: Progress | None = None,
     names: Sequence[str] = ATTRIBUTES,
     samples: int | None = None,
-    own: tuple[OwnBlocks, OwnBlocks | None] | None = None,
 ) -> dict[str, TraceEstimate]:
     """The trace of the named attributes' blocks of H, on the complement of the quaternions' radial directions.
 
     settings: rtol, atol, confidence, the numbers of samples and max_seconds count; the distribution is always random signs.
     samples: just so many, at least LEAST_SAMPLES, whatever the settings say: for rough values, as a training needs them.
-    own: the objective's `own_blocks`, where they are known already.
     """
     if samples is not None and samples < LEAST_SAMPLES:
         raise ValueError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
     quats = objective.active.quats
-    whole, coupled = objective.own_blocks() if own is None else own
+    whole, coupled = objective.own_blocks
     known = {name: value for name, value in whole.traces(quats).items() if name in names}
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)

@@ -21,7 +21,7 @@ from splat.adam import Adam
 from splat.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
 from splat.densify import ScreenGradients
-from splat.own_directions import OwnDirections
+from splat.own_directions import SPARE, OwnDirections
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.split_control import split_in_two
@@ -220,22 +220,33 @@ def test_the_families_leave_the_other_numbers_as_they_are(path, record, monkeypa
     assert "Anisotropy by attribute" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("metric", ["parameters", "scene"])
-def test_in_the_parameters_as_they_are_the_own_blocks_lead_to_the_ends_of_the_whole(
-    objective, checkpoint, metric, monkeypatch
-):
-    seen = []
-    monkeypatch.setattr("analysis.family_stage.families", lambda *given: seen.append(given) or families(*given))
+@pytest.mark.parametrize("metric", ["parameters", "optimiser"])
+def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective, checkpoint, metric, monkeypatch):
+    seen = {}
+
+    def watched(operator, *given):
+        (block,), leads = given[2], given[5]
+        seen[of_gauss_newton(operator), block] = operator, leads[block]
+        return families(operator, *given)
+
+    def of_gauss_newton(operator):
+        return getattr(operator, "inner", operator).gauss_newton
+
+    monkeypatch.setattr("analysis.family_stage.families", watched)
     found(objective, checkpoint, metric=metric)
-    for operator, _, _, (block,), _, _, leads in seen:
-        if block != "all" or metric != "parameters":
-            assert leads is None
-        elif operator.gauss_newton:
-            assert leads["all"].start is leads["all"].approximation is None
+    assert len(seen) == 2 * len(BLOCKS)
+    own, pixelwise = objective.own_blocks
+    for (gauss_newton, block), (operator, lead) in seen.items():
+        scale = operator.scale[:, 0] if metric == "optimiser" else None
+        attribute = None if block == "all" else block
+        if block not in ("all", "means", "quats"):
+            assert lead.start is lead.approximation is None
+        elif gauss_newton or block == "means":
+            known = OwnDirections(objective, pixelwise if gauss_newton else own, pixelwise, attribute, scale)
+            assert torch.equal(lead.start, known.steepest(1 + SPARE, 0)) and lead.approximation is None
         else:
-            known = OwnDirections(objective, *objective.own_blocks())
-            assert torch.equal(leads["all"].start, known.lead(1, 1)[0])
-    assert {block for _, _, _, (block,), *_ in seen} > {"all", "means"}
+            start, followed = OwnDirections(objective, own, pixelwise, attribute, scale).lead(1, 1)
+            assert torch.equal(lead.start, start) and (lead.approximation is None) == (followed is None)
 
 
 def test_time_that_runs_out_is_said(objective, checkpoint):

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from landscape import ScaledOperator
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from splat.curvature import SceneHessian, SceneObjective
 from splat.linearize import GEOMETRY_COLUMNS, OwnBlocks
@@ -27,7 +28,7 @@ def test_the_curvature_along_them_is_the_largest_and_least_of_any_gaussian_alone
         rows = torch.cat([torch.arange(k) + objective.blocks[name].start + i * k for name, k in widths.items()])
         values.append(torch.linalg.eigvalsh(dense[rows][:, rows]))
     values = torch.cat(values).sort().values
-    V = OwnDirections(objective, *objective.own_blocks()).steepest(3, 2)
+    V = OwnDirections(objective, *objective.own_blocks).steepest(3, 2)
     assert torch.allclose(V.norm(dim=0), torch.ones(5, dtype=V.dtype))
     assert torch.allclose(H.project(V), V, atol=1e-12)
     found = (V * H.apply(V)).sum(dim=0)
@@ -39,7 +40,7 @@ def test_the_curvature_along_them_is_the_largest_and_least_of_any_gaussian_alone
 def test_functions_of_the_blocks_are_those_of_the_dense_hessians_own_blocks(ssim_weight):
     gaussians = random_gaussians(12, 1, logit=1.0)
     objective = SceneObjective(gaussians, two_views(), LossSettings(ssim_weight=ssim_weight), BACKGROUND)
-    own, pixelwise = objective.own_blocks()
+    own, pixelwise = objective.own_blocks
     known, n = OwnDirections(objective, own, pixelwise), len(objective.active)
     V = random_like((objective.active.flat.numel(), 3), 2).to(objective.active.flat)
     found = known.function(lambda x: 1 / (30 - x) ** 2, V)
@@ -66,6 +67,27 @@ def test_functions_of_the_blocks_are_those_of_the_dense_hessians_own_blocks(ssim
     assert torch.allclose(found[objective.blocks["sh"]].double(), expected, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("attribute", [None, "means", "log_scales", "quats", "opacity_logits"])
+def test_in_a_metric_and_of_one_attribute_they_are_those_of_the_scaled_operators_own_blocks(attribute):
+    loss = LossSettings("l2", ssim_weight=0.0)  # by which colours have a curvature, and pixels are not coupled
+    objective = SceneObjective(random_gaussians(20, 1, logit=1.0), two_views(), loss, BACKGROUND)
+    scale = random_like(tuple(objective.active.flat.shape), 3).to(objective.active.flat).exp()
+    H, n = ScaledOperator(SceneHessian(objective), scale), len(objective.active)
+    owner = objective.active.with_flat(torch.arange(H.dim, dtype=H.dtype) + n)  # of colours, every row
+    for name in GEOMETRY_COLUMNS:
+        getattr(owner, name).view(n, -1).copy_(torch.arange(n)[:, None])
+    own = torch.where(owner.flat[:, None] == owner.flat, H.apply(torch.eye(H.dim, dtype=H.dtype)), 0.0)
+    rows = slice(0, H.dim) if attribute is None else objective.blocks[attribute]
+    own, size = own[rows, rows], float(own[rows, rows].abs().max())
+    known = OwnDirections(objective, *objective.own_blocks, attribute, scale)
+    V = random_like((len(own), 3), 2).to(objective.active.flat)
+    error, rounding = known.function(torch.square, V) - own @ (own @ V), own.abs() @ (own.abs() @ V.abs())
+    assert (error.abs() <= 1e-10 * rounding).all()
+    start = known.steepest(2, 1)
+    assert torch.allclose(start.norm(dim=0), torch.ones(3, dtype=V.dtype))
+    assert torch.allclose(own @ start, start * (start * (own @ start)).sum(dim=0), atol=1e-9 * size)
+
+
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
 def test_davidsons_method_takes_half_the_passes_with_them_for_the_same_pairs(ssim_weight):
     """A pass takes several vectors; on so few Gaussians, all over each other, the vectors are not fewer."""
@@ -80,7 +102,7 @@ def test_davidsons_method_takes_half_the_passes_with_them_for_the_same_pairs(ssi
             return super().apply(V)
 
     H, settings = Watched(objective), EigenSettings(2, 1, rtol=1e-3)
-    known = OwnDirections(objective, *objective.own_blocks())
+    known = OwnDirections(objective, *objective.own_blocks)
     cold = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings)
     apart = len(passes)
     led = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings, known.steepest(4, 3), None, known)
@@ -100,7 +122,7 @@ def test_blocks_that_curve_up_alone_do_not_lead_along_the_quaternions_lengths(ob
 
 
 def test_davidsons_method_is_for_ends_of_unlike_magnitude_with_more_starts_than_pairs(objective):
-    known = OwnDirections(objective, *objective.own_blocks())
+    known = OwnDirections(objective, *objective.own_blocks)
     ratio = float(known.values.max() / known.values.min().abs())
     assert 1 / APART < ratio < APART
     start, followed = known.lead(2, 1)
