@@ -288,6 +288,15 @@ def test_what_the_system_refuses_is_said_with_the_path(original, tmp_path, capsy
     one_sentence(capsys, f"landscape: cannot use {tmp_path / 'file'}", ": Not a directory")
 
 
+def test_the_process_of_a_command_says_all_that_it_printed_and_ends_with_its_exit_code():
+    program = "from analysis import cli\ncli.main = lambda: print('the last words') or 3\ncli.command()"
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, env=buffered, capture_output=True, text=True, timeout=60
+    )
+    assert (result.returncode, result.stdout) == (3, "the last words\n"), result.stderr
+
+
 def test_help_needs_no_torch():
     program = (
         "import sys, analysis.cli\ntry: analysis.cli.main(['train', '--help'])\nfinally: print('torch' in sys.modules)"
