@@ -121,7 +121,7 @@ class SceneObjective:
     def _support(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
         seen = gaussians.flat.new_zeros(len(gaussians), dtype=torch.bool)
         for view in self.views:
-            seen |= touches(rasterize_view(gaussians, view.camera, self.background, self.settings))
+            seen |= touches(rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True))
         return seen
 
     def of_views(self, count: int) -> "SceneObjective":
@@ -148,9 +148,11 @@ class SceneObjective:
 
         The piece: which splats each tile draws, in which order.  Changes nothing, and may run in several threads at once.
         """
-        total, pieces, flat = 0.0, [], flat.to(self.active.flat.device)
+        total, pieces = 0.0, []
+        gaussians = self.active.with_flat(flat.to(self.active.flat.device))
+        gaussians.require_finite()
         for view, loss in zip(self.views, self._losses, strict=True):
-            raster = rasterize_view(self.active.with_flat(flat), view.camera, self.background, self.settings)
+            raster = rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True)
             total += loss.value(raster.planes)
             pieces.append(raster.order)
         return float(self.mean(torch.tensor(total, dtype=torch.float64))), self.joined(hash(tuple(pieces)))

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
@@ -33,13 +34,29 @@ from splat.settings import RenderSettings
 
 
 def rasterize_view(
-    gaussians: Gaussians, camera: Camera, background: Float[Tensor, "3"], settings: RenderSettings
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Float[Tensor, "3"],
+    settings: RenderSettings,
+    *,
+    finite: bool = False,
 ) -> Any:
-    """Project and composite a view by the kernels where the Gaussians are, without derivatives."""
-    gaussians.require_finite()
+    """Project and composite a view by the kernels where the Gaussians are, without derivatives.
+
+    finite: they are known to be, and are not looked at again.
+    """
+    if not finite:
+        gaussians.require_finite()
     splats = projected(gaussians, lens_of(camera, settings))
     background = background.to(gaussians.flat, non_blocking=True)
     return held_raster(*splats, background, camera.width, camera.height, settings)
+
+
+def row_sums(equation: str, *planes: Any) -> Float[Tensor, "k c h"]:
+    """`einsum` in the planes' own precision; NumPy's makes no products of the planes' size, in an eighth of torch's time."""
+    if isinstance(planes[0], np.ndarray):
+        return torch.from_numpy(np.einsum(equation, *planes))
+    return torch.einsum(equation, *planes)
 
 
 def touches(raster: Any) -> Bool[Tensor, " n"]:
@@ -190,9 +207,10 @@ class LinearizedView:
         """(J u)^T l'' (J u) of every column, and the same with l'' replaced by its pixel-diagonal: no backward pass."""
         planes = self._tangent(U).planes
         kinds = planes[:, :3], self._loss.hvp(planes)[:, :3], self._loss.diagonal
-        images, products, diagonal = (torch.as_tensor(self._raster.crop(each)) for each in kinds)
-        full, pixelwise = images * products, images.square() * diagonal
-        return full.sum(dim=(1, 2, 3), dtype=torch.float64), pixelwise.sum(dim=(1, 2, 3), dtype=torch.float64)
+        images, products, diagonal = (self._raster.crop(each) for each in kinds)
+        rows = row_sums("kchw,kchw->kch", images, products), row_sums("kchw,chw,kchw->kch", images, diagonal, images)
+        full, pixelwise = (each.sum(dim=(1, 2), dtype=torch.float64) for each in rows)
+        return full, pixelwise
 
     def _tangent(self, U: Tensor) -> Any:
         return self._raster.jvp(self._projection.jvp(native(U)))
