@@ -108,14 +108,17 @@ class Checkpoint:
     torch_version: str
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
-        """The scene of the checkpoint at path, or the one in the folder scene, with the views of the training.
+        """The scene of the checkpoint at path, or the one in the folder scene, with the views of the training; without a
+        COLMAP model's points, which gave the Gaussians their start.
 
         FileNotFoundError where there is none; ValueError where it lacks a view or has one of another size.
         """
         reference = self.scene
         folder = reference.find(path) if scene is None else scene
         try:
-            found = load_scene(folder, reference.images, reference.downscale, self.training.config.background)
+            found = load_scene(
+                folder, reference.images, reference.downscale, self.training.config.background, points=False
+            )
             found.select([*reference.train, *reference.test])
         except (ValueError, FileNotFoundError) as error:
             if scene is None or not folder.is_dir():

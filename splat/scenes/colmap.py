@@ -28,8 +28,10 @@ def find_model(root: Path) -> Path | None:
     return None
 
 
-def read_colmap(root: Path, model: Path, images: str | None = None) -> tuple[list[Photo], Points | None]:
-    """Photographs sorted by name, and the model's points with their tracks."""
+def read_colmap(
+    root: Path, model: Path, images: str | None = None, *, points: bool = True
+) -> tuple[list[Photo], Points | None]:
+    """Photographs sorted by name, and the model's points with their tracks, where they are wanted."""
     _require_plausible_counts(model)
     try:
         reconstruction = pycolmap.Reconstruction(model)
@@ -49,7 +51,7 @@ def read_colmap(root: Path, model: Path, images: str | None = None) -> tuple[lis
         rotation = torch.from_numpy(image.cam_from_world().rotation.matrix().copy())
         centre = torch.from_numpy(image.projection_center().copy())
         photos.append(Photo(image.name, path, reconstruction.cameras[image.camera_id], rotation, centre))
-    return photos, points_of(reconstruction, posed)
+    return photos, points_of(reconstruction, posed) if points else None
 
 
 def _require_plausible_counts(model: Path) -> None:

@@ -96,6 +96,7 @@ def load_scene(
     background: Sequence[float] | None = None,
     masks: Path | None = None,
     depths: Path | None = None,
+    points: bool = True,
 ) -> Scene:
     """Recognise and load the scene in a folder; pixels are read later.
 
@@ -105,6 +106,7 @@ def load_scene(
         where the pictures have an alpha channel (as 3DGS does for Blender scenes), else black.
     masks, depths: folders of `splat/scenes/layers.py`; an image that has no file there goes without.  Masks by default:
         those that the scene's files name, else a folder mask or masks in the scene, else DTU's own.
+    points: whether a COLMAP model's are wanted, which take longest to read; without them the scene may have none.
 
     Raises FileNotFoundError for what is missing and ValueError for what cannot be used, in one sentence.
     """
@@ -115,7 +117,7 @@ def load_scene(
         )
     if not 1 <= downscale < float("inf"):
         raise ValueError(f"expected downscale of at least 1, got {downscale}")
-    kind, photos, points, own_background = _read(root, images)
+    kind, photos, found, own_background = _read(root, images, points)
     photos = _with_layers(root, photos, masks, depths)
     require_files([photo.path for photo in photos] + [photo.mask for photo in photos if photo.mask])
     _require_distinct(photos, root)
@@ -125,7 +127,7 @@ def load_scene(
         background = (1.0,) * 3 if image_header(photos[0].path)[1] else (0.0,) * 3
     colour = _colour(background)
     frames = tuple(frame(photo, downscale, colour) for photo in photos)
-    return Scene(root.resolve().name, root.resolve(), kind, frames, points, colour)
+    return Scene(root.resolve().name, root.resolve(), kind, frames, found, colour)
 
 
 def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
@@ -134,10 +136,10 @@ def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
     return torch.tensor(values, dtype=torch.float32)
 
 
-def _read(root: Path, images: str | None) -> tuple[Kind, list[Photo], Points | None, list[float] | None]:
+def _read(root: Path, images: str | None, points: bool) -> tuple[Kind, list[Photo], Points | None, list[float] | None]:
     model = find_model(root)
     if model is not None:
-        return "colmap", *read_colmap(root, model, images), None
+        return "colmap", *read_colmap(root, model, images, points=points), None
     if (root / POSES).is_file():
         return "llff", read_llff(root, images), None, None
     if all((root / name).is_file() for _, name in BLENDER_FILES):

@@ -32,6 +32,13 @@ def test_colmap_cameras_points_and_tracks_come_back(tmp_path: Path, text: bool, 
     assert seen == [list(SEEN[p]) for p in wanted]
 
 
+def test_without_its_points_a_colmap_scene_is_the_same_else(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path / "s", False, ".")
+    scene = load_scene(tmp_path / "s", points=False)
+    assert scene.points is None and scene.names == NAMES
+    require_poses(scene)
+
+
 def test_a_colmap_model_from_before_rigs_loads_the_same(tmp_path: Path) -> None:
     folders.write_colmap(tmp_path)
     for name in ("rigs.bin", "frames.bin"):
