@@ -121,7 +121,6 @@ class ProbeSettings:
             power=None,
             density_starts=3,
             density_steps=4,
-            slice_points=11,
             slice_tolerance=0.1,
             slice_holdout=FEWEST_HELD_OUT,
             probe_steps=(),
@@ -209,7 +208,7 @@ def measure(
         notes.append("the finite probe was left out")
     with stage("slice") as report:
         seconds, stream = budget.share("slice"), streams["slice"]
-        plane = _plane(objective, operator, gradient, value, ends, settings, seconds, render, stream, report, notes)
+        plane = _plane(objective, gradient, value, ends, settings, seconds, render, stream, report, notes)
     return Findings(
         value=value,
         gradient_norm=float(gradient.double().norm()),
@@ -329,7 +328,6 @@ def _finite(
 
 def _plane(
     objective: SceneObjective,
-    operator: CountingOperator,
     gradient: Tensor,
     value: float,
     ends: EigenEnds,
@@ -351,7 +349,9 @@ def _plane(
     workers = 1 if objective.collective or by_triton(center) else thread_count()
     allowed = _within(settings, seconds, render, workers)
     evaluate = evaluation(objective, allowed.workers)
-    plane = evaluate_slice(evaluate, center, vectors, axes, gradient, operator, allowed, generator, progress=report)
+    # Ritz vectors: H between any two of them is their values' diagonal matrix
+    known = curvatures.diag()
+    plane = evaluate_slice(evaluate, center, vectors, axes, gradient, known, allowed, generator, progress=report)
     notes += slice_notes(plane)
     return PlaneSlice(plane, loss_scale, (first, second))
 

@@ -119,7 +119,7 @@ class ProbeOptions:
     """Time for the estimators together; what a stage did not reach in its share is said.  inf: no limit.
     Default: 45, with --quick 12."""
     slice_points: Unset[int] = None
-    """Points along each side of the slice, odd.  Default: 41, with --quick 11."""
+    """Points along each side of the slice, odd.  Default: 41."""
     slice_rise: float = 0.001
     """Rise of the loss, as a share of it, that the slice's curvature units stand for; it reaches 3 units each way."""
     families: FlagCreatePairsOff[bool] = False

@@ -57,7 +57,7 @@ def evaluate_slice(
     directions: Float[Tensor, "n d"],
     coordinates: Sequence[Float64[Tensor, " _"]],
     gradient: Float[Tensor, " n"] | None = None,
-    operator: SymmetricOperator | None = None,
+    operator: SymmetricOperator | Float64[Tensor, "d d"] | None = None,
     settings: SliceSettings = SliceSettings(),
     generator: torch.Generator | None = None,
     store: str | Path | None = None,
@@ -67,8 +67,9 @@ def evaluate_slice(
 
     loss(theta) is the objective, or (objective, signature) where it is piecewise smooth: points whose signature differs from
     the centre's are marked.  It must be safe to call from settings.workers threads.  With gradient and operator (at center)
-    the quadratic model comes beside it, for d matvecs.  generator draws the hold-out points (`refinement`); it is not
-    needed where every point is evaluated.  store: a file that keeps the evaluations, from which a killed run continues.
+    the quadratic model comes beside it, for d matvecs, or for none where E^T H E is given as the operator.  generator draws
+    the hold-out points (`refinement`); it is not needed where every point is evaluated.  store: a file that keeps the
+    evaluations, from which a killed run continues.
 
     >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
     >>> line = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :1], [axis], generator=generator)
@@ -115,11 +116,16 @@ def evaluate_slice(
     )
 
 
-def _derivatives(gradient: Tensor, operator: SymmetricOperator, directions: Tensor) -> tuple[Tensor, Tensor]:
+def _derivatives(
+    gradient: Tensor, operator: SymmetricOperator | Float64[Tensor, "d d"], directions: Tensor
+) -> tuple[Tensor, Tensor]:
     """b and A of the model, on the CPU as all that a slice gives."""
     spans = directions.detach().double()
+    slope = (spans.T @ gradient.double()).cpu()
+    if isinstance(operator, Tensor):
+        return slope, operator.cpu()
     curvature = (spans.T @ operator.apply(directions.to(operator.dtype)).double()).cpu()
-    return (spans.T @ gradient.double()).cpu(), (curvature + curvature.T) / 2
+    return slope, (curvature + curvature.T) / 2
 
 
 def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Tensor]) -> None:

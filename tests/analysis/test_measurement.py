@@ -11,7 +11,7 @@ from analysis.measurement import ProbeSettings, _density, _within, measure
 from landscape import CountingOperator
 from landscape.density import ActiveSpace
 from landscape.operator import DenseOperator
-from splat.curvature import SceneObjective
+from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import random_gaussians
@@ -78,3 +78,18 @@ def test_a_slice_with_little_time_keeps_its_points_and_judges_them_by_fewer(rend
     allowed = _within(ProbeSettings(), seconds=0.5 * renders, each=0.5, workers=2)
     assert (allowed.holdout, allowed.batch, allowed.workers) == (held_out, batch, 2)
     assert allowed.max_seconds == 0.5 * renders and allowed.tolerance == ProbeSettings().slice_tolerance
+
+
+def test_the_slices_model_has_the_hessians_curvature_between_its_directions():
+    objective = SceneObjective(
+        random_gaussians(15, 1, logit=1.0).to(torch.float64), two_views(), LossSettings(), BACKGROUND.double()
+    )
+    settings = replace(ProbeSettings.quick(), slice_points=5, seconds=60.0)
+    found = measure(
+        objective, LossSettings(), settings, torch.Generator().manual_seed(0), lambda name: nullcontext(lambda *_: None)
+    )
+    assert found.plane is not None and found.plane.slice.curvature is not None
+    E = found.ends.largest.vectors[:, :2]
+    between = E.T @ SceneHessian(objective).apply(E)
+    off = (found.plane.slice.curvature - between).abs().max() / between.abs().max()
+    assert off < 1e4 * torch.finfo(torch.float64).eps  # what a probe's checks ask of a product

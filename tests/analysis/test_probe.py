@@ -276,7 +276,7 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     assert main(["probe", str(run / "checkpoint.pt"), "--quick"]) == 0
     said = capsys.readouterr()
     data = read_record(run / "probe").data
-    assert data["provenance"]["dtype"] == "float32" and data["slice"]["points"] == 121
+    assert data["provenance"]["dtype"] == "float32" and data["slice"]["points"] == 41 * 41
     assert set(data["eigenvalues"]) == {"max", "second", "min"} and "power iteration" not in said.out
     # what it left out is said, in the record and aloud
     assert any("surface was left out" in note for note in data["notes"]) and "surface was left out" in " ".join(

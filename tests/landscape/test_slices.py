@@ -34,6 +34,16 @@ def test_of_a_quadratic_the_slice_is_its_own_model():
     assert torch.allclose(result.curvature, directions.T @ A @ directions, rtol=0, atol=1e-14)
 
 
+def test_the_model_is_the_same_from_the_curvature_between_the_directions_alone():
+    directions = torch.stack([EIGENVECTORS[:, -1], EIGENVECTORS[:, 0] + EIGENVECTORS[:, 3]], dim=1)
+    by_operator, by_curvature = (
+        evaluate_slice(quadratic, CENTER, directions, AXES, G, H, ALL)
+        for H in (DenseOperator(A), directions.T @ A @ directions)
+    )
+    assert by_operator.model is not None and by_curvature.model is not None
+    assert torch.allclose(by_operator.model, by_curvature.model, rtol=0, atol=1e-14)
+
+
 def test_rows_follow_the_first_direction_and_columns_the_second():
     weights = torch.tensor([[1.0, 0.0], [0.0, 10.0]] + [[0.0, 0.0]] * 7, dtype=torch.float64)
     result = evaluate_slice(lambda theta: theta[:2].sum(), torch.zeros(N), weights, AXES, settings=ALL)
