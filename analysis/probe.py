@@ -5,11 +5,10 @@ The operator is the exact Hessian of the training loss over the training views, 
 
 import shlex
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
-from importlib import import_module
 from math import inf, isfinite
 from pathlib import Path
-from threading import Thread
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from analysis.options import ProbeOptions
 from analysis.probe_record import probe_arrays, probe_data
 from analysis.provenance import provenance
 from analysis.recording import write_with_pictures
-from analysis.records import FILE, PROBE, record_folder, require_replaceable
+from analysis.records import FILE, PROBE, Record, record_folder, require_replaceable
 from analysis.skips import estimator_skips, product_skips
 from analysis.stages import Stages
 from analysis.tables import probe_table
@@ -97,12 +96,12 @@ def _run(
         if options.quick:
             data["notes"].append(WITHOUT_SURFACE.format(out))
         if writes:
-            with record_folder(out) as folder:
-                Thread(target=import_module, args=["analysis.report"]).start()  # while the pictures are drawn
+            with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
+                surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
                 write_with_pictures(folder, data, arrays, PROBE, stages, start, drawn, options.pictures)
                 from analysis.report import write_report
 
-                write_report(folder)
+                write_report(folder, surface.result())
     if writes:
         _conclude(data, out)
     failed = any(check["passed"] is False for check in data["checks"].values())
@@ -170,6 +169,12 @@ def _provenance(
         command=shlex.join(command),
         settings=asdict(settings),
     )
+
+
+def _embedded_surface(record: Record) -> str:
+    from analysis.report import embedded_surface  # a quarter of a second of imports
+
+    return embedded_surface(record)
 
 
 def _conclude(data: dict[str, Any], out: Path) -> None:

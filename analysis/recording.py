@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from analysis.drawing import Draw, draw
-from analysis.records import Kind, write_record
+from analysis.records import Kind, write_data, write_record
 from analysis.stages import Stages
 
 
@@ -35,4 +35,4 @@ def write_with_pictures(
             data["notes"].append(" ".join(str(error).split()))
     # the pictures are drawn from the record; only now is it known how long they took
     data["timing"] = {**stages.timing, "total": perf_counter() - start}
-    write_record(folder, data, arrays, kind)
+    write_data(folder, data, arrays, kind)

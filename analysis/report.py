@@ -29,15 +29,16 @@ PICTURES = {
 }
 
 
-def write_report(folder: str | Path) -> Path:
+def write_report(folder: str | Path, surface: str | None = None) -> Path:
     """Write report.html about the record in `folder`, with the pictures that lie beside it; returns its path.
 
-    The page replaces an older one at once.  Raises FileNotFoundError or ValueError as `read_record` does.
+    surface: `embedded_surface` of the record, where it is known already.  The page replaces an older one at once.  Raises
+    FileNotFoundError or ValueError as `read_record` does.
     """
     record = read_record(folder)
     path = record.folder / FILE
     temporary = path.with_suffix(".html.tmp")
-    temporary.write_text(render_report(record), encoding="utf-8")
+    temporary.write_text(render_report(record, surface), encoding="utf-8")
     temporary.replace(path)
     return path
 
@@ -53,19 +54,19 @@ def template_environment() -> jinja2.Environment:
     )
 
 
-def render_report(record: Record) -> str:
-    """The page as text."""
+def render_report(record: Record, surface: str | None = None) -> str:
+    """The page as text; surface: as for `write_report`."""
     environment = template_environment()
     environment.filters |= {"quantity": quantity, "measured": measured, "attribute": attribute_name, "cell": _cell}
-    surface = interactive_surface(record)
+    surface = embedded_surface(record) if surface is None else surface
     return environment.get_template("report.html.jinja").render(
         data=record.data,
         verdict=verdict(record.data),
         pictures=pictures_in(record.folder, PICTURES),
         families=family_lines(record.data),
         indices=INDICES,
-        surface="" if surface is None else _embedded(surface),
-        plotly_js="" if surface is None else get_plotlyjs(),
+        surface=surface,
+        plotly_js=get_plotlyjs() if surface else "",
     )
 
 
@@ -102,7 +103,11 @@ def interactive_surface(record: Record) -> go.Figure | None:
     return figure
 
 
-def _embedded(figure: go.Figure) -> str:
+def embedded_surface(record: Record) -> str:
+    """`interactive_surface` as a part of a page, empty without a slice."""
+    figure = interactive_surface(record)
+    if figure is None:
+        return ""
     buttons = ["toImage", "zoom3d", "pan3d", "orbitRotation", "resetCameraDefault3d"]
     settings = {"displaylogo": False, "responsive": True, "plotlyServerURL": "", "modeBarButtons": [buttons]}
     return plotly.io.to_html(figure, full_html=False, include_plotlyjs=False, div_id="surface", config=settings)

@@ -41,9 +41,9 @@ def draw_probe(
     # what the processes are handed: no figure shows the eigenvectors, by far the largest
     used = {group: arrays for group, arrays in record.arrays.items() if group != "eigenvectors"}
     draw = partial(_draw, replace(record, arrays=used), suffix)
-    if processes == 1:
+    if min(processes, len(names)) <= 1:
         return [draw(name) for name in names]
-    with ProcessPoolExecutor(processes) as pool:
+    with ProcessPoolExecutor(min(processes, len(names))) as pool:
         return list(pool.map(draw, reversed(names)))[::-1]  # the slow ones first
 
 

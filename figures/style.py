@@ -14,6 +14,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -81,7 +82,10 @@ def save(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
     with style():
-        figure.savefig(temporary)
+        if path.suffix == ".png":  # the same bytes as savefig's, which draws twice: once for the layout alone
+            FigureCanvasAgg(figure).print_png(temporary)
+        else:
+            figure.savefig(temporary)
     temporary.replace(path)
     return path
 

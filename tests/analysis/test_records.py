@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from analysis.records import FORMAT, read_record, record_folder, write_record
+from analysis.records import FORMAT, read_record, record_folder, write_data, write_record
 from tests.recorded import synthetic
 
 
@@ -43,6 +43,16 @@ def test_a_number_of_any_size_survives_exactly(tmp_path, number):
     record = read_record(written(tmp_path / "probe", data, arrays))
     assert record.data["traces"]["means"]["value"] == number
     assert record.data["counts"]["gaussians"] == 7
+
+
+def test_data_are_written_anew_beside_the_arrays_that_are_there(tmp_path):
+    data, arrays = synthetic()
+    folder = written(tmp_path / "probe", data, arrays)
+    files = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.npz")}
+    write_data(folder, {**data, "notes": ["later"]}, arrays)
+    record = read_record(folder)
+    assert record.data["notes"] == ["later"] and set(record.arrays) == set(arrays)
+    assert {path.name: path.stat().st_mtime_ns for path in folder.glob("*.npz")} == files != {}
 
 
 def test_what_is_not_finite_is_written_as_text_in_strict_json(tmp_path):

@@ -55,6 +55,13 @@ def page(folder, data, arrays, picture=None):
     return (folder / path.name).read_text(encoding="utf-8")
 
 
+def test_a_surface_that_is_known_already_is_not_made_again(tmp_path):
+    with record_folder(tmp_path / "probe") as partial:
+        write_record(partial, *synthetic())
+        text = write_report(partial, "<p>a surface that is known</p>").read_text(encoding="utf-8")
+    assert text.count("<p>a surface that is known</p>") == 1 and 'id="surface"' not in text and "Plotly" in text
+
+
 def sentences(data, level=None):
     return " | ".join(line.text for line in verdict(data) if level in {None, line.level})
 

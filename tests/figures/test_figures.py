@@ -14,7 +14,7 @@ from analysis.records import Record, read_record, record_folder, write_record
 from figures import make_all, slice2d, spectrum, surface, traces
 from figures.plane import plane
 from figures.render_surface import Box
-from figures.style import BLACK, COLUMN, SKY, exponent_of
+from figures.style import BLACK, COLUMN, SKY, exponent_of, save, style
 from tests.recorded import synthetic
 
 POINT = 1 / 72  # inches
@@ -24,6 +24,17 @@ def recorded(folder, data, arrays) -> Record:
     with record_folder(folder) as partial:
         write_record(partial, data, arrays)
     return read_record(folder)
+
+
+def test_a_png_is_what_matplotlib_saves_and_takes_one_drawing(tmp_path, monkeypatch):
+    record = recorded(tmp_path / "probe", *synthetic())
+    with style():
+        traces.draw(record).savefig(tmp_path / "saved.png")
+    figure, drawings = traces.draw(record), []
+    draw = figure.draw
+    monkeypatch.setattr(figure, "draw", lambda renderer: drawings.append(renderer) or draw(renderer))
+    assert save(figure, tmp_path / "traces.png").read_bytes() == (tmp_path / "saved.png").read_bytes()
+    assert len(drawings) == 1
 
 
 def nothing_drawn(*_):
