@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splat.projection_linear import GEOMETRY, Held
+from splat.raster.threads import over_range
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
 CHUNK = 4096  # Gaussians at a time
@@ -109,8 +110,23 @@ def _jacobian_rows(views: Sequence[Held], start: int, stop: int, bands: int) -> 
 def _row_space(rows: Float[Tensor, "n r d"], dtype: torch.dtype) -> RowSpace:
     """An orthonormal basis of each Gaussian's rows: the leading right singular vectors."""
     rows = rows / rows.norm(dim=2, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny)
-    _, values, basis = torch.linalg.svd(rows, full_matrices=False)
+    values, basis = _singular(rows)
     kept = (values > TOLERANCE[dtype] * values[:, :1]) & (values > 0)
     basis = torch.where(kept[:, :, None], basis, torch.zeros_like(basis))
     rank = kept.sum(dim=1)
     return RowSpace(basis[:, : int(rank.max())].to(dtype), rank)
+
+
+def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m d"]]:
+    """Singular values, descending, and right singular vectors."""
+    n, r, d = rows.shape
+    values, basis = rows.new_empty(n, min(r, d)), rows.new_empty(n, min(r, d), d)
+
+    def decompose(first: int, last: int) -> None:
+        _, values[first:last], basis[first:last] = torch.linalg.svd(rows[first:last], full_matrices=False)
+
+    if rows.device.type == "cpu":  # torch itself takes one thread for a batch
+        over_range(n, decompose)
+    else:
+        decompose(0, n)
+    return values, basis

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
-from splat.null_space import RowSpace
+from splat.null_space import RowSpace, seen_parameters
 from splat.scenes.view import View
 from tests.splat.random_scenes import random_camera, random_gaussians
 
@@ -82,3 +82,14 @@ def test_what_is_seen_whole_is_left_as_it_is_bit_for_bit() -> None:
     assert torch.equal(kept[[0, 2, 3]], x[[0, 2, 3]])
     assert torch.allclose(kept, basis.mT @ (basis @ x), atol=1e-6)
     assert all(float((kept[i] - x[i]).norm()) > 0.1 for i in (1, 4))
+
+
+def test_row_spaces_are_the_same_on_any_number_of_threads() -> None:
+    objective, before, found = objective_of(3, 1), torch.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            found.append(seen_parameters([view.held for view in objective.linearized], len(objective.active), 4))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(found[0].basis, found[1].basis) and torch.equal(found[0].rank, found[1].rank)
