@@ -19,7 +19,6 @@ from landscape.grid_evaluations import GridEvaluations
 from landscape.results import StopReason
 from landscape.sparse_grid import SparseGrid
 
-ROUGH = 0.1  # a tolerance for which 5 points along each axis say where to refine; finer ones begin with 9
 SHARE_HELD_OUT = 1 / 8  # at most, of the points that are not known: small grids
 
 
@@ -60,7 +59,7 @@ def evaluate_adaptively(
     """Values at every point of x times y (true where known), |prediction - value| of the last hold-out, why it ended."""
     assert settings.tolerance is not None
     grid, budget = SparseGrid(x, y), _Budget(evaluations, settings)
-    _insert(grid, evaluations, grid.coarse(3 if settings.tolerance < ROUGH else 2), budget.room)
+    _insert(grid, evaluations, grid.coarse(), budget.room)
     threshold = settings.tolerance
     while True:
         stopped = _refine(grid, evaluations, threshold, settings.batch, budget)

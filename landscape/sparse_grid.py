@@ -85,10 +85,10 @@ class SparseGrid:
         self.interpolant, self.node = np.zeros(self.shape), np.zeros(self.shape, bool)
         self._surplus = np.zeros(self.shape)
 
-    def coarse(self, levels: int = 3) -> np.ndarray:
-        """Where to begin: 3 x 3 points, and 2^levels + 1 along each axis through the middle."""
+    def coarse(self) -> np.ndarray:
+        """Where to begin: 3 x 3 points, and 9 along each axis through the middle."""
         x, y = np.meshgrid(*(axis.level for axis in self.axes), indexing="ij")
-        return np.flatnonzero((np.maximum(x, y) <= 1) | ((np.minimum(x, y) == 0) & (np.maximum(x, y) <= levels)))
+        return np.flatnonzero((np.maximum(x, y) <= 1) | ((np.minimum(x, y) == 0) & (np.maximum(x, y) <= 3)))
 
     def with_ancestors(self, points: Iterable[int]) -> np.ndarray:
         """The points and their ancestors that are not nodes yet, ancestors first."""

@@ -64,18 +64,6 @@ def test_a_parabola_costs_the_coarse_grid_one_round_and_the_hold_out():
     assert errors(bowl, found).max() < 1e-14 and found.interpolation_error < 1e-14
 
 
-@pytest.mark.parametrize(("tolerance", "a_side"), [(0.1, 5), (0.09, 9)])
-def test_a_rough_slice_begins_with_five_points_along_each_axis_and_a_finer_one_with_nine(tolerance, a_side):
-    found = sliced(lambda theta: float(theta[0] + 2 * theta[1]), tolerance=tolerance, holdout=5)
-    assert int(found.evaluated.sum()) == 2 * a_side - 1 + 4 + 5  # the axes, the corners, what judges
-
-
-def test_a_rough_slice_is_refined_where_five_points_along_an_axis_do_not_tell():
-    found = sliced(crease, tolerance=0.1)
-    assert found.reason == "tolerance" and float((errors(crease, found) > 0.1).double().mean()) <= found.share_beyond
-    assert int(found.evaluated.sum()) > 13 + 30
-
-
 @pytest.mark.parametrize("side", [5, 11, 21, 35, 64])
 def test_any_number_of_points_a_side_works(side):
     axes = (
