@@ -220,8 +220,10 @@ def test_the_families_leave_the_other_numbers_as_they_are(path, record, monkeypa
     assert "Anisotropy by attribute" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("metric", ["parameters", "optimiser"])
-def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective, checkpoint, metric, monkeypatch):
+@pytest.mark.parametrize(("metric", "moves"), [("parameters", False), ("scene", True), ("optimiser", False)])
+def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(
+    objective, checkpoint, metric, moves, monkeypatch
+):
     seen = {}
 
     def watched(operator, *given):
@@ -237,11 +239,11 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
     assert len(seen) == 2 * len(BLOCKS)
     own, pixelwise = objective.own_blocks
     for (gauss_newton, block), (operator, lead) in seen.items():
-        scale = operator.scale[:, 0] if metric == "optimiser" else None
+        scale = None if metric == "parameters" else operator.scale[:, 0]
         attribute = None if block == "all" else block
         if block not in ("all", "means", "quats"):
             assert lead.start is lead.approximation is None
-        elif gauss_newton or block == "means":
+        elif gauss_newton or block == "means" or (block == "all" and moves):
             known = OwnDirections(objective, pixelwise if gauss_newton else own, pixelwise, attribute, scale)
             assert torch.equal(lead.start, known.steepest(1 + SPARE, 0)) and lead.approximation is None
         else:
