@@ -19,11 +19,12 @@ import torch
 from analysis.accuracy_cases import Case, Truth
 from analysis.accuracy_methods import Method
 from analysis.workloads import workload_of
+from landscape.absolute_sum import absolute_sum
 from landscape.anisotropy import effective_rank, mass_quantile
-from landscape.density import ActiveSpace, absolute_sum, spectral_density
+from landscape.density import ActiveSpace, spectral_density
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.results import Progress
-from landscape.trace import TraceSettings
+from landscape.trace import TraceSettings, total
 from splat.checkpoint import write_atomically
 from splat.curvature import SceneHessian, SceneObjective
 from splat.traces import exact_traces
@@ -84,7 +85,9 @@ def _truth(objective: SceneObjective, hessian: SceneHessian, progress: Progress 
         hessian, generator(1), EigenSettings(rtol=FINE, basis=128, max_matvecs=MOST), progress=progress
     )
     active = ActiveSpace(hessian.project, hessian.rank)
-    density = spectral_density(hessian, generator(2), STARTS, STEPS, progress=progress, active=active)
+    density = spectral_density(
+        hessian, generator(2), STARTS * STEPS, STARTS, progress=progress, active=active, ends=ends, trace=total(traces)
+    )
     rank, quantile = effective_rank(ends, density).value, mass_quantile(ends, density).value
     assert rank is not None and quantile is not None
     return Truth(

@@ -18,6 +18,7 @@ leaves goes to the later ones.  The numbers depend on the seed alone unless time
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from time import monotonic
 
 import torch
@@ -51,6 +52,7 @@ from landscape.grid_evaluations import Loss
 from landscape.probes import split
 from landscape.refinement import SliceSettings
 from landscape.results import Progress
+from landscape.trace import total
 from splat.curvature import SceneHessian, SceneObjective
 from splat.device import by_triton
 from splat.losses import LossSettings
@@ -60,7 +62,9 @@ from splat.traces import exact_traces
 
 GIB = 2**30
 FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density and along a side of a slice that are worth their time
-FEWEST_STARTS = 3  # of a density: a spread of two degrees of freedom has a third of the interval that one has
+FEWEST_STARTS = 3  # of a density of less than MANY_MATVECS; two have three times the interval
+MANY_MATVECS = 48
+MOST_AT_ONCE = 4  # start vectors
 FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
 FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds
@@ -86,8 +90,7 @@ class ProbeSettings:
     trace_samples: int | None = None
     eigen: EigenSettings = field(default_factory=lambda: EigenSettings(largest=2, smallest=1, max_matvecs=150))
     power: PowerSettings | None = field(default_factory=lambda: PowerSettings(max_matvecs=40))
-    density_starts: int = 4
-    density_steps: int = 24
+    density_matvecs: int = 96
     slice_points: int = 41
     slice_radius: float = 3.0
     slice_rise: float = 0.001
@@ -119,8 +122,7 @@ class ProbeSettings:
             trace_samples=5,
             eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, noise=0.3, max_matvecs=60),
             power=None,
-            density_starts=3,
-            density_steps=4,
+            density_matvecs=12,
             slice_tolerance=0.1,
             slice_holdout=FEWEST_HELD_OUT,
             probe_steps=(),
@@ -199,7 +201,11 @@ def measure(
         seconds = budget.share("density")
         active = ActiveSpace(hessian.project, hessian.rank)
         each = timed.seconds / timed.matvecs
-        density = _density(operator, active, streams["density"], settings, seconds, each, report, notes)
+        run = partial(
+            spectral_density, operator, streams["density"],
+            progress=report, active=active, ends=ends, trace=total(traces),
+        )  # fmt: skip
+        density = _density(run, vectors_within(operator, settings.memory), settings, seconds, each, notes)
     finite = None
     if settings.probe_steps:
         with stage("finite probe") as report:
@@ -270,33 +276,28 @@ def _basis(operator: CountingOperator, eigen: EigenSettings, memory: float, note
 
 
 def _density(
-    operator: CountingOperator,
-    active: ActiveSpace,
-    generator: torch.Generator,
+    run: Callable[..., SpectralDensity],
+    room: int,
     settings: ProbeSettings,
     seconds: float,
     each: float,
-    report: Progress,
     notes: list[str],
 ) -> SpectralDensity | None:
-    """As many steps as time and memory allow at so many seconds a product, from fewer start vectors where they are few; None
+    """As many products as time allows at so many seconds each, in runs that memory has room for (of that many vectors); None
     where they are too few."""
-    starts, steps = settings.density_starts, settings.density_steps
-    room = vectors_within(operator, settings.memory)
-    if seconds < FEWEST_STEPS * starts * each:
-        starts = min(starts, FEWEST_STARTS)
-    steps = int(min(steps, seconds / (starts * each), room))
-    if steps < min(FEWEST_STEPS, active.rank):
+    matvecs = int(min(settings.density_matvecs, seconds / each))
+    starts = FEWEST_STARTS if matvecs < MANY_MATVECS else None
+    batch, longest = (
+        (MOST_AT_ONCE, room // (MOST_AT_ONCE + 1)) if room > FEWEST_STEPS * MOST_AT_ONCE else (1, room // 2)
+    )
+    if min(matvecs // FEWEST_STARTS, longest) < FEWEST_STEPS:
         notes.append(
-            f"the spectral density was left out: time and memory allowed {steps} steps for each of {starts} start vectors"
+            f"the spectral density was left out: time and memory allowed {matvecs} products in runs of {longest}"
         )
         return None
-    if starts < settings.density_starts:
-        notes.append(f"the spectral density took {starts} start vectors instead of {settings.density_starts}")
-    if steps < settings.density_steps:
-        notes.append(f"the spectral density took {steps} steps instead of {settings.density_steps}, to stay in budget")
-    batch = max(1, min(starts, room // steps))
-    return spectral_density(operator, generator, starts, steps, batch, report, active)
+    if matvecs < settings.density_matvecs:
+        notes.append(f"the spectral density took {matvecs} products instead of {settings.density_matvecs}")
+    return run(matvecs=matvecs, starts=starts, longest=longest, batch=batch)
 
 
 def _rendered(objective: SceneObjective) -> tuple[float, float]:

@@ -52,6 +52,7 @@ from landscape import (
 from landscape.density import ActiveSpace
 from landscape.probes import split
 from landscape.results import Anisotropy, EigenEnds, TraceEstimate
+from landscape.trace import total
 from splat.checkpoint import write_atomically
 from splat.curvature import SceneHessian, SceneObjective
 from splat.densify import Densified
@@ -64,7 +65,7 @@ START = "start"
 Row = dict[str, Any]
 LEAST = 32  # renders with their gradients, for each view, that the least record takes (measured on 8,000 Gaussians)
 FEWEST_MATVECS = 20  # from a warm start, for the largest eigenvalue
-FEWEST_STEPS = 8  # of a density that is worth its time
+FEWEST_OF_DENSITY = 16  # products that are worth their time
 INDICES = ("literal", "saddle", "share", "effective_rank", "mass_quantile")
 COLUMNS = (
     "step", "gaussians", "state", "note", "seconds", "time_share", "visible_gaussians", "parameters", "start", "matvecs",
@@ -82,8 +83,7 @@ class TrajectorySettings:
     share: float = 0.1
     traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=8))
     eigen: EigenSettings = field(default_factory=lambda: EigenSettings(rtol=1e-2, max_matvecs=150))
-    density_starts: int = 2
-    density_steps: int = 16
+    density_matvecs: int = 32
 
     def __post_init__(self) -> None:
         if self.every < 1:
@@ -223,14 +223,13 @@ def measure(
     short = [f"trace of {name}" for name, trace in traces.items() if trace.reason == "time budget"]
     pairs = {"lambda_max": ends.largest, "lambda_min": ends.smallest}
     short += [name for name, end in pairs.items() if end.reason == "time budget"]
-    possible = left() / (settings.density_starts * operator.seconds / operator.matvecs)
-    steps = int(min(settings.density_steps, possible))
+    matvecs = int(min(settings.density_matvecs, left() * operator.matvecs / operator.seconds))
     density = None
-    if steps < min(FEWEST_STEPS, hessian.rank):
+    if matvecs < FEWEST_OF_DENSITY:
         short.append("spectral density")
     else:
-        active = ActiveSpace(hessian.project, hessian.rank)
-        density = spectral_density(operator, streams[2], settings.density_starts, steps, active=active)
+        active, trace = ActiveSpace(hessian.project, hessian.rank), total(traces)
+        density = spectral_density(operator, streams[2], matvecs, active=active, ends=ends, trace=trace)
     return Found(traces, ends, density, operator.matvecs, least, tuple(short))
 
 
@@ -287,5 +286,5 @@ def _compile(training: Training, views: Sequence[View]) -> None:
     """Compile the kernels of a record, which would count as its time, on a few Gaussians."""
     seen = training.config.objective(training.gaussians, views).mask.nonzero()[:8, 0]
     objective = training.config.objective(training.gaussians.select(seen), views)
-    least = TrajectorySettings(1, eigen=EigenSettings(max_matvecs=10), density_steps=FEWEST_STEPS)
+    least = TrajectorySettings(1, eigen=EigenSettings(max_matvecs=10), density_matvecs=FEWEST_OF_DENSITY)
     measure(objective, torch.Generator(training.gaussians.flat.device).manual_seed(0), least)

@@ -3,11 +3,12 @@
 Everything here sees a `SymmetricOperator` and a `torch.Generator`, and returns a frozen result that carries its error.
 """
 
+from landscape.absolute_sum import absolute_sum
 from landscape.anisotropy import anisotropy, effective_rank, literal, mass_quantile, saddle, share
 from landscape.block_size import fastest_block
 from landscape.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
 from landscape.control import PartlyKnown
-from landscape.density import ActiveSpace, absolute_sum, spectral_density
+from landscape.density import ActiveSpace, spectral_density
 from landscape.diagonal import DiagonalEstimate, GroupSums, estimate_diagonal
 from landscape.directions import gradient_direction, groups_of, line_between, orthonormal, random_directions
 from landscape.distributed import DistributedOperator, Ranks

@@ -16,7 +16,7 @@ from math import inf, isfinite
 
 import torch
 
-from landscape.density import absolute_sum
+from landscape.absolute_sum import absolute_sum
 from landscape.quantiles import absolute_quantile
 from landscape.results import Anisotropy, Bracket, EigenEnds, SpectralDensity
 

@@ -110,7 +110,9 @@ def family(
     if eigen.smallest == 0:  # one direction: both ends are the same
         ends = EigenEnds(ends.largest, ends.largest, ends.method, ends.matvecs, ends.beyond, ends.noise, ends.ritz)
     starts, steps, batch = settings.starts, settings.steps, settings.batch
-    density = spectral_density(operator, generator, starts, max(2, steps), batch, progress, active)
+    density = spectral_density(
+        operator, generator, starts * max(2, steps), starts, batch=batch, progress=progress, active=active, ends=ends
+    )
     return Family(rank, ends, density, anisotropy(ends, density))
 
 

@@ -7,6 +7,7 @@ ones: the first pass leaves components of the size of its own round-off, the sec
 entries of T ("twice is enough", Kahan and Parlett).  Rows of the workspaces are vectors, so that each is contiguous.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -62,11 +63,12 @@ def lanczos(
     steps: int,
     progress: Progress | None = None,
     scale: float = 0.0,
+    enough: Callable[[Sequence[tuple[Float64[Tensor, "m m"], float]]], bool] | None = None,
 ) -> list[LanczosFactorization]:
     """One factorisation per column of starts, run in lock-step so that the operator sees blocks of k vectors.
 
     Memory: k * steps vectors.  scale: |H|, where the starts were chosen so that they do not show it: what is its round-off ends
-    a recurrence.
+    a recurrence.  enough: whether these (T, |r|) of all runs are; asked after every step.
 
     >>> from landscape.operator import DenseOperator
     >>> A = DenseOperator(torch.diag(torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)))
@@ -82,25 +84,25 @@ def lanczos(
     basis = starts.new_empty(k, steps, n, dtype=operator.dtype)
     T = torch.zeros(k, steps, steps, dtype=torch.float64)
     remainders = units.T.to(operator.dtype).contiguous()
-    sizes, running = [0] * k, list(range(k))
+    sizes, lengths, running = [0] * k, [0.0] * k, list(range(k))
     for j in range(steps):
         for i in running:
             basis[i, j] = remainders[i]
+            if j:
+                T[i, j - 1, j] = T[i, j, j - 1] = lengths[i]
         products = operator.apply(torch.stack([basis[i, j] for i in running], dim=1)).T
         for i, product in zip(list(running), products, strict=True):
             w = product.clone()[None]
-            length = norm(w)
+            size = max(scale, norm(w))
             T[i, j, j] = orthogonalise(w, basis[i, : j + 1])[j, 0]
-            sizes[i], remainders[i] = j + 1, w[0]
-            beta = norm(w)
-            if is_dust(beta, max(scale, length, float(T[i].abs().max())), operator.dtype):
+            sizes[i], lengths[i] = j + 1, norm(w)
+            if is_dust(lengths[i], max(size, float(T[i].abs().max())), operator.dtype):
                 running.remove(i)
-                remainders[i] = 0
-            elif j + 1 < steps:
-                T[i, j, j + 1] = T[i, j + 1, j] = beta
-                remainders[i] = w[0] / beta
+                lengths[i] = 0.0
+            remainders[i] = w[0] / (lengths[i] or 1.0)
         if progress:
             progress((j + 1) * k, steps * k, f"Lanczos step {j + 1} of {steps}")
-        if not running:
+        rules = [T[i, :m, :m] for i, m in enumerate(sizes)]
+        if not running or (enough and enough(list(zip(rules, lengths, strict=True)))):
             break
-    return [LanczosFactorization(basis[i, :m].T, T[i, :m, :m], remainders[i]) for i, m in enumerate(sizes)]
+    return [LanczosFactorization(basis[i, :m].T, T[i, :m, :m], remainders[i] * lengths[i]) for i, m in enumerate(sizes)]

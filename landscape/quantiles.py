@@ -21,7 +21,7 @@ over the start vectors may be off at F = p.  The sums of curvature are compared 
 Eigenvalues that are known are counted as such, and the tests are of the others.
 """
 
-from collections.abc import Callable
+from itertools import compress
 from math import inf
 
 import numpy as np
@@ -30,7 +30,7 @@ from jaxtyping import Float64
 from scipy.special import betaincinv
 from torch import Tensor
 
-from landscape.density import bounds_of_rules
+from landscape.absolute_sum import integrals_of_rules
 from landscape.lanczos import lanczos
 from landscape.operator import DenseOperator
 from landscape.results import Bracket, SpectralDensity, t_quantile
@@ -44,7 +44,7 @@ def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Br
 
     >>> from landscape.density import spectral_density
     >>> H = DenseOperator(torch.diag(torch.linspace(0, 1, 1001, dtype=torch.float64)))
-    >>> median = quantile(spectral_density(H, torch.Generator().manual_seed(0), starts=4, steps=40), 0.5)
+    >>> median = quantile(spectral_density(H, torch.Generator().manual_seed(0), matvecs=160, starts=4), 0.5)
     >>> 0.4 < median.low < 0.5 < median.high < 0.6
     True
     """
@@ -67,14 +67,18 @@ def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Br
     above = grid[(share > 0) & ((upto.mean(dim=0) < least) | (share > 1))]
     reached = grid[(share <= 0) | ((below.mean(dim=0) >= most) & (share <= 1))]
     high = _first(reached, inf)
-    return _bracket(density, p, torch.ones_like, above.max() if len(above) else -inf, high)
+    nodes, weights = density.table()
+    at, order = nodes.flatten().sort()
+    sums = weights.flatten()[order].cumsum(0)
+    value = float(at[int(torch.searchsorted(sums, p * sums[-1]).clamp_max(len(at) - 1))])
+    return _within(density, value, above.max() if len(above) else -inf, high)
 
 
 def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: float = 0.95) -> Bracket:
     """The magnitude t such that the share p of sum |lambda| comes from |lambda| <= t."""
     _require_share(p)
-    bounds = zip(*bounds_of_rules(density), strict=True)
-    tails = [_Tail(*rule, (float(low), float(high))) for rule, (low, high) in zip(density.rules(), bounds, strict=True)]
+    totals = integrals_of_rules(density).T.tolist()
+    tails = [_Tail(*rule, (low, high)) for rule, (low, _, high) in zip(density.rules(), totals, strict=True)]
     known = density.known.abs().sort().values
     grid = torch.cat([torch.zeros(1, dtype=torch.float64), known, *(tail.magnitudes for tail in tails)]).unique()
     if len(grid) == 1:
@@ -94,7 +98,7 @@ def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: flo
     low = float(grid[int(beneath.long().cumprod(0).sum().clamp_max(len(grid) - 1))])
     last = int(beyond.long().flip(0).cumprod(0).sum())
     high = float(grid[-last]) if last else inf
-    return _bracket(density, p, torch.abs, max(low, floor), high, magnitudes=True)
+    return _within(density, _middle_of_magnitudes(density, p), max(low, floor), high)
 
 
 class _Tail:
@@ -129,24 +133,40 @@ class _Tail:
         return least - (1 - p) * high, most - (1 - p) * low
 
 
-def _bracket(
-    density: SpectralDensity,
-    p: float,
-    mass: Callable[[Tensor], Tensor],
-    low: Tensor | float,
-    high: Tensor | float,
-    magnitudes: bool = False,
-) -> Bracket:
-    """The quantile of all nodes together, within what is certain."""
+def _within(density: SpectralDensity, value: float, low: Tensor | float, high: Tensor | float) -> Bracket:
     low, high = float(low), float(high)
-    nodes, weights = density.table()
-    at, order = (nodes.abs() if magnitudes else nodes).flatten().sort()
-    sums = (weights * mass(nodes)).flatten()[order].cumsum(0)
-    value = float(at[int(torch.searchsorted(sums, p * sums[-1]).clamp_max(len(at) - 1))])
     steps = int((density.weights > 0).sum(dim=1).max())
-    return Bracket(
-        min(max(value, low), high), low, high, f"{len(density.nodes)} start vectors of {steps} Lanczos steps"
-    )
+    note = f"{len(density.nodes)} start vectors of {steps} Lanczos steps at most"
+    return Bracket(min(max(value, low), high), low, high, note)
+
+
+def _middle_of_magnitudes(density: SpectralDensity, p: float) -> float:
+    """The magnitude that the share p of sum |lambda| lies at or below, in the middle of what is certain.
+
+    Of what a node carries half is taken to lie below it (see above), and more in proportion up to the next node.  What is
+    known, and the nodes of a rule that is the measure itself, are where they are.
+    """
+    rules = [
+        (nodes.abs(), density.rest * weights * nodes.abs() / len(density.nodes)) for nodes, weights in density.rules()
+    ]
+    whole = [not bool((weights > 0).all()) for _, weights in density.rules()]
+    exact = [(density.known.abs(), density.known.abs()), *compress(rules, whole)]
+    at, mass = (torch.cat(parts) for parts in zip(*exact, strict=True))
+    grid = torch.cat([at, *(nodes for nodes, _ in rules)]).unique()
+    smooth = np.zeros(len(grid))
+    for (nodes, amounts), all_of_it in zip(rules, whole, strict=True):
+        if not all_of_it:
+            nodes, order = nodes.sort()
+            below = amounts[order].cumsum(0) - amounts[order] / 2
+            smooth += np.interp(grid.numpy(), nodes.numpy(), below.numpy(), left=0.0, right=float(amounts.sum()))
+    at, order = at.sort()
+    sums = torch.nn.functional.pad(mass[order].cumsum(0), (1, 0))
+    below, upto = (smooth + sums[torch.searchsorted(at, grid, right=side)].numpy() for side in (False, True))
+    goal = p * (float(density.known.abs().sum()) + sum(float(amounts.sum()) for _, amounts in rules))
+    k = min(int(np.searchsorted(upto, goal)), len(grid) - 1)
+    if k == 0 or goal > below[k]:
+        return float(grid[k])
+    return float(np.interp(goal, [upto[k - 1], below[k]], grid[k - 1 : k + 1].numpy()))
 
 
 def _first(values: Tensor, otherwise: float) -> Tensor | float:

@@ -19,7 +19,8 @@ part of itself (`control.PartlyKnown`), Hutchinson uses it as a control variate,
 `PAPER` is StableGS's estimator, Eq. (6): Gaussian z, one block at a time, ten probes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from statistics import NormalDist
 from time import monotonic
 
 import torch
@@ -34,6 +35,15 @@ from landscape.sketched import hutch_plus_plus, xtrace
 
 PAPER = TraceSettings.fixed(10, "gaussian")
 ESTIMATORS = {"auto": chosen, "hutch++": hutch_plus_plus, "xtrace": xtrace}
+
+
+def total(traces: Mapping[str, TraceEstimate]) -> tuple[float, float]:
+    """The trace of all blocks together, with a bound of its standard error: the blocks' may be of one mind.
+
+    Of few samples it is that of a normal law with the same interval.
+    """
+    errors = [(x.high - x.low) / 2 / NormalDist().inv_cdf((1 + x.confidence) / 2) for x in traces.values()]
+    return sum(x.value for x in traces.values()), sum(errors)
 
 
 def estimate_traces(

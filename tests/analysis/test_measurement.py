@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ import torch
 from analysis import measurement
 from analysis.measurement import ProbeSettings, _density, _within, measure
 from landscape import CountingOperator
-from landscape.density import ActiveSpace
+from landscape.density import spectral_density
 from landscape.operator import DenseOperator
 from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
@@ -20,19 +21,21 @@ DIM = 50
 
 
 @pytest.mark.parametrize(
-    ("seconds", "shape", "said"),
+    ("seconds", "room", "shape", "said"),
     [
-        (40.0, (4, 10), []),
-        (16.0, (4, 4), ["4 steps instead of 10"]),
-        (15.0, (3, 5), ["3 start vectors instead of 4", "5 steps instead of 10"]),
-        (11.0, None, ["left out: time and memory allowed 3 steps for each of 3"]),
+        (61.0, 1000, (4, 15), []),
+        (52.0, 1000, (4, 13), ["52 products instead of 60"]),
+        (16.0, 1000, (3, 5), ["16 products instead of 60"]),
+        (61.0, 30, (10, 6), []),
+        (61.0, 9, (15, 4), []),
+        (11.0, 1000, None, ["left out: time and memory allowed 11 products in runs of 200"]),
+        (61.0, 6, None, ["left out: time and memory allowed 60 products in runs of 3"]),
     ],
 )
-def test_a_density_has_fewer_start_vectors_before_it_has_too_few_steps(seconds, shape, said):
+def test_a_density_has_as_many_products_as_time_allows_in_runs_that_memory_has_room_for(seconds, room, shape, said):
     operator = CountingOperator(DenseOperator(torch.diag(torch.linspace(-1, 3, DIM, dtype=torch.float64))))
-    everything, notes = ActiveSpace(lambda V: V, DIM), []
-    generator, settings = torch.Generator().manual_seed(0), ProbeSettings(density_steps=10)
-    density = _density(operator, everything, generator, settings, seconds, 1.0, lambda *_: None, notes)
+    run, notes = partial(spectral_density, operator, torch.Generator().manual_seed(0)), []
+    density = _density(run, room, ProbeSettings(density_matvecs=60), seconds, 1.0, notes)
     assert (None if density is None else tuple(density.nodes.shape)) == shape
     assert len(notes) == len(said) and all(words in note for words, note in zip(said, notes, strict=True))
     assert operator.matvecs == (shape[0] * shape[1] if shape else 0)  # none for the time alone

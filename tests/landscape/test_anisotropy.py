@@ -66,7 +66,7 @@ def test_every_bracket_holds_the_truth(name):
     true = eigenvalues(H)
     magnitude = true.abs().sum()
     found = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-4))
-    family = anisotropy(found, spectral_density(H, generator(), starts=8, steps=16))
+    family = anisotropy(found, spectral_density(H, generator(), matvecs=128, starts=8))
     assert family.share is not None and family.effective_rank is not None
     assert family.share.low <= float(true[-1] / magnitude) <= family.share.high
     assert family.effective_rank.low <= float(magnitude**2 / true.square().sum()) <= family.effective_rank.high

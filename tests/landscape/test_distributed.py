@@ -22,7 +22,7 @@ def measured(H):
     """The numbers of every estimator, by a fixed seed."""
     traces = estimate_traces(H, generator(1), TraceSettings.fixed(8))
     ends = extreme_eigenpairs(H, generator(2), EigenSettings(2, 1, rtol=1e-9, basis=30))
-    density = spectral_density(H, generator(3), starts=2, steps=8)
+    density = spectral_density(H, generator(3), matvecs=16, starts=2)
     return {
         "product": H.apply(torch.eye(N, 3, dtype=H.dtype)),
         "traces": torch.stack([trace.samples for trace in traces.values()]),
