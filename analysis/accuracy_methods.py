@@ -25,15 +25,16 @@ from torch import Tensor
 
 from analysis.accuracy_cases import Case, Meter
 from analysis.bench_scene import OPERATIONS
+from landscape.absolute_sum import absolute_sum
 from landscape.anisotropy import effective_rank, mass_quantile
-from landscape.density import absolute_sum, spectral_density
+from landscape.density import spectral_density
 from landscape.diagonal import Method as DiagonalMethod
 from landscape.diagonal import estimate_diagonal
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.power import PowerSettings, power_ends
 from landscape.results import Bracket, EigenEnds
 from landscape.trace import PAPER, TraceSettings, estimate_traces
-from splat.own_directions import SPARE, OwnDirections
+from splat.own_directions import OwnDirections
 from splat.traces import ONE_PERCENT, exact_traces
 
 Origin = Literal["default", "own", "peer"]
@@ -41,7 +42,7 @@ PASS = 3.0 / 1.6
 JACOBIAN = OPERATIONS["J u 1"] / (OPERATIONS["J u 1"] + OPERATIONS["tangent of backward 1"])
 BUDGETS = (12, 24, 48, 96)  # matvecs a block
 TOLERANCES = (1e-1, 1e-2)  # of residuals; 1e-3 is the default
-DENSITIES = ((2, 12), (4, 24), (8, 48))  # start vectors and steps; (6, 32) is the default
+DENSITIES = ((2, 12), (4, 24), (8, 48))  # start vectors and steps; by default 192 products are divided as they go
 PROBES = (8, 16, 64)  # of a diagonal; 32 is the default
 CONFIDENCE = 0.95
 
@@ -178,8 +179,7 @@ def _from_own_blocks(case: Case, operator: Meter, seed: int) -> list[Answer]:
     operator.charge(PASS)
     if known is not None and case.objective.couples_pixels:
         pixelwise = case.objective.block_diagonal(gauss_newton=True)
-        known = OwnDirections(case.objective, own, pixelwise)
-        start = known.steepest(1 + SPARE, 1 + SPARE)
+        start, known = OwnDirections(case.objective, own, pixelwise).lead(1, 1)
         operator.charge(PASS)
     return end_answers(extreme_eigenpairs(operator, generator(seed), start=start, approximation=known))
 
@@ -204,19 +204,26 @@ def end_answers(ends: EigenEnds) -> list[Answer]:
 
 def density_methods() -> Iterator[Method]:
     """The quantile's lambda_1 is that of Lanczos as it is by default, which a probe has anyway: its products do not count."""
-    for (starts, steps), origin in {(6, 32): "default", **dict.fromkeys(DENSITIES, "own")}.items():
+    yield _density("as it goes", "default")
+    for starts, steps in DENSITIES:
+        yield _density(f"{starts} x {steps}", "own", matvecs=starts * steps, starts=starts)
+    yield _density("as it goes, trace and ends known", "own", known=True)
 
-        def run(case: Case, operator: Meter, seed: int, starts: int = starts, steps: int = steps) -> list[Answer]:
-            ends = case.ends
-            density = spectral_density(operator, generator(seed + 1), starts, steps, active=case.active)
-            found = {
-                "sum of |lambda|": absolute_sum(density),
-                "effective rank": effective_rank(ends, density),
-                "mass quantile": mass_quantile(ends, density),
-            }
-            return [_bracketed(part, bracket) for part, bracket in found.items()]
 
-        yield Method("sums", "Lanczos quadrature", f"{starts} x {steps}", run, origin)  # pyright: ignore[reportArgumentType]
+def _density(text: str, origin: Origin, known: bool = False, **division: int) -> Method:
+    """known: as a probe has it, which needs traces and ends for themselves: their products do not count."""
+
+    def run(case: Case, operator: Meter, seed: int) -> list[Answer]:
+        before = {"ends": case.ends, "trace": (sum(case.truth.traces.values()), 0.0)} if known else {}
+        density = spectral_density(operator, generator(seed + 1), active=case.active, **division, **before)
+        found = {
+            "sum of |lambda|": absolute_sum(density),
+            "effective rank": effective_rank(case.ends, density),
+            "mass quantile": mass_quantile(case.ends, density),
+        }
+        return [_bracketed(part, bracket) for part, bracket in found.items()]
+
+    return Method("sums", "Lanczos quadrature", text, run, origin)
 
 
 def _bracketed(part: str, bracket: Bracket) -> Answer:

@@ -237,9 +237,8 @@ def _of_operator(
 def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:
     """Where the Gaussians' own blocks know the ends of the whole, or of an attribute, to lie.
 
-    Both of the Hessian's whole and of rotations, unless the least curvature is one of positions; else the largest.  Least
-    curvatures of positions several Gaussians may make together: of fern's (8,000 Gaussians, 3 views) the least is -1.05e-3, and
-    Davidson's method goes from their own blocks to one of -4.1e-4.  Gauss-Newton has a null space for its smallest.
+    Both of the Hessian's whole and of rotations; of positions the largest, as several Gaussians make their least curvatures
+    together (`OwnDirections.lead`), and of Gauss-Newton, which has a null space for its smallest.
     """
     if name not in (WHOLE, "means", "quats"):
         return Lead()
@@ -248,14 +247,9 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:
     if hessian.gauss_newton:
         own = pixelwise or objective.block_diagonal(gauss_newton=True)
     known = OwnDirections(objective, own, pixelwise, None if name == WHOLE else name, scale)
-    if hessian.gauss_newton or name == "means" or (name == WHOLE and _moves(known, hessian.blocks["means"])):
+    if hessian.gauss_newton or name == "means":
         return Lead(known.steepest(1 + SPARE, 0))
     return Lead(*known.lead(1, 1))
-
-
-def _moves(known: OwnDirections, positions: slice) -> bool:
-    """Whether the least curvature of any Gaussian alone is one of its position."""
-    return float(known.steepest(0, 1)[positions].square().sum()) > 0.5
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int) -> float:

@@ -103,11 +103,15 @@ class OwnDirections:
 
         A recurrence sees both ends with each product, and needs about the root of the ratio of their magnitudes more of them
         than where they are alike.  Davidson's method aims at each: with SPARE starts more at both ends, as which of them is the
-        steepest is not certain.
+        steepest is not certain.  Where the least curvature is one of a position it would go astray, as several Gaussians may
+        make a smaller one together: of fern's positions (8,000 Gaussians, 3 views) the least is -1.05e-3, and from their own
+        blocks it goes to one of -4.1e-4.  Then only the largest are begun at.
         """
         magnitudes = self.values.max().abs(), self.values.min().abs()
         if not (largest and smallest) or float(min(magnitudes)) * APART > float(max(magnitudes)):
             return self.steepest(largest, smallest), None
+        if "means" in self._columns and float(self.steepest(0, 1)[self._blocks["means"]].square().sum()) > 0.5:
+            return self.steepest(largest + SPARE, 0), None
         return self.steepest(largest + SPARE, smallest + SPARE), self
 
     def function(self, f: Callable[[Tensor], Tensor], V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:

@@ -158,15 +158,27 @@ def test_blocks_that_curve_up_alone_do_not_lead_along_the_quaternions_lengths(ob
     assert torch.allclose(SceneHessian(objective).project(V), V, atol=1e-12)
 
 
+def with_ends(objective, largest, row, least):
+    """Blocks that are 1, but for two Gaussians': the largest of the one's, and one of the other's rows."""
+    n, k = len(objective.active), objective.active.sh.shape[1]
+    blocks = torch.eye(11, dtype=objective.active.flat.dtype).repeat(n, 1, 1)
+    blocks[0, 5, 5], blocks[3, row, row] = largest, least
+    return OwnDirections(objective, OwnBlocks(blocks, objective.active.flat.new_zeros(n, k, 3)))
+
+
 def test_davidsons_method_is_for_ends_of_unlike_magnitude_with_more_starts_than_pairs(objective):
-    known = OwnDirections(objective, *objective.own_blocks)
-    ratio = float(known.values.max() / known.values.min().abs())
-    assert 1 / APART < ratio < APART
+    for ratio, led in ((0.9 * APART, False), (1.1 * APART, True)):
+        known = with_ends(objective, 2 * ratio, row=4, least=-2.0)
+        start, followed = known.lead(2, 1)
+        assert followed is (known if led else None)
+        assert torch.equal(start, known.steepest(3, 2) if led else known.steepest(2, 1))
+        for largest, smallest in ((0, 1), (1, 0)):
+            start, followed = known.lead(largest, smallest)
+            assert followed is None and start.shape[1] == 1
+
+
+@pytest.mark.parametrize(("row", "moves"), [(1, True), (4, False), (10, False)])
+def test_where_the_least_curvature_is_one_of_a_position_only_the_largest_end_is_begun_at(objective, row, moves):
+    known = with_ends(objective, 10 * APART, row, least=-2.0)
     start, followed = known.lead(2, 1)
-    assert followed is None and torch.equal(start, known.steepest(2, 1))
-    known.values = torch.where(known.values > 0, known.values * 2 * APART / ratio, known.values)
-    start, followed = known.lead(2, 1)
-    assert followed is known and torch.equal(start, known.steepest(3, 2))
-    for largest, smallest in ((0, 1), (1, 0)):
-        start, followed = known.lead(largest, smallest)
-        assert followed is None and start.shape[1] == 1
+    assert torch.equal(start, known.steepest(3, 0 if moves else 2)) and followed is (None if moves else known)
