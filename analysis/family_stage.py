@@ -30,17 +30,20 @@ from landscape.families import WHOLE, Lead
 from landscape.operator import SymmetricOperator
 from landscape.probes import split
 from landscape.results import Progress
+from landscape.trace import total
 from splat.curvature import SceneHessian, SceneObjective
 from splat.families import active_spaces
 from splat.metrics import Metric, optimiser_units, scene_size, scene_units
 from splat.own_directions import SPARE, OwnDirections
 from splat.split_control import SplitControl, split_control
+from splat.traces import exact_traces
 from splat.train import Training
 
 SceneName = Literal["trained", "split"]
 OPERATORS = {"hessian": False, "gauss-newton": True}  # name -> gauss_newton
 PARTS = 6  # the whole and five attributes
 FEWEST_STEPS = 2  # that make a density
+TRACE_SAMPLES = 8  # of SSIM's coupling: to a few percent, within which start vectors do not know it
 DENSITY_SHARE = 0.45  # of a family's time: 48 of 108 products by default
 
 
@@ -215,6 +218,7 @@ def _of_operator(
     """(block, dim, family) of the whole and of every attribute of one operator."""
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
     spaces, found = active_spaces(hessian, scale), []
+    traces = {} if hessian.gauss_newton else _traces(hessian.objective, scale, split(generator))
     each = _seconds_a_product(operator, options.family.batch) if options.seconds < inf else 0.0
     names = [WHOLE, *hessian.blocks]
     for done, name in enumerate(names):
@@ -228,10 +232,25 @@ def _of_operator(
             report(done, len(names), state)
 
         dim = hessian.dim if name == WHOLE else hessian.blocks[name].stop - hessian.blocks[name].start
-        leads = {name: _lead(hessian, name, scale)}
+        leads = {name: replace(_lead(hessian, name, scale), trace=traces.get(name))}
         found.append((name, dim, families(operator, stream, settings, [name], spaces, say, leads)[name]))
     report(len(names), len(names), "done")
     return found
+
+
+def _traces(
+    objective: SceneObjective, scale: Tensor | None, generator: torch.Generator
+) -> dict[str, tuple[float, float]]:
+    """The Hessian's traces with standard errors, of every attribute that has one unit, and of the whole where all have."""
+    found, known = exact_traces(objective, generator, samples=TRACE_SAMPLES), {}
+    for name, trace in found.items():
+        units = torch.ones(1) if scale is None else scale[objective.blocks[name]].unique()
+        if len(units) <= 1:
+            value, error = (float(units.square().sum()) * x for x in total({name: trace}))
+            known[name] = value, error
+    if len(known) == len(found):
+        known[WHOLE] = sum(value for value, _ in known.values()), sum(error for _, error in known.values())
+    return known
 
 
 def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:

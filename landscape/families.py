@@ -35,10 +35,12 @@ class FamilySettings:
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """Where the search for both ends begins, and what it follows (see `extreme_eigenpairs`)."""
+    """What is known of a part before: where the search for both ends begins, and what it follows (see `extreme_eigenpairs`);
+    the trace with its standard error."""
 
     start: Float[Tensor, "n k"] | None = None
     approximation: Approximation | None = None
+    trace: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +72,8 @@ def families(
 ) -> dict[str, Family]:
     """The family of each part: "all" and every block by default; a block without rows is left out.
 
-    active: what a known null space leaves of a part; leads: to its ends.  Every part has random numbers of its own, whatever
-    the others need.
+    active: what a known null space leaves of a part; leads: to what is sought.  Every part has random numbers of its own,
+    whatever the others need.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([4.0, -1.0, 2.0, 1.0]).double()), {"a": slice(0, 2), "b": slice(2, 4)})
@@ -103,7 +105,7 @@ def family(
     progress: Progress | None = None,
     lead: Lead = Lead(),
 ) -> Family:
-    """The family of one operator; active: what its known null space leaves; lead: to its ends."""
+    """The family of one operator; active: what its known null space leaves; lead: to what is sought."""
     rank = operator.dim if active is None else active.rank
     eigen = settings.eigen if rank >= settings.eigen.wanted else EigenSettings(1, 0, rtol=settings.eigen.rtol)
     ends = extreme_eigenpairs(operator, generator, eigen, lead.start, progress, lead.approximation)
@@ -111,8 +113,9 @@ def family(
         ends = EigenEnds(ends.largest, ends.largest, ends.method, ends.matvecs, ends.beyond, ends.noise, ends.ritz)
     starts, steps, batch = settings.starts, settings.steps, settings.batch
     density = spectral_density(
-        operator, generator, starts * max(2, steps), starts, batch=batch, progress=progress, active=active, ends=ends
-    )
+        operator, generator, starts * max(2, steps), starts,
+        batch=batch, progress=progress, active=active, ends=ends, trace=lead.trace,
+    )  # fmt: skip
     return Family(rank, ends, density, anisotropy(ends, density))
 
 

@@ -247,6 +247,15 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
         else:
             start, followed = OwnDirections(objective, own, pixelwise, attribute, scale).lead(1, 1)
             assert torch.equal(lead.start, start) and (lead.approximation is None) == (followed is None)
+    units = {block: operator for (gauss_newton, block), (operator, _) in seen.items() if not gauss_newton}
+    diagonal = units["all"].apply(torch.eye(objective.active.flat.numel(), dtype=torch.float64)).diagonal()
+    for (gauss_newton, block), (_, lead) in seen.items():
+        if gauss_newton or (metric == "optimiser" and block in ("all", "sh")):  # colours have two rates
+            assert lead.trace is None
+            continue
+        rows = slice(None) if block == "all" else objective.blocks[block]
+        value, error = lead.trace
+        assert abs(value - float(diagonal[rows].sum())) < 4 * error + 1e-9 * float(diagonal[rows].abs().sum())
 
 
 def test_time_that_runs_out_is_said(objective, checkpoint):
