@@ -78,6 +78,9 @@ SEED = 0
 # of the repetitions: a scene has five blocks' traces to each seed; other quantities vary less, or take longer
 SEEDS_OF_FAMILY = {"matrices": 1.0, "splats": 0.2, "checkpoint": 0.14}
 SEEDS_OF_QUANTITY = {"traces": 3.0, "ends": 0.5, "sums": 0.5, "diagonal": 1.0}
+SEEDS_OF_BOTH = {
+    ("splats", "ends"): 1.0
+}  # a rival's 20 steps miss an end once in 20 runs: that is not for 4 seeds to decide
 OTHERS = 0.25  # of the seeds, for settings of ours that are not the default: nothing is asked of them
 FEWEST_SEEDS = 2  # a bootstrap needs two at least
 PROBES = 8  # quadratic forms of the comparison of precisions
@@ -236,7 +239,8 @@ def _cases(options: BenchOptions) -> list[Case]:
 
 
 def seeds_of(case: Case, method: Method, repetitions: int) -> int:
-    share = SEEDS_OF_FAMILY[case.family] * SEEDS_OF_QUANTITY[method.quantity]
+    of_both = SEEDS_OF_FAMILY[case.family] * SEEDS_OF_QUANTITY[method.quantity]
+    share = SEEDS_OF_BOTH.get((case.family, method.quantity), of_both)
     share *= OTHERS if method.origin == "own" else 1.0
     return max(FEWEST_SEEDS, round(share * repetitions))
 
