@@ -24,7 +24,7 @@ from landscape.anisotropy import effective_rank, mass_quantile
 from landscape.density import ActiveSpace, spectral_density
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.results import Progress
-from landscape.trace import TraceSettings, total
+from landscape.trace import TraceSettings, total_trace
 from splat.checkpoint import write_atomically
 from splat.curvature import SceneHessian, SceneObjective
 from splat.traces import exact_traces
@@ -86,7 +86,14 @@ def _truth(objective: SceneObjective, hessian: SceneHessian, progress: Progress 
     )
     active = ActiveSpace(hessian.project, hessian.rank)
     density = spectral_density(
-        hessian, generator(2), STARTS * STEPS, STARTS, progress=progress, active=active, ends=ends, trace=total(traces)
+        hessian,
+        generator(2),
+        STARTS * STEPS,
+        STARTS,
+        progress=progress,
+        active=active,
+        ends=ends,
+        trace=total_trace(traces),
     )
     rank, quantile = effective_rank(ends, density).value, mass_quantile(ends, density).value
     assert rank is not None and quantile is not None

@@ -30,7 +30,7 @@ from landscape.families import WHOLE, Lead
 from landscape.operator import SymmetricOperator
 from landscape.probes import split
 from landscape.results import Progress
-from landscape.trace import total
+from landscape.trace import total_trace
 from splat.curvature import SceneHessian, SceneObjective
 from splat.families import active_spaces
 from splat.metrics import Metric, optimiser_units, scene_size, scene_units
@@ -246,7 +246,7 @@ def _traces(
     for name, trace in found.items():
         units = torch.ones(1) if scale is None else scale[objective.blocks[name]].unique()
         if len(units) <= 1:
-            value, error = (float(units.square().sum()) * x for x in total({name: trace}))
+            value, error = (float(units.square().sum()) * x for x in total_trace({name: trace}))
             known[name] = value, error
     if len(known) == len(found):
         known[WHOLE] = sum(value for value, _ in known.values()), sum(error for _, error in known.values())

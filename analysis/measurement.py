@@ -52,7 +52,7 @@ from landscape.grid_evaluations import Loss
 from landscape.probes import split
 from landscape.refinement import SliceSettings
 from landscape.results import Progress
-from landscape.trace import total
+from landscape.trace import total_trace
 from splat.curvature import SceneHessian, SceneObjective
 from splat.device import by_triton
 from splat.losses import LossSettings
@@ -203,7 +203,7 @@ def measure(
         each = timed.seconds / timed.matvecs
         run = partial(
             spectral_density, operator, streams["density"],
-            progress=report, active=active, ends=ends, trace=total(traces),
+            progress=report, active=active, ends=ends, trace=total_trace(traces),
         )  # fmt: skip
         density = _density(run, vectors_within(operator, settings.memory), settings, seconds, each, notes)
     finite = None

@@ -52,7 +52,7 @@ from landscape import (
 from landscape.density import ActiveSpace
 from landscape.probes import split
 from landscape.results import Anisotropy, EigenEnds, TraceEstimate
-from landscape.trace import total
+from landscape.trace import total_trace
 from splat.checkpoint import write_atomically
 from splat.curvature import SceneHessian, SceneObjective
 from splat.densify import Densified
@@ -228,7 +228,7 @@ def measure(
     if matvecs < FEWEST_OF_DENSITY:
         short.append("spectral density")
     else:
-        active, trace = ActiveSpace(hessian.project, hessian.rank), total(traces)
+        active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)
         density = spectral_density(operator, streams[2], matvecs, active=active, ends=ends, trace=trace)
     return Found(traces, ends, density, operator.matvecs, least, tuple(short))
 

@@ -41,7 +41,7 @@ from landscape.results import (
     TraceEstimate,
 )
 from landscape.slices import curvature_reach, evaluate_slice, symmetric_axis
-from landscape.trace import PAPER, TraceSettings, estimate_traces
+from landscape.trace import PAPER, TraceSettings, estimate_traces, total_trace
 
 __all__ = [
     "PAPER",
@@ -111,4 +111,5 @@ __all__ = [
     "share",
     "spectral_density",
     "symmetric_axis",
+    "total_trace",
 ]

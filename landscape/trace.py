@@ -37,7 +37,7 @@ PAPER = TraceSettings.fixed(10, "gaussian")
 ESTIMATORS = {"auto": chosen, "hutch++": hutch_plus_plus, "xtrace": xtrace}
 
 
-def total(traces: Mapping[str, TraceEstimate]) -> tuple[float, float]:
+def total_trace(traces: Mapping[str, TraceEstimate]) -> tuple[float, float]:
     """The trace of all blocks together, with a bound of its standard error: the blocks' may be of one mind.
 
     Of few samples it is that of a normal law with the same interval.

@@ -12,7 +12,7 @@ from landscape.lanczos import lanczos, norm
 from landscape.operator import DenseOperator
 from landscape.quantiles import absolute_quantile
 from landscape.results import SpectralDensity, TraceEstimate
-from landscape.trace import total
+from landscape.trace import total_trace
 from tests.landscape.spectra import N, eigenvalues, generator, operator
 
 RUNS = 16
@@ -178,5 +178,5 @@ def test_the_trace_of_all_blocks_has_the_errors_of_all():
             "a", 3, value, half / 2, value - half, value + half, 0.95, 8, 8, "tolerance", samples, "hutchinson"
         )
 
-    value, error = total({"a": block(3.0, 0.1), "b": block(-1.0, 0.3)})
+    value, error = total_trace({"a": block(3.0, 0.1), "b": block(-1.0, 0.3)})
     assert value == 2.0 and error == pytest.approx(0.4 / 1.959964, rel=1e-6)
