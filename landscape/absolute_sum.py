@@ -29,6 +29,7 @@ def absolute_sum(density: SpectralDensity, confidence: float = 0.95) -> Bracket:
     """sum_i |lambda_i|: the mean of `absolute_integral` over start vectors, within its bounds widened by their spread."""
     certain = float(density.known.abs().sum())
     shift, error = density.by_trace(torch.abs, confidence)
+    error += density.of_known(torch.abs)
     below, middle, above = (density.rest * part + certain + shift for part in integrals_of_rules(density))
     low, high = t_interval(below, confidence)[2] - error, t_interval(above, confidence)[3] + error
     note = f"quadrature width {float((above - below).mean()):.3g}, {len(below)} start vectors"

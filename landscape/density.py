@@ -38,7 +38,7 @@ from landscape.quadratic import gram
 from landscape.results import EigenEnds, Progress, SpectralDensity, t_quantile
 
 SETTLED = 1e-4  # the error of an eigenvector that runs find
-FOUND = 1e-2  # of one that was found before
+FOUND, CLOSE = 1e-2, 0.1  # of one that was found before, and its residual, as a share of the eigenvalue
 SAME = 1e-6  # by which the squared cosine between two of them may miss 1
 FEWEST_STARTS = (
     4  # where their number is free: Student's interval of three is half as long again, and kernels like blocks of four
@@ -159,7 +159,7 @@ class _Runs:
     ) -> None:
         self.generator, self.active, self.progress = generator, active, progress
         self.rank = operator.dim if active is None else active.rank
-        self.known, V = found_before(ends, operator, generator.device)
+        self.known, self.missed, V = found_before(ends, operator, generator.device)
         self.operator = ProjectedOperator(operator, lambda X: X - V @ (V.T @ X)) if V.shape[1] else operator
         self.V, self.matvecs = V, 0
         self.rules: list[tuple[Float64[Tensor, " m"], Float64[Tensor, " m"], bool]] = []  # nodes, weights, all of it
@@ -183,8 +183,9 @@ class _Runs:
         spectra = [torch.linalg.eigh(run.T) for run in runs]
         others = [torch.ones_like(values, dtype=torch.bool) for values, _ in spectra]
         if not self.rules and count > 1:
-            known, V, others = found_by_all(runs, spectra)
+            known, residuals, V, others = found_by_all(runs, spectra)
             self.known, self.V = torch.cat([self.known, known]), torch.cat([self.V, V], dim=1)
+            self.missed = torch.cat([self.missed, missed(known, residuals)])
         # 1, or 1 on average: keeps the sums unbiased
         seen = Z.double().square().sum(dim=0).cpu() / max(self.rank - len(self.known), 1)
         for run, (values, S), left, share in zip(runs, spectra, others, seen, strict=True):
@@ -198,20 +199,29 @@ class _Runs:
         for i, (at, mass, _) in enumerate(self.rules):
             nodes[i, : len(at)], weights[i, : len(at)] = at, mass
         whole = torch.tensor([whole for _, _, whole in self.rules])
-        return SpectralDensity(nodes, weights, self.rank, self.matvecs, self.known.sort().values, whole, trace)
+        known, order = self.known.sort()
+        return SpectralDensity(nodes, weights, self.rank, self.matvecs, known, whole, trace, self.missed[order])
 
 
 def found_before(
     ends: EigenEnds | None, operator: SymmetricOperator, device: torch.device
-) -> tuple[Float64[Tensor, " k"], Float[Tensor, "n k"]]:
-    """Eigenvalues and vectors of the pairs whose vectors are good."""
+) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Float[Tensor, "n k"]]:
+    """Eigenvalues, what they miss (`SpectralDensity`) and orthonormal vectors of the pairs that are good."""
     if ends is None:
-        return torch.zeros(0, dtype=torch.float64), torch.zeros(operator.dim, 0, dtype=operator.dtype, device=device)
+        none = torch.zeros(0, dtype=torch.float64)
+        return none, none, torch.zeros(operator.dim, 0, dtype=operator.dtype, device=device)
     pairs = (ends.largest,) if ends.smallest is ends.largest else (ends.largest, ends.smallest)
-    good = [pair.vector_errors < FOUND for pair in pairs]
-    values = torch.cat([pair.values[mask] for pair, mask in zip(pairs, good, strict=True)])
-    vectors = [pair.vectors[:, mask.to(pair.vectors.device)] for pair, mask in zip(pairs, good, strict=True)]
-    return values, torch.linalg.qr(torch.cat(vectors, dim=1)).Q
+    values, residuals, errors = (
+        torch.cat([getattr(pair, name) for pair in pairs]) for name in ("values", "residuals", "vector_errors")
+    )
+    good = (errors < FOUND) & (residuals <= CLOSE * values.abs())
+    vectors = torch.cat([pair.vectors for pair in pairs], dim=1)[:, good.to(ends.largest.vectors.device)]
+    return values[good], missed(values[good], residuals[good]), torch.linalg.qr(vectors).Q
+
+
+def missed(values: Float64[Tensor, " k"], residuals: Float64[Tensor, " k"]) -> Float64[Tensor, " k"]:
+    """See `SpectralDensity.of_known`; an eigenvalue of 0 adds nothing."""
+    return torch.where(values == 0, 0.0, 4 * (residuals / values).square())
 
 
 def settled(values: Float64[Tensor, " m"], S: Float64[Tensor, "m m"], length: float) -> Bool[Tensor, " m"]:
@@ -223,8 +233,8 @@ def settled(values: Float64[Tensor, " m"], S: Float64[Tensor, "m m"], length: fl
 
 def found_by_all(
     runs: Sequence[LanczosFactorization], spectra: Sequence[tuple[Tensor, Tensor]]
-) -> tuple[Float64[Tensor, " k"], Float[Tensor, "n k"], list[Bool[Tensor, " m"]]]:
-    """The simple eigenvalues that all runs have found, with vectors, and which nodes of each run are others."""
+) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Float[Tensor, "n k"], list[Bool[Tensor, " m"]]]:
+    """The simple eigenvalues that all runs have found, with residuals and vectors, and which nodes of each run are others."""
     masks = [settled(values, S, norm(run.r)) for run, (values, S) in zip(runs, spectra, strict=True)]
     vectors = [run.Q @ S[:, mask].to(run.Q) for run, (_, S), mask in zip(runs, spectra, masks, strict=True)]
     same = [gram(vectors[0], other).cpu().square() > 1 - SAME for other in vectors]
@@ -233,4 +243,6 @@ def found_by_all(
     for match, mask in zip(same, masks, strict=True):
         others.append(~mask)
         others[-1][mask] = ~match[common].any(dim=0)
-    return spectra[0][0][masks[0]][common], vectors[0][:, common], others
+    values, S = spectra[0]
+    residuals = norm(runs[0].r) * S[-1].abs()
+    return values[masks[0]][common], residuals[masks[0]][common], vectors[0][:, common], others

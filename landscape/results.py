@@ -200,6 +200,7 @@ class SpectralDensity:
     dim: of how many eigenvalues in all, those of a known null space left out (where some are left out or known, the weights of
     a start vector sum to 1 on average only).  complete: start vectors whose rule is their measure itself; None: of those
     with weights of 0.  trace: of the operator, with its standard error, where it is known better than from these start vectors.
+    missed: what the known eigenvalues' residuals r may add to sums of |lambda|^p, p from 1 to 2, as shares of their own terms.
     """
 
     nodes: Float64[Tensor, "starts steps"]
@@ -209,6 +210,7 @@ class SpectralDensity:
     known: Float64[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     complete: Bool[Tensor, " starts"] | None = None
     trace: tuple[float, float] | None = None
+    missed: Float64[Tensor, " k"] | None = None
 
     @property
     def rest(self) -> int:
@@ -233,7 +235,17 @@ class SpectralDensity:
         samples = self.rest * (self.weights * function(self.nodes)).sum(dim=1) + function(self.known).sum()
         shift, error = self.by_trace(function, confidence)
         value, _, low, high = t_interval(samples + shift, confidence)
+        error += self.of_known(function)
         return Bracket(value, low - error, high + error, f"spread over {samples.numel()} start vectors")
+
+    def of_known(self, function: Callable[[Tensor], Tensor]) -> float:
+        """How far the known eigenvalues' residuals may take sum f(lambda) off.
+
+        With H in the basis of v and its complement, the trace of f(H) less f(lambda) and that of f of the rest is
+        sum_j r_j^2 (f'(lambda) - f'(mu_j)) / (lambda - mu_j) to second order: 2 r^2 for lambda^2, and 2 r^2 / |lambda| at most
+        for |lambda|.  So `missed` is twice 2 (r / lambda)^2.
+        """
+        return 0.0 if self.missed is None else float((self.missed * function(self.known).abs()).sum())
 
     def by_trace(
         self, function: Callable[[Tensor], Tensor], confidence: float

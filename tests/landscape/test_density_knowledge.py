@@ -105,6 +105,35 @@ def test_pairs_with_bad_vectors_are_not_known_and_one_end_is_not_counted_twice()
     assert len(same.known) == 3
 
 
+@pytest.mark.parametrize("f", [torch.abs, torch.square])
+def test_what_residuals_of_known_pairs_miss_is_in_the_interval(f):
+    """Ends that are no eigenvectors: what the rest of the spectrum takes from them is no term of the sum."""
+    values = torch.cat([torch.tensor([-3.0]), torch.linspace(1, 2, 5), torch.tensor([9.0])]).double()
+    Q = torch.linalg.qr(torch.randn(7, 7, generator=generator(), dtype=torch.float64)).Q
+    H = DenseOperator((Q * values) @ Q.T)
+    for seed in range(8):
+        ends = extreme_eigenpairs(H, generator(seed), EigenSettings(rtol=0.05, noise=1.0))
+        V = torch.cat([ends.largest.vectors, ends.smallest.vectors], dim=1)
+        V = torch.linalg.qr(V + 0.003 * torch.randn(7, 2, generator=generator(seed), dtype=torch.float64)).Q
+        theta, U = torch.linalg.eigh(V.T @ H.matrix @ V)
+        V = V @ U
+        off = (H.matrix @ V - V * theta).norm(dim=0)
+        low, high = (
+            replace(
+                end,
+                values=theta[i : i + 1],
+                vectors=V[:, i : i + 1],
+                residuals=off[i : i + 1],
+                vector_errors=off[i : i + 1] / 9,
+            )
+            for i, end in ((0, ends.smallest), (1, ends.largest))
+        )
+        found = spectral_density(H, generator(seed), 60, 4, ends=replace(ends, largest=high, smallest=low)).integral(f)
+        truth = float(f(values).sum())
+        assert found.low <= truth <= found.high and found.high - found.low < 0.1 * truth
+        assert abs(found.value - truth) > 1e-10 * truth
+
+
 def test_where_the_ends_are_all_there_is_no_product_is_spent():
     H = DenseOperator(torch.diag(torch.tensor([-1.0, 2.0, 5.0], dtype=torch.float64)))
     ends = extreme_eigenpairs(H, generator(), EigenSettings(2, 1))
