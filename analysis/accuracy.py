@@ -31,22 +31,24 @@ oracle would.
                  nothing.  It needs the steps that no Krylov method does without, 0.98 to 1.03 of those of a peer that is told
                  how many (0.11 on the power law), as it reads the noise of products from their asymmetry.  On scenes the
                  Gaussians' own blocks lead, and their passes are paid.  Where the ends are of like magnitude a recurrence
-                 begins at the steepest: on small scenes 17 products for 24 (near the fit), 20 for 19 (far).  Elsewhere
-                 Davidson's method: fern at 504 x 378 (2,000 steps, 8,000 Gaussians) in 34 products and 18 passes over the
-                 pixels where a recurrence from the steepest takes 49 in 48, 3DGS at 43,000 Gaussians 45 in 26 for 82 in 79
+                 begins at the steepest: 0.89 (0.85 to 0.98) of the best peer's products far from the fit, 0.60 (0.56 to 0.66)
+                 near it.  Elsewhere Davidson's method: fern at a quarter of its size 0.44 (0.38 to 0.53); at 504 x 378
+                 (2,000 steps, 8,000 Gaussians) 25 products and 12 passes over the pixels where a recurrence from the steepest
+                 takes 50 in 48, 3DGS at 43,000 Gaussians 39 in 26 for 82 in 79
     diagonal     method "auto": 0.76 of XDiag's products on the power law, 21 in all and exact at rank 5, random signs elsewhere
-    quadrature   eigenvalues that start vectors find in common are counted: on the power law a tenth of the error in all three
-                 sums, at rank 5 exact after 18 products (half the peer's), clustered 0.4 to 0.65 of the error in the first two
+    quadrature   192 products, divided as they go: start vectors are many on flat, clustered and indefinite spectra, four of up
+                 to 48 steps elsewhere.  At equal error 0.5 of the best peer's products or less in sum |lambda| and effective
+                 rank (indefinite sum |lambda| to 1.2), mass quantiles 0.5 to 0.8, over 48 seeds; eigenvalues that start
+                 vectors find in common are counted.  With trace and ends known, as a probe has them, sum |lambda| of a power
+                 law and of a flat spectrum is exact, near a fit its error 1.2% instead of 2.5%
     precision    float32 products: rounding adds some 1e-8 of |z| |H z|, six digits below what chance adds.  Sums in float64
                  make no difference at these sizes; they are kept as they cost nothing, and float32's grow with the rows
 
-**Which they do not.**  The quadrature's 6 x 32 against fewer and shorter runs is open: its errors differ by less than seeds
-do.  Where all eigenvalues have one sign, sum |lambda| is the trace: no step beyond the first makes it better, only start
-vectors do, and 6 x 32 takes 0.5 to 5 times the peer's work (flat, 2.7 in the middle).  Mass quantiles of clustered and
-indefinite spectra have the discretisation error of the rules, 8 to 10% after 192 products, ours as the peer's (ratios 1.00 and
-0.85); that 2 x 12 come to 4% is chance.  The scene far from its fit takes 0.98 of the products of a peer that is told how many
-both of its ends need, where 0.85 is asked: a Krylov method without that knowledge has nothing left to save.  Near the fit it is
-0.53 (0.45 to 0.86).
+**Which they do not.**  Mass quantiles of scenes lie where the rules of so few steps have a node or two: their middles are off
+by 15 to 150%, and only their brackets tell.  Far from a fit the two smallest eigenvalues are 0.9% apart, and a recurrence from
+the exact own blocks has found the ends after 16 steps at the earliest, from random vectors after 17: with the pass that is paid
+0.85 of a peer's 20 cannot be had there, and the ratio is what the peers' failures make of it: 20 random steps miss an end in 5%
+of the runs (35% near the fit), so few seeds say little.
 """
 
 from collections.abc import Iterator, Sequence
