@@ -80,9 +80,8 @@ SEED = 0
 # of the repetitions: a scene has five blocks' traces to each seed; other quantities vary less, or take longer
 SEEDS_OF_FAMILY = {"matrices": 1.0, "splats": 0.2, "checkpoint": 0.14}
 SEEDS_OF_QUANTITY = {"traces": 3.0, "ends": 0.5, "sums": 0.5, "diagonal": 1.0}
-SEEDS_OF_BOTH = {
-    ("splats", "ends"): 1.0
-}  # a rival's 20 steps miss an end once in 20 runs: that is not for 4 seeds to decide
+# a rival's 20 steps miss an end once in 20 runs: that is not for 4 seeds to decide
+SEEDS_OF_BOTH = {("splats", "ends"): 1.0}
 OTHERS = 0.25  # of the seeds, for settings of ours that are not the default: nothing is asked of them
 FEWEST_SEEDS = 2  # a bootstrap needs two at least
 PROBES = 8  # quadratic forms of the comparison of precisions

@@ -92,13 +92,12 @@ def spectral_density(
         )
     found = _Runs(operator, generator, active, ends, lambda done, state: progress and progress(done, matvecs, state))
     most = min(matvecs // least, found.rank, longest or found.rank)
-    if starts is not None:
-        lengths, steps = None, most
-    else:
+    steps, count = most, least
+    if starts is None:
         lengths = Lengths(matvecs, most, found.rank - len(found.known), trace is not None)
         found.add(min(batch, least), most, lengths)
         steps = lengths.best or most
-    count = least if starts is not None else len(found.rules) + (matvecs - found.matvecs) // steps
+        count = len(found.rules) + (matvecs - found.matvecs) // steps
     while len(found.rules) < count:
         found.add(min(count - len(found.rules), batch * most // steps), steps)
     return found.density(trace)

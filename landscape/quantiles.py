@@ -21,7 +21,6 @@ over the start vectors may be off at F = p.  The sums of curvature are compared 
 Eigenvalues that are known are counted as such, and the tests are of the others.
 """
 
-from itertools import compress
 from math import inf
 
 import numpy as np
@@ -134,6 +133,7 @@ class _Tail:
 
 
 def _within(density: SpectralDensity, value: float, low: Tensor | float, high: Tensor | float) -> Bracket:
+    """The bracket with the value in it, and what it was made of."""
     low, high = float(low), float(high)
     steps = int((density.weights > 0).sum(dim=1).max())
     note = f"{len(density.nodes)} start vectors of {steps} Lanczos steps at most"
@@ -146,23 +146,21 @@ def _middle_of_magnitudes(density: SpectralDensity, p: float) -> float:
     Of what a node carries half is taken to lie below it (see above), and more in proportion up to the next node.  What is
     known, and the nodes of a rule that is the measure itself, are where they are.
     """
-    rules = [
-        (nodes.abs(), density.rest * weights * nodes.abs() / len(density.nodes)) for nodes, weights in density.rules()
-    ]
-    whole = [not bool((weights > 0).all()) for _, weights in density.rules()]
-    exact = [(density.known.abs(), density.known.abs()), *compress(rules, whole)]
+    exact, curves = [(density.known.abs(), density.known.abs())], []
+    for nodes, weights in density.rules():
+        points = nodes.abs(), density.rest * weights * nodes.abs() / len(density.nodes)
+        (curves if (weights > 0).all() else exact).append(points)
     at, mass = (torch.cat(parts) for parts in zip(*exact, strict=True))
-    grid = torch.cat([at, *(nodes for nodes, _ in rules)]).unique()
+    grid = torch.cat([at, *(nodes for nodes, _ in curves)]).unique()
     smooth = np.zeros(len(grid))
-    for (nodes, amounts), all_of_it in zip(rules, whole, strict=True):
-        if not all_of_it:
-            nodes, order = nodes.sort()
-            below = amounts[order].cumsum(0) - amounts[order] / 2
-            smooth += np.interp(grid.numpy(), nodes.numpy(), below.numpy(), left=0.0, right=float(amounts.sum()))
+    for nodes, amounts in curves:
+        nodes, order = nodes.sort()
+        below = amounts[order].cumsum(0) - amounts[order] / 2
+        smooth += np.interp(grid.numpy(), nodes.numpy(), below.numpy(), left=0.0, right=float(amounts.sum()))
     at, order = at.sort()
     sums = torch.nn.functional.pad(mass[order].cumsum(0), (1, 0))
     below, upto = (smooth + sums[torch.searchsorted(at, grid, right=side)].numpy() for side in (False, True))
-    goal = p * (float(density.known.abs().sum()) + sum(float(amounts.sum()) for _, amounts in rules))
+    goal = p * (float(mass.sum()) + sum(float(amounts.sum()) for _, amounts in curves))
     k = min(int(np.searchsorted(upto, goal)), len(grid) - 1)
     if k == 0 or goal > below[k]:
         return float(grid[k])

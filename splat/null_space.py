@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splat.projection_linear import GEOMETRY, Held
-from splat.raster.threads import over_range
+from splat.raster.threads import over_batch
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
 CHUNK = 4096  # Gaussians at a time
@@ -125,8 +125,5 @@ def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float
     def decompose(first: int, last: int) -> None:
         _, values[first:last], basis[first:last] = torch.linalg.svd(rows[first:last], full_matrices=False)
 
-    if rows.device.type == "cpu":  # torch itself takes one thread for a batch
-        over_range(n, decompose)
-    else:
-        decompose(0, n)
+    over_batch(n, decompose, rows.device)
     return values, basis

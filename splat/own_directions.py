@@ -36,7 +36,7 @@ from splat.linearize import GEOMETRY_COLUMNS, OwnBlocks
 from splat.losses import SIGMA
 from splat.projection_cpu import lens_of
 from splat.raster.functions import projected
-from splat.raster.threads import over_range
+from splat.raster.threads import over_batch
 
 SINGLE = 1 / (4 * pi * SIGMA**2)  # of a pixel alone, what the window's blur keeps
 SPARE = 1  # starts at each end beside one for each wanted pair
@@ -81,10 +81,7 @@ class OwnDirections:
                 rows = slice(i, min(i + CHUNK, last))
                 self.values[rows], self.vectors[rows] = _decomposed(geometry[rows], radial[rows], units[rows])
 
-        if geometry.device.type == "cpu":  # torch itself takes one thread for a batch
-            over_range(n, decompose)
-        else:
-            decompose(0, n)
+        over_batch(n, decompose, geometry.device)
 
     def steepest(self, largest: int, smallest: int) -> Float[Tensor, "p k"]:
         """Unit vectors: of the largest eigenvalues of all blocks but colours', descending, and of the smallest, ascending."""

@@ -53,6 +53,14 @@ def over_range(size: int, kernel: Callable, *arguments) -> None:
     _run([(kernel, edges[t], edges[t + 1], *arguments) for t in range(parts)])
 
 
+def over_batch(size: int, kernel: Callable[[int, int], None], device: torch.device) -> None:
+    """kernel(start, stop) of a batch of small matrices that torch takes apart: on the CPU it has one thread for a batch."""
+    if device.type == "cpu":
+        over_range(size, kernel)
+    else:
+        kernel(0, size)
+
+
 def over_tiles(kernel: Callable, *arguments) -> None:
     """kernel(counter, *arguments) on every thread: each takes the next tile from the counter until none is left."""
     counter = np.zeros(1, np.int64)

@@ -9,7 +9,7 @@ import torch
 
 from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
-from splat.raster.threads import over_range, single_threaded, thread_count
+from splat.raster.threads import over_batch, over_range, single_threaded, thread_count
 from splat.render import render
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import DTYPES, random_gaussians, random_like
@@ -84,3 +84,10 @@ def test_a_thread_that_asks_for_it_works_alone_and_only_that_one():
         assert thread_count() == 1
         assert other.submit(thread_count).result() == torch.get_num_threads()
     assert thread_count() == 2
+
+
+def test_a_batch_is_divided_among_threads_on_the_cpu_alone():
+    for device, parts in (("cpu", min(thread_count(), 10)), ("meta", 1)):
+        seen = []
+        over_batch(10, lambda start, stop, seen=seen: seen.append((start, stop)), torch.device(device))
+        assert len(seen) == parts and sorted(i for part in seen for i in range(*part)) == list(range(10))
