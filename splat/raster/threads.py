@@ -14,6 +14,8 @@ from functools import cache
 import numpy as np
 import torch
 
+ALIGNED = 16  # matrices: of whatever size, these many begin at a multiple of 64 bytes, in float32 and in float64
+
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
@@ -54,11 +56,19 @@ def over_range(size: int, kernel: Callable, *arguments) -> None:
 
 
 def over_batch(size: int, kernel: Callable[[int, int], None], device: torch.device) -> None:
-    """kernel(start, stop) of a batch of small matrices that torch takes apart: on the CPU it has one thread for a batch."""
-    if device.type == "cpu":
-        over_range(size, kernel)
-    else:
+    """kernel(start, stop) of a batch of small matrices that torch takes apart: on the CPU it has one thread for a batch.
+
+    LAPACK rounds a matrix as its address in the batch is aligned, so every part begins where the alignment does: with any
+    number of threads a matrix is as far behind a boundary as it is in the whole batch.
+    """
+    if device.type != "cpu":
         kernel(0, size)
+        return
+
+    def part(start: int, stop: int) -> None:
+        kernel(start * ALIGNED, min(stop * ALIGNED, size))
+
+    over_range(-(-size // ALIGNED), part)
 
 
 def over_tiles(kernel: Callable, *arguments) -> None:

@@ -213,6 +213,8 @@ def test_entries_behind_opaque_fronts_are_those_that_a_view_without_stops_has_mo
 
 def test_tiles_are_dark_where_the_picture_is_met_exactly_and_the_loss_does_not_couple_pixels():
     gaussians, view = random_gaussians(40, 1, logit=1.0), two_views(45, 37)[0]
+    # behind the others one that fills the picture: no tile is empty, however many pixels wide the machine's registers are
+    gaussians.means[0], gaussians.log_scales[0] = torch.tensor([0.0, 0.0, 9.0], dtype=torch.float64), 3.0
     met = hold(gaussians, view, LossSettings()).image[:, :16]  # a row of tiles
     view = replace(view, image=torch.cat([met, view.image[:, 16:].double()], dim=1))
     alone, coupled = (hold(gaussians, view, LossSettings(ssim_weight=weight)) for weight in (0.0, 0.2))

@@ -85,7 +85,7 @@ def test_what_is_seen_whole_is_left_as_it_is_bit_for_bit() -> None:
 
 
 def test_row_spaces_are_the_same_on_any_number_of_threads() -> None:
-    objective, before, found = objective_of(3, 1), torch.get_num_threads(), []
+    objective, before, found = objective_of(3, 1, n=70), torch.get_num_threads(), []
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)

@@ -9,7 +9,7 @@ import torch
 
 from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
-from splat.raster.threads import over_batch, over_range, single_threaded, thread_count
+from splat.raster.threads import ALIGNED, over_batch, over_range, single_threaded, thread_count
 from splat.render import render
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import DTYPES, random_gaussians, random_like
@@ -87,7 +87,24 @@ def test_a_thread_that_asks_for_it_works_alone_and_only_that_one():
 
 
 def test_a_batch_is_divided_among_threads_on_the_cpu_alone():
-    for device, parts in (("cpu", min(thread_count(), 10)), ("meta", 1)):
+    size = 5 * ALIGNED + 3
+    for device, parts in (("cpu", min(thread_count(), 6)), ("meta", 1)):
         seen = []
-        over_batch(10, lambda start, stop, seen=seen: seen.append((start, stop)), torch.device(device))
-        assert len(seen) == parts and sorted(i for part in seen for i in range(*part)) == list(range(10))
+        over_batch(size, lambda start, stop, seen=seen: seen.append((start, stop)), torch.device(device))
+        assert len(seen) == parts and sorted(i for part in seen for i in range(*part)) == list(range(size))
+
+
+@pytest.mark.usefixtures("threads")
+def test_a_batch_is_taken_apart_to_the_same_bits_on_one_two_and_five_threads():
+    # an odd number of entries: every other matrix begins beside a boundary of 16 bytes
+    matrices = torch.randn(103, 27, 23, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    whole = torch.linalg.svd(matrices, full_matrices=False).Vh
+    for threads in (1, 2, 5):
+        torch.set_num_threads(threads)
+        found = torch.empty_like(whole)
+
+        def decompose(start: int, stop: int, found: torch.Tensor = found) -> None:
+            found[start:stop] = torch.linalg.svd(matrices[start:stop], full_matrices=False).Vh
+
+        over_batch(len(matrices), decompose, matrices.device)
+        assert torch.equal(found, whole)
