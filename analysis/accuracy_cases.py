@@ -12,7 +12,7 @@ spectrum is its magnitude, as for the stopping rules of all methods (the larger 
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from time import perf_counter
 
 import torch
@@ -168,11 +168,21 @@ def matrix_cases(seed: int) -> Iterator[Case]:
 # --- splats -----------------------------------------------------------------------------------------------------------
 
 
-def splat_cases(seed: int) -> Iterator[Case]:
-    """A scene far from its fit and one near it, with SSIM; and one with the pixel loss alone, whose traces are exact."""
-    yield splat_case("far from a fit", 0.2, LossSettings(), seed)
-    yield splat_case("near a fit", 0.02, LossSettings(), seed)
-    yield splat_case("pixel loss alone", 0.2, LossSettings(ssim_weight=0.0), seed)
+def splat_cases(seed: int, scenes: int = 1) -> dict[str, Callable[[], Case]]:
+    """How to make them, by name: a scene far from its fit and one near it, with SSIM; and one with the pixel loss alone, whose
+    traces are exact.  Of more scenes the k-th of a kind is another world from another seed, NAME #k."""
+    kinds = {
+        "far from a fit": (0.2, LossSettings()),
+        "near a fit": (0.02, LossSettings()),
+        "pixel loss alone": (0.2, LossSettings(ssim_weight=0.0)),
+    }
+    found = {}
+    for k in range(scenes):
+        settings = replace(SETTINGS, seed=SETTINGS.seed + k)
+        for kind, (noise, loss) in kinds.items():
+            name = kind if k == 0 else f"{kind} #{k + 1}"
+            found[name] = partial(splat_case, name, noise, loss, seed + k, settings)
+    return found
 
 
 def splat_case(name: str, noise: float, loss: LossSettings, seed: int, settings: SyntheticSettings = SETTINGS) -> Case:

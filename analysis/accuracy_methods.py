@@ -63,7 +63,10 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One estimator at one setting.  run(case, operator, seed): the answers, one a part."""
+    """One estimator at one setting.  run(case, operator, seed): the answers, one a part.
+
+    estimator: the name of what several packages have alike, "" where this method stands alone.
+    """
 
     quantity: str
     name: str
@@ -71,6 +74,7 @@ class Method:
     run: Callable[[Case, Meter, int], list[Answer]]
     origin: Origin = "own"
     applies: Callable[[Case], bool] = lambda case: True
+    estimator: str = ""
 
 
 def generator(seed: int) -> torch.Generator:

@@ -26,6 +26,7 @@ PACKAGES = {
     "pyhessian": "pyhessian",
     "hessian_eigenthings": "hessian-eigenthings",
 }
+ALIKE = {"Hutchinson": "the packages' Hutchinson", "Hutch++": "the packages' Hutch++"}  # random signs, the same sums
 STEPS = (10, 20, 40, 80)  # of a Lanczos run
 POWER_STEPS = (50, 150)
 
@@ -44,7 +45,9 @@ def peer_methods(budgets: tuple[int, ...] = BUDGETS) -> tuple[list[Method], list
     return methods, missing
 
 
-def _method(quantity: str, name: str, settings: str, run: Callable[[Case, Meter, int], list[Answer]]) -> Method:
+def _method(
+    quantity: str, name: str, settings: str, run: Callable[[Case, Meter, int], list[Answer]], estimator: str = ""
+) -> Method:
     """A peer that draws from torch's global generator draws what the seed says; the generator's state is put back."""
 
     def seeded(case: Case, operator: Meter, seed: int) -> list[Answer]:
@@ -52,7 +55,7 @@ def _method(quantity: str, name: str, settings: str, run: Callable[[Case, Meter,
             torch.manual_seed(seed)
             return run(case, operator, seed)
 
-    return Method(quantity, name, settings, seeded, "peer")
+    return Method(quantity, name, settings, seeded, "peer", estimator=estimator)
 
 
 def _by_block(trace: Callable[[SymmetricOperator], Any]) -> Callable[[Case, Meter, int], list[Answer]]:
@@ -161,7 +164,7 @@ def _curvlinops(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Method
             def trace(operator: SymmetricOperator, function: str = function, budget: int = budget) -> Tensor:
                 return getattr(module, function)(Wrapped(operator), fewer(budget, operator))
 
-            yield _method("traces", f"curvlinops {name}", f"{budget} matvecs", _by_block(trace))
+            yield _method("traces", f"curvlinops {name}", f"{budget} matvecs", _by_block(trace), ALIKE.get(name, ""))
     for probes in (*PROBES, 32):
         for function, name in {"hutchinson_diag": "Hutchinson", "xdiag": "XDiag"}.items():
 
@@ -197,7 +200,8 @@ def _pyhessian(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Method]
                 return float(np.mean(OnOperator(operator).trace(maxIter=budget, tol=tol)))
 
             name = "PyHessian Hutchinson" + (", its own stop" if tol else "")
-            yield _method("traces", name, f"{budget} probes", _by_block(trace))
+            alike = "" if tol else ALIKE["Hutchinson"]
+            yield _method("traces", name, f"{budget} matvecs", _by_block(trace), alike)
     for tol in (1e-2, 1e-3, 1e-5):
 
         def ends(_: Case, operator: Meter, __: int, tol: float = tol) -> list[Answer]:
@@ -233,7 +237,7 @@ def _eigenthings(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Metho
                     answers.append(Answer(name, found.estimate, found.stderr))
                 return answers
 
-            yield _method("traces", f"hessian-eigenthings {name}", f"{budget} matvecs", traces)
+            yield _method("traces", f"hessian-eigenthings {name}", f"{budget} matvecs", traces, ALIKE[name])
     for steps in STEPS:
 
         def each(_: Case, operator: Meter, seed: int, steps: int = steps) -> list[Answer]:

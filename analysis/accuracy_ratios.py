@@ -3,7 +3,7 @@
 See `analysis.accuracy` for the definition; the numbers are those of its table of runs.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,8 @@ ASKED = {
 }
 MATRICES = 1.1  # of any quantity
 DRAWS = 200  # of the bootstrap
-CONFIDENCE = 0.95
+LIMITS = (0.025, 0.975)  # of a 95% interval
+MEANS = ("error", "needs", "rival_needs", "ratio", "seconds_ratio")  # of scenes together
 QUANTITIES = ("traces", "ends", "sum of |lambda|", "effective rank", "mass quantile", "diagonal")
 SETTING = ["case", "family", "quantity", "origin", "method", "settings"]
 
@@ -90,9 +91,12 @@ def needed(errors: np.ndarray, costs: np.ndarray, goal: float) -> tuple[float, s
 
 
 def ratios(table: pd.DataFrame, floors: Mapping[str, float], seed: int = 0) -> pd.DataFrame:
-    """A line a case, quantity and kind of rival ("peer", "own"): the default's matvecs and seconds over the best rival's."""
+    """A line a case, quantity and kind of rival ("peer", "own"): the default's matvecs and seconds over the best rival's.
+
+    Where there are several scenes, a line more for each quantity that they are asked for (`_together`).
+    """
     table = table.assign(square=_squares(table, "true_error", floors))
-    rng, lines = np.random.default_rng(seed), []
+    rng, lines, drawn = np.random.default_rng(seed), [], {}
     places = table[["case", "family", "quantity"]].drop_duplicates().itertuples(index=False, name=None)
     for case, family, quantity in places:
         part = pd.DataFrame(table[(table["case"] == case) & (table["quantity"] == quantity)])
@@ -103,11 +107,31 @@ def ratios(table: pd.DataFrame, floors: Mapping[str, float], seed: int = 0) -> p
                 continue
             asked = _asked(family, quantity) if against == "peer" else np.nan
             line = {"case": case, "family": family, "quantity": quantity, "against": against}
-            line |= _compared(default, rivals, "matvecs", rng)
-            seconds = _compared(default, rivals, "seconds", rng)
-            line |= {"seconds_ratio": seconds["ratio"], "seconds_bound": seconds["bound"], "asked": asked}
+            compared, draws = _compared(default, rivals, "matvecs", rng)
+            seconds, _ = _compared(default, rivals, "seconds", rng)
+            line |= compared | {"seconds_ratio": seconds["ratio"], "seconds_bound": seconds["bound"], "asked": asked}
             lines.append(line | {"holds": verdict(line, asked)})
+            if family == "splats" and not np.isnan(asked):
+                drawn.setdefault(quantity, []).append((lines[-1], draws))
+    lines += [_together(found) for found in drawn.values() if len(found) > 1]
     return pd.DataFrame(lines)
+
+
+def _together(found: Sequence[tuple[Mapping, np.ndarray]]) -> dict:
+    """The scenes' geometric means; a bound where one of them is a bound (which way, where they agree)."""
+
+    def mean(values: Sequence) -> np.ndarray:
+        return np.exp(np.log(values).mean(axis=0))
+
+    scenes = [scene for scene, _ in found]
+    line = dict(scenes[0]) | {"case": f"all {len(found)} scenes", "rival": "the best of each"}
+    line |= {key: float(mean([scene[key] for scene in scenes])) for key in MEANS}
+    for bound in ("bound", "seconds_bound"):
+        bounds = {scene[bound] for scene in scenes} - {""}
+        line[bound] = bounds.pop() if len(bounds) == 1 else "≈" if bounds else ""
+    low, high = np.quantile(mean([draws for _, draws in found]), LIMITS)
+    line |= {"low": float(low), "high": float(high)}
+    return line | {"holds": verdict(line, float(scenes[0]["asked"]))}
 
 
 def _asked(family: str, quantity: str) -> float:
@@ -115,10 +139,12 @@ def _asked(family: str, quantity: str) -> float:
     return MATRICES if family == "matrices" else ASKED.get((family, quantity), np.nan)
 
 
-def _compared(default: pd.DataFrame, rivals: pd.DataFrame, cost: str, rng: np.random.Generator) -> dict:
-    """The ratio with the best rival, its bootstrap interval, and the two points compared."""
+def _compared(
+    default: pd.DataFrame, rivals: pd.DataFrame, cost: str, rng: np.random.Generator
+) -> tuple[dict, np.ndarray]:
+    """The ratio with the best rival, its bootstrap interval, and the two points compared; and the bootstrap's ratios."""
     own = Curve.of(default, cost)
-    others = {str(name): Curve.of(runs, cost) for name, runs in rivals.groupby("method", sort=False)}
+    others = {str(name): Curve.of(runs, cost) for name, runs in rivals.groupby("estimator", sort=False)}
     errors, costs = own.drawn()
     found = {name: needed(*curve.drawn(), errors[0]) for name, curve in others.items()}
     best = _best(found)
@@ -127,12 +153,13 @@ def _compared(default: pd.DataFrame, rivals: pd.DataFrame, cost: str, rng: np.ra
         error, mine = own.drawn(rng)
         again = {name: needed(*curve.drawn(rng), error[0]) for name, curve in others.items()}
         draws.append(mine[0] / again[_best(again)][0])
-    low, high = np.quantile(draws, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    low, high = np.quantile(draws, LIMITS)
     need, bound = found[best]
-    return {
+    compared = {
         "error": errors[0], "needs": costs[0], "rival": best, "rival_needs": need,
         "ratio": costs[0] / need, "bound": bound, "low": low, "high": high,
     }  # fmt: skip
+    return compared, np.array(draws)
 
 
 def _best(found: Mapping[str, tuple[float, str]]) -> str:
@@ -145,9 +172,9 @@ def verdict(line: Mapping[str, object], asked: float) -> str:
     low, high, bound = float(line["low"]), float(line["high"]), line["bound"]  # pyright: ignore[reportArgumentType]
     if np.isnan(asked):
         return ""
-    if high <= asked and bound != "≥":
+    if high <= asked and bound in ("", "≤"):
         return "yes"
-    return "no" if low > asked and bound != "≤" else "open"
+    return "no" if low > asked and bound in ("", "≥") else "open"
 
 
 def ratio_table(found: pd.DataFrame, title: str) -> Table:

@@ -11,6 +11,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 Along = Literal["eigenvectors", "random", "gradient", "line"]
 DeviceName = Literal["auto", "cpu", "cuda"]
+Quantity = Literal["traces", "ends", "sums", "diagonal"]
 T = TypeVar("T")
 Unset = Annotated[T | None, arg(help_behavior_hint="")]  # its docstring says what stands for None
 
@@ -234,6 +235,12 @@ class BenchOptions:
     Default: a synthetic scene."""
     checkpoint: Annotated[Positional[Path | None], arg(metavar="[CHECKPOINT]", help_behavior_hint="")] = None
     """accuracy only: a checkpoint to take instead of small scenes and matrices.  Its truth is a long run, kept in OUT."""
+    quantities: UseAppendAction[tuple[Quantity, ...]] = ()
+    """accuracy only: study this alone; may be given several times.  Default: all."""
+    cases: UseAppendAction[tuple[str, ...]] = ()
+    """accuracy only: study this case alone, by its name in the tables; may be given several times.  Default: all."""
+    scenes: int = 1
+    """accuracy only: small scenes of each kind, each with another seed."""
     out: Path = Path("runs/bench")
     """Folder of the tables (CSV) and figures; files of an earlier run are replaced."""
     repetitions: int = 15

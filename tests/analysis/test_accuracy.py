@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import analysis.accuracy as accuracy
 from analysis.accuracy import Run, measure, precision_runs, truth_of
-from analysis.accuracy_cases import Case, Meter, Truth, matrix_cases, spectra, splat_case
+from analysis.accuracy_cases import Case, Meter, Truth, matrix_cases, spectra, splat_case, splat_cases
 from analysis.accuracy_methods import JACOBIAN, PASS, Answer, Method, own_methods
 from analysis.accuracy_peers import PACKAGES, peer_methods, scipy_methods
 from analysis.accuracy_ratios import needed, points, ratios
@@ -261,10 +261,18 @@ def test_an_installed_peer_estimates_what_it_is_asked_for(module, matrix):
 # --- ratios -----------------------------------------------------------------------------------------------------------
 
 
-def table_of(**methods: tuple[str, dict[str, tuple[float, float]]]) -> pd.DataFrame:
-    """Runs of four seeds that all have the same matvecs and error."""
+def table_of(
+    case: str = "c", family: str = "matrices", alike: str = "", **methods: tuple[str, dict[str, tuple[float, float]]]
+) -> pd.DataFrame:
+    """Runs of four seeds that all have the same matvecs and error.  alike: the estimator of all peers, else their names."""
+
+    def run(name: str, origin: str, setting: str, seed: int, cost: float, error: float) -> Run:
+        estimator = alike if alike and origin == "peer" else name
+        about = (case, family, "traces", "all", name, estimator, setting, origin, seed)
+        return Run(*about, cost, cost / 10, error, 0.0, 1.0)
+
     return pd.DataFrame(
-        vars(Run("c", "matrices", "traces", "all", name, setting, origin, seed, cost, cost / 10, error, 0.0, 1.0))
+        vars(run(name, origin, setting, seed, cost, error))
         for name, (origin, settings) in methods.items()
         for setting, (cost, error) in settings.items()
         for seed in range(4)
@@ -303,6 +311,34 @@ def test_a_rival_that_never_reaches_the_error_gives_way_to_one_that_does():
         failed=("peer", {"1": (1.0, math.nan)}),
     )
     assert ratios(table, {"c": 1e-16})["rival"].tolist() == ["slow"]
+
+
+def test_packages_that_have_an_estimator_alike_are_one_rival():
+    lucky, other = ("peer", {"50": (50.0, 6e-3)}), ("peer", {"50": (50.0, 8e-3)})
+
+    def bound(error: float, alike: str) -> tuple[str, str]:
+        table = table_of(alike=alike, d=("default", {"": (100.0, error)}), lucky=lucky, other=other)
+        line = ratios(table, {"c": 0.0}).iloc[0]
+        return line["rival"], line["bound"]
+
+    assert bound(6.5e-3, "") == ("lucky", "≥")
+    # the root of their mean square is 7.07e-3
+    assert bound(7.0e-3, "both") == ("both", "≤") and bound(7.1e-3, "both") == ("both", "≥")
+
+
+def test_scenes_together_are_their_geometric_mean():
+    rival = {"10": (10.0, 1e-1), "1000": (1000.0, 1e-3)}
+    scenes = [
+        table_of(case=name, family="splats", d=("default", {"": (cost, 1e-2)}), r=("peer", rival))
+        for name, cost in (("a", 20.0), ("b", 80.0))
+    ]
+    matrix = table_of(d=("default", {"": (99.0, 1e-2)}), r=("peer", rival))
+    found = ratios(pd.concat([*scenes, matrix]), {"a": 0.0, "b": 0.0, "c": 0.0})
+    assert found["case"].tolist() == ["a", "b", "c", "all 2 scenes"]
+    alone, together = found.iloc[1], found.iloc[3]
+    assert alone["ratio"] == pytest.approx(0.8) and alone["holds"] == "no" and alone["asked"] == 0.5
+    assert together["ratio"] == pytest.approx(0.4) == together["low"] and together["holds"] == "yes"
+    assert together["bound"] == "" and together["needs"] == pytest.approx(40)
 
 
 def test_errors_below_the_round_off_count_as_it():
@@ -346,6 +382,30 @@ def test_the_command_prints_writes_and_draws(small, tmp_path, capsys):
     for name in ("traces", "ends", "precision"):
         assert (tmp_path / f"accuracy_{name}.png").stat().st_size > 10_000
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_study_of_one_quantity_and_one_case_leaves_the_others_out(tmp_path, monkeypatch):
+    run = Run("", "", "", "", "", "", "", "", 0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    met: set[tuple[str, str]] = set()
+
+    def note(case: Case, method: Method, seed: int) -> list[Run]:
+        met.add((case.name, method.quantity))
+        return [run]
+
+    monkeypatch.setattr(accuracy, "measure", note)
+    monkeypatch.setattr(accuracy, "_report", lambda *_: None)
+    options = BenchOptions(subject="accuracy", out=tmp_path, repetitions=1, quantities=("ends",), cases=("flat",))
+    assert run_bench(options) == 0 and met == {("flat", "ends")}
+    with pytest.raises(ValueError, match=r"expected --cases among 'far from a fit', .*'flat', got 'round'"):
+        run_bench(BenchOptions(subject="accuracy", out=tmp_path, cases=("round",)))
+
+
+def test_scenes_of_a_kind_are_different_worlds():
+    recipes = splat_cases(0, scenes=2)
+    assert [name for name in recipes if name.startswith("far")] == ["far from a fit", "far from a fit #2"]
+    one, other = (recipes[name].args for name in ("near a fit", "near a fit #2"))
+    assert one[:3] == ("near a fit", 0.02, LossSettings()) and other[1:3] == one[1:3]
+    assert one[3] != other[3] and one[4].seed != other[4].seed
 
 
 def test_a_checkpoint_belongs_to_accuracy_alone(tmp_path):
