@@ -2,10 +2,12 @@
 
 Above, value against rank on a symmetric logarithmic axis (linear within the band about 0), bars: residual norms, within
 each of which lies a true eigenvalue.  Filled: the residual is under a tenth of the value.  The ends are written out.
-Below, where a density was recorded, the share of directions whose curvature is at most x, a line for each start vector.
+Below, where a density was recorded, the share of directions whose curvature is at most x, and the share of sum |lambda| that
+they have, a line for each start vector: the further apart the two, the less isotropic the loss.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,10 +17,12 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 
 from analysis.quantities import measured, power_of_ten
 from analysis.records import Record
-from figures.style import BLACK, NEGATIVE, POSITIVE, new_figure, script, style
+from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, script, style
 
 DECADES = 5  # shown on either side of 0
 CONVERGED = 0.1  # residual over |value|
+DIRECTIONS: dict[str, Any] = {"color": BLACK, "linewidth": 0.7}
+CURVATURE: dict[str, Any] = {"color": VERMILION, "linewidth": 0.7}
 
 
 def draw(record: Record) -> Figure:
@@ -34,9 +38,9 @@ def draw(record: Record) -> Figure:
         panels = figure.subplots(rows, 1, squeeze=False, height_ratios=[2, 1][:rows])
         _draw_values(panels[0, 0], values, residuals)
         _label_ends(panels[0, 0], record)
-        figure.legend(handles=_legend(), loc="outside lower center", ncols=2, handletextpad=0.1)
         if rows == 2:
             _draw_distribution(panels[1, 0], arrays["nodes"], arrays["weights"])
+        figure.legend(handles=_legend(rows == 2), loc="outside lower center", ncols=2, handlelength=1.2)
     return figure
 
 
@@ -70,12 +74,14 @@ def _draw_distribution(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> No
     left, right = axes.get_xlim()
     for row, masses in zip(nodes, weights, strict=True):
         order = np.argsort(row)
-        shares = np.concatenate([[0.0], np.cumsum(masses[order]), [1.0]])
-        axes.step(np.concatenate([[left], row[order], [right]]), shares, where="post", color=BLACK, linewidth=0.7)
+        x = np.concatenate([[left], row[order], [right]])
+        for mass, look in ((masses, DIRECTIONS), (masses * np.abs(row), CURVATURE)):
+            sums = np.concatenate([[0.0], np.cumsum(mass[order])])
+            axes.step(x, np.append(sums, sums[-1]) / (sums[-1] or 1.0), where="post", **look)
     axes.axvline(0, color=BLACK, linewidth=0.6)
     axes.set_ylim(-0.03, 1.03)
     axes.set_xlabel("curvature x (loss per squared parameter unit)")
-    axes.set_ylabel("share of\ndirections ≤ x")
+    axes.set_ylabel("share ≤ x")
     axes.grid(True)
 
 
@@ -97,11 +103,13 @@ def _symmetric_log(axes: Axes, axis: str, values: np.ndarray) -> None:
     getattr(axes, f"{axis}axis").set_minor_locator(NullLocator())
 
 
-def _legend() -> list[Line2D]:
-    return [
+def _legend(distribution: bool) -> list[Line2D]:
+    handles = [
         Line2D([], [], linestyle="none", marker="o", markersize=3, color="0.3", markerfacecolor=face, label=label)
         for face, label in (("0.3", f"residual < {CONVERGED:.0%} of the value"), ("white", "not converged"))
     ]
+    lines = ((DIRECTIONS, "of all directions"), (CURVATURE, "of the curvature, Σ|λ|"))
+    return [*handles, *(Line2D([], [], label=label, **look) for look, label in lines if distribution)]
 
 
 def main() -> None:

@@ -128,6 +128,18 @@ def test_an_undetermined_sign_reaches_the_left_edge(tmp_path):
     assert [float(np.asarray(bar.get_xdata())[0]) == left for bar in bars] == [False, False, False, True, False]
 
 
+def test_a_density_shows_who_has_the_curvature(tmp_path):
+    data, arrays = synthetic()
+    arrays["spectrum"] |= {"nodes": np.array([[0.1, 61.0, -20.0]]), "weights": np.array([[0.9, 0.05, 0.05]])}
+    axes = spectrum.draw(recorded(tmp_path / "probe", data, arrays)).axes[1]
+    directions, curvature = (np.asarray(line.get_ydata(), float) for line in axes.lines[:2])
+    x = np.asarray(axes.lines[0].get_xdata(), float)
+    np.testing.assert_array_equal(x[1:-1], [-20.0, 0.1, 61.0])
+    np.testing.assert_allclose(directions[1:-1], [0.05, 0.95, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(curvature[1:-1], np.array([1.0, 1.09, 4.14]) / 4.14, rtol=1e-12)
+    assert directions[0] == 0 == curvature[0] and directions[-1] == 1 == curvature[-1]
+
+
 def test_cross_sections_are_the_rows_and_columns_through_the_centre(tmp_path):
     record = recorded(tmp_path / "probe", *synthetic())
     figure, arrays = slice2d.draw(record), record.arrays["slice"]
