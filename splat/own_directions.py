@@ -24,10 +24,11 @@ those twelve scenes, 15.2 from a random vector.
 """
 
 from collections.abc import Callable
+from functools import cached_property
 from math import inf, pi
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from splat.camera import Camera
@@ -42,14 +43,17 @@ SINGLE = 1 / (4 * pi * SIGMA**2)  # of a pixel alone, what the window's blur kee
 SPARE = 1  # starts at each end beside one for each wanted pair
 APART = 30.0  # the ratio of two ends from which a recurrence needs more passes and time than Davidson's method
 CHUNK = 65_536  # Gaussians at a time
+FEW = 256  # Gaussians that are taken apart in any case
+BOUND_SLACK = 1e-5  # of a norm, for its rounding
 
 
 class OwnDirections:
     """An `Approximation` of the scene's Hessian, or of its block of one attribute but colours; in a metric, of D H D.
 
     own: of the Hessian, or of its Gauss-Newton part; pixelwise: of that part, where the loss couples pixels.  attribute: all by
-    default; scale: D, above 0, 1 by default.  values: (n, w), of the blocks, ascending; vectors: (n, w, w), theirs, in columns,
-    0 for a quaternion's length; sh: (n, m), the diagonal of the colours, none for one attribute.
+    default; scale: D, above 0, 1 by default.  sh: (n, m), the diagonal of the colours, none for one attribute.
+
+    The blocks are taken apart where they are asked for: all of them for Davidson's method, a few for their ends.
     """
 
     def __init__(
@@ -73,27 +77,61 @@ class OwnDirections:
             units, radial, geometry = units[:, columns], radial[:, columns], geometry[:, columns, columns]
             rows, self._columns = units.numel(), {attribute: slice(0, units.shape[1])}
             self._blocks = {attribute: slice(0, rows), "sh": slice(rows, rows)}
-        self.values: Float64[Tensor, "n w"] = torch.empty_like(units, dtype=torch.float64)
-        self.vectors: Float[Tensor, "n w w"] = torch.empty_like(geometry, memory_format=torch.contiguous_format)
+        self._geometry, self._radial, self._units = geometry, radial, units
+
+    @cached_property
+    def pairs(self) -> tuple[Float64[Tensor, "n w"], Float[Tensor, "n w w"]]:
+        """Eigenvalues of every block, ascending, and its eigenvectors, in columns; 0 for a quaternion's length."""
+        return self._taken_apart(self._geometry, self._radial, self._units)
+
+    def _taken_apart(
+        self, blocks: Float[Tensor, "m w w"], radial: Float[Tensor, "m w"], units: Float[Tensor, "m w"]
+    ) -> tuple[Float64[Tensor, "m w"], Float[Tensor, "m w w"]]:
+        values = torch.empty_like(units, dtype=torch.float64)
+        vectors = torch.empty_like(blocks, memory_format=torch.contiguous_format)
 
         def decompose(first: int, last: int) -> None:
             for i in range(first, last, CHUNK):
                 rows = slice(i, min(i + CHUNK, last))
-                self.values[rows], self.vectors[rows] = _decomposed(geometry[rows], radial[rows], units[rows])
+                values[rows], vectors[rows] = _decomposed(blocks[rows], radial[rows], units[rows])
 
-        over_batch(n, decompose, geometry.device)
+        over_batch(len(blocks), decompose, blocks.device)
+        return values, vectors
 
     def steepest(self, largest: int, smallest: int) -> Float[Tensor, "p k"]:
         """Unit vectors: of the largest eigenvalues of all blocks but colours', descending, and of the smallest, ascending."""
-        length = self.vectors.norm(dim=1) < 0.5  # of the quaternion, which has no curvature and is left out
-        values, most = self.values.masked_fill(length, inf).flatten(), int((~length).sum())
-        bottom = values.topk(min(smallest, most), largest=False).indices
-        top = values.masked_fill(length.flatten(), -inf).topk(min(largest, most)).indices
+        _, gaussians, vectors = self._ends(largest, smallest)
+        geometry = self._like.new_zeros(*self._units.shape, len(gaussians))
+        geometry[gaussians, :, torch.arange(len(gaussians), device=gaussians.device)] = vectors
+        return self._joined(geometry, self._like.new_zeros(*self.sh.shape, len(gaussians)))
+
+    def _ends(
+        self, largest: int, smallest: int
+    ) -> tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]:
+        """These eigenvalues of all blocks, whose they are, and the eigenvectors.
+
+        No eigenvalue is larger than its block's Frobenius norm: once some of the largest blocks are known, those beneath what
+        was found at both ends are left as they are.
+        """
+        bounds = (self._geometry * self._units[:, :, None] * self._units[:, None, :]).flatten(1).norm(dim=1)
+        some = bounds.topk(min(max(FEW, largest, smallest), len(bounds))).indices
+        found = self._ends_of(some, largest, smallest)
+        least = torch.cat([found[0][:largest], -found[0][largest:]]).min()
+        if len(some) < len(bounds) and bool((held := bounds * (1 + BOUND_SLACK) >= least).sum() > len(some)):
+            found = self._ends_of(held.nonzero()[:, 0], largest, smallest)
+        return found
+
+    def _ends_of(
+        self, gaussians: Int[Tensor, " m"], largest: int, smallest: int
+    ) -> tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]:
+        values, vectors = self._taken_apart(*(x[gaussians] for x in (self._geometry, self._radial, self._units)))
+        length = vectors.norm(dim=1) < 0.5  # of the quaternion, which has no curvature and is left out
+        most, width = int((~length).sum()), values.shape[1]
+        top = values.masked_fill(length, -inf).flatten().topk(min(largest, most)).indices
+        bottom = values.masked_fill(length, inf).flatten().topk(min(smallest, most), largest=False).indices
         chosen = torch.cat([top, bottom])
-        geometry = self._like.new_zeros(*self.values.shape, len(chosen))
-        gaussians, columns = chosen // self.values.shape[1], chosen % self.values.shape[1]
-        geometry[gaussians, :, torch.arange(len(chosen), device=chosen.device)] = self.vectors[gaussians, :, columns]
-        return self._joined(geometry, self._like.new_zeros(*self.sh.shape, len(chosen)))
+        whose = chosen // width
+        return values.flatten()[chosen], gaussians[whose], vectors[whose, :, chosen % width]
 
     def lead(self, largest: int, smallest: int) -> tuple[Float[Tensor, "p k"], "OwnDirections | None"]:
         """Where to begin the search for so many pairs, and what it is to follow: None for a recurrence (`landscape.eigen`).
@@ -104,8 +142,8 @@ class OwnDirections:
         make a smaller one together: of fern's positions (8,000 Gaussians, 3 views) the least is -1.05e-3, and from their own
         blocks it goes to one of -4.1e-4.  Then only the largest are begun at.
         """
-        magnitudes = self.values.max().abs(), self.values.min().abs()
-        if not (largest and smallest) or float(min(magnitudes)) * APART > float(max(magnitudes)):
+        magnitudes = self._ends(1, 1)[0].abs()
+        if not (largest and smallest) or float(magnitudes.min()) * APART > float(magnitudes.max()):
             return self.steepest(largest, smallest), None
         if "means" in self._columns and float(self.steepest(0, 1)[self._blocks["means"]].square().sum()) > 0.5:
             return self.steepest(largest + SPARE, 0), None
@@ -114,14 +152,15 @@ class OwnDirections:
     def function(self, f: Callable[[Tensor], Tensor], V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """f(D) V, where V is."""
         home, V = V.device, V.to(self._like)
-        n, k = len(self.values), V.shape[1]
+        values, vectors = self.pairs
+        n, k = len(values), V.shape[1]
         geometry = torch.cat([V[self._blocks[name]].reshape(n, -1, k) for name in self._columns], dim=1)
-        geometry = self.vectors @ (f(self.values).to(V)[:, :, None] * (self.vectors.mT @ geometry))
+        geometry = vectors @ (f(values).to(V)[:, :, None] * (vectors.mT @ geometry))
         return self._joined(geometry, f(self.sh)[:, :, None] * V[self._blocks["sh"]].view(*self.sh.shape, k)).to(home)
 
     def _joined(self, geometry: Float[Tensor, "n w k"], sh: Float[Tensor, "n m k"]) -> Float[Tensor, "p k"]:
         """Vectors laid out as the scene's parameters, or the attribute's."""
-        result = self._like.new_empty(self.values.numel() + self.sh.numel(), geometry.shape[2])
+        result = self._like.new_empty(self._units.numel() + self.sh.numel(), geometry.shape[2])
         for name, columns in self._columns.items():
             result[self._blocks[name]] = geometry[:, columns].reshape(-1, geometry.shape[2])
         result[self._blocks["sh"]] = sh.reshape(-1, geometry.shape[2])

@@ -97,7 +97,7 @@ def test_near_a_fit_the_steepest_values_are_five_times_nearer_to_the_hessians_th
     H, (own, pixelwise) = SceneHessian(objective), objective.own_blocks
     errors = []
     for known in (OwnDirections(objective, own, pixelwise), OwnDirections(objective, own)):
-        V, values = known.steepest(6, 6), known.values.flatten().sort().values
+        V, values = known.steepest(6, 6), known.pairs[0].flatten().sort().values
         true = (V * H.apply(V)).sum(dim=0)
         found = torch.cat([values[-6:].flip(0), values[:6]])
         errors.append(float((found - true).abs().mean() / true.abs().max()))
@@ -156,6 +156,31 @@ def test_blocks_that_curve_up_alone_do_not_lead_along_the_quaternions_lengths(ob
     V = known.steepest(2, 3)
     assert torch.allclose(V.norm(dim=0), torch.ones(5, dtype=V.dtype))
     assert torch.allclose(SceneHessian(objective).project(V), V, atol=1e-12)
+
+
+@pytest.mark.parametrize(("low", "others"), [(-3.0, -1.0), (-1.2, -1.0), (0.1, 1.0)])
+def test_few_blocks_are_taken_apart_for_their_ends_and_none_that_has_one_is_left_out(monkeypatch, low, others):
+    """Ten blocks are larger than the one that has the least eigenvalue; where none is beneath zero no block may be left out."""
+    gaussians = random_gaussians(90, 0, logit=1.0)
+    objective = SceneObjective(gaussians, two_views(), LossSettings("l2", ssim_weight=0.0), BACKGROUND)
+    n = len(objective.active)
+    values = objective.active.flat.new_full((n, 11), 0.2)
+    values[10:20], values[10:20, 6], values[15, 2], values[40, 1] = 2.0, others, 2.5, low
+    turns = torch.linalg.qr(random_like((n, 11, 11), 5).to(values)).Q
+    taken, plain = [], OwnDirections._taken_apart
+
+    def counted(self, *of):
+        taken.append(len(of[0]))
+        return plain(self, *of)
+
+    monkeypatch.setattr(OwnDirections, "_taken_apart", counted)
+    known = OwnDirections(objective, OwnBlocks(turns @ torch.diag_embed(values) @ turns.mT, values.new_zeros(n, 1, 3)))
+    found = {}
+    for few in (8, n):
+        monkeypatch.setattr("splat.own_directions.FEW", few)
+        found[few] = known.steepest(1, 1)
+    assert torch.allclose((found[8] * found[n]).sum(dim=0).abs(), torch.ones(2, dtype=values.dtype))
+    assert taken == ([8, 11, n] if others < 0 else [8, n, n])
 
 
 def with_ends(objective, largest, row, least):
