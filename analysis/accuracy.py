@@ -221,7 +221,7 @@ def run_accuracy(options: BenchOptions) -> int:
             for method in methods
             for seed in range(seeds_of(case, method, options.repetitions))
             if method.applies(case) and (case.family != "checkpoint" or affordable(method))
-            if method.quantity in (options.quantities or get_args(Quantity))
+            if method.quantity in (options.quantity or get_args(Quantity))
         ]
         progress.update(bar, total=len(jobs))
         for case, method, seed in jobs:
@@ -229,7 +229,7 @@ def run_accuracy(options: BenchOptions) -> int:
             runs += measure(case, method, SEED + seed)
             progress.advance(bar)
         for case in cases:
-            if isinstance(case.operator, DenseOperator) and not options.quantities:
+            if isinstance(case.operator, DenseOperator) and not options.quantity:
                 runs += [run for seed in range(PRECISION_SEEDS) for run in precision_runs(case, SEED + seed)]
     for sentence in missing:
         console.print(sentence, style="yellow", highlight=False, soft_wrap=True)
@@ -238,13 +238,17 @@ def run_accuracy(options: BenchOptions) -> int:
 
 
 def _cases(options: BenchOptions) -> list[Case]:
+    if options.scenes < 1:
+        raise ValueError(f"expected at least 1 scene of each kind, got --scenes {options.scenes}")
     if options.checkpoint is not None:
+        if options.case or options.scenes > 1:
+            raise ValueError("expected neither --case nor --scenes beside a checkpoint, which is the only case")
         return [checkpoint_case(options.checkpoint, options.out, options.downscale)]
     matrices, scenes = {case.name: case for case in matrix_cases(SEED)}, splat_cases(SEED, options.scenes)
-    if strange := set(options.cases) - {*matrices, *scenes}:
+    if strange := set(options.case) - {*matrices, *scenes}:
         names = ", ".join(map(repr, (*scenes, *matrices)))
-        raise ValueError(f"expected --cases among {names}, got {', '.join(map(repr, sorted(strange)))}")
-    chosen = options.cases or (*scenes, *matrices)
+        raise ValueError(f"expected --case to be one of {names}, got {', '.join(map(repr, sorted(strange)))}")
+    chosen = options.case or (*scenes, *matrices)
     return [scenes[name]() if name in scenes else matrices[name] for name in chosen]
 
 

@@ -81,6 +81,10 @@ def run_bench(options: BenchOptions) -> int:
         raise ValueError(
             f"expected one subject, got a second one, {options.checkpoint}; only accuracy takes a checkpoint"
         )
+    if (options.quantity or options.case or options.scenes != 1) and options.subject != "accuracy":
+        raise ValueError(
+            "expected --quantity, --case and --scenes with what they confine: landscape bench accuracy ..."
+        )
     if options.device == "cuda" and options.subject in ("kernels", "stress", "accuracy"):
         raise ValueError(
             f"expected a scene, a checkpoint or --sizes for the device cuda, got {options.subject}, which measures the CPU's "

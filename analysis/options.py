@@ -235,16 +235,17 @@ class BenchOptions:
     Default: a synthetic scene."""
     checkpoint: Annotated[Positional[Path | None], arg(metavar="[CHECKPOINT]", help_behavior_hint="")] = None
     """accuracy only: a checkpoint to take instead of small scenes and matrices.  Its truth is a long run, kept in OUT."""
-    quantities: UseAppendAction[tuple[Quantity, ...]] = ()
+    quantity: UseAppendAction[tuple[Quantity, ...]] = ()
     """accuracy only: study this alone; may be given several times.  Default: all."""
-    cases: UseAppendAction[tuple[str, ...]] = ()
-    """accuracy only: study this case alone, by its name in the tables; may be given several times.  Default: all."""
+    case: UseAppendAction[tuple[str, ...]] = ()
+    """accuracy only: study this one alone, by its name in the tables; may be given several times.  Default: all."""
     scenes: int = 1
-    """accuracy only: small scenes of each kind, each with another seed."""
+    """accuracy only: small scenes of each kind, each another world."""
     out: Path = Path("runs/bench")
     """Folder of the tables (CSV) and figures; files of an earlier run are replaced."""
     repetitions: int = 15
-    """How often each thing is timed, in turns with what it is compared with; accuracy: seeds of each trace on a matrix."""
+    """How often each thing is timed, in turns with what it is compared with.
+    accuracy: what the numbers of seeds go by, such as three times as many for a trace on a matrix."""
     sizes: Annotated[tuple[str, ...], arg(metavar="SIZE...", help_behavior_hint="")] = ()
     """Synthetic sizes, GAUSSIANS@WIDTHxHEIGHT.  Default: 10k@504x378 100k@504x378, and for kernels 500k@1600x1060."""
     prototype: Unset[Path] = None

@@ -394,10 +394,17 @@ def test_a_study_of_one_quantity_and_one_case_leaves_the_others_out(tmp_path, mo
 
     monkeypatch.setattr(accuracy, "measure", note)
     monkeypatch.setattr(accuracy, "_report", lambda *_: None)
-    options = BenchOptions(subject="accuracy", out=tmp_path, repetitions=1, quantities=("ends",), cases=("flat",))
+    options = BenchOptions(subject="accuracy", out=tmp_path, repetitions=1, quantity=("ends",), case=("flat",))
     assert run_bench(options) == 0 and met == {("flat", "ends")}
-    with pytest.raises(ValueError, match=r"expected --cases among 'far from a fit', .*'flat', got 'round'"):
-        run_bench(BenchOptions(subject="accuracy", out=tmp_path, cases=("round",)))
+    with pytest.raises(ValueError, match=r"expected --case to be one of 'far from a fit', .*'flat', got 'round'"):
+        run_bench(BenchOptions(subject="accuracy", out=tmp_path, case=("round",)))
+    for other in (None, "stress"):
+        with pytest.raises(ValueError, match="landscape bench accuracy"):
+            run_bench(BenchOptions(subject=other, out=tmp_path, quantity=("ends",)))
+    with pytest.raises(ValueError, match="at least 1 scene"):
+        run_bench(BenchOptions(subject="accuracy", out=tmp_path, scenes=0))
+    with pytest.raises(ValueError, match="which is the only case"):
+        run_bench(BenchOptions(subject="accuracy", out=tmp_path, checkpoint=tmp_path / "x.pt", scenes=2))
 
 
 def test_scenes_of_a_kind_are_different_worlds():
