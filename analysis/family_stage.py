@@ -218,7 +218,7 @@ def _of_operator(
     """(block, dim, family) of the whole and of every attribute of one operator."""
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
     spaces, found = active_spaces(hessian, scale), []
-    traces = {} if hessian.gauss_newton else _traces(hessian.objective, scale, split(generator))
+    traces = _traces(hessian, scale, split(generator))
     each = _seconds_a_product(operator, options.family.batch) if options.seconds < inf else 0.0
     names = [WHOLE, *hessian.blocks]
     for done, name in enumerate(names):
@@ -238,19 +238,12 @@ def _of_operator(
     return found
 
 
-def _traces(
-    objective: SceneObjective, scale: Tensor | None, generator: torch.Generator
-) -> dict[str, tuple[float, float]]:
-    """The Hessian's traces with standard errors, of every attribute that has one unit, and of the whole where all have."""
-    found, known = exact_traces(objective, generator, samples=TRACE_SAMPLES), {}
-    for name, trace in found.items():
-        units = torch.ones(1) if scale is None else scale[objective.blocks[name]].unique()
-        if len(units) <= 1:
-            value, error = (float(units.square().sum()) * x for x in total_trace({name: trace}))
-            known[name] = value, error
-    if len(known) == len(found):
-        known[WHOLE] = sum(value for value, _ in known.values()), sum(error for _, error in known.values())
-    return known
+def _traces(hessian: SceneHessian, scale: Tensor | None, generator: torch.Generator) -> dict[str, tuple[float, float]]:
+    """The operator's traces with standard errors, of the whole and of every attribute."""
+    found = exact_traces(
+        hessian.objective, generator, samples=TRACE_SAMPLES, gauss_newton=hessian.gauss_newton, scale=scale
+    )
+    return {WHOLE: total_trace(found), **{name: total_trace({name: trace}) for name, trace in found.items()}}
 
 
 def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:

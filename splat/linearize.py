@@ -86,13 +86,20 @@ class OwnBlocks:
     def __mul__(self, factor: float) -> "OwnBlocks":
         return OwnBlocks(self.geometry * factor, self.sh * factor)
 
-    def traces(self, quats: Float[Tensor, "n 4"] | None = None) -> dict[str, float]:
-        """Trace of each attribute's block, summed in double precision; without the radial directions of unit quats."""
-        result = {name: float(part.sum()) for name, part in self.diagonals.items()}
+    def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
+        """Trace of each attribute's block, summed in double precision; without the radial directions of unit quats.
+
+        scale: D, of D P B P D instead of P B P, where P leaves these directions out.
+        """
+        diagonals = self.diagonals
         if quats is not None:
             q, columns = quats.double(), GEOMETRY_COLUMNS["quats"]
-            result["quats"] -= float(torch.einsum("ni,nij,nj->", q, self.geometry[:, columns, columns].double(), q))
-        return result
+            along = (self.geometry[:, columns, columns].double() @ q[:, :, None])[:, :, 0]
+            diagonals["quats"] = diagonals["quats"] - 2 * q * along + q.square() * (q * along).sum(dim=1, keepdim=True)
+        if scale is not None:
+            units = scale.attributes
+            diagonals = {name: part * units[name].double().view_as(part).square() for name, part in diagonals.items()}
+        return {name: float(part.sum()) for name, part in diagonals.items()}
 
     @property
     def diagonals(self) -> dict[str, Float64[Tensor, "n ..."]]:

@@ -39,24 +39,31 @@ def exact_traces(
     progress: Progress | None = None,
     names: Sequence[str] = ATTRIBUTES,
     samples: int | None = None,
+    *,
+    gauss_newton: bool = False,
+    scale: Float[Tensor, " p"] | None = None,
 ) -> dict[str, TraceEstimate]:
     """The trace of the named attributes' blocks of H, on the complement of the quaternions' radial directions.
+
+    gauss_newton: of its Gauss-Newton part, whose T_b is C_b.  scale: D, of D H D.
 
     settings: rtol, atol, confidence, the numbers of samples and max_seconds count; the distribution is always random signs.
     samples: just so many, at least LEAST_SAMPLES, whatever the settings say: for rough values, as a training needs them.
     """
     if samples is not None and samples < LEAST_SAMPLES:
         raise ValueError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
-    quats = objective.active.quats
+    quats, units = objective.active.quats, None if scale is None else objective.active.with_flat(scale)
     whole, coupled = objective.own_blocks
-    known = {name: value for name, value in whole.traces(quats).items() if name in names}
+    if gauss_newton:
+        whole = coupled or objective.block_diagonal(gauss_newton=True)
+    known = {name: value for name, value in whole.traces(quats, units).items() if name in names}
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
     if coupled is None:
         return {
             name: TraceEstimate.exact(name, sizes[name], value, settings.confidence) for name, value in known.items()
         }
-    pixelwise = coupled.traces(quats)
+    pixelwise = coupled.traces(quats, units)
     first, most = (samples, samples) if samples else (settings.min_probes, settings.max_probes)
     blocks = [_Block(name, sizes[name], known[name], pixelwise[name], settings, first, most) for name in known]
     deadline = monotonic() + settings.max_seconds
@@ -64,7 +71,7 @@ def exact_traces(
         count, next_look = still[0].count, min(block.looks.next for block in still)
         # few blocks leave room for several samples in the pass over the pixels
         together = min(max(COLUMNS // len(still), 1), next_look - count)
-        sampled = _sample(objective, generator, [block.name for block in still], together)
+        sampled = _sample(objective, generator, [block.name for block in still], together, scale)
         late = monotonic() > deadline
         for block, x, y in zip(still, *sampled, strict=True):
             block.add(x, y, late)
@@ -129,14 +136,19 @@ def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " 
 
 
 def _sample(
-    objective: SceneObjective, generator: torch.Generator, names: list[str], count: int
+    objective: SceneObjective,
+    generator: torch.Generator,
+    names: list[str],
+    count: int,
+    scale: Float[Tensor, " p"] | None = None,
 ) -> tuple[Float64[Tensor, "b s"], Float64[Tensor, "b s"]]:
     """x and y of the named blocks for so many draws of signs, which are the same whatever the names and the count are."""
     seeds = torch.randint(2**62, (count,), generator=generator, device=generator.device).tolist()
     total = torch.zeros(2, len(names) * count, dtype=torch.float64)
     for view, held in zip(objective.view_numbers, objective.linearized, strict=True):
         generators = [torch.Generator(generator.device).manual_seed(seed + view) for seed in seeds]
-        total += torch.stack(held.loss_curvatures(_signs(objective, generators, names).flatten(1))).cpu()
+        U = _signs(objective, generators, names).flatten(1)
+        total += torch.stack(held.loss_curvatures(U if scale is None else U * scale[:, None])).cpu()
     x, y = objective.mean(total)
     return x.view(len(names), count), y.view(len(names), count)
 

@@ -118,7 +118,7 @@ def of_split(objective: SceneObjective, checkpoint: Checkpoint) -> SceneObjectiv
 
 @pytest.mark.parametrize("operator", ["hessian", "gauss-newton"])
 def test_every_family_is_that_of_the_dense_block_in_the_metrics_units(split, objective, checkpoint, operator):
-    held = []
+    held, resolved = [], 0
     for scene, of in (("trained", objective), ("split", of_split(objective, checkpoint))):
         true = spectra(of, checkpoint, operator)
         rows = [row for row in split.rows if (row.scene, row.operator) == (scene, operator)]
@@ -130,11 +130,18 @@ def test_every_family_is_that_of_the_dense_block_in_the_metrics_units(split, obj
             assert int((spectrum.abs() > 1e-12 * size).sum()) <= family.rank < row.dim or family.rank == row.dim
             low, high = ends.largest.interval()
             assert low - 1e-9 * size <= float(spectrum[-1]) <= high + 1e-9 * size, (row.block, scene)
-            assert ends.smallest.interval()[0] <= float(spectrum[0]) + 1e-9 * size
+            least, residual = float(ends.smallest.values[0]), float(ends.smallest.residuals[0])
+            assert float((spectrum - least).abs().min()) <= residual + 1e-9 * size
+            if not ends.smallest.reason.endswith(
+                "budget"
+            ):  # of Gauss-Newton's, next to nothing, 40 products may see no end
+                assert least - residual <= float(spectrum[0]) + 1e-9 * size, (row.block, scene)
+                resolved += 1
             for name, value in indices(spectrum).items():
                 bracket = getattr(family.indices, name)
                 held.append(bracket.low * (1 - 1e-9) <= value <= bracket.high * (1 + 1e-9))
     assert held.count(False) <= most_misses(len(held), 0.05), held
+    assert resolved >= (10 if operator == "hessian" else 5)
 
 
 def test_the_effect_of_the_split_brackets_the_quotient_of_the_dense_indices(split, objective, checkpoint):
@@ -247,13 +254,10 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
         else:
             start, followed = OwnDirections(objective, own, pixelwise, attribute, scale).lead(1, 1)
             assert torch.equal(lead.start, start) and (lead.approximation is None) == (followed is None)
-    units = {block: operator for (gauss_newton, block), (operator, _) in seen.items() if not gauss_newton}
-    diagonal = units["all"].apply(torch.eye(objective.active.flat.numel(), dtype=torch.float64)).diagonal()
+    eye = torch.eye(objective.active.flat.numel(), dtype=torch.float64)
+    diagonals = {newton: seen[newton, "all"][0].apply(eye).diagonal() for newton in (False, True)}
     for (gauss_newton, block), (_, lead) in seen.items():
-        if gauss_newton or (metric == "optimiser" and block in ("all", "sh")):  # colours have two rates
-            assert lead.trace is None
-            continue
-        rows = slice(None) if block == "all" else objective.blocks[block]
+        diagonal, rows = diagonals[gauss_newton], slice(None) if block == "all" else objective.blocks[block]
         value, error = lead.trace
         assert abs(value - float(diagonal[rows].sum())) < 4 * error + 1e-9 * float(diagonal[rows].abs().sum())
 

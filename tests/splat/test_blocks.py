@@ -16,7 +16,7 @@ from splat.losses_cpu import ViewLoss
 from splat.render import render
 from splat.scenes.view import View
 from splat.traces import LEAST_SAMPLES, _Block, _sample, exact_traces
-from tests.splat.random_scenes import random_camera, random_gaussians
+from tests.splat.random_scenes import random_camera, random_gaussians, random_like
 
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")
 PIXEL_SUMS = [LossSettings(kind, ssim_weight=0) for kind in ("l1", "charbonnier", "l2")]
@@ -103,24 +103,45 @@ def test_the_pixel_diagonal_of_the_loss_is_that_of_its_dense_hessian(kind) -> No
     assert float((got - expected).norm() / expected.norm()) < 1e-12
 
 
+def units_of(objective: SceneObjective) -> Tensor:
+    """Of every row its own, above 0."""
+    return random_like(tuple(objective.active.flat.shape), 9).to(objective.active.flat).exp()
+
+
 @pytest.mark.parametrize("loss", PIXEL_SUMS[1:], ids=lambda loss: loss.pixel)
-def test_traces_of_sums_over_pixels_are_exact(loss: LossSettings) -> None:
+@pytest.mark.parametrize("gauss_newton", [False, True])
+@pytest.mark.parametrize("scaled", [False, True])
+def test_traces_of_sums_over_pixels_are_exact(loss: LossSettings, gauss_newton: bool, scaled: bool) -> None:
     objective = objective_of(awkward_gaussians(), loss, noise=0.1)
-    H = dense(SceneHessian(objective))
-    for name, estimate in exact_traces(objective, torch.Generator().manual_seed(0)).items():
+    H, scale = dense(SceneHessian(objective, gauss_newton=gauss_newton)), units_of(objective) if scaled else None
+    if scale is not None:
+        H = scale[:, None] * H * scale
+    found = exact_traces(objective, torch.Generator().manual_seed(0), gauss_newton=gauss_newton, scale=scale)
+    for name, estimate in found.items():
         diagonal = H.diagonal()[objective.blocks[name]]
         assert estimate.reason == "exact" and estimate.standard_error == 0
         assert abs(estimate.value - float(diagonal.sum())) <= 1e-9 * float(diagonal.abs().sum())
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.5], ids=["near a fit", "far from a fit"])
-def test_traces_with_ssim_are_within_their_errors_over_many_seeds(noise: float) -> None:
+@pytest.mark.parametrize(
+    ("noise", "gauss_newton", "scaled"),
+    [(0.02, False, False), (0.5, False, False), (0.5, False, True), (0.5, True, False), (0.02, True, True)],
+    ids=["near a fit", "far from a fit", "in units", "Gauss-Newton", "Gauss-Newton, in units"],
+)
+def test_traces_with_ssim_are_within_their_errors_over_many_seeds(
+    noise: float, gauss_newton: bool, scaled: bool
+) -> None:
     objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise)
-    H, seeds, settings = dense(SceneHessian(objective)), 60, TraceSettings.fixed(12)
+    scale = units_of(objective) if scaled else None
+    diagonal = dense(SceneHessian(objective, gauss_newton=gauss_newton)).diagonal()
+    diagonal = diagonal if scale is None else diagonal * scale.square()
+    seeds, settings = 60, TraceSettings.fixed(12)
     scores = {name: [] for name in objective.blocks}
     for seed in range(seeds):
-        for name, estimate in exact_traces(objective, torch.Generator().manual_seed(seed), settings).items():
-            truth = float(H.diagonal()[objective.blocks[name]].sum())
+        generator = torch.Generator().manual_seed(seed)
+        found = exact_traces(objective, generator, settings, gauss_newton=gauss_newton, scale=scale)
+        for name, estimate in found.items():
+            truth = float(diagonal[objective.blocks[name]].sum())
             scores[name].append((estimate.value - truth) / estimate.standard_error)
     for name, values in scores.items():
         z = torch.tensor(values)
