@@ -21,34 +21,35 @@ stopping rule are given the right budget, as an oracle would.
 
 **Which defaults the figures support** (products, seeds as below).
 
-    traces       method "auto": a sketch on the power law (26 products for 1.7%, Hutchinson's 100 for 5%; 1.06 of the best
-                 peer's) and at rank 5 (13, exact; 1.08), Hutchinson on the others.  There three peers run the same estimator,
-                 whose mean square error, 2 p_2 / m, is known: the default needs 0.98 +- 0.08 (clustered), 1.08 +- 0.10
-                 (indefinite) and 0.88 +- 0.06 (flat) of its m, over 300 seeds.  Ratios of this table, from tens of seeds and
-                 over the luckiest of the three, are off by a factor of 1.5 either way.  On splats `exact_traces`, a third
-                 of the best peer's work at equal error, and no error at all without SSIM
+    traces       method "auto": a sketch on the power law (26 products for 1.5%, Hutchinson's 100 for 6%; 1.01 of the best
+                 peer's, 0.97 to 1.07 over 500 seeds) and at rank 5 (13, exact; 1.08), Hutchinson on the others.  There three
+                 packages run the same estimator, whose mean square error, 2 p_2 / m, is known: over 10,000 seeds the default
+                 needs 1.00 (0.97 to 1.03; clustered) and 1.03 (1.00 to 1.06; indefinite) of its m, and over 2,000 0.96 (0.89 to
+                 1.00) of theirs on the flat one.  A ratio from tens of seeds is off by a factor of 1.5 either way.  On splats
+                 `exact_traces`, a third of the best peer's work at equal error, and no error at all without SSIM
     both ends    one Lanczos run to 1e-3 with a basis of 64: looser saves two to four products, other bases and blocks
-                 nothing.  It needs the steps that no Krylov method does without, 0.98 to 1.03 of those of a peer that is told
+                 nothing.  It needs the steps that no Krylov method does without, 0.93 to 0.99 of those of a peer that is told
                  how many (0.11 on the power law), as it reads the noise of products from their asymmetry.  On scenes the
-                 Gaussians' own blocks lead, and their passes are paid.  Where the ends are of like magnitude a recurrence
-                 begins at the steepest: 0.89 (0.85 to 0.98) of the best peer's products far from the fit, 0.60 (0.56 to 0.66)
-                 near it.  Elsewhere Davidson's method: fern at a quarter of its size 0.44 (0.38 to 0.53); at 504 x 378
-                 (2,000 steps, 8,000 Gaussians) 25 products and 12 passes over the pixels where a recurrence from the steepest
-                 takes 50 in 48, 3DGS at 43,000 Gaussians 39 in 26 for 82 in 79
-    diagonal     method "auto": 0.76 of XDiag's products on the power law, 21 in all and exact at rank 5, random signs elsewhere
+                 Gaussians' own blocks lead, and their pass is paid.  Where the ends are of like magnitude a recurrence begins
+                 at the steepest: over 24 small scenes (`--scenes 8`, 12 seeds) 0.59 of SciPy's products, which stops by itself,
+                 and 0.80 (0.80 to 0.83) of those of the best peer when it is told how many steps do, 0.64 to 1.01 one by one;
+                 fern at a quarter of its size 0.74.  Elsewhere Davidson's method: fern at 504 x 378 (another training of 2,000
+                 steps, 8,000 Gaussians) 25 products and 12 passes over the pixels where a recurrence from the steepest takes 50
+                 in 48, 3DGS at 43,000 Gaussians 39 in 26 for 82 in 79
+    diagonal     method "auto": 0.76 of XDiag's products on the power law, 0.88 and exact at rank 5 (21), random signs elsewhere
     quadrature   192 products, divided as they go: start vectors are many on flat, clustered and indefinite spectra, four of up
                  to 48 steps elsewhere.  At equal error 0.5 of the best peer's products or less in sum |lambda| and effective
-                 rank (indefinite sum |lambda| to 1.2), mass quantiles 0.5 to 0.8, over 48 seeds; eigenvalues that start
-                 vectors find in common are counted.  With trace and ends known, as a probe has them, sum |lambda| of a power
-                 law and of a flat spectrum is exact, near a fit its error 1.2% instead of 2.5%
+                 rank, mass quantiles 0.5 to 0.8, over 48 seeds (300 on the indefinite one); eigenvalues that start vectors find
+                 in common are counted.  With trace and ends known, as a probe has them, sum |lambda| of a power law and of a
+                 flat spectrum is exact, near a fit its error 1.2% instead of 2.5%
     precision    float32 products: rounding adds some 1e-8 of |z| |H z|, six digits below what chance adds.  Sums in float64
                  make no difference at these sizes; they are kept as they cost nothing, and float32's grow with the rows
 
 **Which they do not.**  Mass quantiles of scenes lie where the rules of so few steps have a node or two: their middles are off
-by 15 to 150%, and only their brackets tell.  Far from a fit the two smallest eigenvalues are 0.9% apart, and a recurrence from
-the exact own blocks has found the ends after 16 steps at the earliest, from random vectors after 17: with the pass that is paid
-0.85 of a peer's 20 cannot be had there, and the ratio is what the peers' failures make of it: 20 random steps miss an end in 5%
-of the runs (35% near the fit), so few seeds say little.
+by 15 to 150%, and only their brackets tell.  On seven of the 24 scenes the ends take more than 0.85 of the products of a peer
+that is told how many: 10 to 15 steps do there from random vectors, too, and a good start saves no more than its pass costs.
+(With a peer's steps in doublings, 10, 20, 40, the same runs seemed to take 0.65: its error falls to round-off between two.)
+In seconds six of them take 1.14 (0.86 to 1.35): with so small a scene a product takes a millisecond, the rest of a step as long.
 """
 
 from collections.abc import Iterator, Sequence
