@@ -49,7 +49,7 @@ stopping rule are given the right budget, as an oracle would.
 by 15 to 150%, and only their brackets tell.  On seven of the 24 scenes the ends take more than 0.85 of the products of a peer
 that is told how many: 10 to 15 steps do there from random vectors, too, and a good start saves no more than its pass costs.
 (With a peer's steps in doublings, 10, 20, 40, the same runs seemed to take 0.65: its error falls to round-off between two.)
-In seconds six of them take 1.14 (0.86 to 1.35): with so small a scene a product takes a millisecond, the rest of a step as long.
+In seconds six of them take 1.14 (0.86 to 1.35): with so small a scene a product takes a millisecond, the rest as long.
 """
 
 from collections.abc import Iterator, Sequence
