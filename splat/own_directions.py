@@ -44,7 +44,10 @@ SPARE = 1  # starts at each end beside one for each wanted pair
 APART = 30.0  # the ratio of two ends from which a recurrence needs more passes and time than Davidson's method
 CHUNK = 65_536  # Gaussians at a time
 FEW = 256  # Gaussians that are taken apart in any case
+MANY = 4  # a part of all Gaussians that is as well taken apart with all the others
 BOUND_SLACK = 1e-5  # of a norm, for its rounding
+# some eigenvalues of all blocks, the Gaussians whose they are, and the eigenvectors
+Ends = tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]
 
 
 class OwnDirections:
@@ -105,33 +108,25 @@ class OwnDirections:
         geometry[gaussians, :, torch.arange(len(gaussians), device=gaussians.device)] = vectors
         return self._joined(geometry, self._like.new_zeros(*self.sh.shape, len(gaussians)))
 
-    def _ends(
-        self, largest: int, smallest: int
-    ) -> tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]:
-        """These eigenvalues of all blocks, whose they are, and the eigenvectors.
+    def _ends(self, largest: int, smallest: int) -> Ends:
+        """The steepest of all, but few blocks are taken apart: no eigenvalue is larger than its block's Frobenius norm, and once
+        some of the largest blocks are known, those beneath what was found at both ends are left as they are."""
+        if "pairs" not in self.__dict__:
+            bounds = (self._geometry * self._units[:, :, None] * self._units[:, None, :]).flatten(1).norm(dim=1)
+            some = bounds.topk(min(max(FEW, largest, smallest), len(bounds))).indices
+            found = self._ends_of(some, largest, smallest)
+            least = torch.cat([found[0][:largest], -found[0][largest:]]).min()
+            held = (bounds * (1 + BOUND_SLACK) >= least).nonzero()[:, 0]
+            if len(held) <= len(some):
+                return found
+            if MANY * len(held) <= len(bounds):
+                return self._ends_of(held, largest, smallest)
+        return _chosen(*self.pairs, largest, smallest)
 
-        No eigenvalue is larger than its block's Frobenius norm: once some of the largest blocks are known, those beneath what
-        was found at both ends are left as they are.
-        """
-        bounds = (self._geometry * self._units[:, :, None] * self._units[:, None, :]).flatten(1).norm(dim=1)
-        some = bounds.topk(min(max(FEW, largest, smallest), len(bounds))).indices
-        found = self._ends_of(some, largest, smallest)
-        least = torch.cat([found[0][:largest], -found[0][largest:]]).min()
-        if len(some) < len(bounds) and bool((held := bounds * (1 + BOUND_SLACK) >= least).sum() > len(some)):
-            found = self._ends_of(held.nonzero()[:, 0], largest, smallest)
-        return found
-
-    def _ends_of(
-        self, gaussians: Int[Tensor, " m"], largest: int, smallest: int
-    ) -> tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]:
-        values, vectors = self._taken_apart(*(x[gaussians] for x in (self._geometry, self._radial, self._units)))
-        length = vectors.norm(dim=1) < 0.5  # of the quaternion, which has no curvature and is left out
-        most, width = int((~length).sum()), values.shape[1]
-        top = values.masked_fill(length, -inf).flatten().topk(min(largest, most)).indices
-        bottom = values.masked_fill(length, inf).flatten().topk(min(smallest, most), largest=False).indices
-        chosen = torch.cat([top, bottom])
-        whose = chosen // width
-        return values.flatten()[chosen], gaussians[whose], vectors[whose, :, chosen % width]
+    def _ends_of(self, gaussians: Int[Tensor, " m"], largest: int, smallest: int) -> Ends:
+        pairs = self._taken_apart(*(x[gaussians] for x in (self._geometry, self._radial, self._units)))
+        values, whose, vectors = _chosen(*pairs, largest, smallest)
+        return values, gaussians[whose], vectors
 
     def lead(self, largest: int, smallest: int) -> tuple[Float[Tensor, "p k"], "OwnDirections | None"]:
         """Where to begin the search for so many pairs, and what it is to follow: None for a recurrence (`landscape.eigen`).
@@ -142,8 +137,10 @@ class OwnDirections:
         make a smaller one together: of fern's positions (8,000 Gaussians, 3 views) the least is -1.05e-3, and from their own
         blocks it goes to one of -4.1e-4.  Then only the largest are begun at.
         """
+        if not (largest and smallest):
+            return self.steepest(largest, smallest), None
         magnitudes = self._ends(1, 1)[0].abs()
-        if not (largest and smallest) or float(magnitudes.min()) * APART > float(magnitudes.max()):
+        if float(magnitudes.min()) * APART > float(magnitudes.max()):
             return self.steepest(largest, smallest), None
         if "means" in self._columns and float(self.steepest(0, 1)[self._blocks["means"]].square().sum()) > 0.5:
             return self.steepest(largest + SPARE, 0), None
@@ -165,6 +162,17 @@ class OwnDirections:
             result[self._blocks[name]] = geometry[:, columns].reshape(-1, geometry.shape[2])
         result[self._blocks["sh"]] = sh.reshape(-1, geometry.shape[2])
         return result
+
+
+def _chosen(values: Float64[Tensor, "m w"], vectors: Float[Tensor, "m w w"], largest: int, smallest: int) -> Ends:
+    """Of these blocks' eigenpairs the largest, descending, and the smallest, ascending."""
+    length = vectors.norm(dim=1) < 0.5  # of the quaternion, which has no curvature and is left out
+    most, width = int((~length).sum()), values.shape[1]
+    top = values.masked_fill(length, -inf).flatten().topk(min(largest, most)).indices
+    bottom = values.masked_fill(length, inf).flatten().topk(min(smallest, most), largest=False).indices
+    chosen = torch.cat([top, bottom])
+    whose = chosen // width
+    return values.flatten()[chosen], whose, vectors[whose, :, chosen % width]
 
 
 def _softened(
