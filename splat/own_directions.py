@@ -109,8 +109,11 @@ class OwnDirections:
         return self._joined(geometry, self._like.new_zeros(*self.sh.shape, len(gaussians)))
 
     def _ends(self, largest: int, smallest: int) -> Ends:
-        """The steepest of all, but few blocks are taken apart: no eigenvalue is larger than its block's Frobenius norm, and once
-        some of the largest blocks are known, those beneath what was found at both ends are left as they are."""
+        """The steepest, with few blocks taken apart.
+
+        No eigenvalue is larger than its block's Frobenius norm: once some of the largest blocks are known, those beneath what
+        was found at both ends are left as they are.
+        """
         if "pairs" not in self.__dict__:
             bounds = (self._geometry * self._units[:, :, None] * self._units[:, None, :]).flatten(1).norm(dim=1)
             some = bounds.topk(min(max(FEW, largest, smallest), len(bounds))).indices
