@@ -8,7 +8,7 @@ A method is run on an operator that counts, with a seed, and returns an `Answer`
     diagonal          one part, a vector
 
 Work that is not products H v is charged in products: a pass over the pixels for all own blocks, and to find their ends, PASS
-(the most that was measured on fern: 1.05 to 1.2 with vectors of 512 bits, 0.65 to 0.85 with 256, and 0.15); a product with the
+(the most that was measured on fern: 1.05 to 1.2 with vectors of 512 bits, 0.65 to 1.1 with 256, and 0.15); a product with the
 images' Jacobian JACOBIAN (its share of a product's arithmetic; there is no backward pass).
 """
 
