@@ -266,18 +266,7 @@ def diagonal_methods() -> Iterator[Method]:
 def block_diagonal(case: Case) -> Float64[Tensor, " n"]:
     """The diagonal of the own blocks, less the radial directions of the quaternions."""
     assert case.objective is not None
-    own, q = case.objective.block_diagonal(), case.objective.active.quats.double()
-    geometry = own.geometry.double()
-    radial = torch.eye(4, dtype=torch.float64) - q[:, :, None] * q[:, None, :]
-    turns = radial @ geometry[:, 6:10, 6:10] @ radial
-    diagonal = geometry.diagonal(dim1=1, dim2=2)
-    parts = {
-        "means": diagonal[:, 0:3],
-        "log_scales": diagonal[:, 3:6],
-        "quats": turns.diagonal(dim1=1, dim2=2),
-        "opacity_logits": diagonal[:, 10],
-        "sh": own.sh.double(),
-    }
+    parts = case.objective.block_diagonal().diagonals_across(case.objective.active.quats)
     result = torch.empty(case.operator.dim, dtype=torch.float64)
     for name, rows in case.operator.blocks.items():
         result[rows] = parts[name].reshape(-1)

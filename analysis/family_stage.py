@@ -257,7 +257,7 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:
     objective = hessian.objective
     own, pixelwise = objective.own_blocks
     if hessian.gauss_newton:
-        own = pixelwise or objective.block_diagonal(gauss_newton=True)
+        own = objective.pixelwise_blocks
     known = OwnDirections(objective, own, pixelwise, None if name == WHOLE else name, scale)
     if hessian.gauss_newton or name == "means":
         return Lead(known.steepest(1 + SPARE, 0))

@@ -128,7 +128,7 @@ class SceneObjective:
         """The mean over the first so many views alone; what is held still is shared."""
         part = copy(self)
         part.views, part._losses = self.views[:count], self._losses[:count]
-        for name in ("gradient", "own_blocks"):  # those of all views
+        for name in ("gradient", "own_blocks", "pixelwise_blocks"):  # those of all views
             part.__dict__.pop(name, None)
         return part
 
@@ -227,7 +227,12 @@ class SceneObjective:
     @cached_property
     def own_blocks(self) -> tuple[OwnBlocks, OwnBlocks | None]:
         """Own blocks of the Hessian and, where the loss couples pixels, of what it is pixel by pixel alone."""
-        return self.block_diagonal(), self.block_diagonal(gauss_newton=True) if self.couples_pixels else None
+        return self.block_diagonal(), self.pixelwise_blocks if self.couples_pixels else None
+
+    @cached_property
+    def pixelwise_blocks(self) -> OwnBlocks:
+        """Own blocks of the Gauss-Newton part as it is pixel by pixel: all of it, where the loss does not couple pixels."""
+        return self.block_diagonal(gauss_newton=True)
 
 
 class SceneHessian:

@@ -91,11 +91,7 @@ class OwnBlocks:
 
         scale: D, of D P B P D instead of P B P, where P leaves these directions out.
         """
-        diagonals = self.diagonals
-        if quats is not None:
-            q, columns = quats.double(), GEOMETRY_COLUMNS["quats"]
-            along = (self.geometry[:, columns, columns].double() @ q[:, :, None])[:, :, 0]
-            diagonals["quats"] = diagonals["quats"] - 2 * q * along + q.square() * (q * along).sum(dim=1, keepdim=True)
+        diagonals = self.diagonals if quats is None else self.diagonals_across(quats)
         if scale is not None:
             units = scale.attributes
             diagonals = {name: part * units[name].double().view_as(part).square() for name, part in diagonals.items()}
@@ -106,6 +102,13 @@ class OwnBlocks:
         """The diagonal, attribute by attribute."""
         diagonal = self.geometry.double().diagonal(dim1=1, dim2=2)
         return {**{name: diagonal[:, columns] for name, columns in GEOMETRY_COLUMNS.items()}, "sh": self.sh.double()}
+
+    def diagonals_across(self, quats: Float[Tensor, "n 4"]) -> dict[str, Float64[Tensor, "n ..."]]:
+        """That of P B P, where P leaves out the radial directions of unit quats."""
+        q, columns, diagonals = quats.double(), GEOMETRY_COLUMNS["quats"], self.diagonals
+        along = (self.geometry[:, columns, columns].double() @ q[:, :, None])[:, :, 0]
+        turns = diagonals["quats"] - 2 * q * along + q.square() * (q * along).sum(dim=1, keepdim=True)
+        return {**diagonals, "quats": turns}
 
 
 class LinearizedView:

@@ -115,7 +115,7 @@ class OwnDirections:
         was found at both ends are left as they are.
         """
         if "pairs" not in self.__dict__:
-            bounds = (self._geometry * self._units[:, :, None] * self._units[:, None, :]).flatten(1).norm(dim=1)
+            bounds = self._norms
             some = bounds.topk(min(max(FEW, largest, smallest), len(bounds))).indices
             found = self._ends_of(some, largest, smallest)
             least = torch.cat([found[0][:largest], -found[0][largest:]]).min()
@@ -125,6 +125,11 @@ class OwnDirections:
             if MANY * len(held) <= len(bounds):
                 return self._ends_of(held, largest, smallest)
         return _chosen(*self.pairs, largest, smallest)
+
+    @cached_property
+    def _norms(self) -> Float[Tensor, " n"]:
+        """Every block's Frobenius norm; what a quaternion's length has in it counts, too."""
+        return (self._geometry * self._units[:, :, None] * self._units[:, None, :]).flatten(1).norm(dim=1)
 
     def _ends_of(self, gaussians: Int[Tensor, " m"], largest: int, smallest: int) -> Ends:
         pairs = self._taken_apart(*(x[gaussians] for x in (self._geometry, self._radial, self._units)))

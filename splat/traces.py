@@ -55,7 +55,7 @@ def exact_traces(
     quats, units = objective.active.quats, None if scale is None else objective.active.with_flat(scale)
     whole, coupled = objective.own_blocks
     if gauss_newton:
-        whole = coupled or objective.block_diagonal(gauss_newton=True)
+        whole = objective.pixelwise_blocks
     known = {name: value for name, value in whole.traces(quats, units).items() if name in names}
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
