@@ -11,22 +11,30 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from splat.consistency_kernels import consistency_rows
 from splat.device import by_triton
 from splat.losses import LossSettings, window
 from splat.losses_formulas import CHARBONNIER, L1, L2
-from splat.losses_kernels import diagonal_rows, gradient_rows, product_rows, value_rows
+from splat.losses_kernels import (
+    PRODUCT_FIELDS,
+    diagonal_rows,
+    form_rows,
+    gradient_rows,
+    product_rows,
+    value_rows,
+)
 from splat.raster.cpu import aligned
 from splat.raster.formulas import TILE_ROWS
 from splat.raster.functions import last_derivative
 from splat.raster.simd import lanes_of
 from splat.raster.threads import over_range
-from splat.window_kernels import moments_rows
+from splat.window_kernels import RING, moments_rows
 
 KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
+RINGS = 5 << 18  # bytes of the rows that a sweep keeps: with more of them, a vector more costs more than it shares
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 
@@ -112,55 +120,74 @@ class ViewLoss(ImageLoss):
     def linearize(self, image: np.ndarray, second_order: bool = True) -> "LinearLoss":
         """Value, gradient and Hessian's products at padded planes (at least three), which must not change.
 
-        second_order: on a GPU more is held for the products; here it costs nothing.
+        second_order: what the products need is held, too.
         """
         gradient = aligned((4, *self.shape[2:]), self.dtype)
+        blurred = self.planes(1).reshape(-1) if second_order and self.structural else np.empty(0, self.dtype)
         gradient[:, self.shape[0] :] = 0
         gradient[3] = 0
         pixels, distances = np.zeros((2, 3 * self.shape[0]))
         over_range(
             len(pixels), gradient_rows, self.shape, self.taps, *self._against(image), *self._pointwise(),
-            gradient.reshape(-1), pixels, distances,
+            gradient.reshape(-1), blurred, pixels, distances,
         )  # fmt: skip
-        return LinearLoss(self, self._value(pixels, distances), gradient, image)
+        return LinearLoss(self, self._value(pixels, distances), gradient, image, blurred)
 
 
 class LinearLoss:
     """A loss held still at an image: value, gradient (4, padded planes; that of alpha is 0) and Hessian-vector products."""
 
-    def __init__(self, loss: ViewLoss, value: float, gradient: np.ndarray, image: np.ndarray):
-        self.loss, self.value, self.gradient, self._image = loss, value, gradient, image
+    def __init__(self, loss: ViewLoss, value: float, gradient: np.ndarray, image: np.ndarray, blurred: np.ndarray):
+        self.loss, self.value, self.gradient, self._image, self._blurred = loss, value, gradient, image, blurred
 
     def scalar(self, like: Tensor) -> Float[Tensor, ""]:
         """The value as a tensor like another."""
         return like.new_tensor(self.value)
 
     def _held(self) -> tuple:
-        return *self.loss._against(self._image), *self.loss._pointwise()
+        return *self.loss._against(self._image), self._blurred, *self.loss._pointwise()
 
     def hvp(self, tangents: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """l'' v for K padded tangents (K, 4, ...), to out (which may be the tangents themselves)."""
-        loss = self.loss
+        loss, height = self.loss, self.loss.shape[0]
         products = aligned((len(tangents), 4, *loss.shape[2:]), loss.dtype) if out is None else out
-        product = loss.planes(1)[0]
-        for tangent, result in zip(tangents, products, strict=True):
-            v = np.ascontiguousarray(tangent[:3], loss.dtype).reshape(-1)
+        found = loss.planes(min(self._together, len(tangents)))
+        for first in range(0, len(tangents), self._together):
+            some, results = (each[first : first + self._together] for each in (tangents, products))
+            V = np.ascontiguousarray(some, loss.dtype).reshape(-1)
             over_range(
-                3 * loss.shape[0], product_rows, loss.shape, loss.taps, v, *self._held(), product.reshape(-1)
+                3 * height, product_rows, loss.shape, loss.taps, V, *self._held(), found.reshape(len(found), -1)[: len(some)]
             )  # fmt: skip
-            result[:3, : loss.shape[0]] = product[:, : loss.shape[0]]
-            result[:, loss.shape[0] :] = 0
-            result[3] = 0
+            results[:, :3, :height] = found[: len(some), :, :height]
+            results[:, :, height:] = 0
+            results[:, 3] = 0
         return products
+
+    @property
+    def _together(self) -> int:
+        """Vectors in a sweep."""
+        rows = PRODUCT_FIELDS * RING * self.loss.shape[3] * self.loss.dtype.itemsize
+        return max(1, RINGS // rows)
+
+    def curvatures(self, tangents: np.ndarray) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
+        """v . l'' v for K padded tangents (K, 3 or more, ...), and v . D v with the diagonal D of l''."""
+        loss, sums = self.loss, np.empty((2, len(tangents), 3 * self.loss.shape[0]))
+        V = np.ascontiguousarray(tangents, loss.dtype).reshape(-1)
+        over_range(
+            sums.shape[2], form_rows, loss.shape, loss.taps, V, *self._held(), self.diagonal.reshape(-1), *sums
+        )  # fmt: skip
+        full, pixelwise = torch.from_numpy(sums.sum(axis=2))
+        return full, pixelwise
 
     @property
     def bytes(self) -> int:
         """Memory of what is held, the target's included, the image's not."""
-        return self.loss.target.nbytes + self.loss._target_moments.nbytes + self.gradient.nbytes
+        target = self.loss.target.nbytes + self.loss._target_moments.nbytes
+        return target + self.gradient.nbytes + self._blurred.nbytes
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that `hvp` takes beside its result and a few rows a thread, for however many tangents."""
-        return self.gradient[:3].nbytes
+        """Bytes that `hvp` of so many tangents takes beside its result and a few rows a thread."""
+        return min(vectors, self._together) * self.gradient[:3].nbytes
 
     @cached_property
     def diagonal(self) -> np.ndarray:

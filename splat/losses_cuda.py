@@ -41,9 +41,9 @@ class CudaImageLoss:
         """Uninitialised fields, (..., 3, h, w)."""
         return self.like.new_empty(*sizes, 3, *self.shape)
 
-    def sums(self) -> Float64[Tensor, "2 b"]:
-        """Places for every program's sums of the pixel loss and of 1 - S."""
-        return self.like.new_zeros(2, self.programs, dtype=torch.float64)
+    def sums(self, *sizes: int) -> Float64[Tensor, "2 *sizes b"]:
+        """Places for every program's sums of two numbers: the pixel loss and 1 - S, say."""
+        return self.like.new_zeros(2, *sizes, self.programs, dtype=torch.float64)
 
     def total(self, sums: Float64[Tensor, "2 b"]) -> Float64[Tensor, ""]:
         """The loss."""
@@ -159,9 +159,7 @@ class CudaLinearLoss:
         loss, K = self.loss, len(tangents)
         tangents, blurred = tangents.contiguous(), loss.like
         if loss.ssim:
-            fed, bends = loss.fields(K, 3), loss.fields(K, 3)
-            held = self._residual, loss.target
-            loss.run(kernels.feed, tangents, tangents.stride(0), *held, fed, loss.constants, vectors=K)
+            fed, bends = self._fed(tangents), loss.fields(K, 3)
             loss.run(kernels.curve, fed, self._second, bends, loss.constants, vectors=K, FORMULAS=FORMULAS)
             blurred = loss.blurred(bends.flatten(0, 1), loss.constants)
         products = self.gradient.new_empty(K, *self.gradient.shape) if out is None else out
@@ -171,6 +169,25 @@ class CudaLinearLoss:
         )  # fmt: skip
         products[:, 3] = 0
         return products
+
+    def _fed(self, tangents: Float[Tensor, "k p h w"]) -> Float[Tensor, "k 3 3 h w"]:
+        """v, r v and (y - c) v of every tangent, blurred along the rows."""
+        loss, fed = self.loss, self.loss.fields(len(tangents), 3)
+        held = self._residual, loss.target
+        loss.run(kernels.feed, tangents, tangents.stride(0), *held, fed, loss.constants, vectors=len(tangents))
+        return fed
+
+    def curvatures(self, tangents: Float[Tensor, "k p h w"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
+        """v . l'' v for K tangents (at least three planes each), and v . D v with the diagonal D of l''."""
+        loss, K = self.loss, len(tangents)
+        tangents = tangents.contiguous()
+        fed, sums = self._fed(tangents) if loss.ssim else loss.like, loss.sums(K)
+        loss.run(
+            kernels.forms, tangents, tangents.stride(0), fed, self._second, self._residual, self._blurred, self.diagonal,
+            *sums, loss.constants, vectors=K, KIND=loss.kind, SSIM=loss.ssim, FORMULAS=FORMULAS,
+        )  # fmt: skip
+        full, pixelwise = sums.sum(dim=2)
+        return full, pixelwise
 
     @property
     def bytes(self) -> int:

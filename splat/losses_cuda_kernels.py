@@ -30,6 +30,7 @@ pixel_slope = traced(losses_formulas.pixel_slope)
 pixel_curvature = traced(losses_formulas.pixel_curvature)
 spread = traced(losses_formulas.spread)
 bent = traced(losses_formulas.bent)
+form = traced(losses_formulas.form)
 own_bend = traced(losses_formulas.own_bend)
 pair_slopes = traced(consistency_kernels.pair_slopes)
 
@@ -212,19 +213,31 @@ def finish_gradient(
         tl.store(gradient + at, total, here)
 
 
+@device
+def changes(fed, at, y, height, width, constants, here):
+    """m', p' and q' of a vector."""
+    size = 3 * height * width
+    dm = windowed(fed, at, y, width, height, constants, here)
+    dp = windowed(fed + size, at, y, width, height, constants, here)
+    return dm, 2.0 * dp, windowed(fed + 2 * size, at, y, width, height, constants, here)
+
+
+@device
+def second_derivatives(second, at, size, here):
+    bends = ()
+    for j in tl.static_range(SECONDS):
+        bends = bends + (tl.load(second + j * size + at, here, other=0.0),)
+    return bends
+
+
 @triton.jit
 def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr, FORMULAS: tl.constexpr):
     """S_m', S_p', S_q' of every vector."""
     at, _x, y, here = pixels(height, width, BLOCK)
     size = 3 * height * width
     first = tl.program_id(1).to(tl.int64) * 3 * size
-    dm = windowed(fed + first, at, y, width, height, constants, here)
-    dp = 2.0 * windowed(fed + first + size, at, y, width, height, constants, here)
-    dq = windowed(fed + first + 2 * size, at, y, width, height, constants, here)
-    bends = ()
-    for j in tl.static_range(SECONDS):
-        bends = bends + (tl.load(second + j * size + at, here, other=0.0),)
-    found = bent(bends, dm, dp, dq)
+    dm, dp, dq = changes(fed + first, at, y, height, width, constants, here)
+    found = bent(second_derivatives(second, at, size, here), dm, dp, dq)
     for j in tl.static_range(3):
         tl.store(out + first + j * size + at, found[j], here)
 
@@ -248,6 +261,25 @@ def finish_product(
         turned = 2.0 * tangent * tl.load(blurred_sp + at, here, other=0.0)
         total -= tl.load(constants + STRUCTURAL) * (spread(r, aim, bm, bp, bq) + turned)
     tl.store(out + vector * out_stride + at, total, here)
+
+
+@triton.jit
+def forms(
+    v, v_stride, fed, second, residual, blurred_sp, diagonal, full, pixelwise, constants, height, width,
+    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+):  # fmt: skip
+    """Sums of v . l'' v and of v . D v, D the diagonal of l'', of every vector: one a program."""
+    at, _x, y, here = pixels(height, width, BLOCK)
+    size, vector = 3 * height * width, tl.program_id(1).to(tl.int64)
+    r, tangent = tl.load(residual + at, here, other=0.0), tl.load(v + vector * v_stride + at, here, other=0.0)
+    squared = tangent * tangent
+    total = pixel_curvature(r, KIND, tl.load(constants + EPS), tl.load(constants + PIXEL)) * squared
+    if SSIM:
+        dm, dp, dq = changes(fed + vector * 3 * size, at, y, height, width, constants, here)
+        bends, blurred = second_derivatives(second, at, size, here), tl.load(blurred_sp + at, here, other=0.0)
+        total -= tl.load(constants + STRUCTURAL) * form(bends, dm, dp, dq, squared, blurred)
+    partial_sum(total, here, full + vector * tl.num_programs(0))
+    partial_sum(tl.load(diagonal + at, here, other=0.0) * squared, here, pixelwise + vector * tl.num_programs(0))
 
 
 @triton.jit

@@ -71,6 +71,13 @@ def bent(second, dm, dp, dq):
 
 
 @formula
+def form(second, dm, dp, dq, squared, blurred_sp):
+    """What a pixel has of the second derivative of sum S along v: (m', p', q') . S'' (m', p', q') + 2 v^2 blur(S_p)."""
+    sm, sp, sq = bent(second, dm, dp, dq)
+    return sm * dm + sp * dp + sq * dq + 2.0 * squared * blurred_sp
+
+
+@formula
 def spread(residual, aim, bm, bp, bq):
     """blur(S_m) + 2 r blur(S_p) + (y - c) blur(S_q), or the same of other fields; aim: y - c."""
     return bm + 2.0 * residual * bp + aim * bq

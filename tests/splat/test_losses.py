@@ -122,6 +122,20 @@ def test_kernels_give_the_specifications_value_gradient_and_products(size, setti
 
 
 @each_dtype
+@each_loss
+@each_size
+def test_quadratic_forms_are_those_of_the_specifications_products_and_of_the_diagonal(size, settings, dtype):
+    expected = truth(size, settings)
+    exact, loss = (ViewLoss.of(expected.target.to(each), settings, each) for each in (torch.float64, dtype))
+    diagonal = exact.cropped(exact.linearize(exact.padded(expected.image)).diagonal)
+    held = loss.linearize(loss.padded(expected.image.to(dtype)))
+    full, pixelwise = held.curvatures(np.stack([loss.padded(v.to(dtype)) for v in expected.v]))
+    for found, products in ((full, expected.product), (pixelwise, diagonal * expected.v)):
+        terms = (expected.v * products).flatten(1)
+        assert ((found - terms.sum(dim=1)).abs() <= DERIVATIVE[dtype] * terms.abs().sum(dim=1)).all()
+
+
+@each_dtype
 @each_size
 @pytest.mark.parametrize("contrast", [1.0, 0.001])
 def test_the_windows_mean_and_variance_of_a_target_are_scipys(size, contrast, dtype):
@@ -172,7 +186,8 @@ def test_padding_and_alpha_have_no_derivative(settings, dtype):
 
 
 @each_loss
-def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_vectors(settings):
+def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_vectors(settings, monkeypatch):
+    monkeypatch.setattr("splat.losses_cpu.RINGS", 1 << 16)  # so that two vectors are two sweeps
     expected = truth((37, 53), settings)
     x, y = expected.image.clone().requires_grad_(), expected.target.clone().requires_grad_()
 
@@ -184,7 +199,15 @@ def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_v
         held.hvp(over, out=over)
         consistency = consistency_loss(x, y, settings)
         both = [each.numpy() for each in (consistency.detach(), *torch.autograd.grad(consistency, (x, y)))]
-        return [np.array(held.value), held.gradient, held.hvp(tangents), over, held.diagonal, *both]
+        return [
+            np.array(held.value),
+            held.gradient,
+            held.hvp(tangents),
+            over,
+            held.diagonal,
+            *held.curvatures(tangents),
+            *both,
+        ]
 
     before = torch.get_num_threads()
     try:

@@ -33,6 +33,11 @@ def test_kernels_on_the_gpu_give_the_specifications_value_gradient_and_products(
     products = held.hvp(tangents)
     assert relative_error(products[:, :3].cpu(), expected.product) < DERIVATIVE[dtype]
     assert not products[:, 3].any() and not held.gradient[3].any()
+    full, pixelwise = (each.cpu() for each in held.curvatures(tangents))
+    weights = (expected.v, held.diagonal.cpu().double() * expected.v)
+    for found, factor, each in ((full, expected.product, expected.v), (pixelwise, *weights)):
+        terms = (factor * each).flatten(1)
+        assert ((found - terms.sum(dim=1)).abs() <= DERIVATIVE[dtype] * terms.abs().sum(dim=1)).all()
     assert torch.equal(held.hvp(tangents, out=tangents), products)
 
 
