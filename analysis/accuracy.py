@@ -30,12 +30,9 @@ stopping rule are given the right budget, as an oracle would.
     both ends    one Lanczos run to 1e-3 with a basis of 64: looser saves two to four products, other bases and blocks
                  nothing.  It needs the steps that no Krylov method does without, 0.93 to 0.99 of those of a peer that is told
                  how many (0.11 on the power law), as it reads the noise of products from their asymmetry.  On scenes the
-                 Gaussians' own blocks lead, and their pass is paid.  Where the ends are of like magnitude a recurrence begins
-                 at the steepest: over 24 small scenes (`--scenes 8`, 12 seeds) 0.59 of SciPy's products, which stops by itself,
-                 and 0.80 (0.80 to 0.83) of those of the best peer when it is told how many steps do, 0.64 to 1.01 one by one;
-                 fern at a quarter of its size 0.74.  Elsewhere Davidson's method: fern at 504 x 378 (another training of 2,000
-                 steps, 8,000 Gaussians) 25 products and 12 passes over the pixels where a recurrence from the steepest takes 50
-                 in 48, 3DGS at 43,000 Gaussians 39 in 26 for 82 in 79
+                 Gaussians' own blocks lead, and their pass is paid: over 24 small scenes (`--scenes 8`, 12 seeds) 0.59 of
+                 SciPy's products, which stops by itself, and 0.80 (0.80 to 0.83) of those of the best peer when it is told how
+                 many steps do, 0.64 to 1.01 one by one; fern at a quarter of its size 0.74
     diagonal     method "auto": 0.76 of XDiag's products on the power law, 0.88 and exact at rank 5 (21), random signs elsewhere
     quadrature   192 products, divided as they go: start vectors are many on flat, clustered and indefinite spectra, four of up
                  to 48 steps elsewhere.  At equal error 0.5 of the best peer's products or less in sum |lambda| and effective

@@ -176,16 +176,11 @@ def _lanczos(
 
 
 def _from_own_blocks(case: Case, operator: Meter, seed: int) -> list[Answer]:
-    """As `landscape probe` does it, which has the pixelwise part from the traces: here it is paid for where it is used."""
+    """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
     assert case.objective is not None
-    own = case.objective.block_diagonal()
-    start, known = OwnDirections(case.objective, own).lead(1, 1)
+    start = OwnDirections(case.objective, case.objective.block_diagonal()).steepest(1, 1)
     operator.charge(PASS)
-    if known is not None and case.objective.couples_pixels:
-        pixelwise = case.objective.block_diagonal(gauss_newton=True)
-        start, known = OwnDirections(case.objective, own, pixelwise).lead(1, 1)
-        operator.charge(PASS)
-    return end_answers(extreme_eigenpairs(operator, generator(seed), start=start, approximation=known))
+    return end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
 
 
 def _power(settings: PowerSettings) -> Callable[[Case, Meter, int], list[Answer]]:

@@ -34,7 +34,7 @@ from landscape.trace import total_trace
 from splat.curvature import SceneHessian, SceneObjective
 from splat.families import active_spaces
 from splat.metrics import Metric, optimiser_units, scene_size, scene_units
-from splat.own_directions import SPARE, OwnDirections
+from splat.own_directions import OwnDirections
 from splat.split_control import SplitControl, split_control
 from splat.traces import exact_traces
 from splat.train import Training
@@ -250,7 +250,7 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:
     """Where the Gaussians' own blocks know the ends of the whole, or of an attribute, to lie.
 
     Both of the Hessian's whole and of rotations; of positions the largest, as several Gaussians make their least curvatures
-    together (`OwnDirections.lead`), and of Gauss-Newton, which has a null space for its smallest.
+    together, and of Gauss-Newton, which has a null space for its smallest.
     """
     if name not in (WHOLE, "means", "quats"):
         return Lead()
@@ -260,8 +260,8 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:
         own = objective.pixelwise_blocks
     known = OwnDirections(objective, own, pixelwise, None if name == WHOLE else name, scale)
     if hessian.gauss_newton or name == "means":
-        return Lead(known.steepest(1 + SPARE, 0))
-    return Lead(*known.lead(1, 1))
+        return Lead(known.steepest(1, 0))
+    return Lead(known.steepest(1, 1))
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int) -> float:

@@ -189,9 +189,9 @@ def measure(
     with stage("eigenvalues") as report:
         eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
         eigen = replace(eigen, basis=_basis(operator, eigen, settings.memory, notes))
-        start, known = OwnDirections(objective, *own).lead(eigen.largest, eigen.smallest)
+        start = OwnDirections(objective, *own).steepest(eigen.largest, eigen.smallest)
         timed = CountingOperator(operator)
-        ends = extreme_eigenpairs(timed, streams["eigenvalues"], eigen, start, report, known)
+        ends = extreme_eigenpairs(timed, streams["eigenvalues"], eigen, start, report)
     power = None
     if settings.power is not None:
         with stage("power iteration") as report:

@@ -12,7 +12,7 @@ from landscape.density import ActiveSpace, spectral_density
 from landscape.diagonal import DiagonalEstimate, GroupSums, estimate_diagonal
 from landscape.directions import gradient_direction, groups_of, line_between, orthonormal, random_directions
 from landscape.distributed import DistributedOperator, Ranks
-from landscape.eigen import Approximation, EigenSettings, extreme_eigenpairs
+from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.families import Family, FamilySettings, Lead, families, family
 from landscape.finite_probe import FiniteProbe, finite_probe
 from landscape.lanczos import LanczosFactorization, lanczos
@@ -47,7 +47,6 @@ __all__ = [
     "PAPER",
     "ActiveSpace",
     "Anisotropy",
-    "Approximation",
     "Bracket",
     "CountingOperator",
     "DenseOperator",

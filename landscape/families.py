@@ -15,7 +15,7 @@ from torch import Tensor
 
 from landscape.anisotropy import anisotropy
 from landscape.density import ActiveSpace, spectral_density
-from landscape.eigen import Approximation, EigenSettings, extreme_eigenpairs
+from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.operator import RestrictedOperator, SymmetricOperator
 from landscape.probes import split
 from landscape.results import Anisotropy, EigenEnds, Progress, SpectralDensity
@@ -35,11 +35,9 @@ class FamilySettings:
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """What is known of a part before: where the search for both ends begins, and what it follows (see `extreme_eigenpairs`);
-    the trace with its standard error."""
+    """What is known of a part before: where the search for both ends begins, and the trace with its standard error."""
 
     start: Float[Tensor, "n k"] | None = None
-    approximation: Approximation | None = None
     trace: tuple[float, float] | None = None
 
 
@@ -108,7 +106,7 @@ def family(
     """The family of one operator; active: what its known null space leaves; lead: to what is sought."""
     rank = operator.dim if active is None else active.rank
     eigen = settings.eigen if rank >= settings.eigen.wanted else EigenSettings(1, 0, rtol=settings.eigen.rtol)
-    ends = extreme_eigenpairs(operator, generator, eigen, lead.start, progress, lead.approximation)
+    ends = extreme_eigenpairs(operator, generator, eigen, lead.start, progress)
     if eigen.smallest == 0:  # one direction: both ends are the same
         ends = EigenEnds(ends.largest, ends.largest, ends.method, ends.matvecs, ends.beyond, ends.noise, ends.ritz)
     starts, steps, batch = settings.starts, settings.steps, settings.batch

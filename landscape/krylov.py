@@ -15,7 +15,7 @@ from torch import Tensor
 from landscape.lanczos import norm, orthogonalise, unit_columns
 from landscape.operator import SymmetricOperator
 from landscape.probes import draw_probes
-from landscape.subspace import EigenSettings, Goal, Ritz, Subspace
+from landscape.subspace import EigenSettings, Ritz, Subspace
 
 
 class Krylov(Subspace):
@@ -27,7 +27,7 @@ class Krylov(Subspace):
         self, operator: SymmetricOperator, generator: torch.Generator, settings: EigenSettings, start: Tensor | None
     ) -> None:
         first = draw_probes(operator.dim, min(settings.block, operator.dim), generator, operator.dtype)
-        super().__init__(operator, generator, settings, settings.basis, settings.block, first.shape[1])
+        super().__init__(operator, generator, settings)
         self.scale, self.coupling = 1.0, torch.zeros(0, 0, dtype=torch.float64)
         self.random_share, self.first_cycle = 1.0, 0
         if start is not None:
@@ -55,8 +55,10 @@ class Krylov(Subspace):
         residuals = torch.linalg.vector_norm(self.coupling @ coordinates[m - self.coupling.shape[1] :], dim=0)
         return Ritz(values, coordinates, residuals, *self.outermost())
 
-    def aim(self, ritz: Ritz, goal: Goal) -> None:
-        """A recurrence has no choice."""
+    def leaving(self) -> float:
+        return norm(self.coupling)
+
+    def make_room(self, ritz: Ritz) -> None:
         if self.size + self.width <= self.capacity:
             return
         following = self.basis[self.size : self.size + self.width].clone()

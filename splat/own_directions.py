@@ -1,9 +1,8 @@
-"""The Hessian's blocks of single Gaussians, taken apart: where the search for the ends of the spectrum begins, and goes.
+"""The Hessian's blocks of single Gaussians, taken apart: where the search for the ends of the spectrum begins.
 
 Steep eigenvectors of a scene live on one or two Gaussians, and the block of a Gaussian's own rows, but for its colours, is
-known exactly (`linearize.OwnBlocks`); of its colours the diagonal is.  Their eigenvectors, at right angles to the quaternions'
-lengths as in `curvature.SceneHessian`, are where to begin, and with the eigenvalues they are what Davidson's method wants to
-know of the Hessian (`landscape.davidson`).
+known exactly (`linearize.OwnBlocks`).  Their eigenvectors, at right angles to the quaternions' lengths as in
+`curvature.SceneHessian`, are where to begin.
 
 Where the loss couples pixels, its curvature l'' is known pixel by pixel only, which is too much: SSIM does not care for what
 changes a window evenly.  Of an image u the window's blur B keeps the share rho = |B u|^2 / |u|^2, and that share of the
@@ -17,13 +16,9 @@ of l'' leaves out already (of an L2 loss's curvature beside SSIM's too much is l
 twelve scenes of 50 to 100 Gaussians the six steepest values at either end are so off by 4% of the steepest on average, by 27%
 as they are pixel by pixel; fern's largest (8,000 Gaussians, 3 views) is 254 for 252.
 
-The two largest and the smallest eigenvalue of fern to 10% then take 16 products in 6 passes over the pixels instead of 25 in
-12, and a recurrence from the steepest of them 36 in 35; the largest and smallest to 0.1% 25 in 12, 38 in 25 and 50 in 48.
-Where the ends are of like magnitude a recurrence needs fewer vectors (`lead`): 12.4 where Davidson's method takes 21.4, on
-those twelve scenes, 15.2 from a random vector.
+On those twelve scenes a recurrence from the steepest takes 12.4 products, from a random vector 15.2.
 """
 
-from collections.abc import Callable
 from functools import cached_property
 from math import inf, pi
 
@@ -40,8 +35,6 @@ from splat.raster.functions import projected
 from splat.raster.threads import over_batch
 
 SINGLE = 1 / (4 * pi * SIGMA**2)  # of a pixel alone, what the window's blur keeps
-SPARE = 1  # starts at each end beside one for each wanted pair
-APART = 30.0  # the ratio of two ends from which a recurrence needs more passes and time than Davidson's method
 CHUNK = 65_536  # Gaussians at a time
 FEW = 256  # Gaussians that are taken apart in any case
 MANY = 4  # a part of all Gaussians that is as well taken apart with all the others
@@ -51,12 +44,10 @@ Ends = tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]
 
 
 class OwnDirections:
-    """An `Approximation` of the scene's Hessian, or of its block of one attribute but colours; in a metric, of D H D.
+    """Of the scene's Hessian, or of its block of one attribute but colours; in a metric, of D H D.
 
     own: of the Hessian, or of its Gauss-Newton part; pixelwise: of that part, where the loss couples pixels.  attribute: all by
-    default; scale: D, above 0, 1 by default.  sh: (n, m), the diagonal of the colours, none for one attribute.
-
-    The blocks are taken apart where they are asked for: all of them for Davidson's method, a few for their ends.
+    default; scale: D, above 0, 1 by default.
     """
 
     def __init__(
@@ -72,14 +63,13 @@ class OwnDirections:
         units = torch.cat([getattr(D, name).reshape(n, -1) for name in GEOMETRY_COLUMNS], dim=1)
         radial = torch.zeros_like(units)
         radial[:, GEOMETRY_COLUMNS["quats"]] = objective.active.quats
-        geometry, sh = (own.geometry, own.sh) if pixelwise is None else _softened(own, pixelwise, _kept(objective))
-        self.sh: Float[Tensor, "n m"] = (sh * D.sh.square()).flatten(1)
-        self._blocks, self._columns = objective.blocks, GEOMETRY_COLUMNS
+        geometry = own.geometry if pixelwise is None else _softened(own, pixelwise, _kept(objective))
+        self._blocks, self._columns, self._rows = objective.blocks, GEOMETRY_COLUMNS, self._like.numel()
         if attribute is not None:
-            columns, self.sh = GEOMETRY_COLUMNS[attribute], self.sh[:, :0]
+            columns = GEOMETRY_COLUMNS[attribute]
             units, radial, geometry = units[:, columns], radial[:, columns], geometry[:, columns, columns]
-            rows, self._columns = units.numel(), {attribute: slice(0, units.shape[1])}
-            self._blocks = {attribute: slice(0, rows), "sh": slice(rows, rows)}
+            self._rows, self._columns = units.numel(), {attribute: slice(0, units.shape[1])}
+            self._blocks = {attribute: slice(0, self._rows)}
         self._geometry, self._radial, self._units = geometry, radial, units
 
     @cached_property
@@ -106,7 +96,10 @@ class OwnDirections:
         _, gaussians, vectors = self._ends(largest, smallest)
         geometry = self._like.new_zeros(*self._units.shape, len(gaussians))
         geometry[gaussians, :, torch.arange(len(gaussians), device=gaussians.device)] = vectors
-        return self._joined(geometry, self._like.new_zeros(*self.sh.shape, len(gaussians)))
+        result = self._like.new_zeros(self._rows, len(gaussians))
+        for name, columns in self._columns.items():
+            result[self._blocks[name]] = geometry[:, columns].reshape(-1, len(gaussians))
+        return result
 
     def _ends(self, largest: int, smallest: int) -> Ends:
         """The steepest, with few blocks taken apart.
@@ -136,41 +129,6 @@ class OwnDirections:
         values, whose, vectors = _chosen(*pairs, largest, smallest)
         return values, gaussians[whose], vectors
 
-    def lead(self, largest: int, smallest: int) -> tuple[Float[Tensor, "p k"], "OwnDirections | None"]:
-        """Where to begin the search for so many pairs, and what it is to follow: None for a recurrence (`landscape.eigen`).
-
-        A recurrence sees both ends with each product, and needs about the root of the ratio of their magnitudes more of them
-        than where they are alike.  Davidson's method aims at each: with SPARE starts more at both ends, as which of them is the
-        steepest is not certain.  Where the least curvature is one of a position it would go astray, as several Gaussians may
-        make a smaller one together: of fern's positions (8,000 Gaussians, 3 views) the least is -1.05e-3, and from their own
-        blocks it goes to one of -4.1e-4.  Then only the largest are begun at.
-        """
-        if not (largest and smallest):
-            return self.steepest(largest, smallest), None
-        magnitudes = self._ends(1, 1)[0].abs()
-        if float(magnitudes.min()) * APART > float(magnitudes.max()):
-            return self.steepest(largest, smallest), None
-        if "means" in self._columns and float(self.steepest(0, 1)[self._blocks["means"]].square().sum()) > 0.5:
-            return self.steepest(largest + SPARE, 0), None
-        return self.steepest(largest + SPARE, smallest + SPARE), self
-
-    def function(self, f: Callable[[Tensor], Tensor], V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-        """f(D) V, where V is."""
-        home, V = V.device, V.to(self._like)
-        values, vectors = self.pairs
-        n, k = len(values), V.shape[1]
-        geometry = torch.cat([V[self._blocks[name]].reshape(n, -1, k) for name in self._columns], dim=1)
-        geometry = vectors @ (f(values).to(V)[:, :, None] * (vectors.mT @ geometry))
-        return self._joined(geometry, f(self.sh)[:, :, None] * V[self._blocks["sh"]].view(*self.sh.shape, k)).to(home)
-
-    def _joined(self, geometry: Float[Tensor, "n w k"], sh: Float[Tensor, "n m k"]) -> Float[Tensor, "p k"]:
-        """Vectors laid out as the scene's parameters, or the attribute's."""
-        result = self._like.new_empty(self._units.numel() + self.sh.numel(), geometry.shape[2])
-        for name, columns in self._columns.items():
-            result[self._blocks[name]] = geometry[:, columns].reshape(-1, geometry.shape[2])
-        result[self._blocks["sh"]] = sh.reshape(-1, geometry.shape[2])
-        return result
-
 
 def _chosen(values: Float64[Tensor, "m w"], vectors: Float[Tensor, "m w w"], largest: int, smallest: int) -> Ends:
     """Of these blocks' eigenpairs the largest, descending, and the smallest, ascending."""
@@ -183,12 +141,9 @@ def _chosen(values: Float64[Tensor, "m w"], vectors: Float[Tensor, "m w w"], lar
     return values.flatten()[chosen], whose, vectors[whose, :, chosen % width]
 
 
-def _softened(
-    own: OwnBlocks, pixelwise: OwnBlocks, kept: Float[Tensor, " n"]
-) -> tuple[Float[Tensor, "n 11 11"], Float[Tensor, "n k 3"]]:
+def _softened(own: OwnBlocks, pixelwise: OwnBlocks, kept: Float[Tensor, " n"]) -> Float[Tensor, "n 11 11"]:
     """The blocks with this share of each Gaussian's pixelwise part."""
-    excess = (1 - kept)[:, None, None].to(own.geometry)
-    return own.geometry - excess * pixelwise.geometry, own.sh - excess * pixelwise.sh
+    return own.geometry - (1 - kept)[:, None, None].to(own.geometry) * pixelwise.geometry
 
 
 def _kept(objective: SceneObjective) -> Float64[Tensor, " n"]:

@@ -21,7 +21,7 @@ from splat.adam import Adam
 from splat.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
 from splat.densify import ScreenGradients
-from splat.own_directions import SPARE, OwnDirections
+from splat.own_directions import OwnDirections
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.split_control import split_in_two
@@ -247,13 +247,10 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
         scale = None if metric == "parameters" else operator.scale[:, 0]
         attribute = None if block == "all" else block
         if block not in ("all", "means", "quats"):
-            assert lead.start is lead.approximation is None
-        elif gauss_newton or block == "means":
-            known = OwnDirections(objective, pixelwise if gauss_newton else own, pixelwise, attribute, scale)
-            assert torch.equal(lead.start, known.steepest(1 + SPARE, 0)) and lead.approximation is None
+            assert lead.start is None
         else:
-            start, followed = OwnDirections(objective, own, pixelwise, attribute, scale).lead(1, 1)
-            assert torch.equal(lead.start, start) and (lead.approximation is None) == (followed is None)
+            known = OwnDirections(objective, pixelwise if gauss_newton else own, pixelwise, attribute, scale)
+            assert torch.equal(lead.start, known.steepest(1, 0 if gauss_newton or block == "means" else 1))
     eye = torch.eye(objective.active.flat.numel(), dtype=torch.float64)
     diagonals = {newton: seen[newton, "all"][0].apply(eye).diagonal() for newton in (False, True)}
     for (gauss_newton, block), (_, lead) in seen.items():

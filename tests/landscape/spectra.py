@@ -7,6 +7,7 @@ from landscape.operator import DenseOperator
 from tests.oracles import symmetric_matrix
 
 N = 120
+ROUNDING = 1e-14  # of a quotient of eigenvalues, where a bracket has no width but that
 _index = np.arange(N)
 SPECTRA = {
     "power law": 1 / (1 + _index) ** 1.5,

@@ -320,3 +320,32 @@ def test_bad_requests_are_refused():
         extreme_eigenpairs(DenseOperator(torch.eye(2)), generator(), EigenSettings(2, 1))
     with pytest.raises(ValueError, match="start vectors that are not zero"):
         extreme_eigenpairs(operator("zero"), generator(), start=torch.zeros(N))
+
+
+@pytest.mark.parametrize("block", [1, 2])
+@pytest.mark.parametrize(("largest", "smallest"), [(5, 0), (3, 0), (4, 1), (0, 5), (2, 2)])
+@pytest.mark.parametrize("rank", [1, 2, 6])
+def test_pairs_of_a_null_space_are_not_taken_from_the_other_end(rank, largest, smallest, block):
+    """The recurrence ends with the null space's first vector: the others come from random vectors, one by one."""
+    values = torch.zeros(60, dtype=torch.float64)
+    values[:rank] = -torch.arange(1, rank + 1)
+    Q = torch.linalg.qr(torch.randn(60, 60, generator=torch.Generator().manual_seed(1), dtype=torch.float64)).Q
+    H = DenseOperator((Q * values @ Q.T + (Q * values @ Q.T).T) / 2)
+    ends = extreme_eigenpairs(H, torch.Generator().manual_seed(0), EigenSettings(largest, smallest, block=block))
+    ordered = values.sort().values
+    assert torch.allclose(ends.largest.values, ordered.flip(0)[:largest], atol=1e-12)
+    assert torch.allclose(ends.smallest.values, ordered[:smallest], atol=1e-12)
+
+
+def test_one_value_is_not_settled_by_the_first_product():
+    values = torch.ones(100_000)
+    values[7] = 4.0
+
+    class Diagonal:
+        dim, dtype, blocks = len(values), values.dtype, {"all": slice(0, len(values))}
+
+        def apply(self, V):
+            return values[:, None] * V
+
+    ends = extreme_eigenpairs(Diagonal(), torch.Generator().manual_seed(0), EigenSettings(1, 0, rtol=1e-2))
+    assert float(ends.largest.values[0]) == pytest.approx(4.0, rel=1e-3)

@@ -5,7 +5,7 @@ from landscape.density import ActiveSpace
 from landscape.eigen import EigenSettings
 from landscape.families import FamilySettings, Lead, families, family
 from landscape.operator import CountingOperator, DenseOperator, ProjectedOperator
-from tests.landscape.spectra import N, eigenvalues, generator, operator
+from tests.landscape.spectra import ROUNDING, N, eigenvalues, generator, operator
 
 BLOCKS = {"a": slice(0, 50), "b": slice(50, N), "none": slice(N, N)}
 
@@ -27,7 +27,8 @@ def test_every_parts_brackets_hold_the_indices_of_its_own_dense_block(name):
         assert indices.effective_rank.low <= total**2 / float(true.square().sum()) <= indices.effective_rank.high
         magnitudes = true.abs().sort().values
         small = float(magnitudes[int(torch.searchsorted(magnitudes.cumsum(0), 0.05 * total))])
-        assert indices.mass_quantile.low <= float(true[-1]) / small <= indices.mass_quantile.high
+        quantile = float(true[-1]) / small
+        assert indices.mass_quantile.low * (1 - ROUNDING) <= quantile <= indices.mass_quantile.high * (1 + ROUNDING)
         assert found[part].rank == rows.stop - rows.start
 
 
@@ -79,16 +80,10 @@ def test_progress_names_the_part_and_unknown_parts_are_refused():
 
 
 def test_a_part_is_led_to_its_ends_and_the_others_have_the_numbers_that_they_have_without():
-    H = DenseOperator(torch.diag(torch.logspace(-3, 2, N, dtype=torch.float64)), BLOCKS)
-
-    class Itself:
-        def function(self, f, V):
-            return f(H.matrix.diagonal())[:, None] * V
-
-    lead = Lead(torch.eye(N, dtype=torch.float64)[:, [0, N - 1]], Itself())
+    H = DenseOperator(torch.diag(torch.linspace(-1, 3, N, dtype=torch.float64)), BLOCKS)
+    lead = Lead(torch.eye(N, dtype=torch.float64)[:, [0, N - 1]])
     led, alone = families(H, generator(), leads={"all": lead}), families(H, generator())
-    assert led["all"].ends.method == "davidson" and alone["all"].ends.method == "lanczos"
     assert led["all"].ends.matvecs < alone["all"].ends.matvecs
-    assert float(led["all"].ends.smallest.values[0]) == pytest.approx(1e-3, rel=1e-2)
+    assert float(led["all"].ends.smallest.values[0]) == pytest.approx(-1, rel=1e-2)
     for part in ("a", "b"):
         assert led[part].record() == alone[part].record()

@@ -205,7 +205,7 @@ def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_v
             held.hvp(tangents),
             over,
             held.diagonal,
-            *held.curvatures(tangents),
+            *map(Tensor.numpy, held.curvatures(tangents)),
             *both,
         ]
 

@@ -75,7 +75,7 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         assert not +placed.waits and not +placed.brought  # so that they can be recorded
         _ = objective.gradient, objective.block_diagonal(), objective.loss(flat)
         known = OwnDirections(objective, *objective.own_blocks)
-        known.lead(1, 1), known.function(lambda values: 1 / (1 + values.square()), V)
+        _ = known.steepest(1, 1), known.pairs
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
         split_control(objective.active, [views[0].camera])
     assert not +placed.mixed
