@@ -60,22 +60,22 @@ def copy_colour(target, to, source, at, inside):
 
 
 @jit
-def pack_splats(splats, frame, params, n, BLOCK: tl.constexpr):
-    """params (n, 16) of splats (n, 9)."""
+def pack_splats(splats, frame, packed, n, BLOCK: tl.constexpr):
+    """packed (n, 16) of splats (n, 9)."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
     splat = load_splat(splats, i, inside)
     along, across, shear = whiten(splat)
     mx, my = splat[0] - 0.5, splat[1] - 0.5
     x, y = nearest(mx), nearest(my)
-    p = params + i.to(tl.int64) * 16
+    p = packed + i.to(tl.int64) * 16
     tl.store(p + X, x, inside)
     tl.store(p + Y, y, inside)
     tl.store(p + U, along * (x - mx), inside)
     tl.store(p + V, across * (shear * (x - mx) + (y - my)), inside)
     tl.store(p + ALONG, along, inside)
     tl.store(p + ACROSS, across, inside)
-    rounded = shear.to(params.dtype.element_ty)
+    rounded = shear.to(packed.dtype.element_ty)
     tl.store(p + SHEAR, rounded, inside)
     tl.store(p + SHEAR_REST, shear - rounded.to(tl.float64), inside)
     opacity = splat[5]
