@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splat.raster import binning
-from splat.raster.triton_formulas import device, jit, launch, twins
+from splat.raster.triton_formulas import device, launch, sized, twins
 
 WIDTH, HEIGHT = 16, 16  # of a tile, in pixels
 BLOCK = 256
@@ -70,7 +70,7 @@ def load_splat(splats, i, inside):
     )
 
 
-@jit
+@sized("n")
 def count_strips(
     order, drawn, splats, limits, first, count, n, width, height, WIDTH: tl.constexpr, BLOCK: tl.constexpr
 ):
@@ -86,7 +86,7 @@ def count_strips(
     tl.store(count + i, tl.where(some, x1 // WIDTH - x0 // WIDTH + 1, 0), inside)
 
 
-@jit
+@sized("strips", "columns")
 def count_rows(
     strip_rank, order, splats, limits, first_column, strip_start, first, count, strips, columns, width, height,
     WIDTH: tl.constexpr, HEIGHT: tl.constexpr, BLOCK: tl.constexpr,
@@ -105,7 +105,7 @@ def count_rows(
     tl.store(count + i, tl.where(y0 <= y1, y1 // HEIGHT - y0 // HEIGHT + 1, 0), inside)
 
 
-@jit
+@sized("entries", "columns")
 def list_entries(
     entry_strip, strip_rank, order, entry_start, first_tile, tile, splat, entries, columns, BLOCK: tl.constexpr
 ):

@@ -12,7 +12,7 @@ import triton.language as tl
 
 from splat.raster import packing, whitening
 from splat.raster.cuda_binning import load_splat
-from splat.raster.triton_formulas import device, jit, max_over, static_range, twin, twins
+from splat.raster.triton_formulas import device, max_over, sized, static_range, twin, twins
 
 PARAMS = 16
 X, Y, U, V, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT, CAP = (tl.constexpr(i) for i in range(14))
@@ -59,7 +59,7 @@ def copy_colour(target, to, source, at, inside):
         tl.store(target + to + j, tl.load(source + at + j, inside, other=0.0), inside)
 
 
-@jit
+@sized("n")
 def pack_splats(splats, frame, packed, n, BLOCK: tl.constexpr):
     """packed (n, 16) of splats (n, 9)."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -89,7 +89,7 @@ def pack_splats(splats, frame, packed, n, BLOCK: tl.constexpr):
     copy_colour(p, RED - 6, splats, i.to(tl.int64) * 9, inside)
 
 
-@jit
+@sized("n", "K", "begin", "size")
 def pack_tangents(splats, directions, tangents, moved, n, K, begin, size, BLOCK: tl.constexpr):
     """tangents (n, size, 12) of the directions begin, begin + 1, ... of (n, K, 9); a program has one of them.
 
@@ -111,7 +111,7 @@ def pack_tangents(splats, directions, tangents, moved, n, K, begin, size, BLOCK:
     tl.store(moved + i.to(tl.int64) * size + k, some.to(tl.int8), inside)
 
 
-@jit
+@sized("n", "K")
 def sum_slots(first, last, sums, totals, n, K, WIDTH: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr):
     """totals (n, K, WIDTH) in double precision of the sums (slots, K, WIDTH), slot by slot: in a fixed order.
 
@@ -132,7 +132,7 @@ def sum_slots(first, last, sums, totals, n, K, WIDTH: tl.constexpr, PADDED: tl.c
     tl.store(totals + at + j, total, (i < n)[:, None] & (j < WIDTH))
 
 
-@jit
+@sized("n")
 def reduce_gradient(splats, totals, gradient, n, BLOCK: tl.constexpr):
     """gradient (n, 9) from totals (n, 9)."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -142,7 +142,7 @@ def reduce_gradient(splats, totals, gradient, n, BLOCK: tl.constexpr):
     copy_colour(gradient, at, totals, at, inside)
 
 
-@jit
+@sized("n", "K", "begin", "size")
 def reduce_curvature(splats, directions, moments, totals, product, n, K, begin, size, BLOCK: tl.constexpr):
     """product (n, K, 9) along the directions begin, begin + 1, ... from totals (n, size, 9); moments: the gradient's totals."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
