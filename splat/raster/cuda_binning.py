@@ -25,6 +25,7 @@ from splat.raster.triton_formulas import device, launch, sized, twins
 
 WIDTH, HEIGHT = 16, 16  # of a tile, in pixels
 BLOCK = 256
+LIMIT = 2**31  # places and slots of entries are 32 bits wide
 
 ellipse_of, box_of, rows_of_strip = twins(binning.ellipse_of, binning.box_of, binning.rows_of_strip)
 
@@ -130,8 +131,14 @@ def starts(count: Int[Tensor, "n"]) -> Int[Tensor, "n_1"]:
 
 
 def repeated(count: Int[Tensor, "n"], start: Int[Tensor, "n_1"]) -> Int[Tensor, "total"]:
-    """The index i, count[i] times over; reads the total back."""
-    return torch.repeat_interleave(count, output_size=int(start[-1]))
+    """The index i, count[i] times over; reads the total back.  ValueError where it is beyond what the kernels count to."""
+    total = int(start[-1])
+    if total >= LIMIT:
+        raise ValueError(
+            f"expected fewer than 2^31 tiles that splats touch in a view, got {total}; render smaller images, or Gaussians "
+            "that are fewer or smaller"
+        )
+    return torch.repeat_interleave(count, output_size=total)
 
 
 def bin_splats(
