@@ -17,7 +17,7 @@ from analysis.family_table import family_lines
 from analysis.probe import scene_objective
 from analysis.records import Record, read_record
 from analysis.report import render_report
-from landscape import Bracket, EigenSettings, FamilySettings, families
+from landscape import Bracket, DenseOperator, EigenSettings, FamilySettings, families
 from splat.adam import Adam
 from splat.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
@@ -266,14 +266,12 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
 def test_a_product_is_timed_where_the_scene_is():
     there, placed = SimpleNamespace(active=SimpleNamespace(flat=torch.empty(0, device="meta"))), []
 
-    class Identity:
-        dim, dtype = 3, torch.float32
-
+    class Identity(DenseOperator):
         def apply(self, V):
             placed.append((V.device.type, *V.shape))
             return V
 
-    _seconds_a_product(Identity(), 2, there)
+    _seconds_a_product(Identity(torch.eye(3)), 2, there)  # pyright: ignore[reportArgumentType]
     assert placed == [("meta", 3, 2)] * 2
 
 
