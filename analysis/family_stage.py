@@ -27,7 +27,7 @@ from torch import Tensor
 from analysis.measurement import Stage, basis_within, vectors_within
 from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
 from landscape.families import WHOLE, Lead
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, finished
 from landscape.probes import split
 from landscape.results import Progress
 from landscape.trace import total_trace
@@ -219,7 +219,7 @@ def _of_operator(
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
     spaces, found = active_spaces(hessian, scale), []
     traces = _traces(hessian, scale, split(generator))
-    each = _seconds_a_product(operator, options.family.batch) if options.seconds < inf else 0.0
+    each = _seconds_a_product(operator, options.family.batch, hessian.objective) if options.seconds < inf else 0.0
     names = [WHOLE, *hessian.blocks]
     for done, name in enumerate(names):
         stream, allowed = split(generator), seconds()
@@ -264,12 +264,12 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:
     return Lead(known.steepest(1, 1))
 
 
-def _seconds_a_product(operator: SymmetricOperator, batch: int) -> float:
-    """With `batch` vectors; the kernels may be compiled for the first."""
-    start = 0.0
+def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: SceneObjective) -> float:
+    """With `batch` vectors where the scene is; the kernels may be compiled for the first."""
+    V, start = objective.active.flat.new_ones(operator.dim, batch), 0.0
     for _ in range(2):
         start = monotonic()
-        operator.apply(torch.ones(operator.dim, batch, dtype=operator.dtype))
+        finished(operator.apply(V))
     return monotonic() - start
 
 

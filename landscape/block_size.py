@@ -14,7 +14,7 @@ from time import perf_counter
 
 import torch
 
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, finished
 from landscape.probes import draw_probes
 
 PRODUCTS = {1: 1.0, 2: 1.6, 4: 2.4}
@@ -33,12 +33,12 @@ def fastest_block(
     if operator.dim < 2 * max(PRODUCTS):
         return 1
     V = draw_probes(operator.dim, max(PRODUCTS), generator, operator.dtype)
-    operator.apply(V[:, :1].contiguous())  # what the first product alone has to do
+    finished(operator.apply(V[:, :1].contiguous()))  # what the first product alone has to do
     cost = {}
     for block, products in PRODUCTS.items():
-        vectors = V[:, :block].contiguous()
+        vectors = finished(V[:, :block].contiguous())
         start = clock()
-        operator.apply(vectors)
+        finished(operator.apply(vectors))
         cost[block] = (clock() - start) / block * products
     best = min(cost, key=cost.__getitem__)
     return best if cost[best] < CLEARLY * cost[1] else 1

@@ -45,6 +45,13 @@ def require_vectors(V: Tensor, n: int) -> None:
         raise ValueError(f"expected V of shape (n, k) with n = {n}, got {tuple(V.shape)}")
 
 
+def finished(tensor: Tensor) -> Tensor:
+    """The tensor, once it is computed: a GPU is still at work when the call that launched it returns."""
+    if tensor.is_cuda:
+        torch.cuda.synchronize(tensor.device)
+    return tensor
+
+
 def require_blocks(blocks: Mapping[str, slice], n: int) -> dict[str, slice]:
     """A copy of blocks; raise ValueError unless they are disjoint ranges of 0..n."""
     end = 0
@@ -174,9 +181,9 @@ class CountingOperator:
         self.matvecs, self.calls, self.seconds = 0, 0, 0.0
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        require_vectors(V, self.dim)
+        require_vectors(finished(V), self.dim)
         start = perf_counter()
-        result = self.inner.apply(V)
+        result = finished(self.inner.apply(V))
         self.seconds += perf_counter() - start
         self.matvecs += V.shape[1]
         self.calls += 1

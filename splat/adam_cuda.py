@@ -9,12 +9,12 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.raster.triton_formulas import INTERPRETED, launch
+from splat.raster.triton_formulas import INTERPRETED, launch, sized
 
 BLOCK = 1 << 14 if INTERPRETED else 1024
 
 
-@triton.jit
+@sized("n")
 def _step(
     parameters, gradient, rates, first, second, numbers, n,
     BETA1: tl.constexpr, BETA2: tl.constexpr, EPS: tl.constexpr, GRID: tl.constexpr, BLOCK: tl.constexpr,

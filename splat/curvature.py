@@ -34,8 +34,11 @@ RECORDED = 1 << 28  # bytes of workspace, up to which a GPU has made a view's pr
 
 
 def free_memory(device: torch.device) -> int:
-    """Bytes, where the Gaussians are."""
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
+    """Bytes, where the Gaussians are; of a GPU's also those that torch holds for tensors to come."""
+    if device.type != "cuda":
+        return psutil.virtual_memory().available
+    held = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + held
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ def scene_size(objective: SceneObjective) -> float:
     axes = torch.stack([camera.forward for camera in cameras])
     mean = axes.mean(dim=0)
     if float((axes @ mean).min()) > FACING * float(mean.norm()):
-        depth = (objective.active.means.double() - cameras[0].centre) @ cameras[0].forward
+        depth = (objective.active.means.cpu().double() - cameras[0].centre) @ cameras[0].forward
         return float(depth[depth > 0].median())
     centres = torch.stack([camera.centre for camera in cameras])
     return float((centres - centres.mean(dim=0)).norm(dim=1).mean())

@@ -23,6 +23,9 @@ from splat.raster.threads import over_batch
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
 CHUNK = 4096  # Gaussians at a time
+WIDEST = (
+    32  # rows and columns of the matrices that CUDA takes apart together; of larger ones it takes one after the other
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +48,16 @@ class RowSpace:
 
     def scaled(self, scale: Float[Tensor, "n d"]) -> "RowSpace":
         """The space of all D x, D = diag(scale) > 0 and x in this space."""
-        directions = torch.linalg.qr((self.basis.double() * scale[:, None].double()).mT).Q.mT
+        rows = (self.basis.double() * scale[:, None].double()).cpu()  # CUDA forms one Q after the other
+        directions = torch.empty_like(rows)
+
+        def decompose(first: int, last: int) -> None:
+            directions[first:last] = torch.linalg.qr(rows[first:last].mT).Q.mT
+
+        over_batch(len(rows), decompose, rows.device)
         # the padding is at the end
         held = torch.arange(self.basis.shape[1], device=self.basis.device) < self.rank[:, None]
-        return RowSpace(torch.where(held[:, :, None], directions, 0.0).to(self.basis.dtype), self.rank)
+        return RowSpace(torch.where(held[:, :, None], directions.to(self.basis), 0.0), self.rank)
 
 
 Stacked = Callable[[Tensor], Tensor]
@@ -118,12 +127,21 @@ def _row_space(rows: Float[Tensor, "n r d"], dtype: torch.dtype) -> RowSpace:
 
 
 def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m d"]]:
-    """Singular values, descending, and right singular vectors."""
-    n, r, d = rows.shape
+    """Singular values, descending, and right singular vectors; of wide rows on the CPU."""
+    home, (n, r, d) = rows.device, rows.shape
+    if rows.is_cuda and d > WIDEST:
+        rows = rows.cpu()
     values, basis = rows.new_empty(n, min(r, d)), rows.new_empty(n, min(r, d), d)
 
     def decompose(first: int, last: int) -> None:
-        _, values[first:last], basis[first:last] = torch.linalg.svd(rows[first:last], full_matrices=False)
+        for start in range(first, last, CHUNK):
+            some = slice(start, min(start + CHUNK, last))
+            _, values[some], basis[some] = torch.linalg.svd(_shortened(rows[some]), full_matrices=False)
 
     over_batch(n, decompose, rows.device)
-    return values, basis
+    return values.to(home), basis.to(home)
+
+
+def _shortened(rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n _ d"]:
+    """On a GPU no more rows than columns, which have the same singular values and right singular vectors."""
+    return torch.linalg.qr(rows, mode="r").R if rows.is_cuda and rows.shape[1] > rows.shape[2] else rows

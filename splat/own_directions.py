@@ -35,7 +35,7 @@ from splat.raster.functions import projected
 from splat.raster.threads import over_batch
 
 SINGLE = 1 / (4 * pi * SIGMA**2)  # of a pixel alone, what the window's blur keeps
-CHUNK = 65_536  # Gaussians at a time
+CHUNK = 8192  # Gaussians at a time: CUDA refuses 32,768 blocks and takes up to 1 MB of memory for each
 FEW = 256  # Gaussians that are taken apart in any case
 MANY = 4  # a part of all Gaussians that is as well taken apart with all the others
 BOUND_SLACK = 1e-5  # of a norm, for its rounding

@@ -10,7 +10,6 @@ Values and the tangents of the linearisation are in double precision, products w
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
 # (in a kernel names mean tensors)
 
-import triton
 import triton.language as tl
 
 from splat.projection_formulas import (
@@ -24,7 +23,7 @@ from splat.projection_formulas import (
     to_camera,
 )
 from splat.projection_linear import add_symmetric
-from splat.raster.triton_formulas import device
+from splat.raster.triton_formulas import device, sized
 from splat.raster.whitening import plain, whitened, whitened_adjoint, whitening
 from splat.traced import digest, tangent_of, traced, variable
 
@@ -152,7 +151,7 @@ def sigmoid(x):
 # --- values and adjoint -----------------------------------------------------------------------------------------------
 
 
-@triton.jit
+@sized("n")
 def project_splats(
     flat, lens, splats, depths, drawn, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
 ):  # fmt: skip
@@ -205,7 +204,7 @@ def harmonic_weights(flat, colour_bar, i, n, BANDS: tl.constexpr, mask):
     return found
 
 
-@triton.jit
+@sized("n")
 def project_adjoint(
     flat, lens, splats, drawn, bar, gradient, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
 ):  # fmt: skip
@@ -241,7 +240,7 @@ def project_adjoint(
 # --- the linearisation ------------------------------------------------------------------------------------------------
 
 
-@triton.jit
+@sized("n", "m")
 def linearize_geometry(
     flat, lens, splats, bar, index, jacobian, curvature, n, m, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
 ):  # fmt: skip
@@ -259,7 +258,7 @@ def linearize_geometry(
         tl.store(curvature + (j * (j + 1) // 2 + lane) * m + e, bends[j], here & (lane <= j))
 
 
-@triton.jit
+@sized("n", "m")
 def linearize_colour(
     flat, lens, splats, bar, index, curvature, harmonic, slope, colour_bar, visible, colour_slope, n, m,
     BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
@@ -287,7 +286,7 @@ def linearize_colour(
         tl.store(colour_slope + (c * 3 + lane) * m + e, total, here & (lane < 3))
 
 
-@triton.jit
+@sized("start", "count", "m")
 def plain_jacobian(splats, index, jacobian, out, start, count, m, BLOCK: tl.constexpr, FORMULAS: tl.constexpr):
     """The geometry's Jacobian in plain coordinates: five rows of out (count, 9, 11), of the Gaussians at places from start."""
     e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -318,7 +317,7 @@ def tangents_at(block, i, k, K, n, here):
     return found
 
 
-@triton.jit
+@sized("n", "m", "K")
 def push_forward(
     block, splats, index, jacobian, harmonic, visible, colour_slope, out, n, m, K,
     BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr, FORMULAS: tl.constexpr,
@@ -352,7 +351,7 @@ def push_forward(
         tl.store(at + 6 + c, tl.load(visible + c * m + e, held, other=0.0) * total, here)
 
 
-@triton.jit
+@sized("n", "m", "K")
 def pull_back(
     cotangents, block, splats, opacity_bar, index, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope,
     out, n, m, K, SECOND_ORDER: tl.constexpr,

@@ -21,10 +21,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splat.raster import binning
-from splat.raster.triton_formulas import device, jit, launch, twins
+from splat.raster.triton_formulas import device, launch, sized, twins
 
 WIDTH, HEIGHT = 16, 16  # of a tile, in pixels
 BLOCK = 256
+LIMIT = 2**31  # places and slots of entries are 32 bits wide
 
 ellipse_of, box_of, rows_of_strip = twins(binning.ellipse_of, binning.box_of, binning.rows_of_strip)
 
@@ -70,7 +71,7 @@ def load_splat(splats, i, inside):
     )
 
 
-@jit
+@sized("n")
 def count_strips(
     order, drawn, splats, limits, first, count, n, width, height, WIDTH: tl.constexpr, BLOCK: tl.constexpr
 ):
@@ -86,7 +87,7 @@ def count_strips(
     tl.store(count + i, tl.where(some, x1 // WIDTH - x0 // WIDTH + 1, 0), inside)
 
 
-@jit
+@sized("strips", "columns")
 def count_rows(
     strip_rank, order, splats, limits, first_column, strip_start, first, count, strips, columns, width, height,
     WIDTH: tl.constexpr, HEIGHT: tl.constexpr, BLOCK: tl.constexpr,
@@ -105,7 +106,7 @@ def count_rows(
     tl.store(count + i, tl.where(y0 <= y1, y1 // HEIGHT - y0 // HEIGHT + 1, 0), inside)
 
 
-@jit
+@sized("entries", "columns")
 def list_entries(
     entry_strip, strip_rank, order, entry_start, first_tile, tile, splat, entries, columns, BLOCK: tl.constexpr
 ):
@@ -130,8 +131,14 @@ def starts(count: Int[Tensor, "n"]) -> Int[Tensor, "n_1"]:
 
 
 def repeated(count: Int[Tensor, "n"], start: Int[Tensor, "n_1"]) -> Int[Tensor, "total"]:
-    """The index i, count[i] times over; reads the total back."""
-    return torch.repeat_interleave(count, output_size=int(start[-1]))
+    """The index i, count[i] times over; reads the total back.  ValueError where it is beyond what the kernels count to."""
+    total = int(start[-1])
+    if total >= LIMIT:
+        raise ValueError(
+            f"expected fewer than 2^31 tiles that splats touch in a view, got {total}; render smaller images, or Gaussians "
+            "that are fewer or smaller"
+        )
+    return torch.repeat_interleave(count, output_size=total)
 
 
 def bin_splats(

@@ -39,11 +39,11 @@ def powers_of_columns(total, j, place, rows, u, degree: tl.constexpr):
 
 @jit
 def block_moments(
-    order, start, reached, splat_of, slots, params, frame, transmittance, stop, gradient, curvature, sums, columns, width,
+    order, start, reached, splat_of, slots, packed, frame, transmittance, stop, gradient, curvature, sums, columns, width,
     height, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
 ):  # fmt: skip
     """The 36 sums of every entry or, added up, of every splat.  gradient: g, 4 planes; curvature: h, 3 planes."""
-    real: tl.constexpr = params.dtype.element_ty
+    real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
     x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
     x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
@@ -63,7 +63,7 @@ def block_moments(
     for back in range(0, count):
         k = count - 1 - back
         s_index = tl.load(splat_of + first + k)
-        splat = params + s_index.to(tl.int64) * 16
+        splat = packed + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         r = reciprocal(1.0 - alpha)

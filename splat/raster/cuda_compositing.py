@@ -201,11 +201,11 @@ def clear_slots(slots, first, count, sums, WIDTH: tl.constexpr):
 
 @jit
 def forward(
-    order, start, splat_of, params, frame, planes, transmittance, stop, reached, columns, width, height,
+    order, start, splat_of, packed, frame, planes, transmittance, stop, reached, columns, width, height,
     WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
 ):  # fmt: skip
     """Render planes (4, h, w), the final T and the entry at which each pixel stopped; how many entries each tile reached."""
-    real: tl.constexpr = params.dtype.element_ty
+    real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
     x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
     x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
@@ -220,7 +220,7 @@ def forward(
     done = 0
     while done < count:
         for k in range(done, tl.minimum(done + CHUNK, count)):
-            splat = params + following.to(tl.int64) * 16
+            splat = packed + following.to(tl.int64) * 16
             following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
             _u, v, terms = exponent_terms(splat, x0, y0, x, y)
             alpha, _uncapped = alpha_row(v, terms, T > 0, cap)
@@ -242,11 +242,11 @@ def forward(
 
 @jit
 def backward(
-    order, start, reached, splat_of, slots, params, frame, transmittance, stop, cotangent, sums, columns, width, height,
+    order, start, reached, splat_of, slots, packed, frame, transmittance, stop, cotangent, sums, columns, width, height,
     WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
 ):  # fmt: skip
     """The nine sums of every entry or, added up, of every splat, from the cotangent of the planes."""
-    real: tl.constexpr = params.dtype.element_ty
+    real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
     x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
     x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
@@ -263,7 +263,7 @@ def backward(
     for back in range(0, count):
         k, s_index = count - 1 - back, following
         following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
-        splat = params + s_index.to(tl.int64) * 16
+        splat = packed + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         T, after, w, beta, _r, we = step_back(alpha, T, R, g, load3(splat, RED))
@@ -306,14 +306,14 @@ def any_moved(moved, splat_of, first, count, K: tl.constexpr):
 
 @jit
 def tangent(
-    order, start, reached, splat_of, params, frame, stop, tangents, moved, planes, transmittances, moves, columns, width,
+    order, start, reached, splat_of, packed, frame, stop, tangents, moved, planes, transmittances, moves, columns, width,
     height, K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
 ):  # fmt: skip
     """J u for K tangents: their planes (K, 4, h, w) and the tangents of the final transmittance (K, h, w).
 
     moved: (n, K), which splats the tangents move; moves: whether they move any in a tile.  Where none, all is 0.
     """
-    real: tl.constexpr = params.dtype.element_ty
+    real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
     x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
     x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
@@ -331,7 +331,7 @@ def tangent(
     for k in range(0, count):
         s_index = following
         following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
-        splat = params + s_index.to(tl.int64) * 16
+        splat = packed + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         w = alpha * T
@@ -348,7 +348,7 @@ def tangent(
 
 @jit
 def curvature(
-    order, start, reached, splat_of, slots, params, frame, transmittance, stop, cotangent, tangents, moves, transmittances,
+    order, start, reached, splat_of, slots, packed, frame, transmittance, stop, cotangent, tangents, moves, transmittances,
     cotangents, sums, columns, width, height,
     K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
 ):  # fmt: skip
@@ -356,7 +356,7 @@ def curvature(
 
     cotangent: g, 4 planes; cotangents: g' of every tangent, (K, 4, h, w); moves, transmittances: as `tangent` left them.
     """
-    real: tl.constexpr = params.dtype.element_ty
+    real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
     x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
     x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
@@ -380,7 +380,7 @@ def curvature(
     for back in range(0, count):
         k, s_index = count - 1 - back, following
         following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
-        splat = params + s_index.to(tl.int64) * 16
+        splat = packed + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         free = uncapped <= tl.load(splat + CAP)

@@ -12,7 +12,7 @@ import triton.language as tl
 
 from splat.raster import packing, whitening
 from splat.raster.cuda_binning import load_splat
-from splat.raster.triton_formulas import device, jit, max_over, static_range, twin, twins
+from splat.raster.triton_formulas import device, max_over, sized, static_range, twin, twins
 
 PARAMS = 16
 X, Y, U, V, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT, CAP = (tl.constexpr(i) for i in range(14))
@@ -59,23 +59,23 @@ def copy_colour(target, to, source, at, inside):
         tl.store(target + to + j, tl.load(source + at + j, inside, other=0.0), inside)
 
 
-@jit
-def pack_splats(splats, frame, params, n, BLOCK: tl.constexpr):
-    """params (n, 16) of splats (n, 9)."""
+@sized("n")
+def pack_splats(splats, frame, packed, n, BLOCK: tl.constexpr):
+    """packed (n, 16) of splats (n, 9)."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
     splat = load_splat(splats, i, inside)
     along, across, shear = whiten(splat)
     mx, my = splat[0] - 0.5, splat[1] - 0.5
     x, y = nearest(mx), nearest(my)
-    p = params + i.to(tl.int64) * 16
+    p = packed + i.to(tl.int64) * 16
     tl.store(p + X, x, inside)
     tl.store(p + Y, y, inside)
     tl.store(p + U, along * (x - mx), inside)
     tl.store(p + V, across * (shear * (x - mx) + (y - my)), inside)
     tl.store(p + ALONG, along, inside)
     tl.store(p + ACROSS, across, inside)
-    rounded = shear.to(params.dtype.element_ty)
+    rounded = shear.to(packed.dtype.element_ty)
     tl.store(p + SHEAR, rounded, inside)
     tl.store(p + SHEAR_REST, shear - rounded.to(tl.float64), inside)
     opacity = splat[5]
@@ -89,7 +89,7 @@ def pack_splats(splats, frame, params, n, BLOCK: tl.constexpr):
     copy_colour(p, RED - 6, splats, i.to(tl.int64) * 9, inside)
 
 
-@jit
+@sized("n", "K", "begin", "size")
 def pack_tangents(splats, directions, tangents, moved, n, K, begin, size, BLOCK: tl.constexpr):
     """tangents (n, size, 12) of the directions begin, begin + 1, ... of (n, K, 9); a program has one of them.
 
@@ -111,7 +111,7 @@ def pack_tangents(splats, directions, tangents, moved, n, K, begin, size, BLOCK:
     tl.store(moved + i.to(tl.int64) * size + k, some.to(tl.int8), inside)
 
 
-@jit
+@sized("n", "K")
 def sum_slots(first, last, sums, totals, n, K, WIDTH: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr):
     """totals (n, K, WIDTH) in double precision of the sums (slots, K, WIDTH), slot by slot: in a fixed order.
 
@@ -132,7 +132,7 @@ def sum_slots(first, last, sums, totals, n, K, WIDTH: tl.constexpr, PADDED: tl.c
     tl.store(totals + at + j, total, (i < n)[:, None] & (j < WIDTH))
 
 
-@jit
+@sized("n")
 def reduce_gradient(splats, totals, gradient, n, BLOCK: tl.constexpr):
     """gradient (n, 9) from totals (n, 9)."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -142,7 +142,7 @@ def reduce_gradient(splats, totals, gradient, n, BLOCK: tl.constexpr):
     copy_colour(gradient, at, totals, at, inside)
 
 
-@jit
+@sized("n", "K", "begin", "size")
 def reduce_curvature(splats, directions, moments, totals, product, n, K, begin, size, BLOCK: tl.constexpr):
     """product (n, K, 9) along the directions begin, begin + 1, ... from totals (n, size, 9); moments: the gradient's totals."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

@@ -7,12 +7,12 @@ this module.  Formulas therefore take and give numbers and tuples of numbers, in
 
     quadratic, dot = twins(formulas.quadratic, formulas.dot)
 
-`jit` marks kernels and `device` what they call: `triton.jit` too, or with Triton's interpreter (TRITON_INTERPRET=1) the plain
-function, since the interpreter patches its language anew at every call of a jitted one.
+`jit` and `sized` mark kernels and `device` what they call: `triton.jit` too, or with Triton's interpreter (TRITON_INTERPRET=1)
+the plain function, since the interpreter patches its language anew at every call of a jitted one.
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from types import FunctionType
 from typing import Any
 
@@ -27,8 +27,16 @@ static_range: Any = range if INTERPRETED else tl.static_range  # a loop that is 
 
 
 def jit(function: Callable) -> Any:
-    """A kernel, run by `launch`: `triton.jit`."""
+    """A kernel, run by `launch`: `triton.jit`.  No parameter may be called params: Triton's code round it uses the name."""
     return triton.jit(function)
+
+
+def sized(*names: str) -> Any:
+    """A kernel with parameters that change from launch to launch: numbers of Gaussians, vectors or entries.
+
+    Others are compiled anew, which takes seconds, where they become 1 or a multiple of 16 or cease to be.
+    """
+    return partial(triton.jit, do_not_specialize=names)
 
 
 def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants: Any) -> None:

@@ -156,11 +156,12 @@ def disagreement(step: Step, partner: Gaussians, pose: Camera) -> tuple[Float[Te
 
 def confirmed(gaussians: Gaussians, others: Gaussians, distance: float) -> Bool[Tensor, " n"]:
     """Which Gaussians have one of the others within this distance."""
-    nearest, _ = scipy.spatial.KDTree(others.means.double().numpy()).query(gaussians.means.double().numpy())
-    return torch.as_tensor(nearest) <= distance
+    own, theirs = (each.means.cpu().double().numpy() for each in (gaussians, others))
+    nearest, _ = scipy.spatial.KDTree(theirs).query(own)
+    return torch.as_tensor(nearest <= distance).to(gaussians.flat.device)
 
 
 def _pruned(gaussians: Gaussians, stays: Bool[Tensor, " n"]) -> Densified:
     kept = stays.nonzero()[:, 0]
-    fresh = torch.zeros(len(kept), dtype=torch.bool)
+    fresh = torch.zeros_like(kept, dtype=torch.bool)
     return Densified(gaussians.select(kept), kept, fresh, cloned=0, split=0, pruned=len(stays) - len(kept))

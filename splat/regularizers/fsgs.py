@@ -137,13 +137,14 @@ def pearson(x: Tensor, y: Tensor) -> Float[Tensor, ""]:
 @torch.no_grad()
 def unpool(gaussians: Gaussians, extent: float, settings: FSGS) -> Densified:
     """The Gaussians with new ones on the edges of the sources.  What is there stays, first and in its order."""
-    means, n = gaussians.means.double().numpy(), len(gaussians)
+    n, device = len(gaussians), gaussians.flat.device
     k = min(settings.neighbours, n - 1)
-    everyone = torch.arange(n)
+    everyone = torch.arange(n, device=device)
     source = destination = everyone[:0]
     if k:
-        distances, nearest = map(torch.as_tensor, scipy.spatial.KDTree(means).query(means, k=k + 1))
-        distances, nearest = distances[:, 1:], nearest[:, 1:]  # the nearest is the Gaussian itself
+        means = gaussians.means.cpu().double().numpy()
+        found = scipy.spatial.KDTree(means).query(means, k=k + 1)
+        distances, nearest = (torch.as_tensor(each[:, 1:]).to(device) for each in found)  # the nearest is itself
         wide = distances.mean(dim=1) > settings.threshold * extent
         wide &= gaussians.log_scales.exp().amax(dim=1) > settings.large * extent
         source = everyone[wide].repeat_interleave(k)
@@ -153,4 +154,4 @@ def unpool(gaussians: Gaussians, extent: float, settings: FSGS) -> Densified:
     result.means[n:] = (gaussians.means[source] + gaussians.means[destination]) / 2
     result.quats[n:] = torch.tensor([1.0, 0, 0, 0]).to(result.flat)
     result.sh[n:] = 0
-    return Densified(result, parents, torch.arange(len(parents)) >= n, cloned=0, split=0, pruned=0)
+    return Densified(result, parents, torch.arange(len(parents), device=device) >= n, cloned=0, split=0, pruned=0)

@@ -5,18 +5,19 @@ from contextlib import nullcontext
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from scipy.stats import binom
 
 from analysis.cli import main
-from analysis.family_stage import FamilyFindings, FamilyOptions, measure_families, quotient
+from analysis.family_stage import FamilyFindings, FamilyOptions, _seconds_a_product, measure_families, quotient
 from analysis.family_table import family_lines
 from analysis.probe import scene_objective
 from analysis.records import Record, read_record
 from analysis.report import render_report
-from landscape import Bracket, EigenSettings, FamilySettings, families
+from landscape import Bracket, DenseOperator, EigenSettings, FamilySettings, families
 from splat.adam import Adam
 from splat.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
@@ -257,6 +258,18 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
         diagonal, rows = diagonals[gauss_newton], slice(None) if block == "all" else objective.blocks[block]
         value, error = lead.trace
         assert abs(value - float(diagonal[rows].sum())) < 4 * error + 1e-9 * float(diagonal[rows].abs().sum())
+
+
+def test_a_product_is_timed_where_the_scene_is():
+    there, placed = SimpleNamespace(active=SimpleNamespace(flat=torch.empty(0, device="meta"))), []
+
+    class Identity(DenseOperator):
+        def apply(self, V):
+            placed.append((V.device.type, *V.shape))
+            return V
+
+    _seconds_a_product(Identity(torch.eye(3)), 2, there)  # pyright: ignore[reportArgumentType]
+    assert placed == [("meta", 3, 2)] * 2
 
 
 def test_time_that_runs_out_is_said(objective, checkpoint):

@@ -35,6 +35,19 @@ def test_the_block_is_the_one_whose_whole_run_is_clearly_the_fastest(fixed, each
     assert fastest_block(H, generator(), clock=lambda: H.now) == block
 
 
+def test_a_block_is_timed_until_a_gpu_has_it(monkeypatch):
+    H, pending = Timed(8.0, 1.0), []
+
+    class Launching(DenseOperator):
+        def apply(self, V):
+            pending.append(V)
+            return V
+
+    monkeypatch.setattr(torch.Tensor, "is_cuda", True)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda _device: [H.apply(pending.pop()) for _ in pending[:]])
+    assert fastest_block(Launching(H.matrix), generator(), clock=lambda: H.now) == 4  # else every block takes no time
+
+
 def test_it_costs_eight_products():
     H = CountingOperator(operator("indefinite"))
     assert fastest_block(H, generator()) in PRODUCTS

@@ -66,6 +66,26 @@ def test_counting_counts_vectors_and_calls():
     assert (operator.matvecs, operator.calls) == (5, 2) and operator.seconds > 0
 
 
+def test_seconds_are_those_until_a_gpu_has_the_product(monkeypatch):
+    product, now, pending = 5.0, [0.0], [3.0]  # seconds of a product; the clock; the seconds of work that is under way
+
+    class Launching(DenseOperator):
+        def apply(self, V):
+            pending.append(product)
+            return super().apply(V)
+
+    def synchronize(_device):
+        now[0] += sum(pending)
+        pending.clear()
+
+    monkeypatch.setattr(torch.Tensor, "is_cuda", True)
+    monkeypatch.setattr(torch.cuda, "synchronize", synchronize)
+    monkeypatch.setattr("landscape.operator.perf_counter", lambda: now[0])
+    operator = CountingOperator(Launching(A))
+    operator.apply(V)
+    assert operator.seconds == product  # without what was under way before
+
+
 @pytest.mark.parametrize("name", COMPOSED)
 def test_a_flat_vector_is_refused_with_the_remedy(name):
     with pytest.raises(ValueError, match=r"expected V of shape \(n, k\) with n = 7, got \(7,\); use V\[:, None\]"):

@@ -40,6 +40,7 @@ def kernels() -> list[tuple]:
         (losses.finish_gradient, (), pixels | ssim | {"SLOPES": True}),
         (losses.curve, (), pixels),
         (losses.finish_product, (), pixels | ssim),
+        (losses.forms, ("full", "pixelwise"), pixels | ssim),
         (losses.finish_diagonal, (), pixels | ssim),
         (losses.feed_pair, (), pixels),
         (losses.differentiate_pair, (), pixels),
@@ -56,7 +57,7 @@ def _formulas(kernel) -> dict[str, str]:
 
 def test_every_kernel_of_projection_and_losses_compiles():
     lines = run_as_script(__file__)
-    assert len(lines) == 21
+    assert len(lines) == 22
     for line in lines:
         name, registers, _ = line.split()
         assert 16 <= int(registers) <= 255, name

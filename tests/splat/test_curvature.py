@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from landscape.checks import check_operator
-from splat.curvature import SceneHessian, SceneObjective
+from splat.curvature import SceneHessian, SceneObjective, free_memory
 from splat.gaussians import Gaussians
 from splat.linearize import LinearizedView
 from splat.losses import LossSettings
@@ -227,3 +227,10 @@ def test_a_view_that_draws_nothing_of_what_the_vectors_move_is_left_out_without_
         assert (hessian.passes - before[0], hessian.spared - before[1]) == (passes, spared)
         each = [held.ggn(columns) if gauss_newton else held.hvp(columns) for held in scene.linearized]
         assert torch.equal(product, (each[0] + each[1]) / 2)
+
+
+def test_free_memory_of_a_gpu_is_also_what_torch_holds_for_tensors_to_come(monkeypatch):
+    for name, found in {"mem_get_info": (100, 1000), "memory_reserved": 70, "memory_allocated": 30}.items():
+        monkeypatch.setattr(torch.cuda, name, lambda _device, found=found: found)
+    assert free_memory(torch.device("cuda")) == 140
+    assert free_memory(torch.device("cpu")) > 1000

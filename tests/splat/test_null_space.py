@@ -6,7 +6,7 @@ from torch import Tensor
 
 from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
-from splat.null_space import RowSpace, seen_parameters
+from splat.null_space import CHUNK, RowSpace, _row_space, seen_parameters
 from splat.scenes.view import View
 from tests.splat.random_scenes import random_camera, random_gaussians
 
@@ -82,6 +82,24 @@ def test_what_is_seen_whole_is_left_as_it_is_bit_for_bit() -> None:
     assert torch.equal(kept[[0, 2, 3]], x[[0, 2, 3]])
     assert torch.allclose(kept, basis.mT @ (basis @ x), atol=1e-6)
     assert all(float((kept[i] - x[i]).norm()) > 0.1 for i in (1, 4))
+
+
+@pytest.mark.parametrize(("rows", "columns", "copies"), [(8, 16, 0), (36, 16, 0), (40, 35, 1)])
+def test_a_gpu_takes_no_large_matrices_apart(
+    monkeypatch: pytest.MonkeyPatch, rows: int, columns: int, copies: int
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    A = torch.randn(CHUNK + 3, rows, 5, generator=generator, dtype=torch.float64)
+    A = A @ torch.randn(CHUNK + 3, 5, columns, generator=generator, dtype=torch.float64)  # of rank 5
+    plain, sizes, brought, svd, cpu = _row_space(A, A.dtype), [], [], torch.linalg.svd, torch.Tensor.cpu
+    monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda tensor: not brought))
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda tensor: brought.append(tensor.shape) or cpu(tensor))
+    monkeypatch.setattr(torch.linalg, "svd", lambda A, **options: sizes.append(A.shape) or svd(A, **options))
+    found = _row_space(A, A.dtype)
+    assert len(brought) == copies and max(size[0] for size in sizes) <= CHUNK
+    assert copies or all(size[1] <= 16 for size in sizes)
+    assert torch.equal(found.rank, plain.rank) and int(found.rank.max()) == int(found.rank.min()) == 5
+    assert torch.allclose(found.basis.mT @ found.basis, plain.basis.mT @ plain.basis, atol=1e-12)
 
 
 def test_row_spaces_are_the_same_on_any_number_of_threads() -> None:

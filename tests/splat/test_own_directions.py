@@ -128,6 +128,16 @@ def test_a_recurrence_from_the_steepest_finds_the_same_ends(ssim_weight):
         assert pairs.reason == "tolerance" and torch.allclose(pairs.values, true, rtol=2e-3)
 
 
+def test_no_more_blocks_are_taken_apart_at_once_than_a_gpu_takes(objective, monkeypatch):
+    sizes, eigh, n = [], torch.linalg.eigh, 40_000
+    monkeypatch.setattr(torch.linalg, "eigh", lambda blocks: sizes.append(len(blocks)) or eigh(blocks))
+    blocks = torch.diag_embed(torch.arange(2.0 * n, dtype=torch.float64).view(n, 2))
+    known = OwnDirections(objective, *objective.own_blocks)
+    values, _ = known._taken_apart(blocks, blocks.new_zeros(n, 2), blocks.new_ones(n, 2))
+    assert torch.equal(values, blocks.diagonal(dim1=1, dim2=2))
+    assert sum(sizes) == n and max(sizes) <= 8192
+
+
 def test_blocks_that_curve_up_alone_do_not_lead_along_the_quaternions_lengths(objective):
     n, k = len(objective.active), objective.active.sh.shape[1]
     flat = objective.active.flat

@@ -13,7 +13,10 @@ from landscape.operator import DenseOperator
 from splat.curvature import SceneHessian, SceneObjective
 from splat.localization import conditions, localize
 from splat.losses import LossSettings
+from splat.metrics import scene_units
 from splat.own_directions import OwnDirections
+from splat.regularizers.corgs import _pruned, confirmed
+from splat.regularizers.fsgs import FSGS, unpool
 from splat.split_control import split_control
 from splat.train import Training, train
 from tests.splat.held_scenes import BACKGROUND, two_views
@@ -38,6 +41,15 @@ def test_what_is_on_the_wrong_side_is_noted(monkeypatch):
     assert +placed.brought == Counter({"to": 2, "index": 1})
 
 
+def put_on_gpu(training: Training, placed: Placed) -> None:
+    training.gaussians = training.gaussians.with_flat(placed.on_gpu(training.gaussians.flat))
+    for name in ("first", "second"):
+        moment = getattr(training.adam, name)
+        setattr(training.adam, name, moment.with_flat(placed.on_gpu(moment.flat)))
+    sums = training.screen_gradients
+    sums.total, sums.renders = placed.on_gpu(sums.total), placed.on_gpu(sums.renders)
+
+
 def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_five_times(monkeypatch):
     views = tiny_views()
     config = replace(tiny_config(), random_background=False)  # which would compare with another picture every step
@@ -45,17 +57,29 @@ def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_five_times(mo
     placed = Placed(monkeypatch)
     monkeypatch.setattr("splat.device.INTERPRETED", True)
     with placed:
-        training.gaussians = training.gaussians.with_flat(placed.on_gpu(training.gaussians.flat))
-        for name in ("first", "second"):
-            moment = getattr(training.adam, name)
-            setattr(training.adam, name, moment.with_flat(placed.on_gpu(moment.flat)))
-        sums = training.screen_gradients
-        sums.total, sums.renders = placed.on_gpu(sums.total), placed.on_gpu(sums.renders)
+        put_on_gpu(training, placed)
         steps = train(training, views)
         next(steps)
         # whether the parameters are finite, the largest scale, how many strips and entries, the loss
         assert +placed.waits == Counter({"_local_scalar_dense": 5})
         next(steps)  # with density control
+    assert not +placed.mixed
+
+
+@pytest.mark.parametrize("method", ["fsgs", "cor-gs"])
+def test_what_the_host_finds_out_about_neighbours_is_brought_back(monkeypatch, method):
+    training = Training.start(tiny_gaussians(12), EXTENT, tiny_config())
+    placed = Placed(monkeypatch)
+    with placed:
+        put_on_gpu(training, placed)
+        there = training.gaussians
+        if method == "fsgs":
+            change = unpool(there, EXTENT, FSGS(threshold=0.2, large=0.1))
+        else:
+            change = _pruned(there, confirmed(there, there.select(torch.arange(3)), 0.3))
+        assert 0 < len(change.gaussians) != len(there)
+        training.follow(change)
+        _ = change.fresh & (change.gaussians.opacity_logits > 0)  # that it is there, too
     assert not +placed.mixed
 
 
@@ -73,7 +97,7 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         placed.waits.clear(), placed.brought.clear()
         hessian.apply(V)
         assert not +placed.waits and not +placed.brought  # so that they can be recorded
-        _ = objective.gradient, objective.block_diagonal(), objective.loss(flat)
+        _ = objective.gradient, objective.block_diagonal(), objective.loss(flat), scene_units(objective)
         known = OwnDirections(objective, *objective.own_blocks)
         _ = known.steepest(1, 1), known.pairs
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))

@@ -6,7 +6,7 @@ import torch
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton; install splat-landscape[gpu]")
 
-from splat.raster.cuda_binning import HEIGHT, WIDTH, bin_splats, number_slots
+from splat.raster.cuda_binning import HEIGHT, WIDTH, bin_splats, number_slots, repeated, starts
 from tests.splat.raster.compositing_cases import CASES, truth
 from tests.splat.raster.test_binning import active_pixels
 
@@ -47,3 +47,9 @@ def test_the_entries_that_are_reached_are_numbered_splat_by_splat(device):
     assert len(kept) < len(lists.splat) and sorted(slot.tolist()) == list(range(len(kept)))
     assert ((slots.first.cpu()[splat] <= slot) & (slot < slots.last.cpu()[splat])).all()
     assert (slots.last - slots.first).sum() == len(kept)
+
+
+def test_more_entries_than_32_bits_number_are_refused():
+    count = torch.tensor([2**30, 2**30], dtype=torch.int32)
+    with pytest.raises(ValueError, match=r"fewer than 2\^31 tiles.*got 2147483648"):
+        repeated(count, starts(count))

@@ -11,7 +11,7 @@ INTEGERS = (
 LONG = ("strip_start", "entry_start", "last")
 DOUBLES = ("frame", "splats", "limits", "directions", "totals", "gradient", "moments", "product")
 REALS = (
-    "params", "planes", "transmittance", "cotangent", "sums", "tangents", "transmittances", "cotangents", "curvature",
+    "packed", "planes", "transmittance", "cotangent", "sums", "tangents", "transmittances", "cotangents", "curvature",
 )  # fmt: skip
 
 
@@ -63,4 +63,4 @@ def test_every_kernel_compiles_and_keeps_its_loops_in_registers():
 
 if __name__ == "__main__":
     for kernel, parameters, constants, warps in kernels():
-        print(kernel.__name__, parameters["params"], *compile_kernel(kernel, parameters, constants, warps))
+        print(kernel.__name__, parameters["packed"], *compile_kernel(kernel, parameters, constants, warps))

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splat.regularizers.occlusion_edge import dominant_edge
+from splat.regularizers.occlusion_edge import _sobel, dominant_edge
 
 
 def grid(height: int = 60, width: int = 80) -> tuple[Tensor, Tensor]:
@@ -45,6 +45,14 @@ def test_the_normal_is_the_first_eigenvector_of_the_structure_tensor_of_the_stro
     normal, coherence = dominant_edge(depth, torch.ones_like(depth))
     assert abs(normal.numpy() @ vectors[:, 1]) == pytest.approx(1, rel=1e-12)
     assert coherence == pytest.approx((values[1] - values[0]) / values.sum(), rel=1e-10)
+
+
+@pytest.mark.parametrize(("dtype", "round_off"), [(torch.float32, 1e-5), (torch.float64, 1e-14)])
+def test_the_gradient_is_the_convolution_with_sobels_kernels_to_round_off(dtype: torch.dtype, round_off: float) -> None:
+    depth = 5 + torch.rand(17, 23, generator=torch.Generator().manual_seed(2), dtype=dtype)
+    kernel = torch.tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]], dtype=dtype) / 8
+    convolved = torch.nn.functional.conv2d(depth[None, None], torch.stack([kernel, kernel.T])[:, None])[0]
+    assert float((_sobel(depth) - convolved).abs().max()) < round_off
 
 
 def test_many_weak_edges_do_not_outvote_a_strong_one() -> None:
