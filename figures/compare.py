@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.records import Record, read_record
 from analysis.verdict import attribute_name
-from figures.plane import Plane, plane
+from figures.plane import Plane, plane, same_scale
 from figures.style import (
     BLACK,
     BLUE,
@@ -45,6 +45,8 @@ COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)
 LINES = ("-", "--", ":")  # once the colours are used up
 LEVELS = 12
 ACROSS = 3  # panels in a row
+WIDTH = 5.0  # inches for the panels of a row
+TALLEST = 3.0  # inches of a panel
 
 
 def draw_traces(records: Records) -> Figure:
@@ -136,8 +138,10 @@ def draw_slices(records: Records) -> Figure:
     power = exponent_of(high, low)
     levels = MaxNLocator(LEVELS).tick_values(low / 10.0**power, high / 10.0**power)
     rows, columns = -(-len(planes) // ACROSS), min(len(planes), ACROSS)
+    same = same_scale(*reach)
+    shape = reach[1] / reach[0] if same else 0.75
     with style():
-        figure = new_figure(0.4 + 2.1 * rows, 2 * COLUMN)
+        figure = new_figure(0.4 + (0.3 + min(WIDTH / columns * shape, TALLEST)) * rows, 2 * COLUMN)
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         filled = None
         for axes, (label, (x, y, change, _)) in zip(panels.ravel(), windows.items(), strict=False):
@@ -150,9 +154,11 @@ def draw_slices(records: Records) -> Figure:
             axes.set(
                 xlim=np.array([-1, 1]) * reach[0] / 10.0**exponent, ylim=np.array([-1, 1]) * reach[1] / 10.0**exponent
             )
+            axes.set_aspect("equal" if same else "auto")
         for axes in panels.ravel()[len(planes) :]:
             axes.set_axis_off()
-        figure.supxlabel(f"step along the steepest direction, param. units{unit_suffix(exponent)}", fontsize=7)
+        scales = "" if same else " (axes differ in scale)"
+        figure.supxlabel(f"step along the steepest direction, param. units{unit_suffix(exponent)}{scales}", fontsize=7)
         figure.supylabel(f"step along the second{unit_suffix(exponent)}", fontsize=7)
         figure.colorbar(filled, ax=panels, label=f"change of loss{unit_suffix(power)}")  # pyright: ignore[reportArgumentType]
     return figure

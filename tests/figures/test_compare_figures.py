@@ -28,6 +28,16 @@ def test_slices_share_the_smallest_window_and_the_levels(tmp_path):
     assert (levels[0] == levels[1]).all()
 
 
+@pytest.mark.parametrize(("stretch", "aspect", "words"), [(1.0, 1.0, False), (10.0, "auto", True)])
+def test_steps_of_both_directions_look_equally_long_or_the_axes_say_that_they_differ(tmp_path, stretch, aspect, words):
+    pair = records(tmp_path, 1.0, 0.25)
+    for record in pair.values():
+        record.arrays["slice"]["y"] *= stretch
+    figure = draw_slices(pair)
+    assert [axes.get_aspect() for axes in figure.axes if axes.get_title(loc="left")] == [aspect] * 2
+    assert ("axes differ in scale" in figure.get_supxlabel()) == words
+
+
 def test_a_trace_shows_its_sign_and_whether_its_interval_decides_it(tmp_path):
     (record,) = records(tmp_path, 1.0).values()
     record.data["traces"]["sh"] |= {"value": 12.0, "low": -1.0, "high": 25.0, "sign": "undetermined"}
