@@ -24,8 +24,9 @@ class TrainOptions:
     """Folder of the scene: COLMAP, LLFF, Blender, instant-ngp, nerfstudio or DTU."""
     out: Unset[Path] = None
     """Folder of the run, which must not exist yet.  Default: runs/NAME, after the scene."""
-    views: int | Literal["all"] = 3
-    """Training views, chosen by the scene's protocol; all: every view that is not held out."""
+    views: Unset[int | Literal["all"]] = None
+    """Training views, chosen by the scene's protocol; all: every view that is not held out.
+    Default: the protocol's number: 8 for Blender, else 3."""
     iterations: int = 2000
     """Steps, one view each."""
     seed: int = 0

@@ -47,7 +47,7 @@ from splat.regularizers.methods import METHODS
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
-from splat.scenes.splits import Split, split_scene
+from splat.scenes.splits import Split, split_scene, usual_views
 from splat.scenes.view import View
 from splat.start import initial_gaussians
 from splat.train import TrainConfig, Training, train
@@ -110,7 +110,8 @@ def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig
     """What the options stand for, before any image is read.  ValueError or FileNotFoundError where they are wrong."""
     colour = COLOURS.get(options.background)
     scene = load_scene(options.scene, options.images, options.downscale, colour, options.masks, options.depths)
-    split = split_scene(scene, None if options.views == "all" else options.views)
+    views = usual_views(scene) if options.views is None else options.views
+    split = split_scene(scene, None if views == "all" else views)
     reference = SceneReference.to(
         scene, out / CHECKPOINT, split, options.images, options.downscale, options.start, options.depths
     )
