@@ -16,6 +16,7 @@ from analysis.cli import main
 from analysis.probe import scene_objective
 from analysis.probe_record import loss_name
 from analysis.records import Record, read_record, record_folder, write_record
+from analysis.slicing import _finite_curvature
 from figures.make_all import recorded_figures
 from splat.adam import Adam
 from splat.checkpoint import load_checkpoint, save_checkpoint
@@ -24,7 +25,7 @@ from splat.densify import ScreenGradients
 from splat.losses import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from tests.recorded import synthetic
+from tests.recorded import synthetic, synthetic_line
 
 ROOT = Path(__file__).parents[2]
 SCENE = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
@@ -186,6 +187,15 @@ def test_along_the_gradient_the_slope_is_its_length_and_finite_steps_are_second_
         ends = objective.loss(center + step * v), objective.loss(center - step * v)
         assert abs((sum(ends) - 2 * objective.loss(center)) / step**2 - value) <= bound
     assert record.data["counts"]["renders"] == 3 * (record.data["slice"]["evaluations"] + probe["evaluations"])
+
+
+def test_what_finite_steps_see_is_said_as_the_range_over_those_that_round_off_does_not_hide():
+    probe = synthetic_line()[0]["finite_probe"]
+    said = _finite_curvature(probe)
+    assert "from 41.0 to 70.0, at the 3 of 4 steps that round-off does not hide (±1.00 × 10⁻⁵ to ±0.00100)" in said
+    assert said.endswith(", 2 of them across sorts that changed")
+    hidden = probe | {"curvatures": [None] * 4, "round_off": [None] * 4, "crossed": None}
+    assert _finite_curvature(hidden) == "at finite steps: round-off hides the curvature at all 4 steps"
 
 
 def test_a_line_leads_to_the_other_checkpoint_and_what_is_in_sight_there_alone(run, tmp_path):
