@@ -62,6 +62,21 @@ def test_a_density_is_shared_out_among_the_directions_on_both_sides_of_zero(tmp_
     assert left.get_xlim()[::-1] == right.get_xlim()
 
 
+def test_a_side_of_which_only_ends_are_known_says_so_and_the_legend_names_them(tmp_path):
+    (record,) = records(tmp_path, 1.0).values()
+    record.arrays["spectrum"]["nodes"] = np.abs(record.arrays["spectrum"]["nodes"])
+    figure = draw_densities({"one": record})
+    said = [[text.get_text() for text in axes.texts] for axes in figure.axes]
+    assert said == [["the density found none;\nthe ends alone are known"], []]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "end of the spectrum"]
+    for end in record.data["eigenvalues"].values():
+        end["value"] = None
+    figure = draw_densities({"one": record})
+    assert [text.get_text() for text in figure.axes[0].texts] == ["none found"] and len(
+        figure.legends[0].get_texts()
+    ) == 1
+
+
 def test_a_run_without_slice_or_density_is_left_out_of_those_pictures_alone(tmp_path):
     both = records(tmp_path, 1.0, 2.0)
     poor = list(both.values())[1]
@@ -70,7 +85,7 @@ def test_a_run_without_slice_or_density_is_left_out_of_those_pictures_alone(tmp_
     assert len([axes for axes in draw_slices(both).axes if axes.get_title(loc="left")]) == 1
     for draw in (draw_sections, draw_densities, draw_traces):
         figure = draw(both)
-        assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        assert [text.get_text() for text in figure.legends[0].get_texts()][:2] == [
             label.replace("$", r"\$") for label in both
         ]
     colours = {line.get_color() for line in draw_sections(both).axes[0].lines}
