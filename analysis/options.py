@@ -134,7 +134,8 @@ class ProbeOptions:
     """Units in which the families compare curvature.
     parameters: as stored.
     scene: positions by the scene's size.
-    optimiser: steps of the training's first learning rates."""
+    optimiser: steps of the training's first learning rates.
+    Any but parameters measures the families and takes their time."""
     family_seconds: float = 1800.0
     """Time for the families together, beside SECONDS.  inf: no limit."""
 

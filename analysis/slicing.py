@@ -31,7 +31,7 @@ from analysis.measurement import evaluation, slice_notes
 from analysis.options import SliceOptions
 from analysis.probe import scene_objective
 from analysis.probe_record import loss_name
-from analysis.provenance import provenance
+from analysis.provenance import provenance, require_seed
 from analysis.quantities import measured, quantity
 from analysis.recording import write_with_pictures
 from analysis.records import SLICE, record_folder, require_replaceable
@@ -63,6 +63,7 @@ DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
 def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     """Slice the checkpoint's loss; returns the exit code.  command: as typed, for the record."""
+    require_seed(options.seed)
     shape = Shape.of(options.along, options.dimension, options.radius, options.points, options.other is not None)
     device = device_named(options.device)
     settings = _settings(options, shape, device)

@@ -353,6 +353,8 @@ def few(run: Path, tmp_path: Path) -> str:
         (["--along", "gradient", "--dimension", "2"], ["dimension 2", "--along twice"]),
         (["--along", "gradient", "--along", "random", "--dimension", "1"], ["--along once"]),
         (["--along", "gradient", "--along", "random", "--along", "eigenvectors"], ["one or two directions"]),
+        (["--along", "gradient", "--along", "gradient"], ["--along gradient twice", "leave one out", "--dimension 2"]),
+        (["--seed", "-1"], ["seed in [0, 2^63), got -1"]),
         (["--along", "random", "--radius", "100"], ["too long"]),
         (["OTHER", "--along", "gradient"], ["one more checkpoint", "--along line"]),
         (["FEW"], ["15 Gaussians with SH degree", "got 9", "after densification"]),
