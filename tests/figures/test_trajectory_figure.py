@@ -71,6 +71,16 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
     assert list(np.asarray(gaussians.get_ydata())) == [1000, 2000, 3000, 4000]
 
 
+def test_powers_of_ten_have_a_line_of_their_own_and_the_legend_says_what_is_open():
+    figure = trajectory.draw(rows(1e-4).assign(run="a"))
+    titles = [axes.get_title() for axes in figure.axes]
+    assert "smallest eigenvalue\n(×10⁻⁶)" in titles and "largest eigenvalue\n(×10⁻⁶)" in titles
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "open: the index is negative"]
+    positive = rows().assign(run="a")
+    positive["literal"] = positive["literal"].abs()
+    assert [text.get_text() for text in trajectory.draw(positive).legends[0].get_texts()] == ["a"]
+
+
 def test_of_an_index_without_any_bound_nothing_is_drawn(tmp_path):
     table = rows().assign(run="a")
     table.loc[2, ["literal_low", "literal_high"]] = 0.0, math.nan
