@@ -21,6 +21,7 @@ from analysis.compare_table import Run, compare_table, comparison, frame
 from analysis.drawing import draw
 from analysis.options import CompareOptions, DeviceName, ProbeOptions
 from analysis.overrides import leaves
+from analysis.quantities import quantity
 from analysis.records import FILE, read_record
 from analysis.report import pictures_in, template_environment
 from analysis.training import CHECKPOINT, METRICS
@@ -137,6 +138,22 @@ def cautions(runs: Sequence[Run]) -> list[str]:
     return lines
 
 
+def split_controls(runs: Sequence[Run]) -> list[str]:
+    """What the split changes in the images of each run that has a split control."""
+    lines = []
+    for run in runs:
+        if control := run.data.get("split_control"):
+            rows = run.data.get("families", [])
+            seen = next((row["gaussians"] for row in rows if row["split"]), control["gaussians"])
+            lost = control["gaussians"] - seen
+            lines.append(
+                f"{run.label}: the split into {control['gaussians']:,} halves changes the images by {quantity(control['rms'])} "
+                f"(root mean square; {quantity(control['psnr'])} dB)"
+                + (f", and {lost:,} of the halves touch no pixel." if lost else ".")
+            )
+    return lines
+
+
 def _write(runs: Sequence[Run], out: Path) -> None:
     """Table, pictures, page; and the table and the cautions once more for the terminal."""
     console, labels = Console(), [run.label for run in runs]
@@ -166,6 +183,7 @@ def render_page(runs: Sequence[Run], rows: Sequence[Any], notes: Sequence[str], 
         runs=runs,
         sections=sections,
         notes=notes,
+        controls=split_controls(runs),
         pictures=pictures_in(out, PICTURES),
         objective=runs[0].data.get("objective", {}),
     )

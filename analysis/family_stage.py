@@ -29,7 +29,7 @@ from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
 from landscape.families import WHOLE, Lead
 from landscape.operator import SymmetricOperator, finished
 from landscape.probes import split
-from landscape.results import Progress
+from landscape.results import Progress, finite_or_none
 from landscape.trace import total_trace
 from splat.curvature import SceneHessian, SceneObjective
 from splat.families import active_spaces
@@ -89,6 +89,7 @@ class FamilyRow:
             "rank": found.rank,
             "lambda_max": ends.largest.record(),
             "lambda_min": ends.smallest.record(),
+            "beyond": finite_or_none(ends.beyond),
             "indices": found.indices.record(),
             "starts": len(found.density.nodes),
             "steps": found.density.nodes.shape[1],

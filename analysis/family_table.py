@@ -12,6 +12,8 @@ from analysis.verdict import attribute_name
 
 INDICES = ("literal", "saddle", "share", "effective_rank", "mass_quantile")
 OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
+WIDTH = 15  # of a column of the terminal's table, with which it fits into 80
+CAPTION = "≥: λ min was not reached, or cannot be told from 0"
 NARROW = 0.1  # of the value: a bracket that is written as an error
 
 
@@ -58,19 +60,32 @@ def family_lines(data: Mapping[str, Any]) -> list[Line]:
 
 
 def family_table(data: Mapping[str, Any]) -> Table:
-    """The indices of the lines, brackets beneath the values."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"Anisotropy by attribute ({data['families'][0]['unit']})")
+    """The indices of the lines, brackets beneath the values, within 80 columns: without saddle, which is -literal."""
+    title = f"Anisotropy by attribute ({data['families'][0]['unit']})"
+    look: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False, "show_edge": False}
+    table = Table(title=title, caption=CAPTION, **look)
     table.add_column("", no_wrap=True)
-    for name in INDICES:
-        table.add_column(name.replace("_", " "), justify="right", no_wrap=True)
+    shown = [i for i, name in enumerate(INDICES) if name != "saddle"]
+    for i in shown:
+        table.add_column(INDICES[i].replace("_", " "), justify="right", no_wrap=True)
     operator = ""
     for line in family_lines(data):
         if line.operator != operator:
             table.add_section()
             table.add_row(operator := line.operator, style="bold")
         label = line.block if line.scene in ("", "trained") else f"  {line.scene}"
-        table.add_row(label, *("\n".join(filter(None, (cell.value, cell.bracket))) for cell in line.indices))
+        cells = [line.indices[i] for i in shown]
+        table.add_row(label, *("\n".join(_folded(text) for text in (c.value, c.bracket) if text) for c in cells))
     return table
+
+
+def _folded(text: str) -> str:
+    """In two lines where it is too wide for a column.
+
+    >>> _folded("7.45 × 10⁻⁴ … 1.02 × 10⁴"), _folded("34.1 … 120")
+    ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
+    """
+    return text if len(text) <= WIDTH else text.replace(" ± ", "\n± ").replace(" … ", " …\n")
 
 
 def bracketed(index: Mapping[str, Any]) -> Cell:
@@ -92,12 +107,23 @@ def bracketed(index: Mapping[str, Any]) -> Cell:
 
 
 def _line(row: Mapping[str, Any], several: bool) -> Line:
-    pairs = row["lambda_max"], row["lambda_min"]
-    ends = tuple(Cell(measured(pair["value"], pair["residual"]), "", pair["reason"]) for pair in pairs)
+    ends = tuple(_end(row[f"lambda_{name}"], row.get("beyond"), sign) for name, sign in (("max", 1), ("min", -1)))
     indices = tuple(bracketed(row["indices"][name]) for name in INDICES)
     scene = "" if not several else "split" if row["split"] else "trained"
     operator, block = OPERATOR_NAMES[row["operator"]], attribute_name(row["block"])
     return Line(operator, block, scene, f"{row['gaussians']:,}", f"{row['rank']:,}", ends, indices)
+
+
+def _end(pair: Mapping[str, Any], beyond: float | None, outwards: int) -> Cell:
+    """An end of the spectrum; of one that the budget did not reach, between what it lies.  outwards: 1 for the largest."""
+    value, residual, reason = pair["value"], pair["residual"], pair["reason"]
+    if not reason.endswith("budget") or value is None or residual is None:
+        return Cell(measured(value, residual), "", reason)
+    inner = quantity(value - outwards * residual)
+    if beyond is None:
+        return Cell("not reached", f"{'≥' if outwards > 0 else '≤'} {inner}", reason)
+    outer = quantity(value + outwards * (residual + beyond))
+    return Cell("not reached", " … ".join((inner, outer)[::outwards]), reason)
 
 
 def _factor(effect: Mapping[str, Any]) -> Cell:

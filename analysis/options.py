@@ -24,8 +24,9 @@ class TrainOptions:
     """Folder of the scene: COLMAP, LLFF, Blender, instant-ngp, nerfstudio or DTU."""
     out: Unset[Path] = None
     """Folder of the run, which must not exist yet.  Default: runs/NAME, after the scene."""
-    views: int | Literal["all"] = 3
-    """Training views, chosen by the scene's protocol; all: every view that is not held out."""
+    views: Unset[int | Literal["all"]] = None
+    """Training views, chosen by the scene's protocol; all: every view that is not held out.
+    Default: the protocol's number: 8 for Blender, else 3."""
     iterations: int = 2000
     """Steps, one view each."""
     seed: int = 0
@@ -133,7 +134,8 @@ class ProbeOptions:
     """Units in which the families compare curvature.
     parameters: as stored.
     scene: positions by the scene's size.
-    optimiser: steps of the training's first learning rates."""
+    optimiser: steps of the training's first learning rates.
+    Any but parameters measures the families and takes their time."""
     family_seconds: float = 1800.0
     """Time for the families together, beside SECONDS.  inf: no limit."""
 

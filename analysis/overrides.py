@@ -20,10 +20,14 @@ T = TypeVar("T")
 def assignments(texts: Sequence[str]) -> dict[str, str]:
     """KEY=VALUE of each text."""
     pairs = [text.partition("=") for text in texts]
-    for (key, equals, _), text in zip(pairs, texts, strict=True):
+    found: dict[str, str] = {}
+    for (key, equals, value), text in zip(pairs, texts, strict=True):
         if not (key.strip() and equals):
             raise ValueError(f"expected KEY=VALUE, as in gamma=0.5, got {text!r}")
-    return {key.strip(): value.strip() for key, _, value in pairs}
+        if key.strip() in found:
+            raise ValueError(f"expected each KEY once, got --set {key.strip()} twice; leave one out")
+        found[key.strip()] = value.strip()
+    return found
 
 
 def leaves(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from analysis.family_table import family_table
 from analysis.measurement import ProbeSettings, measure
 from analysis.options import ProbeOptions
 from analysis.probe_record import probe_arrays, probe_data
-from analysis.provenance import provenance
+from analysis.provenance import provenance, require_seed
 from analysis.recording import write_with_pictures
 from analysis.records import FILE, PROBE, Record, record_folder, require_replaceable
 from analysis.skips import estimator_skips, product_skips
@@ -49,6 +49,7 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | 
 
     Started by torchrun, the processes share the views, and the first one writes.
     """
+    require_seed(options.seed)
     device = device_named(options.device)
     with torchrun_ranks(device) as ranks:
         return _run(options, command, drawn, device, ranks)

@@ -10,6 +10,12 @@ from typing import Any
 PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib", "pyvista", "plotly")
 
 
+def require_seed(seed: int) -> None:
+    """ValueError where it is out of range."""
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"expected a seed in [0, 2^63), got {seed}")
+
+
 def provenance(seed: int, *, lanes: int | None = None, **more: Any) -> dict[str, Any]:
     """The `provenance` of a record (see `analysis.records`); `more` (checkpoint, scene, ...) is added as it is.
 

@@ -48,6 +48,7 @@ finite_probe      null, or the second difference (L(+d v) + L(-d v) - 2 L) / d^2
 families          absent, or rows of the anisotropy families (`analysis.family_stage`), each with: operator ("hessian" or
                   "gauss-newton"), block ("all" or an attribute), metric and unit, split (whether of the split scene),
                   gaussians, dim, rank (dim without the exact null space); lambda_max, lambda_min: value, residual, ...;
+                  beyond: how far outside an end that ran out of its budget may lie (see `landscape.results.EigenEnds`);
                   indices: as anisotropy; starts, steps of the density; matvecs
 split_control     absent, or gaussians; rms, largest, psnr of the images' change; effects: operator, block, index, and value,
                   low, high, note of the split scene's index over the trained scene's

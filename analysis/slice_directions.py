@@ -61,8 +61,13 @@ class Shape:
         cls, along: Sequence[Along], dimension: int | None, radii: Sequence[float], points: int, other: bool
     ) -> "Shape":
         """The shape that was asked for; ValueError where the wishes contradict each other."""
+        if twice := [kind for kind in dict.fromkeys(along) if along.count(kind) > 1]:
+            raise ValueError(
+                f"expected directions of different kinds, got --along {twice[0]} twice; leave one out, and for a plane of one "
+                "kind, eigenvectors or random, give --dimension 2"
+            )
         default: Along = "line" if other else "eigenvectors"
-        named: list[Along] = list(dict.fromkeys(along)) or [default]
+        named = list(along) or [default]
         kinds: tuple[Along, ...] = tuple(sorted(named, key=lambda kind: kind != "line"))  # a line keeps its ends
         if len(kinds) > 2:
             raise ValueError(f"expected one or two directions, got {' and '.join(kinds)}; slice again for the others")

@@ -31,7 +31,7 @@ from analysis.measurement import evaluation, slice_notes
 from analysis.options import SliceOptions
 from analysis.probe import scene_objective
 from analysis.probe_record import loss_name
-from analysis.provenance import provenance
+from analysis.provenance import provenance, require_seed
 from analysis.quantities import measured, quantity
 from analysis.recording import write_with_pictures
 from analysis.records import SLICE, record_folder, require_replaceable
@@ -47,7 +47,7 @@ from analysis.slice_directions import (
 )
 from analysis.slice_record import Found, slice_arrays, slice_data
 from analysis.stages import Stages
-from analysis.verdict import of_slice
+from analysis.verdict import of_slice, resolved
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
 from landscape.grid_evaluations import Evaluation, Loss, slice_digest
 from landscape.probes import split
@@ -63,6 +63,7 @@ DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
 def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     """Slice the checkpoint's loss; returns the exit code.  command: as typed, for the record."""
+    require_seed(options.seed)
     shape = Shape.of(options.along, options.dimension, options.radius, options.points, options.other is not None)
     device = device_named(options.device)
     settings = _settings(options, shape, device)
@@ -246,10 +247,15 @@ def _conclude(data: dict[str, Any], out: Path) -> None:
 
 
 def _finite_curvature(probe: dict[str, Any]) -> str:
-    """What the step with the least error sees: of a crossed one, only the round-off is an error."""
-    errors = np.nan_to_num(np.add(probe["round_off"], probe["truncation"]).astype(float), nan=inf)
-    best = int(errors.argmin())
-    crossed = probe["crossed"] is not None and probe["crossed"][best]
-    value = measured(probe["curvatures"][best], probe["round_off"][best] if crossed else errors[best])
-    across = ", across sorts that changed" if crossed else ""
-    return f"at finite steps: curvature {value} at a step of {quantity(probe['steps'][best])}{across}"
+    """Between what the curvature lies that the steps see which round-off does not hide."""
+    sure, steps = np.array(resolved(probe)), np.array(probe["steps"])
+    if not sure.any():
+        return f"at finite steps: round-off hides the curvature at all {len(sure)} steps"
+    values = np.array(probe["curvatures"], float)[sure]
+    crossed = int((sure & np.array(probe["crossed"] or [False] * len(sure))).sum())
+    across = f", {crossed} of them across sorts that changed" if crossed else ""
+    return (
+        f"at finite steps: curvature from {quantity(values.min())} to {quantity(values.max())}, at the {sure.sum()} of "
+        f"{len(sure)} steps that round-off does not hide (±{quantity(steps[sure].min())} to ±{quantity(steps[sure].max())})"
+        f"{across}"
+    )

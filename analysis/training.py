@@ -47,14 +47,25 @@ from splat.regularizers.methods import METHODS
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
-from splat.scenes.splits import Split, split_scene
+from splat.scenes.splits import Split, split_scene, usual_views
 from splat.scenes.view import View
 from splat.start import initial_gaussians
 from splat.train import TrainConfig, Training, train
 
 CHECKPOINT, METRICS, HISTORY, RENDERS = "checkpoint.pt", "metrics.json", "history.csv", "test"
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+OPTIONS = {  # settings of the training that have an option of their own
+    "iterations": "iterations",
+    "seed": "seed",
+    "sh_degree": "sh_degree",
+    "background": "background",
+    "random_background": "background",
+    "loss.pixel": "pixel_loss",
+    "loss.ssim_weight": "ssim_weight",
+    "densify.enabled": "densify",
+}
 AGAIN = "repeat its command with --resume, or choose another --out"
+WARNING: dict[str, Any] = {"style": "yellow", "soft_wrap": True, "highlight": False, "markup": False}
 SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
 
 
@@ -95,14 +106,16 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         console.print(
             f"{method.name} begins after step {warm_up}, which this run does not reach: it is plain 3DGS so far; "
             f"take more --iterations, or --set warm_up={config.iterations // 2}",
-            style="yellow", soft_wrap=True, highlight=False,
-        )  # fmt: skip
+            **WARNING,
+        )
     trajectory = None if along is None else Trajectory(out, training, views, along)
     if not _follow(training, views, out / CHECKPOINT, reference, options.checkpoint_every, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])
         console.print(f"stopped after step {training.step}; to continue: {again}", soft_wrap=True, highlight=False)
         return 130
     _report(training, views, held_out, out)
+    if trajectory and (skipped := trajectory.skipped):
+        console.print(skipped, **WARNING)
     return 0
 
 
@@ -110,7 +123,8 @@ def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig
     """What the options stand for, before any image is read.  ValueError or FileNotFoundError where they are wrong."""
     colour = COLOURS.get(options.background)
     scene = load_scene(options.scene, options.images, options.downscale, colour, options.masks, options.depths)
-    split = split_scene(scene, None if options.views == "all" else options.views)
+    views = usual_views(scene) if options.views is None else options.views
+    split = split_scene(scene, None if views == "all" else views)
     reference = SceneReference.to(
         scene, out / CHECKPOINT, split, options.images, options.downscale, options.start, options.depths
     )
@@ -131,7 +145,15 @@ def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
         densify=DensifySettings(enabled=options.densify),
         method=METHODS[options.method](),
     )
-    return overridden(config, assignments(options.set))
+    changes = assignments(options.set)
+    for key, name in OPTIONS.items():
+        given = getattr(options, name)
+        if key in changes and given != getattr(TrainOptions, name):
+            raise ValueError(
+                f"expected one value for {key}, got --set {key}={changes[key]} beside the option --{name.replace('_', '-')}, "
+                f"which is {given}; leave one out"
+            )
+    return overridden(config, changes)
 
 
 def _require_run(out: Path, resume: bool) -> None:
@@ -190,6 +212,7 @@ def _follow(
 ) -> bool:
     """Train to the end with a progress bar and checkpoints; False where a signal ended it, after a checkpoint."""
     total, spent = training.config.iterations, Spent.read(path.parent)
+    warned = trajectory.skipped if trajectory else ""
     with interruption() as interrupted, _progress(console) as progress:
         bar = progress.add_task("training", total=total, completed=training.step, loss=math.nan, gaussians=0)
         loss = math.nan
@@ -198,6 +221,8 @@ def _follow(
             progress.update(bar, completed=done.step, loss=loss, gaussians=done.gaussians)
             if trajectory:
                 trajectory.after_step(spent.wall)
+                if not warned and (warned := trajectory.skipped):
+                    console.print(f"after step {done.step}: {warned}", **WARNING)
             stop = interrupted.is_set()
             if stop or done.step % every == 0 or done.step == total:
                 if trajectory:

@@ -61,7 +61,7 @@ from splat.scenes.view import View
 from splat.traces import exact_traces
 from splat.train import Training
 
-START = "start"
+START, NO_TIME = "start", "no time"
 Row = dict[str, Any]
 LEAST = 32  # renders with their gradients, for each view, that the least record takes (measured on 8,000 Gaussians)
 FEWEST_MATVECS = 20  # from a warm start, for the largest eigenvalue
@@ -133,7 +133,7 @@ class Trajectory:
         row: Row = {"step": step, "gaussians": len(self.training.gaussians), "state": "skipped", "seconds": 0.0}
         least = self._expected(trained / step)
         if allowed < least:
-            row["note"] = f"no time: {least:.2g} s were needed at least, {max(allowed, 0.0):.2g} s were allowed"
+            row["note"] = f"{NO_TIME}: {least:.2g} s were needed at least, {max(allowed, 0.0):.2g} s were allowed"
         else:
             start = perf_counter()
             try:
@@ -146,6 +146,15 @@ class Trajectory:
         # as objects: a whole number stays one beside a row that has none, as it does in rows read again
         table = pd.DataFrame(self.rows, columns=COLUMNS, dtype=object)
         write_atomically(self.run / RECORDS, table.to_csv(index=False).encode())
+
+    @property
+    def skipped(self) -> str:
+        """How many records were skipped, why the last one was, and what to do, as a sentence; empty where none was."""
+        notes = [row["note"] for row in self.rows if row["state"] == "skipped"]
+        if not notes:
+            return ""
+        remedy = "; --probe-share inf sets no limit to their time" if notes[-1].startswith(NO_TIME) else ""
+        return f"{len(notes)} of {len(self.rows)} records of the landscape were skipped ({notes[-1]}){remedy}"
 
     def _expected(self, step: float) -> float:
         """Seconds that the next record takes at least, where a step takes so many."""

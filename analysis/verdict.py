@@ -4,11 +4,11 @@ Every sentence follows from numbers of the record and their errors alone; where 
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from analysis.quantities import measured, quantity
+from analysis.quantities import UNDETERMINED, measured, quantity
 
 ATTRIBUTES = {
     "means": "position",
@@ -124,8 +124,9 @@ def _of_anisotropy(family: Mapping[str, Any]) -> list[Line]:
             Line(f"The ratio of the two ends of the spectrum is not determined{_in_brackets(saddle)}.", "caution")
         )
     if share and _is_finite(share["value"]):
+        bracket = _bracket(share, "{:.2%}".format)
         lines.append(
-            Line(f"The steepest direction alone holds {share['value']:.2%} of all absolute curvature{_bracket(share)}.")
+            Line(f"The steepest direction alone holds {share['value']:.2%} of all absolute curvature{bracket}.")
         )
     return lines
 
@@ -152,6 +153,13 @@ def _of_finite_probe(probe: Mapping[str, Any] | None) -> list[Line]:
         error = math.hypot(probe["round_off"][best] or math.inf, probe["truncation"][best] or math.inf)
         text += f"{measured(probe['curvatures'][best], error)} at ±{quantity(probe['steps'][best])} and "
     return [Line(f"{text}{quantity(far)} at ±{quantity(probe['steps'][-1])}.")]
+
+
+def resolved(probe: Mapping[str, Any]) -> list[bool]:
+    """Of which finite steps round-off does not hide the curvature."""
+    here = abs(probe["infinitesimal"])
+    pairs = zip(probe["curvatures"], probe["round_off"], strict=True)
+    return [_is_finite(value) and _is_finite(bound) and bound <= max(abs(value), here) / 2 for value, bound in pairs]
 
 
 def _of_skips(skipped: Mapping[str, Mapping[str, Any]]) -> list[Line]:
@@ -217,10 +225,9 @@ def _overlap(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
     return abs(abs(first["value"]) - abs(second["value"])) < 2 * math.hypot(*errors)
 
 
-def _bracket(entry: Mapping[str, Any]) -> str:
-    if entry["low"] is None and entry["high"] is None:
-        return ""
-    return f" (between {quantity(entry['low'])} and {quantity(entry['high'])})"
+def _bracket(entry: Mapping[str, Any], written: Callable[[float], str] = quantity) -> str:
+    ends = [UNDETERMINED if entry[end] is None else written(entry[end]) for end in ("low", "high")]
+    return "" if ends == [UNDETERMINED] * 2 else f" (between {ends[0]} and {ends[1]})"
 
 
 def _in_brackets(entry: Mapping[str, Any]) -> str:

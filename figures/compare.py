@@ -10,6 +10,7 @@ compare_sections    the loss along each of these directions, as far as each slic
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,7 +20,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.records import Record, read_record
 from analysis.verdict import attribute_name
-from figures.plane import Plane, plane
+from figures.plane import Plane, plane, same_scale
 from figures.style import (
     BLACK,
     BLUE,
@@ -45,6 +46,11 @@ COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)
 LINES = ("-", "--", ":")  # once the colours are used up
 LEVELS = 12
 ACROSS = 3  # panels in a row
+WIDTH = 5.0  # inches for the panels of a row
+END: dict[str, Any] = {"linestyle": (0, (2, 2)), "linewidth": 0.6}
+ENDS_ALONE = "the density found none;\nthe ends alone are known"
+BEHIND = {"color": "white", "pad": 1.0}
+TALLEST = 3.0  # inches of a panel
 
 
 def draw_traces(records: Records) -> Figure:
@@ -86,20 +92,21 @@ def draw_densities(records: Records) -> Figure:
         raise ValueError("expected a spectral density in at least one record, got none")
     with style():
         figure = new_figure(2.6, 2 * COLUMN)
-        panels = figure.subplots(1, 2, sharey=True)
+        panels, ends = figure.subplots(1, 2, sharey=True), []
         for look, record in zip(_looks(records), records.values(), strict=True):
-            spectrum, ends = record.arrays.get("spectrum", {}), record.data["eigenvalues"]
+            spectrum, found = record.arrays.get("spectrum", {}), record.data["eigenvalues"]
             for axes, sign, end in zip(panels, (-1, 1), ("min", "max"), strict=True):
                 if "nodes" in spectrum and (sign * spectrum["nodes"] > 0).any():
                     axes.step(*beyond(sign * spectrum["nodes"], spectrum["weights"]), where="pre", **look)
-                if sign * (ends[end]["value"] or 0) > 0:
-                    axes.axvline(sign * ends[end]["value"], color=look["color"], linestyle=(0, (2, 2)), linewidth=0.6)
+                if sign * (found[end]["value"] or 0) > 0:
+                    ends.append(axes.axvline(sign * found[end]["value"], color=look["color"], **END))
         for axes, words in zip(panels, ("down", "up"), strict=True):
             axes.set(xscale="log", yscale="log", xlabel="|curvature| (loss per squared parameter unit)")
             axes.set_title(f"Directions that curve {words}", loc="left")
             axes.grid(True)
-            if not axes.lines:
-                axes.text(0.5, 0.5, "none found", transform=axes.transAxes, ha="center")
+            if all(line in ends for line in axes.lines):
+                words = ENDS_ALONE if axes.lines else "none found"
+                axes.text(0.5, 0.9, words, transform=axes.transAxes, ha="center", va="top", bbox=BEHIND)
         limits = np.array([axes.get_xlim() for axes in panels if axes.lines])
         top = limits[:, 1].max()
         for axes in panels:
@@ -108,7 +115,7 @@ def draw_densities(records: Records) -> Figure:
         most = max(record.data["counts"]["active_parameters"] for record in records.values())
         panels[0].set_ylim(0.5 / most, 2)  # one direction is a share of 1 / parameters
         panels[0].set_ylabel("share of directions\nat least so curved")
-        _legend(figure, records)
+        _legend(figure, records, *[Line2D([], [], color=BLACK, label="end of the spectrum", **END)] * bool(ends))
     return figure
 
 
@@ -136,8 +143,10 @@ def draw_slices(records: Records) -> Figure:
     power = exponent_of(high, low)
     levels = MaxNLocator(LEVELS).tick_values(low / 10.0**power, high / 10.0**power)
     rows, columns = -(-len(planes) // ACROSS), min(len(planes), ACROSS)
+    same = same_scale(*reach)
+    shape = reach[1] / reach[0] if same else 0.75
     with style():
-        figure = new_figure(0.4 + 2.1 * rows, 2 * COLUMN)
+        figure = new_figure(0.4 + (0.3 + min(WIDTH / columns * shape, TALLEST)) * rows, 2 * COLUMN)
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         filled = None
         for axes, (label, (x, y, change, _)) in zip(panels.ravel(), windows.items(), strict=False):
@@ -150,9 +159,11 @@ def draw_slices(records: Records) -> Figure:
             axes.set(
                 xlim=np.array([-1, 1]) * reach[0] / 10.0**exponent, ylim=np.array([-1, 1]) * reach[1] / 10.0**exponent
             )
+            axes.set_aspect("equal" if same else "auto")
         for axes in panels.ravel()[len(planes) :]:
             axes.set_axis_off()
-        figure.supxlabel(f"step along the steepest direction, param. units{unit_suffix(exponent)}", fontsize=7)
+        scales = "" if same else " (axes differ in scale)"
+        figure.supxlabel(f"step along the steepest direction, param. units{unit_suffix(exponent)}{scales}", fontsize=7)
         figure.supylabel(f"step along the second{unit_suffix(exponent)}", fontsize=7)
         figure.colorbar(filled, ax=panels, label=f"change of loss{unit_suffix(power)}")  # pyright: ignore[reportArgumentType]
     return figure
@@ -198,9 +209,10 @@ def _looks(records: Records) -> list[dict[str, str]]:
     ]
 
 
-def _legend(figure: Figure, records: Records) -> None:
+def _legend(figure: Figure, records: Records, *more: Line2D) -> None:
     handles = [Line2D([], [], label=literal(label), **look) for label, look in zip(records, _looks(records))]  # pyright: ignore[reportArgumentType]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(records)))
+    handles += more
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)))
 
 
 FIGURES: dict[str, Callable[[Records], Figure]] = {

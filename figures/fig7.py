@@ -10,6 +10,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -17,12 +18,13 @@ from matplotlib.ticker import MaxNLocator
 
 from figures.manifold import Scale, landscape_of, section, start_of, surface
 from figures.style import BLUE, GREEN, VERMILION, literal, new_figure, save, style
-from figures.trajectory import index_over_steps
+from figures.trajectory import below_zero, index_over_steps
 
 RECORDS = "trajectory.csv"
 PAGE = 6.9  # inches
 COLOURS = (VERMILION, GREEN)
 BEGINNING = "start"
+BAR: dict[str, Any] = {"shrink": 0.6, "aspect": 14}  # without a name: the title above has it
 
 
 def draw(runs: Sequence[Path]) -> Figure:
@@ -39,9 +41,11 @@ def draw(runs: Sequence[Path]) -> Figure:
         index.set(xlabel="step", ylabel="|λmax / λmin|", title="Anisotropy index")
         index.xaxis.set_major_locator(MaxNLocator(4, integer=True))
         index.grid(True)
-        for i, (end, name) in enumerate(zip(ends, names, strict=True)):
-            surface(figure, (2, 3, 2 + i), end, scale, f"{name}, end")
-        surface(figure, (2, 3, 4), start, wide, f"{BEGINNING}, steps × {wide.reach / scale.reach:.2g}")
+        drawn = [surface(figure, (2, 3, 2 + i), end, scale, f"{names[i]}, end") for i, end in enumerate(ends)]
+        figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], **BAR)
+        title = f"{BEGINNING}, steps × {wide.reach / scale.reach:.2g}"
+        around, colours = surface(figure, (2, 3, 4), start, wide, title)
+        figure.colorbar(colours, ax=around, **BAR)
         for axis, direction in enumerate(("e₁", "e₂")):
             axes = figure.add_subplot(2, 3, 5 + axis)
             section(axes, start, scale, axis, color=BLUE, linestyle="--")
@@ -49,8 +53,9 @@ def draw(runs: Sequence[Path]) -> Figure:
                 section(axes, end, scale, axis, color=colour)
             axes.set(xlabel=scale.step_label(direction), ylabel=scale.loss_label, title=f"Section along {direction}")
         handles = [figure.axes[-1].lines[i] for i in (1, 2, 0)]
-        labels = [literal(name) for name in (*names, BEGINNING)]
-        figure.legend(handles, labels, loc="outside lower center", ncols=3)
+        for line, name in zip(handles, (*names, BEGINNING), strict=True):
+            line.set_label(literal(name))
+        figure.legend(handles=[*handles, *below_zero(measured, "literal")], loc="outside lower center", ncols=4)
     return figure
 
 

@@ -5,14 +5,16 @@ as the widest of them reaches, and the change of the loss from its own centre.  
 Where a slice was not recorded that far there is nothing.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
 from analysis.records import PROBE, SLICE, read_record
@@ -20,6 +22,8 @@ from figures.plane import Plane, plane
 from figures.style import BLACK, FIELD_MAP, MISSING, exponent_of, literal, unit_suffix
 
 CHECKPOINT, START = "checkpoint.pt", "start"
+INNER = 0.65  # of the reach of a surface: no tick farther out
+ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
 SLICES = (("slice-eigenvectors-2d", SLICE), ("probe", PROBE))  # beside a checkpoint, the first that is there
 LEVELS = 10
 NAMES = ("e₁", "e₂")
@@ -95,26 +99,40 @@ def _slice(run: Path) -> str:
     return f"run: landscape slice {run / CHECKPOINT}"
 
 
-def surface(figure: Figure, place: tuple[int, int, int], landscape: Plane, scale: Scale, title: str) -> None:
-    """The loss as a surface over both steps."""
+def surface(
+    figure: Figure, place: tuple[int, int, int], landscape: Plane, scale: Scale, title: str
+) -> tuple[Axes3D, ScalarMappable]:
+    """The loss as a surface over both steps: its axes, and its colours."""
     axes: Axes3D = figure.add_subplot(*place, projection="3d")  # pyright: ignore[reportAssignmentType]
     steps, loss = 10.0**scale.steps, 10.0**scale.loss
     x, y = np.meshgrid(landscape.x.steps / steps, landscape.y.steps / steps, indexing="ij")
     height = change_of(landscape).filled(np.nan) / loss
     low, high = scale.low / loss, scale.high / loss
-    axes.plot_surface(x, y, height, cmap=FIELD_MAP, rcount=60, ccount=60, linewidth=0.1, vmin=low, vmax=high)
+    drawn = axes.plot_surface(x, y, height, cmap=FIELD_MAP, rcount=60, ccount=60, linewidth=0.1, vmin=low, vmax=high)
     reach = scale.reach / steps
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(low, high))
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.set_major_locator(MaxNLocator(3))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(FixedLocator(_inner_ticks(reach)))
+    axes.zaxis.set_major_locator(MaxNLocator(3))
     axes.tick_params(labelsize=5, pad=-3)
-    axes.tick_params(axis="y", pad=-1.5)  # its first tick stands where the last one of x does
-    axes.set_xlabel(scale.step_label("e₁"), fontsize=6, labelpad=-7)
-    axes.set_ylabel(scale.step_label("e₂"), fontsize=6, labelpad=-5)
+    axes.set_xlabel(scale.step_label("e₁"), fontsize=6, labelpad=-4)
+    axes.set_ylabel(scale.step_label("e₂"), fontsize=6, labelpad=-3)
     axes.set_title(f"{literal(title)}\n{scale.loss_label}", y=0.95)
     axes.view_init(elev=32, azim=-58)
     # the layout does not count the labels of such axes
     axes.set_box_aspect(None, zoom=0.72)  # pyright: ignore[reportArgumentType]
+    return axes, drawn
+
+
+def _inner_ticks(reach: float) -> list[float]:
+    """A round number to either side, far enough from the ends, where another axis has ticks.
+
+    >>> _inner_ticks(0.067)
+    [-0.04, 0.04]
+    """
+    power = 10.0 ** math.floor(math.log10(INNER * reach))
+    tick = max(round_one * power for round_one in ROUND if round_one * power <= INNER * reach)
+    return [-tick, tick]
 
 
 def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
@@ -139,4 +157,5 @@ def section(axes: Axes, landscape: Plane, scale: Scale, axis: int, **look: objec
     axes.plot(along.steps / 10.0**scale.steps, line, **look)  # pyright: ignore[reportArgumentType]
     reach, loss = scale.reach / 10.0**scale.steps, 10.0**scale.loss
     axes.set(xlim=(-reach, reach), ylim=(scale.low / loss, scale.high / loss))
+    axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.grid(True)

@@ -17,6 +17,8 @@ from analysis.quantities import quantity
 from analysis.records import Record
 from figures.style import exponent_of, literal, unit_suffix
 
+TRUE_PROPORTIONS = 2.5  # ranges whose ratio is below this are drawn to the same scale
+
 
 @dataclass(frozen=True)
 class Direction:
@@ -114,6 +116,11 @@ def _alike(arrays: dict[str, np.ndarray]) -> bool:
     """Whether both axes read well with the same power of ten taken out."""
     spans = sorted((np.ptp(arrays["x"]), np.ptp(arrays["y"])))
     return spans[1] < 100 * spans[0]
+
+
+def same_scale(x: float, y: float) -> bool:
+    """Whether two ranges are drawn to the same scale."""
+    return 1 / TRUE_PROPORTIONS < x / y < TRUE_PROPORTIONS
 
 
 def curvature_text(direction: Direction) -> str:

@@ -63,5 +63,8 @@ def render(height: np.ndarray, colour: np.ndarray, levels: np.ndarray, out: Path
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        print("expected FIELD.npz OUT.png; to draw a record: python -m figures.surface RUN/probe", file=sys.stderr)
+        sys.exit(2)
     with np.load(sys.argv[1], allow_pickle=False) as field:
         render(field["height"], field["colour"], field["levels"], Path(sys.argv[2]))

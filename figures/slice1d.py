@@ -2,8 +2,9 @@
 
 Above: dots are true renders, blue where the order of the splats or the set of visible ones is not the checkpoint's; between
 them the loss is interpolated.  Dashed: the quadratic model.  Below: second differences of renders at steps to both sides, with
-the bounds of their round-off (grey where it hides them); hollow where an end is crossed.  The line is the infinitesimal
-curvature.  What steps that cross sorts see beside it is the loss's shape at that distance: its kinks and jumps, smoothed.
+the bounds of their round-off (grey where it hides them; a triangle where a value lies beyond the axis); hollow where an end is
+crossed.  The line is the infinitesimal curvature.  What steps that cross sorts see beside it is the loss's shape at that
+distance: its kinks and jumps, smoothed.
 """
 
 from typing import Any
@@ -15,11 +16,13 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.quantities import quantity
 from analysis.records import Record
+from analysis.verdict import resolved
 from figures.plane import Direction, direction
 from figures.slice2d import CROSSED, RENDERED
 from figures.style import BLACK, BLUE, VERMILION, exponent_of, new_figure, script, style, unit_suffix
 
 DOT = {"markersize": 5}
+SHORT = 0.25  # of a value: a bar within which it sets the limits
 
 
 def draw(record: Record) -> Figure:
@@ -79,7 +82,7 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> Non
     crossed = np.array(probe["crossed"] or [False] * len(steps))
     exact = probe["infinitesimal"]
     axes.axhline(exact, color=VERMILION, linewidth=0.9, label=f"infinitesimal: {quantity(exact)}")
-    sure = _resolved(exact, values, bounds)
+    sure = np.array(resolved(probe))
     if not sure.all():
         hidden: dict[str, Any] = {"fmt": "none", "ecolor": "0.8", "elinewidth": 1.2, "label": "hidden by round-off"}
         axes.errorbar(steps[~sure], values[~sure], bounds[~sure], **hidden)
@@ -91,22 +94,27 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> Non
             drawn: dict[str, Any] = {"color": BLUE, "markerfacecolor": face, "markersize": 3.5, "elinewidth": 0.8}
             axes.errorbar(*(each[where & sure] for each in (steps, values, bounds)), fmt="o", label=label, **drawn)
     axes.set_xscale("log")
-    axes.set_ylim(*_limits(exact, values, bounds))
+    low, high = _limits(exact, values[sure], bounds[sure])
+    axes.set_ylim(low, high)
+    label = "beyond the axis"
+    for beyond, edge, marker in ((values < low, low, "v"), (values > high, high, "^")):
+        if (beyond & sure).any():
+            axes.plot(
+                steps[beyond & sure], [edge] * (beyond & sure).sum(), marker, color=BLUE, clip_on=False, label=label
+            )
+            label = None
     axes.set_xlabel(f"step along {along.name}, {along.scale}")
     axes.set_ylabel("curvature (loss per squared step)")
     axes.grid(True)
     axes.set_title("Curvature at finite steps (bars: round-off)", loc="left")
 
 
-def _resolved(exact: float, values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Which values round-off does not hide."""
-    return np.isfinite(values) & (bounds <= np.maximum(np.abs(values), abs(exact)) / 2)
-
-
 def _limits(exact: float, values: np.ndarray, bounds: np.ndarray) -> tuple[float, float]:
-    """Of what is resolved, with a margin: bars of the other steps reach beyond."""
-    sure = _resolved(exact, values, bounds)
-    ends = np.concatenate([[exact], values[sure] - bounds[sure], values[sure] + bounds[sure]])
+    """Of the values with the shorter bars, with a margin: a value that is hardly known does not flatten those that are."""
+    short = bounds <= SHORT * np.maximum(np.abs(values), abs(exact))
+    if short.any():
+        values, bounds = values[short], bounds[short]
+    ends = np.concatenate([[exact], values - bounds, values + bounds])
     low, high = float(ends.min()), float(ends.max())
     margin = 0.2 * (high - low) or abs(exact) or 1.0
     return low - margin, high + margin

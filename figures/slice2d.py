@@ -17,13 +17,12 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.quantities import quantity
 from analysis.records import Record
-from figures.plane import Direction, Plane, curvature_text, plane
+from figures.plane import Direction, Plane, curvature_text, plane, same_scale
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
 
 LEVELS = 12
 RENDERED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": BLACK, "markeredgewidth": 0}
 CROSSED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": SKY, "markeredgewidth": 0}
-TRUE_PROPORTIONS = 2.5  # ranges whose ratio is below this are drawn to the same scale
 
 
 def draw(record: Record) -> Figure:
@@ -66,9 +65,7 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
     axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
     axes.set_xlabel(field.x.label)
     axes.set_ylabel(field.y.label)
-    ratio = np.ptp(field.x.steps) / np.ptp(field.y.steps)
-    same = 1 / TRUE_PROPORTIONS < ratio < TRUE_PROPORTIONS
-    if same:
+    if same := same_scale(np.ptp(field.x.steps), np.ptp(field.y.steps)):
         axes.set_aspect(10.0 ** (field.y.exponent - field.x.exponent))
     axes.set_title("Loss around the checkpoint" + ("" if same else " (axes differ in scale)"), loc="left")
     return filled

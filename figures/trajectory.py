@@ -10,6 +10,7 @@ import argparse
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -39,7 +40,7 @@ from figures.style import (
 COLOURS = (VERMILION, GREEN, BLUE, ORANGE, PURPLE, SKY, BLACK)
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
 INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
-PANEL = 1.05  # inches of height
+PANEL = 1.12  # inches of height
 LEGEND_LINE = 0.14
 
 
@@ -55,7 +56,7 @@ def draw(table: pd.DataFrame) -> Figure:
         )
     runs = {str(name): COLOURS[i % len(COLOURS)] for i, name in enumerate(table["run"].unique())}
     with style():
-        figure = new_figure(PANEL * 5 + LEGEND_LINE * (len(runs) + 2))
+        figure = new_figure(PANEL * 5 + LEGEND_LINE * (len(runs) + 3))
         panels = figure.subplots(5, 2)
         for axes, name in zip(panels.flat, ATTRIBUTES, strict=False):
             columns = f"trace_{name}", f"trace_{name}_low", f"trace_{name}_high"
@@ -73,6 +74,7 @@ def draw(table: pd.DataFrame) -> Figure:
             axes.grid(True)
             axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
         handles = [Line2D([], [], color=colour, label=literal(name)) for name, colour in runs.items()]
+        handles += below_zero(measured, *INDICES)
         figure.legend(handles=handles, loc="outside lower center", ncols=1)
     return figure
 
@@ -107,13 +109,21 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
     _few_decades(axes)
 
 
+def below_zero(measured: pd.DataFrame, *names: str) -> list[Line2D]:
+    """What hollow markers mean, for a legend, where one of the indices has any."""
+    if not (measured[list(names)] < 0).to_numpy().any():
+        return []
+    look: dict[str, Any] = {"marker": "o", "markersize": 3, "markerfacecolor": "white", "linestyle": "none"}
+    return [Line2D([], [], color=BLACK, label="open: the index is negative", **look)]
+
+
 def _bands(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], columns: tuple[str, str, str], title: str) -> None:
     """columns: of the values and of both ends of their bands."""
     lowest = float(np.nanmin(measured[columns[1]].to_numpy(float)))
     highest = float(np.nanmax(measured[columns[2]].to_numpy(float)))
     logarithmic = lowest > 0 and highest > 10 * lowest
     exponent = 0 if logarithmic else exponent_of(measured[columns[0]].to_numpy(float))
-    axes.set_title(literal(title) + unit_suffix(exponent))
+    axes.set_title(f"{literal(title)}\n{unit_suffix(exponent).strip()}".strip())
     for run, colour in runs.items():
         part = pd.DataFrame(measured[measured["run"] == run])
         value, low, high = (part[name].to_numpy(float) / 10.0**exponent for name in columns)
@@ -163,6 +173,13 @@ def main() -> None:
     parser.add_argument("table", type=Path, help="trajectories.csv, as written by `landscape trajectory`")
     parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
     arguments = parser.parse_args()
+    if arguments.table.is_dir():
+        print(
+            f"expected the table trajectories.csv as written by landscape trajectory, got the folder {arguments.table}; "
+            "name the table in it, or run landscape trajectory on the runs",
+            file=sys.stderr,
+        )
+        sys.exit(2)
     try:
         figure = draw(pd.read_csv(arguments.table))
         print(save(figure, arguments.table.with_suffix(f".{arguments.format}")))

@@ -29,6 +29,7 @@ BLENDER_TRAINING = (26, 86, 2, 55, 75, 93, 16, 73)
 DTU_TRAINING = (25, 22, 28, 40, 44, 48, 0, 8, 13)
 DTU_LEFT_OUT = (3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 36, 37, 38, 39)
 DTU_VIEWS = 49  # some scans have 64
+FEWEST = 3  # training views of the protocols for LLFF and DTU
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,11 @@ class Split:
     train: tuple[str, ...]
     test: tuple[str, ...]
     protocol: str
+
+
+def usual_views(scene: Scene) -> int:
+    """How many training views the scene has where nobody says: all 8 of Blender's protocol, else the fewest of the field."""
+    return len(BLENDER_TRAINING) if scene.kind == "blender" else FEWEST
 
 
 def split_scene(

@@ -235,6 +235,18 @@ def test_options_out_of_range_are_refused(original, tmp_path, capsys, option, va
     refuse(capsys, arguments(original, tmp_path / "run", option, value), message)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--set", "densify.every=50", "--set", "densify.every=60"], "expected each KEY once"),
+        (["--no-densify", "--set", "densify.enabled=true"], "--set densify.enabled=true beside the option --densify"),
+        (["--seed", "3", "--set", "seed=4"], "--set seed=4 beside the option --seed, which is 3; leave one out"),
+    ],
+)
+def test_a_setting_given_twice_is_refused(original, tmp_path, capsys, options, message):
+    refuse(capsys, arguments(original, tmp_path / "run", *options), message)
+
+
 def test_a_checkpoint_that_is_not_one_is_refused_on_resuming(finished, original, tmp_path, capsys):
     out = tmp_path / "run"
     out.mkdir()

@@ -10,7 +10,7 @@ import pytest
 
 from analysis.cli import main
 from analysis.family_table import bracketed
-from analysis.quantities import measured
+from analysis.quantities import measured, quantity
 from analysis.records import record_folder, write_record
 from splat.checkpoint import load_checkpoint, save_checkpoint
 from splat.losses import LossSettings
@@ -27,13 +27,20 @@ def record(folder: Path, scale: float, **changes) -> None:
     data, arrays = synthetic(scale)
     data["provenance"] |= {"iteration": ITERATIONS} | changes
     effects = [{"operator": "hessian", "block": block, "index": "saddle", **FACTOR} for block in ("all", "means")]
-    data["split_control"] = {"gaussians": 20182, "rms": 0.0, "largest": 0.0, "psnr": 99.0, "effects": effects}
+    data["split_control"] = {
+        "gaussians": 20182,
+        "rms": 0.01 * scale,
+        "largest": 0.1,
+        "psnr": 40.0 / scale,
+        "effects": effects,
+    }
     end = {"value": 4.0, "residual": 0.1, "reason": "tolerance"}
     about = {"operator": "hessian", "block": "means", "metric": "parameters", "unit": "parameter units", "split": False}
     index = {"value": 7.0 * scale, "low": 6.0 * scale, "high": 9.0 * scale, "note": ""}
     names = ("literal", "saddle", "share", "effective_rank", "mass_quantile")
     family = {"gaussians": 10091, "dim": 30273, "rank": 30000, "lambda_max": end, "lambda_min": end}
-    data["families"] = [about | family | {"indices": dict.fromkeys(names, index)}]
+    family |= {"indices": dict.fromkeys(names, index)}
+    data["families"] = [about | family, about | family | {"split": True, "gaussians": 20000}]
     with record_folder(folder) as partial:
         write_record(partial, data, arrays)
 
@@ -108,11 +115,15 @@ def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(train
     assert main(["compare", str(trained / "plain/0"), str(trained / "sam/0"), "--out", str(tmp_path)]) == 0
     said, page = capsys.readouterr().out, (tmp_path / "compare.html").read_text()
     assert "http" not in page.replace("http-equiv", "") and "<script" not in page
+    assert "which hardly changes the image" in page
     for scale in (1.0, 0.5):
         data, _ = synthetic(scale)
         trace, saddle = data["traces"]["means"], bracketed(data["anisotropy"]["saddle"])
         for text in (measured(trace["value"], trace["standard_error"]), saddle.value, "× 2.50", "2.00 … 3.10"):
             assert text in said and text in page
+        assert (
+            f"by {quantity(0.01 * scale)} (root mean square; {quantity(40 / scale)} dB), and 182 of the halves" in page
+        )
         assert bracketed({"value": 7 * scale, "low": 6 * scale, "high": 9 * scale, "note": ""}).bracket in page
 
 

@@ -1,6 +1,8 @@
 """The families in a probe: each against dense matrices, the split control's effect, what the record and the page say."""
 
 import copy
+import io
+import re
 from contextlib import nullcontext
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -9,11 +11,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from rich.console import Console
 from scipy.stats import binom
 
 from analysis.cli import main
 from analysis.family_stage import FamilyFindings, FamilyOptions, _seconds_a_product, measure_families, quotient
-from analysis.family_table import family_lines
+from analysis.family_table import Cell, family_lines, family_table
 from analysis.probe import scene_objective
 from analysis.records import Record, read_record
 from analysis.report import render_report
@@ -215,6 +218,40 @@ def test_a_family_whose_small_end_is_not_resolved_is_given_by_its_bound(record):
     assert cells[-1].value == "–"  # a bound that says nothing
     page = Tables(render_report(Record(record.folder, data, record.arrays)))
     assert page.rows("families")[1][7] == "≥ 34.2"
+
+
+def test_an_end_that_was_not_reached_says_so_with_its_bound(record):
+    row = copy.deepcopy(record.data["families"][0])
+    row["lambda_min"] |= {"value": 1e-5, "residual": 2.4e-4, "reason": "matvec budget"}
+    for beyond, bracket in ((0.03, "−0.0302 … 2.50 × 10⁻⁴"), (None, "≤ 2.50 × 10⁻⁴")):
+        (line,) = family_lines({"families": [row | {"beyond": beyond}]})
+        assert line.ends[1] == Cell("not reached", bracket, "matvec budget")
+    row["lambda_max"] |= {"value": 2.0, "residual": 0.1, "reason": "time budget"}
+    (line,) = family_lines({"families": [row | {"beyond": 0.5}]})
+    assert line.ends[0] == Cell("not reached", "1.90 … 2.60", "time budget")
+    row["lambda_min"] |= {"reason": "tolerance"}
+    assert family_lines({"families": [row]})[0].ends[1].value == "(0.1 ± 2.4) × 10⁻⁴"
+    assert "beyond" in record.data["families"][0]
+
+
+def test_at_80_columns_every_number_and_label_of_the_terminals_table_is_whole(record):
+    data = copy.deepcopy(record.data)
+    wide = {"value": -1.234e-4, "low": -1.235e-4, "high": -1.233e-4, "note": ""}
+    bracket = {"value": 2.5e-4, "low": 7.45e-4, "high": 1.02e4, "note": ""}
+    for entry in [row["indices"] for row in data["families"]]:
+        entry |= {"literal": wide, "share": bracket, "mass_quantile": bracket}
+    for effect in data["split_control"]["effects"]:
+        effect |= wide if effect["index"] == "literal" else bracket
+    console = Console(width=80, file=io.StringIO())
+    console.print(family_table(data))
+    assert isinstance(console.file, io.StringIO)
+    lines = console.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    said = "\n".join(lines)
+    for whole in ("Gauss-Newton", "colour (SH)", "  changes by", "effective rank", "mass quantile"):
+        assert whole in said
+    assert said.count("± 0.0010) × 10⁻⁴") == 36 and said.count("7.45 × 10⁻⁴ …") == said.count("1.02 × 10⁴") >= 72
+    assert not re.search(r"\S…", said)  # where text was cut off
 
 
 def test_the_families_leave_the_other_numbers_as_they_are(path, record, monkeypatch, capsys):

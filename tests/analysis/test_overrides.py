@@ -73,3 +73,5 @@ def test_an_assignment_has_a_key_and_an_equals_sign():
     for text in ("a", "=1", ""):
         with pytest.raises(ValueError, match="expected KEY=VALUE"):
             assignments([text])
+    with pytest.raises(ValueError, match="expected each KEY once, got --set a twice"):
+        assignments(["a=1", " a = 2"])

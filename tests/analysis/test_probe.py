@@ -327,6 +327,11 @@ def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_pa
     assert "The check of symmetry failed" in " ".join(capsys.readouterr().out.split())
 
 
+def test_a_seed_below_zero_is_refused_as_that_of_a_training_is(run, tmp_path, capsys):
+    refused(capsys, [str(run / "double.pt"), "--out", str(tmp_path / "out"), "--seed=-1"], "seed in [0, 2^63), got -1")
+    assert not (tmp_path / "out").exists()
+
+
 def skewed(run):
     """SceneHessian.apply with a hundredth of the result moved to the next row."""
     from splat.curvature import SceneHessian

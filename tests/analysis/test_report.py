@@ -204,6 +204,12 @@ def test_an_unbounded_ratio_is_given_by_its_bound():
     assert "is not determined (the small end is not resolved)" in sentences(data)
 
 
+def test_a_share_and_its_bracket_have_the_same_unit():
+    data, _ = synthetic()
+    data["anisotropy"]["share"] = {"value": 0.008, "low": 0.00627, "high": 0.00954, "note": ""}
+    assert "holds 0.80% of all absolute curvature (between 0.63% and 0.95%)." in sentences(data)
+
+
 def test_needles_are_counted_and_notes_are_sentences():
     data, _ = synthetic()
     data["eigenvalues"]["max"]["lives_on"] = {"needles": 0.78, "needle_count": 1, "participation": 1.8}

@@ -16,6 +16,7 @@ from analysis.cli import main
 from analysis.probe import scene_objective
 from analysis.probe_record import loss_name
 from analysis.records import Record, read_record, record_folder, write_record
+from analysis.slicing import _finite_curvature
 from figures.make_all import recorded_figures
 from splat.adam import Adam
 from splat.checkpoint import load_checkpoint, save_checkpoint
@@ -24,7 +25,7 @@ from splat.densify import ScreenGradients
 from splat.losses import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from tests.recorded import synthetic
+from tests.recorded import synthetic, synthetic_line
 
 ROOT = Path(__file__).parents[2]
 SCENE = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
@@ -188,6 +189,15 @@ def test_along_the_gradient_the_slope_is_its_length_and_finite_steps_are_second_
     assert record.data["counts"]["renders"] == 3 * (record.data["slice"]["evaluations"] + probe["evaluations"])
 
 
+def test_what_finite_steps_see_is_said_as_the_range_over_those_that_round_off_does_not_hide():
+    probe = synthetic_line()[0]["finite_probe"]
+    said = _finite_curvature(probe)
+    assert "from 41.0 to 70.0, at the 3 of 4 steps that round-off does not hide (±1.00 × 10⁻⁵ to ±0.00100)" in said
+    assert said.endswith(", 2 of them across sorts that changed")
+    hidden = probe | {"curvatures": [None] * 4, "round_off": [None] * 4, "crossed": None}
+    assert _finite_curvature(hidden) == "at finite steps: round-off hides the curvature at all 4 steps"
+
+
 def test_a_line_leads_to_the_other_checkpoint_and_what_is_in_sight_there_alone(run, tmp_path):
     for start, end in (("behind", "double"), ("double", "turned")):
         record = sliced(tmp_path / start, run / f"{start}.pt", str(run / f"{end}.pt"), "--points", "9", "--all-points")
@@ -343,6 +353,8 @@ def few(run: Path, tmp_path: Path) -> str:
         (["--along", "gradient", "--dimension", "2"], ["dimension 2", "--along twice"]),
         (["--along", "gradient", "--along", "random", "--dimension", "1"], ["--along once"]),
         (["--along", "gradient", "--along", "random", "--along", "eigenvectors"], ["one or two directions"]),
+        (["--along", "gradient", "--along", "gradient"], ["--along gradient twice", "leave one out", "--dimension 2"]),
+        (["--seed", "-1"], ["seed in [0, 2^63), got -1"]),
         (["--along", "random", "--radius", "100"], ["too long"]),
         (["OTHER", "--along", "gradient"], ["one more checkpoint", "--along line"]),
         (["FEW"], ["15 Gaussians with SH degree", "got 9", "after densification"]),

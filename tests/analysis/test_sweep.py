@@ -140,7 +140,7 @@ def test_a_cell_is_the_command_that_a_user_would_type(folder):
     ("old", "new", "message"),
     [
         ('path = "still"', "", "expected the folder of the scene as scenes.still.path"),
-        ("views = 3", 'views = "few"', "expected a whole number or all for scenes.still.views, got 'few'"),
+        ("views = 3", 'views = "few"', "expected a whole number or all or none for scenes.still.views, got 'few'"),
         ("views = 3", "view = 3", "expected a key among path, .*, got scenes.still.view"),
         ("views = 3", "seed = 3", "expected a key among path, .*, got scenes.still.seed"),
         ("iterations = 6", "iterations = 0.5", "expected a whole number for iterations, got 0.5"),

@@ -12,6 +12,8 @@ from PIL import Image
 from torch import Tensor
 
 from analysis.cli import main
+from analysis.options import TrainOptions
+from analysis.training import planned
 from splat.checkpoint import load_checkpoint
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -54,6 +56,15 @@ def lpips(monkeypatch) -> None:
     module = ModuleType("lpips")
     module.LPIPS = Network  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "lpips", module)
+
+
+@pytest.mark.parametrize(("views", "number"), [(None, 2), (3, 3), ("all", 4)])
+def test_the_number_of_training_views_is_the_protocols_where_nobody_says_one(
+    original, tmp_path, monkeypatch, views, number
+):
+    monkeypatch.setattr("analysis.training.usual_views", lambda scene: 2)
+    _, split, *_ = planned(TrainOptions(original, views=views), tmp_path / "run")
+    assert len(split.train) == number
 
 
 def test_without_lpips_the_metric_is_left_out_in_one_sentence_and_null_in_the_record(

@@ -139,8 +139,11 @@ def test_a_run_killed_beside_a_checkpoint_and_resumed_gives_the_same_rows(scene,
 def test_what_does_not_fit_is_skipped_and_time_that_ends_a_record_is_said(run, at_the_end, tmp_path):
     training, views, _ = at_the_end
     trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY, 0.1))
+    assert trajectory.skipped == ""
     trajectory.after_step(1e-3)
     (row,) = trajectory.rows
+    assert trajectory.skipped.startswith("1 of 1 records of the landscape were skipped (no time: ")
+    assert trajectory.skipped.endswith("0.0001 s were allowed); --probe-share inf sets no limit to their time")
     assert (
         row["state"] == "skipped"
         and row["seconds"] == row["time_share"] == 0
@@ -158,6 +161,16 @@ def test_what_does_not_fit_is_skipped_and_time_that_ends_a_record_is_said(run, a
     assert list(rows(tmp_path)["state"]) == ["skipped", "cut", "skipped", "whole"]
     counts = pd.read_csv(tmp_path / "trajectory.csv", dtype=str)["visible_gaussians"]
     assert counts.iloc[-1].isdigit()  # beside rows that have none
+
+
+def test_a_training_warns_of_the_first_record_that_it_skips_and_counts_all_at_the_end(scene, capsys):
+    assert main([*arguments(scene, "short"), "--probe-every", str(EVERY), "--probe-share", "1e-9"]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "were skipped" in line]
+    count = len(rows(scene.parent / "short"))
+    assert len(said) == 2 and all("--probe-share inf" in line for line in said)
+    assert said[0].startswith(f"after step {EVERY}: 1 of 1 records") and said[1].startswith(
+        f"{count} of {count} records"
+    )
 
 
 def test_vectors_follow_their_gaussians_and_new_ones_begin_at_zero(at_the_end, tmp_path):

@@ -28,6 +28,16 @@ def test_slices_share_the_smallest_window_and_the_levels(tmp_path):
     assert (levels[0] == levels[1]).all()
 
 
+@pytest.mark.parametrize(("stretch", "aspect", "words"), [(1.0, 1.0, False), (10.0, "auto", True)])
+def test_steps_of_both_directions_look_equally_long_or_the_axes_say_that_they_differ(tmp_path, stretch, aspect, words):
+    pair = records(tmp_path, 1.0, 0.25)
+    for record in pair.values():
+        record.arrays["slice"]["y"] *= stretch
+    figure = draw_slices(pair)
+    assert [axes.get_aspect() for axes in figure.axes if axes.get_title(loc="left")] == [aspect] * 2
+    assert ("axes differ in scale" in figure.get_supxlabel()) == words
+
+
 def test_a_trace_shows_its_sign_and_whether_its_interval_decides_it(tmp_path):
     (record,) = records(tmp_path, 1.0).values()
     record.data["traces"]["sh"] |= {"value": 12.0, "low": -1.0, "high": 25.0, "sign": "undetermined"}
@@ -52,6 +62,21 @@ def test_a_density_is_shared_out_among_the_directions_on_both_sides_of_zero(tmp_
     assert left.get_xlim()[::-1] == right.get_xlim()
 
 
+def test_a_side_of_which_only_ends_are_known_says_so_and_the_legend_names_them(tmp_path):
+    (record,) = records(tmp_path, 1.0).values()
+    record.arrays["spectrum"]["nodes"] = np.abs(record.arrays["spectrum"]["nodes"])
+    figure = draw_densities({"one": record})
+    said = [[text.get_text() for text in axes.texts] for axes in figure.axes]
+    assert said == [["the density found none;\nthe ends alone are known"], []]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "end of the spectrum"]
+    for end in record.data["eigenvalues"].values():
+        end["value"] = None
+    figure = draw_densities({"one": record})
+    assert [text.get_text() for text in figure.axes[0].texts] == ["none found"] and len(
+        figure.legends[0].get_texts()
+    ) == 1
+
+
 def test_a_run_without_slice_or_density_is_left_out_of_those_pictures_alone(tmp_path):
     both = records(tmp_path, 1.0, 2.0)
     poor = list(both.values())[1]
@@ -60,7 +85,7 @@ def test_a_run_without_slice_or_density_is_left_out_of_those_pictures_alone(tmp_
     assert len([axes for axes in draw_slices(both).axes if axes.get_title(loc="left")]) == 1
     for draw in (draw_sections, draw_densities, draw_traces):
         figure = draw(both)
-        assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        assert [text.get_text() for text in figure.legends[0].get_texts()][:2] == [
             label.replace("$", r"\$") for label in both
         ]
     colours = {line.get_color() for line in draw_sections(both).axes[0].lines}

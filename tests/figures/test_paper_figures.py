@@ -67,6 +67,31 @@ def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
     assert first / start == pytest.approx(3) and second / first == pytest.approx(3)
 
 
+@pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
+def test_ticks_of_steps_are_apart_from_each_other_and_from_the_names_of_their_axes(runs, module):
+    figure = module.draw(runs)
+    renderer = laid_out(figure)
+    for axes in figure.axes:
+        names = [axes.xaxis.label, axes.yaxis.label]
+        ticks = axes.get_xticklabels() + (axes.get_yticklabels() if hasattr(axes, "get_zlim") else [])
+        low, high = axes.get_xlim()
+        shown = [t for t in ticks if t.get_text() and (hasattr(axes, "get_zlim") or low <= t.get_position()[0] <= high)]
+        boxes = [text.get_window_extent(renderer).shrunk(0.9, 0.7) for text in shown]
+        assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i]), [t.get_text() for t in shown]
+        if not hasattr(axes, "get_zlim"):
+            assert not any(name.get_window_extent(renderer).overlaps(box) for name in names for box in boxes)
+
+
+def test_the_colours_of_the_surfaces_have_bars_and_open_dots_a_word(runs):
+    figure = fig7.draw(runs)
+    bars = [axes for axes in figure.axes if axes.get_label() == "<colorbar>"]
+    ends, start = Scale.of(*map(landscape_of, runs)), Scale.of(start_of(runs[0]))
+    for bar, scale in zip(bars, (ends, start), strict=True):
+        assert bar.get_ylim() == pytest.approx((scale.low / 10.0**scale.loss, scale.high / 10.0**scale.loss))
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert words == ["3dgs", "stablegs", "start", "open: the index is negative"]
+
+
 def test_the_index_is_the_recorded_one_of_each_run(runs):
     index = fig7.draw(runs).axes[0]
     dots = [line for line in index.lines if line.get_marker() == "o" and len(np.asarray(line.get_xdata()))]

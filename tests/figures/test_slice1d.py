@@ -66,6 +66,18 @@ def test_curvatures_that_round_off_hides_set_no_limits_and_have_no_dot(tmp_path)
     assert "infinitesimal: 40.0" in labels and "hidden by round-off" in labels
 
 
+def test_a_value_that_is_hardly_known_does_not_flatten_the_others_and_shows_where_it_lies(tmp_path):
+    data, arrays = synthetic_line()
+    probe = data["finite_probe"]
+    probe["curvatures"][0], probe["round_off"][0] = -9000.0, 3000.0
+    below = slice1d.draw(recorded(tmp_path / "slice", data, arrays)).axes[1]
+    low, high = below.get_ylim()
+    assert 20 < low < 37 and 70 < high < 90
+    (beyond,) = [line for line in below.lines if line.get_marker() == "v"]
+    assert list(np.asarray(beyond.get_xdata())) == probe["steps"][:1] and list(np.asarray(beyond.get_ydata())) == [low]
+    assert "beyond the axis" in below.get_legend_handles_labels()[1]
+
+
 def test_a_line_has_one_figure_and_a_plane_is_asked_for_elsewhere(tmp_path):
     record = recorded(tmp_path / "slice", *synthetic_line())
     assert [path.name for path in make_all.draw_probe(record.folder)] == ["slice1d.png"]

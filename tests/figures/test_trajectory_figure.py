@@ -1,6 +1,8 @@
 """The landscape along trainings: gathered, drawn as recorded, and legible; what is missing is named."""
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +71,16 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
     assert list(np.asarray(gaussians.get_ydata())) == [1000, 2000, 3000, 4000]
 
 
+def test_powers_of_ten_have_a_line_of_their_own_and_the_legend_says_what_is_open():
+    figure = trajectory.draw(rows(1e-4).assign(run="a"))
+    titles = [axes.get_title() for axes in figure.axes]
+    assert "smallest eigenvalue\n(×10⁻⁶)" in titles and "largest eigenvalue\n(×10⁻⁶)" in titles
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "open: the index is negative"]
+    positive = rows().assign(run="a")
+    positive["literal"] = positive["literal"].abs()
+    assert [text.get_text() for text in trajectory.draw(positive).legends[0].get_texts()] == ["a"]
+
+
 def test_of_an_index_without_any_bound_nothing_is_drawn(tmp_path):
     table = rows().assign(run="a")
     table.loc[2, ["literal_low", "literal_high"]] = 0.0, math.nan
@@ -89,6 +101,21 @@ def test_the_command_prints_the_first_and_last_values_and_writes_table_and_pictu
     assert ["3dgs/0", "(1", "skipped)", "step", "1,000", "(whole)", "step", "2,000", "(whole)"] in lines
     assert ["largest", "eigenvalue", "2.00", "±", "0.10", "4.00", "±", "0.10"] in lines
     assert ["literal", "−4.00", "(−4.40", "to", "−3.60)", "−16.0", "(−17.6", "to", "−14.4)"] in lines
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("trajectory", "expected the table trajectories.csv as written by"),
+        ("render_surface", "expected FIELD.npz OUT.png"),
+    ],
+)
+def test_a_figures_script_that_is_given_something_else_says_what_it_expects(tmp_path, module, words):
+    given = [str(tmp_path)] if module == "trajectory" else []
+    done = subprocess.run(
+        [sys.executable, "-m", f"figures.{module}", *given], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2 and done.stderr.startswith(words) and done.stderr.count("\n") == 1
 
 
 def test_a_run_without_records_or_named_twice_is_refused_with_what_to_do(tmp_path, capsys):

@@ -7,7 +7,7 @@ import folders
 import pytest
 
 from splat.scenes.scene import load_scene
-from splat.scenes.splits import explicit_split, llff_split, split_scene
+from splat.scenes.splits import explicit_split, llff_split, split_scene, usual_views
 
 FERN = tuple(f"image{i:03d}.png" for i in range(20))
 
@@ -51,6 +51,12 @@ def test_blender_takes_the_published_views_from_a_full_scene_and_from_a_reduced_
     assert full.train == tuple(f"train/r_{k}" for k in (26, 86, 2, 55, 75, 93, 16, 73))
     assert full.test == tuple(f"test/r_{k}" for k in range(0, 200, 8)) and len(full.test) == 25
     assert split_scene(load_scene(tmp_path / "reduced"), 3).train == full.train[:3]
+
+
+def test_without_a_wish_blender_trains_on_the_eight_of_its_protocol_and_others_on_three(tmp_path: Path) -> None:
+    folders.write_blender(tmp_path / "blender", (2, 16, 26, 55, 73, 75, 86, 93), (0, 8))
+    folders.write_colmap(tmp_path / "colmap")
+    assert [usual_views(load_scene(tmp_path / name)) for name in ("blender", "colmap")] == [8, 3]
 
 
 def test_blender_refuses_more_views_than_there_are(tmp_path: Path) -> None:
