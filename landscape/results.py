@@ -110,7 +110,8 @@ class TraceEstimate:
 class Eigenpairs:
     """k eigenpairs of one end of the spectrum, the outermost first.
 
-    residuals: |H v - lambda v| by a last application of the operator itself, not the recurrence's estimate.
+    residuals: |H v - lambda v|, or a bound that noise is in: the recurrence's estimate and a margin, where these meet the goal
+        (`subspace`); else by a last application of the operator itself.
     vector_errors: residual over the distance to the nearest other approximate eigenvalue, about the sine of the angle
         between v and the true eigenvector; infinite where that distance is not known.
     """
@@ -196,10 +197,10 @@ class SpectralDensity:
     """The spectrum as seen by stochastic Lanczos quadrature: for every start vector, nodes and weights of a Gauss rule.
 
     known: simple eigenvalues that were found themselves.  The density of all the others, normalised to 1, is about the mean
-    over starts of sum_j weights_j delta(x - nodes_j); it is exact in expectation for polynomials of degree below 2 steps.
-    dim: of how many eigenvalues in all, those of a known null space left out (where some are left out or known, the weights of
-    a start vector sum to 1 on average only).  complete: start vectors whose rule is their measure itself; None: of those
-    with weights of 0.  trace: of the operator, with its standard error, where it is known better than from these start vectors.
+    over starts of sum_j weights_j delta(x - nodes_j); it is exact in expectation for polynomials of degree below 2 steps
+    (`density` for a bias too small to be seen).  dim: of how many eigenvalues in all, those of a known null space left out.
+    complete: start vectors whose rule is their measure itself; None: of those with weights of 0.  trace: of the operator,
+    with its standard error, where it is known better than from these start vectors.
     missed: what the known eigenvalues' residuals r may add to sums of |lambda|^p, p from 1 to 2, as shares of their own terms.
     """
 
