@@ -306,6 +306,7 @@ class Slice:
     model, slope and curvature are None where neither gradient nor operator was given.  crossed marks evaluated points whose
     signature (order of sorting, visible set) differs from the centre's, so that the objective may jump on the way there;
     at points that are not evaluated it is False and nothing is known.  evaluations: of the objective, the centre's too.
+    looks: hold-outs that were drawn, one after the other, until one was good enough or a budget ended it.
     """
 
     coordinates: tuple[Float64[Tensor, " _"], ...]
@@ -319,6 +320,7 @@ class Slice:
     crossed: Bool[Tensor, "..."] | None
     evaluations: int
     reason: StopReason
+    looks: int = 1
 
     @property
     def difference(self) -> Float64[Tensor, "..."] | None:
@@ -333,8 +335,12 @@ class Slice:
 
     @property
     def interpolation_error(self) -> float:
-        """The largest error of the hold-out as a share of the range; 0 where every point is evaluated."""
-        if self.evaluated.all() or not self.holdout.any():
+        """The largest error of the hold-out as a share of the range; 0 where every point is evaluated, infinite without any."""
+        if self.evaluated.all():
+            return 0.0
+        if not self.holdout.numel():
+            return inf
+        if not self.holdout.any():
             return 0.0
         return float(self.holdout.max()) / self.range if self.range else inf
 
@@ -342,9 +348,12 @@ class Slice:
     def share_beyond(self) -> float:
         """At most this share of the points drawn from is off by more than interpolation_error, with 95% confidence.
 
-        If a share p were, m random points would all miss it with the probability (1 - p)^m at most.
+        If a share p were, m random points would all miss it with the probability (1 - p)^m at most.  That is 0.05 / 2^k at
+        the k-th look: one look of many that is lucky is likelier than one.
         """
-        return 0.0 if self.evaluated.all() else 1 - 0.05 ** (1 / self.holdout.numel())
+        if self.evaluated.all():
+            return 0.0
+        return 1 - (0.05 / 2**self.looks) ** (1 / self.holdout.numel()) if self.holdout.numel() else 1.0
 
     def record(self) -> dict[str, Number | int | str]:
         return {
