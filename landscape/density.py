@@ -12,9 +12,9 @@ ratios: without bias for a Gaussian z, else with one that is sd(|P z|^2) / r tim
 |P z|^2 would add its own skewed spread to every sum.
 
 **Uneven signs.**  Entries are random signs, which see a diagonal matrix without error, times magnitudes with squares uniform on
-[1 - UNEVEN, 1 + UNEVEN], which have a hundredth of the variance of Gaussian entries there.  Signs alone coincide: of an
-eigenvalue that two rows share, all of k start vectors see the same direction with the probability 2^(1 - k), and it would
-pass for simple.
+[1 - UNEVEN, 1 + UNEVEN], which have a 600th of the variance of Gaussian entries there.  Signs alone coincide: of an eigenvalue
+that two rows share, all of k start vectors see the same direction with the probability 2^(1 - k), and it would pass for
+simple.  Uneven ones see directions about 0.03 apart, 30 times what SAME tells from none.
 
 **Eigenvalues that are known.**  A few eigenvalues that dominate are most of the variance over start vectors.  Eigenpairs that
 were found before are projected out as a null space is, and each is counted as the one eigenvalue that it is, instead of
@@ -43,7 +43,7 @@ from landscape.operator import ProjectedOperator, SymmetricOperator
 from landscape.quadratic import gram
 from landscape.results import EigenEnds, Progress, SpectralDensity, t_quantile
 
-UNEVEN = 0.25  # spread of the squares of a start vector's entries about 1
+UNEVEN = 0.1  # spread of the squares of a start vector's entries about 1
 SETTLED = 1e-4  # the error of an eigenvector that runs find
 FOUND, CLOSE = 1e-2, 0.1  # of one that was found before, and its residual, as a share of the eigenvalue
 SAME = 1e-6  # by which the squared cosine between two of them may miss 1
