@@ -10,6 +10,11 @@
 Brackets follow from the eigenvalues' residuals, how far out an end that has not converged may lie, the round-off and the sums'
 intervals (each at a level that gives the quotient 95%).  The literal index is negative for an indefinite operator; where
 lambda_n may be zero it has no upper bound.
+
+What the bracket of an end is certain of is that a true eigenvalue lies within; which one it is, is not.  A search that ends at
+its tolerance may have taken the neighbour of an end for it, where the two are about as far apart as was asked for, and the
+end itself then lies outside, with every index that is made of it: on a Cauchy spectrum (n = 100, rtol = 1%) in 27 of 250 seeds,
+on spectra with a gap at the ends in none.  `EigenEnds.beyond` bounds how far out it may lie.
 """
 
 from math import inf, isfinite

@@ -125,7 +125,7 @@ def estimate_diagonal(
         if progress:
             progress(samples.shape[1], probes, f"diagonal: {samples.shape[1]} probes")
         if choosing and samples.shape[1] <= half:
-            kept.append((Z, Y))
+            kept.append((Z, Y.clone()))  # an operator may give the same buffer again
         if choosing and samples.shape[1] == half and _pays(samples, kept):
             return _sketched(operator, kept, batch, probes, progress)
     if controls.numel():

@@ -171,7 +171,8 @@ class Hutchinson:
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
         """Probes and their products with H, taken into account."""
         Z = draw_probes(self.operator.dim, count, self.generator, self.operator.dtype, self.settings.distribution)
-        forms = [self.operator.apply(Z)] + ([] if self.part is None else [self.part.apply(Z)])
+        # kept below, and an operator may give the same buffer again
+        forms = [form.apply(Z).clone() for form in (self.operator, self.part) if form is not None]
         sums = torch.stack([torch.stack([column_dots(Z[r], Y[r]) for r in self.rows.values()]) for Y in forms])
         sums = sums.cpu()
         if not torch.isfinite(sums).all():

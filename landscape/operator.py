@@ -33,7 +33,7 @@ class SymmetricOperator(Protocol):
     def dtype(self) -> torch.dtype: ...
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        """H V.  Raises ValueError where V has another shape than (dim, k)."""
+        """H V, which the next call may overwrite.  Raises ValueError where V has another shape than (dim, k)."""
         ...
 
 

@@ -110,7 +110,8 @@ class TraceEstimate:
 class Eigenpairs:
     """k eigenpairs of one end of the spectrum, the outermost first.
 
-    residuals: |H v - lambda v| by a last application of the operator itself, not the recurrence's estimate.
+    residuals: |H v - lambda v|, or a bound that noise is in: the recurrence's estimate and a margin, where these meet the goal
+        (`subspace`); else by a last application of the operator itself.
     vector_errors: residual over the distance to the nearest other approximate eigenvalue, about the sine of the angle
         between v and the true eigenvector; infinite where that distance is not known.
     """
@@ -196,10 +197,10 @@ class SpectralDensity:
     """The spectrum as seen by stochastic Lanczos quadrature: for every start vector, nodes and weights of a Gauss rule.
 
     known: simple eigenvalues that were found themselves.  The density of all the others, normalised to 1, is about the mean
-    over starts of sum_j weights_j delta(x - nodes_j); it is exact in expectation for polynomials of degree below 2 steps.
-    dim: of how many eigenvalues in all, those of a known null space left out (where some are left out or known, the weights of
-    a start vector sum to 1 on average only).  complete: start vectors whose rule is their measure itself; None: of those
-    with weights of 0.  trace: of the operator, with its standard error, where it is known better than from these start vectors.
+    over starts of sum_j weights_j delta(x - nodes_j); it is exact in expectation for polynomials of degree below 2 steps
+    (`density` for a bias too small to be seen).  dim: of how many eigenvalues in all, those of a known null space left out.
+    complete: start vectors whose rule is their measure itself; None: of those with weights of 0.  trace: of the operator,
+    with its standard error, where it is known better than from these start vectors.
     missed: what the known eigenvalues' residuals r may add to sums of |lambda|^p, p from 1 to 2, as shares of their own terms.
     """
 
@@ -305,6 +306,7 @@ class Slice:
     model, slope and curvature are None where neither gradient nor operator was given.  crossed marks evaluated points whose
     signature (order of sorting, visible set) differs from the centre's, so that the objective may jump on the way there;
     at points that are not evaluated it is False and nothing is known.  evaluations: of the objective, the centre's too.
+    looks: hold-outs that were drawn, one after the other, until one was good enough or a budget ended it.
     """
 
     coordinates: tuple[Float64[Tensor, " _"], ...]
@@ -318,6 +320,7 @@ class Slice:
     crossed: Bool[Tensor, "..."] | None
     evaluations: int
     reason: StopReason
+    looks: int = 1
 
     @property
     def difference(self) -> Float64[Tensor, "..."] | None:
@@ -332,8 +335,12 @@ class Slice:
 
     @property
     def interpolation_error(self) -> float:
-        """The largest error of the hold-out as a share of the range; 0 where every point is evaluated."""
-        if self.evaluated.all() or not self.holdout.any():
+        """The largest error of the hold-out as a share of the range; 0 where every point is evaluated, infinite without any."""
+        if self.evaluated.all():
+            return 0.0
+        if not self.holdout.numel():
+            return inf
+        if not self.holdout.any():
             return 0.0
         return float(self.holdout.max()) / self.range if self.range else inf
 
@@ -341,9 +348,12 @@ class Slice:
     def share_beyond(self) -> float:
         """At most this share of the points drawn from is off by more than interpolation_error, with 95% confidence.
 
-        If a share p were, m random points would all miss it with the probability (1 - p)^m at most.
+        If a share p were, m random points would all miss it with the probability (1 - p)^m at most.  That is 0.05 / 2^k at
+        the k-th look: one look of many that is lucky is likelier than one.
         """
-        return 0.0 if self.evaluated.all() else 1 - 0.05 ** (1 / self.holdout.numel())
+        if self.evaluated.all():
+            return 0.0
+        return 1 - (0.05 / 2**self.looks) ** (1 / self.holdout.numel()) if self.holdout.numel() else 1.0
 
     def record(self) -> dict[str, Number | int | str]:
         return {

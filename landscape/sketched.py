@@ -193,7 +193,9 @@ def _products(operator: SymmetricOperator, V: Tensor, settings: TraceSettings, n
     """H V, `batch` vectors at a time."""
     if V.shape[1] == 0:
         return V
-    result = torch.cat([operator.apply(some) for some in V.split(settings.batch, dim=1)], dim=1)
+    result = torch.empty_like(V)
+    for part, vectors in zip(result.split(settings.batch, dim=1), V.split(settings.batch, dim=1), strict=True):
+        part.copy_(operator.apply(vectors))
     if not isfinite(float(result.double().sum())):
         raise ValueError(f"expected finite products H v, got NaN or infinite entries in {name}")
     return result

@@ -92,10 +92,10 @@ def evaluate_slice(
     reason: StopReason
     if settings.tolerance is None or generator is None:
         found.require(range(len(points)))
-        values, holdout, reason = found.value, np.empty(0), "exact"
+        values, holdout, looks, reason = found.value, np.empty(0), 0, "exact"
     else:
         x, y = axes[0].numpy(), axes[1].numpy() if len(axes) == 2 else np.zeros(1)
-        values, holdout, reason = evaluate_adaptively(found, x, y, settings, generator)
+        values, holdout, looks, reason = evaluate_adaptively(found, x, y, settings, generator)
     slope = curvature = model = None
     if gradient is not None and operator is not None:
         slope, curvature = _derivatives(gradient, operator, directions)
@@ -113,6 +113,7 @@ def evaluate_slice(
         crossed=torch.from_numpy(found.crossed).reshape(shape) if found.has_signature else None,
         evaluations=int(found.known.sum()) + 1,
         reason=reason,
+        looks=looks,
     )
 
 

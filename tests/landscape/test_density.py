@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from landscape.absolute_sum import FAR, absolute_integral, absolute_sum, integrals_of_rules
-from landscape.density import SETTLED, spectral_density
+from landscape.density import SETTLED, draw_starts, spectral_density
+from landscape.eigen import EigenSettings, extreme_eigenpairs
+from landscape.lanczos import unit_columns
 from landscape.operator import DenseOperator
-from landscape.probes import draw_probes
 from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
 from tests.oracles import absolute_matrix
 
@@ -16,7 +17,7 @@ from tests.oracles import absolute_matrix
 def test_moments_below_twice_the_steps_are_those_of_the_start_vectors(name):
     H, steps = operator(name), 6
     density = spectral_density(H, generator(), matvecs=3 * steps, starts=3, batch=1)
-    Z = draw_probes(N, 3, generator(), torch.float64, "rademacher") / N**0.5
+    Z = unit_columns(draw_starts(N, 3, generator(), torch.float64))
     scale = max(1.0, float(H.matrix.norm()))
     power = Z
     for degree in range(2 * steps):
@@ -30,7 +31,7 @@ def test_moments_below_twice_the_steps_are_those_of_the_start_vectors(name):
 def test_as_many_steps_as_rows_give_the_measure_itself(name):
     H = operator(name)
     density = spectral_density(H, generator(), matvecs=2 * N, starts=2, batch=1)
-    Z = draw_probes(N, 2, generator(), torch.float64, "rademacher") / N**0.5
+    Z = unit_columns(draw_starts(N, 2, generator(), torch.float64))
     values, vectors = torch.linalg.eigh(H.matrix)
     for level in (-0.151, 0.051, 0.51):
         exact = torch.where(values[:, None] < level, (vectors.T @ Z).square(), 0.0).sum(dim=0)
@@ -43,7 +44,7 @@ def test_as_many_steps_as_rows_give_the_measure_itself(name):
 def test_the_sum_of_magnitudes_of_each_start_vector_lies_within_its_bounds(name, steps):
     H = operator(name)
     density = spectral_density(H, generator(), matvecs=4 * steps, starts=4, batch=1)
-    Z = draw_probes(N, 4, generator(), torch.float64, "rademacher") / N**0.5
+    Z = unit_columns(draw_starts(N, 4, generator(), torch.float64))
     exact = (Z * (torch.from_numpy(absolute_matrix(H.matrix.numpy())) @ Z)).sum(dim=0)
     # the bounds are square roots of quantities of the size of |H|^2: round-off of the root of eps
     rounding = float(H.matrix.norm()) / FAR  # what a node that is left out, so far away, may add
@@ -95,6 +96,28 @@ def test_of_a_multiple_eigenvalue_among_simple_ones_the_simple_ones_are_known():
         assert not torch.isclose(density.known, torch.tensor(5.0).double(), atol=0.01).any()
         for simple in (-4.0, 3.0, 7.0):
             assert float((density.known - simple).abs().min()) < 1e-6
+
+
+@pytest.mark.parametrize(("shared", "starts"), [(torch.eye(2), 4), (torch.tensor([[0.8, 0.4], [0.4, 0.2]]), 2)])
+def test_a_multiple_eigenvalue_that_few_rows_share_is_not_taken_for_a_simple_one(shared, starts):
+    """On a diagonal, and twice the same block of rank 1: random signs alone see one direction of it again and again."""
+    matrix = torch.diag(torch.linspace(0, 1, 100, dtype=torch.float64))
+    for i in (0, 2) if shared[0, 1] else (0,):
+        matrix[i : i + 2, i : i + 2] = 50 * shared.double()
+    for seed in range(24):
+        known = spectral_density(DenseOperator(matrix), generator(seed), 12 * starts, starts).known
+        assert not torch.isclose(known, torch.tensor(50.0).double(), atol=0.1).any()
+
+
+def test_what_a_start_vector_sees_of_all_that_is_not_known_is_no_error():
+    """Known vectors take another share of each start vector; where all others are the same, that is all they differ by."""
+    Q = torch.linalg.qr(torch.randn(60, 60, generator=generator(), dtype=torch.float64)).Q
+    spectrum = torch.cat([torch.linspace(10, 20, 4), torch.tensor([1.0, -1.0]).repeat(28)]).double()
+    H = DenseOperator((Q * spectrum) @ Q.T)
+    ends = extreme_eigenpairs(H, generator(), EigenSettings(4, 0, rtol=1e-9))
+    for seed in range(5):
+        total = absolute_sum(spectral_density(H, generator(seed), 32, 4, batch=1, ends=ends))
+        assert (total.low, total.value, total.high) == pytest.approx([float(spectrum.abs().sum())] * 3, rel=1e-9)
 
 
 @pytest.mark.parametrize(("name", "times"), [("power law", 5.0), ("both tails", 2.0), ("rank-deficient", 1e9)])

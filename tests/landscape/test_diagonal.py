@@ -6,7 +6,7 @@ import torch
 
 from landscape.diagonal import _controlled, estimate_diagonal
 from landscape.operator import CountingOperator, DenseOperator
-from tests.landscape.spectra import generator
+from tests.landscape.spectra import Buffered, generator
 from tests.landscape.test_control import BLOCKS, PART, REST, H, N, Partly
 from tests.oracles import symmetric_matrix
 
@@ -91,3 +91,10 @@ def test_bad_input_is_refused():
 
     with pytest.raises(ValueError, match="expected finite products H z"):
         estimate_diagonal(Broken(INDEFINITE), generator())
+
+
+def test_an_operator_may_give_the_same_memory_at_every_call():
+    matrix = torch.from_numpy(symmetric_matrix(1 / np.arange(1, 121.0) ** 1.5, seed=1))
+    plain, buffered = (estimate_diagonal(H, generator(), 32) for H in (DenseOperator(matrix), Buffered(matrix)))
+    assert plain.method == buffered.method == "sketch"
+    assert torch.allclose(plain.values, buffered.values, rtol=1e-9)

@@ -3,7 +3,8 @@ import pytest
 import torch
 
 from landscape.absolute_sum import absolute_integral, absolute_sum
-from landscape.density import ActiveSpace, spectral_density
+from landscape.density import ActiveSpace, draw_starts, spectral_density
+from landscape.lanczos import unit_columns
 from landscape.operator import DenseOperator, ProjectedOperator
 from landscape.probes import draw_probes
 from landscape.quantiles import _Tail, absolute_quantile, quantile
@@ -29,7 +30,7 @@ def test_the_curvature_that_a_start_vector_sees_above_any_magnitude_is_within_it
     H = operator(name)
     density = spectral_density(H, generator(), matvecs=3 * steps, starts=3, batch=1)
     values, vectors = torch.linalg.eigh(H.matrix)
-    seen = (vectors.T @ draw_probes(N, 3, generator(), torch.float64, "rademacher")).square() / N
+    seen = (vectors.T @ unit_columns(draw_starts(N, 3, generator(), torch.float64))).square()
     scale = float(values.abs().max())
     # off the eigenvalues, where the exact side of a jump is round-off's to choose
     levels = scale * torch.linspace(0, 1.1, 1000, dtype=torch.float64) ** 3 + 1e-5 * scale

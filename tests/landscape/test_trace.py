@@ -6,6 +6,7 @@ import torch
 
 from landscape.operator import CountingOperator, DenseOperator
 from landscape.trace import PAPER, TraceSettings, estimate_traces
+from tests.landscape.spectra import Buffered
 from tests.oracles import symmetric_matrix
 
 N = 40
@@ -177,3 +178,15 @@ def test_bad_settings_are_refused():
         TraceSettings(memory=0.0)
     with pytest.raises(ValueError, match="blocks out of a, b, c, got 'd'"):
         estimate_traces(DenseOperator(INDEFINITE, BLOCKS), generator(), blocks=["d"])
+
+
+@pytest.mark.parametrize("method", ["auto", "hutchinson", "hutch++", "xtrace"])
+def test_an_operator_may_give_the_same_memory_at_every_call(method):
+    matrix = torch.from_numpy(symmetric_matrix(1 / np.arange(1, 121.0) ** 1.5, seed=1))
+    plain, buffered = (
+        estimate_traces(H, torch.Generator().manual_seed(0), TraceSettings.fixed(40, method=method))["all"]
+        for H in (DenseOperator(matrix), Buffered(matrix))
+    )
+    assert torch.allclose(plain.samples, buffered.samples, rtol=1e-9)
+    assert (plain.low, plain.high) == pytest.approx((buffered.low, buffered.high), rel=1e-9)
+    assert plain.method == buffered.method == ("xtrace" if method == "auto" else method)
