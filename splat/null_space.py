@@ -23,9 +23,7 @@ from splat.raster.threads import over_batch
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
 CHUNK = 4096  # Gaussians at a time
-WIDEST = (
-    32  # rows and columns of the matrices that CUDA takes apart together; of larger ones it takes one after the other
-)
+WIDEST = 32  # rows and columns of matrices that CUDA takes apart together; larger ones it takes one by one
 
 
 @dataclass(frozen=True, eq=False)
