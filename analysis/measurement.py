@@ -120,7 +120,7 @@ class ProbeSettings:
             checked_views=1,
             traces=TraceSettings(rtol=0.1),
             trace_samples=5,
-            eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, noise=0.3, max_matvecs=60),
+            eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=60),
             power=None,
             density_matvecs=12,
             slice_tolerance=0.1,
