@@ -96,6 +96,14 @@ def feed_residual(x, y, top, row, shape, taps, b0, b1, b2, ring):
 
 
 @formula
+def feed_all(V, K, x, y, top, row, shape, taps, b0, b1, b2, own, ring):
+    """Stage one for the residual and for all K vectors of V."""
+    feed_residual(x, y, top, row, shape, taps, b0, b1, b2, own)
+    for k in range(K):
+        feed(V, k * (V.size // K), x, y, top, row, shape, taps, b0, b1, b2, ring, 3 * k)
+
+
+@formula
 def similarity_at(ring, row, i, at, size, stride, taps, target):
     """`similarity` at a row and column, from the ring of the residual's stage one."""
     m, p, q = down_three(ring, 0, row, i, stride, taps)
@@ -242,8 +250,7 @@ def product_rows(start, stop, shape, taps, V, x, y, target, blurred_sp, kind, ep
     """The Hessian of the loss times every v in V.  products must not be V: another range may still read it."""
     height, width, plane_rows, stride = shape
     L, size, K = lanes(x), 3 * plane_rows * stride, len(products)
-    each = V.size // K
-    second = six_buffers(x, stride)
+    each, second = V.size // K, six_buffers(x, stride)
     b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
     own, ring, slopes = ring_buffer(x, 3, stride), ring_buffer(x, 3 * K, stride), ring_buffer(x, 3 * K, stride)
     for channel in range(3):
@@ -254,9 +261,7 @@ def product_rows(start, stop, shape, taps, V, x, y, target, blurred_sp, kind, ep
         lead = 2 * REACH if structural != 0 else 0
         for ahead in range(first - lead, last + lead):
             if structural != 0:
-                feed_residual(x, y, top, ahead, shape, taps, b0, b1, b2, own)
-                for k in range(K):
-                    feed(V, k * each, x, y, top, ahead, shape, taps, b0, b1, b2, ring, 3 * k)
+                feed_all(V, K, x, y, top, ahead, shape, taps, b0, b1, b2, own, ring)
                 row = ahead - REACH
                 if first - REACH <= row < last + REACH:
                     if 0 <= row < height:
@@ -292,8 +297,7 @@ def form_rows(
     """v . l'' v and v . D v of every v in V, D the diagonal of l'', summed over each row: (k, 3 height) each."""
     height, width, plane_rows, stride = shape
     L, size, K = lanes(x), 3 * plane_rows * stride, len(full)
-    each = V.size // K
-    second = six_buffers(x, stride)
+    each, second = V.size // K, six_buffers(x, stride)
     b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
     own, ring = ring_buffer(x, 3, stride), ring_buffer(x, 3 * K, stride)
     for channel in range(3):
@@ -304,9 +308,7 @@ def form_rows(
         lead = REACH if structural != 0 else 0
         for ahead in range(first - lead, last + lead):
             if structural != 0:
-                feed_residual(x, y, top, ahead, shape, taps, b0, b1, b2, own)
-                for k in range(K):
-                    feed(V, k * each, x, y, top, ahead, shape, taps, b0, b1, b2, ring, 3 * k)
+                feed_all(V, K, x, y, top, ahead, shape, taps, b0, b1, b2, own, ring)
             row = ahead - lead
             if row < first:
                 continue
