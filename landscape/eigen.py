@@ -1,6 +1,6 @@
 """Eigenpairs at the two ends of the spectrum.
 
-`extreme_eigenpairs` grows one subspace for both ends (`subspace`) by a Lanczos recurrence (`krylov`).  A run ends when every
+`extreme_eigenpairs` grows one subspace for both ends by a Lanczos recurrence (`krylov`).  A run ends when every
 wanted pair has a residual under max(rtol |lambda|, atol), or under the round-off of the matvec, or at its budget.
 
 A recurrence comes across the ends by itself.  A subspace that grows where the blocks of single Gaussians point (Davidson's
@@ -18,7 +18,7 @@ from torch import Tensor
 from landscape.krylov import Krylov
 from landscape.operator import SymmetricOperator
 from landscape.results import EigenEnds, Progress
-from landscape.subspace import EigenSettings, Goal
+from landscape.ritz import EigenSettings, Goal
 
 __all__ = ["EigenSettings", "extreme_eigenpairs"]
 

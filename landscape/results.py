@@ -111,7 +111,7 @@ class Eigenpairs:
     """k eigenpairs of one end of the spectrum, the outermost first.
 
     residuals: |H v - lambda v|, or a bound that noise is in: the recurrence's estimate and a margin, where these meet the goal
-        (`subspace`); else by a last application of the operator itself.
+        (`krylov`); else by a last application of the operator itself.
     vector_errors: residual over the distance to the nearest other approximate eigenvalue, about the sine of the angle
         between v and the true eigenvector; infinite where that distance is not known.
     """

@@ -19,7 +19,6 @@ as they are pixel by pixel; fern's largest (8,000 Gaussians, 3 views) is 254 for
 On those twelve scenes a recurrence from the steepest takes 12.4 products, from a random vector 15.2.
 """
 
-from functools import cached_property
 from math import inf, pi
 
 import torch
@@ -37,7 +36,6 @@ from splat.raster.threads import over_batch
 SINGLE = 1 / (4 * pi * SIGMA**2)  # of a pixel alone, what the window's blur keeps
 CHUNK = 8192  # Gaussians at a time: CUDA refuses 32,768 blocks and takes up to 1 MB of memory for each
 FEW = 256  # Gaussians that are taken apart in any case
-MANY = 4  # a part of all Gaussians that is as well taken apart with all the others
 BOUND_SLACK = 1e-5  # of a norm, for its rounding
 # some eigenvalues of all blocks, the Gaussians whose they are, and the eigenvectors
 Ends = tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]
@@ -72,24 +70,9 @@ class OwnDirections:
             self._blocks = {attribute: slice(0, self._rows)}
         self._geometry, self._radial, self._units = geometry, radial, units
 
-    @cached_property
-    def pairs(self) -> tuple[Float64[Tensor, "n w"], Float[Tensor, "n w w"]]:
-        """Eigenvalues of every block, ascending, and its eigenvectors, in columns; 0 for a quaternion's length."""
-        return self._taken_apart(self._geometry, self._radial, self._units)
-
-    def _taken_apart(
-        self, blocks: Float[Tensor, "m w w"], radial: Float[Tensor, "m w"], units: Float[Tensor, "m w"]
-    ) -> tuple[Float64[Tensor, "m w"], Float[Tensor, "m w w"]]:
-        values = torch.empty_like(units, dtype=torch.float64)
-        vectors = torch.empty_like(blocks, memory_format=torch.contiguous_format)
-
-        def decompose(first: int, last: int) -> None:
-            for i in range(first, last, CHUNK):
-                rows = slice(i, min(i + CHUNK, last))
-                values[rows], vectors[rows] = _decomposed(blocks[rows], radial[rows], units[rows])
-
-        over_batch(len(blocks), decompose, blocks.device)
-        return values, vectors
+    def pairs(self, gaussians: Int[Tensor, " m"]) -> tuple[Float64[Tensor, "m w"], Float[Tensor, "m w w"]]:
+        """Eigenvalues of these Gaussians' blocks, ascending, and eigenvectors, in columns; 0 for a quaternion's length."""
+        return _taken_apart(*(x[gaussians] for x in (self._geometry, self._radial, self._units)))
 
     def steepest(self, largest: int, smallest: int) -> Float[Tensor, "p k"]:
         """Unit vectors: of the largest eigenvalues of all blocks but colours', descending, and of the smallest, ascending."""
@@ -107,27 +90,35 @@ class OwnDirections:
         No eigenvalue is larger than its block's Frobenius norm: once some of the largest blocks are known, those beneath what
         was found at both ends are left as they are.
         """
-        if "pairs" not in self.__dict__:
-            bounds = self._norms
-            some = bounds.topk(min(max(FEW, largest, smallest), len(bounds))).indices
-            found = self._ends_of(some, largest, smallest)
-            least = torch.cat([found[0][:largest], -found[0][largest:]]).min()
-            held = (bounds * (1 + BOUND_SLACK) >= least).nonzero()[:, 0]
-            if len(held) <= len(some):
-                return found
-            if MANY * len(held) <= len(bounds):
-                return self._ends_of(held, largest, smallest)
-        return _chosen(*self.pairs, largest, smallest)
+        bounds = self._norms()
+        some = bounds.topk(min(max(FEW, largest, smallest), len(bounds))).indices
+        found = self._ends_of(some, largest, smallest)
+        least = torch.cat([found[0][:largest], -found[0][largest:]]).min()
+        held = (bounds * (1 + BOUND_SLACK) >= least).nonzero()[:, 0]
+        return found if len(held) <= len(some) else self._ends_of(held, largest, smallest)
 
-    @cached_property
     def _norms(self) -> Float[Tensor, " n"]:
         """Every block's Frobenius norm; what a quaternion's length has in it counts, too."""
         return (self._geometry * self._units[:, :, None] * self._units[:, None, :]).flatten(1).norm(dim=1)
 
     def _ends_of(self, gaussians: Int[Tensor, " m"], largest: int, smallest: int) -> Ends:
-        pairs = self._taken_apart(*(x[gaussians] for x in (self._geometry, self._radial, self._units)))
-        values, whose, vectors = _chosen(*pairs, largest, smallest)
+        values, whose, vectors = _chosen(*self.pairs(gaussians), largest, smallest)
         return values, gaussians[whose], vectors
+
+
+def _taken_apart(
+    blocks: Float[Tensor, "m w w"], radial: Float[Tensor, "m w"], units: Float[Tensor, "m w"]
+) -> tuple[Float64[Tensor, "m w"], Float[Tensor, "m w w"]]:
+    values = torch.empty_like(units, dtype=torch.float64)
+    vectors = torch.empty_like(blocks, memory_format=torch.contiguous_format)
+
+    def decompose(first: int, last: int) -> None:
+        for i in range(first, last, CHUNK):
+            rows = slice(i, min(i + CHUNK, last))
+            values[rows], vectors[rows] = _decomposed(blocks[rows], radial[rows], units[rows])
+
+    over_batch(len(blocks), decompose, blocks.device)
+    return values, vectors
 
 
 def _chosen(values: Float64[Tensor, "m w"], vectors: Float[Tensor, "m w w"], largest: int, smallest: int) -> Ends:
