@@ -121,11 +121,14 @@ def cautions(runs: Sequence[Run]) -> list[str]:
     lines = [f"The {what} are not the same." if what.endswith("s") else f"The {what} is not the same."
              for what, of in settings.items() if any(of(run) != of(runs[0]) for run in runs)]  # fmt: skip
     found = [leaves(run.data["provenance"].get("settings", {})) for run in runs]
-    lines += [
-        f"The probes were run with different {name}: {', '.join(str(settings.get(name)) for settings in found)}."
+    different = [
+        f"{name} {', '.join(str(settings.get(name)) for settings in found)}"
         for name in dict.fromkeys(name for settings in found for name in settings)
         if any(settings.get(name) != found[0].get(name) for settings in found)
     ]
+    if different:
+        order = ", ".join(run.label for run in runs)
+        lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
     for run in runs:
         failed = [name.replace("_", " ") for name, check in run.data["checks"].items() if check["passed"] is False]
         lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]

@@ -174,7 +174,11 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
     assert main(["compare", *runs]) == 0
     assert "not the same" not in capsys.readouterr().out
     data, arrays = synthetic()
-    data["provenance"] |= {"iteration": ITERATIONS, "dtype": "float64", "settings": {"eigen": {"rtol": 0.5}}}
+    data["provenance"] |= {
+        "iteration": ITERATIONS,
+        "dtype": "float64",
+        "settings": {"eigen": {"rtol": 0.5}, "quick": True},
+    }
     data["checks"]["symmetry"]["passed"] = False
     with record_folder(Path(runs[1]) / "probe") as partial:
         write_record(partial, data, arrays)
@@ -185,7 +189,7 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
     for part in (
         "The seed is not the same",
         "The precision is not the same",
-        "The probes were run with different eigen.rtol: None, 0.5.",
+        "The probes were run with different settings (those of plain/0, sam/0): eigen.rtol None, 0.5; quick None, True.",
         "sam/0: the check of symmetry failed",
         "sam/0 was not scored",
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",
