@@ -35,6 +35,7 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
     "#D55E00",
     "#CC79A7",
 )
+RUNS = (VERMILION, GREEN, BLUE, ORANGE, PURPLE, SKY, BLACK)  # a run has the same colour in every figure
 POSITIVE, NEGATIVE, UNDETERMINED = BLUE, VERMILION, "0.45"
 
 _RC: dict[Any, Any] = {
