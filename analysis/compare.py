@@ -25,6 +25,7 @@ from analysis.quantities import quantity
 from analysis.records import FILE, read_record
 from analysis.report import pictures_in, template_environment
 from analysis.training import CHECKPOINT, METRICS
+from analysis.verdict import of_budgets
 from splat.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
 PAGE, TABLE, INDEX, PROBE = "compare.html", "compare.csv", "compare.json", "probe"
@@ -132,6 +133,7 @@ def cautions(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         failed = [name.replace("_", " ") for name, check in run.data["checks"].items() if check["passed"] is False]
         lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]
+        lines += [f"{run.label}: {line.text}" for line in of_budgets(run.data["eigenvalues"])]
         lines += [f"{run.label} was not scored." for _ in range(not run.metrics)]
     if without := [run for run in runs if not run.data.get("split_control")]:
         lines.append(

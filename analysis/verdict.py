@@ -38,7 +38,7 @@ def verdict(data: Mapping[str, Any]) -> list[Line]:
         *_of_checks(data["checks"]),
         *_of_traces(data["traces"]),
         *_of_ends(data["eigenvalues"]),
-        *_of_budgets(data["eigenvalues"]),
+        *of_budgets(data["eigenvalues"]),
         *_of_anisotropy(data["anisotropy"]),
         *_of_needles(data["eigenvalues"]["max"].get("lives_on"), data["counts"]),
         *_of_finite_probe(data.get("finite_probe")),
@@ -118,7 +118,7 @@ def _of_ends(ends: Mapping[str, Any]) -> list[Line]:
     return [Line(f"Whether the Hessian is indefinite is not decided by the residuals: {ends_text}.", "caution")]
 
 
-def _of_budgets(ends: Mapping[str, Any]) -> list[Line]:
+def of_budgets(ends: Mapping[str, Any]) -> list[Line]:
     """A residual says that an eigenvalue is near, not that none lies beyond: of that only a search that converged is a sign."""
     reasons = {name: ends[end].get("reason") or "" for end, name in (("max", "largest"), ("min", "smallest"))}
     return [
