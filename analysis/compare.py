@@ -104,7 +104,10 @@ def _probe(run: Path, device: DeviceName) -> None:
 def _metrics(run: Path) -> dict[str, Any]:
     """Nothing of a run that was stopped before it was scored."""
     path = run / METRICS
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    try:
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    except ValueError as error:
+        raise ValueError(f"expected the scores of landscape train in {path}, got a damaged file ({error})") from None
 
 
 def cautions(runs: Sequence[Run]) -> list[str]:

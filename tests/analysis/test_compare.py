@@ -200,6 +200,12 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         )
 
 
+def test_damaged_scores_are_named(runs, capsys):
+    path = Path(runs[1]) / "metrics.json"
+    path.write_text('{"test":')
+    refused(capsys, runs, f"expected the scores of landscape train in {path}, got a damaged file")
+
+
 def test_at_least_two_different_runs_are_asked_for(runs, capsys):
     refused(capsys, runs[:1], "expected at least two runs")
     refused(capsys, [runs[0], runs[0]], "expected at least two runs, each once")

@@ -111,6 +111,12 @@ def test_the_colours_of_the_surfaces_have_bars_and_open_dots_a_word(runs):
     assert words == ["3dgs", "stablegs", "start", "open: the index is negative"]
 
 
+def test_a_figure_makes_the_folder_that_it_is_written_to(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["fig1", *map(str, runs), "--out", str(tmp_path / "paper/figures/one.svg")])
+    fig1.main()
+    assert (tmp_path / "paper/figures/one.svg").is_file()
+
+
 def test_the_index_is_the_recorded_one_of_each_run(runs):
     index = fig7.draw(runs).axes[0]
     dots = [line for line in index.lines if line.get_marker() == "o" and len(np.asarray(line.get_xdata()))]
