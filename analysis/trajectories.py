@@ -35,6 +35,7 @@ INDICES = ("literal", "saddle", "share", "effective_rank")
 def run_trajectory(options: TrajectoryOptions) -> int:
     """Gather, draw, print; returns the exit code."""
     table = gathered(options.runs)
+    _require_same_function(options.runs)
     common = Path(os.path.commonpath([run.resolve() for run in options.runs]))
     out = options.out or common / "trajectory"
     out.mkdir(parents=True, exist_ok=True)
@@ -51,6 +52,17 @@ def run_trajectory(options: TrajectoryOptions) -> int:
         drawn = ""
     console.print(f"{drawn}numbers: {path}", soft_wrap=True, highlight=False)
     return 0
+
+
+def _require_same_function(runs: Sequence[Path]) -> None:
+    """ValueError where the curvatures of the runs that have a checkpoint are those of different functions."""
+    from analysis.compare import require_same  # these need torch, which no refusal above waits for
+    from analysis.training import CHECKPOINT
+    from splat.checkpoint import load_checkpoint
+
+    kept = {str(run): run / CHECKPOINT for run in runs if (run / CHECKPOINT).is_file()}
+    if len(kept) > 1:
+        require_same(list(kept), [load_checkpoint(path) for path in kept.values()])
 
 
 def gathered(runs: Sequence[Path]) -> pd.DataFrame:

@@ -16,6 +16,7 @@ from splat.checkpoint import load_checkpoint, save_checkpoint
 from splat.losses import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from tests.figures.test_trajectory_figure import rows
 from tests.recorded import synthetic
 
 ITERATIONS = 4
@@ -148,6 +149,16 @@ def test_other_functions_are_not_compared(runs, capsys):
     save_checkpoint(path, loaded.training, replace(loaded.scene, train=loaded.scene.train[::-1]))
     refused(capsys, runs, "expected runs with the same training views")
     assert not (Path(runs[0]).parents[1] / "compare").exists()
+
+
+def test_trajectories_of_other_functions_are_not_drawn_into_one_picture(runs, capsys, monkeypatch):
+    monkeypatch.setattr("analysis.trajectories.draw", lambda module, target: [])
+    for run in runs:
+        rows().to_csv(Path(run) / "trajectory.csv", index=False)
+    assert main(["trajectory", *runs]) == 0
+    changed(runs[1], loss=LossSettings("l2"))
+    assert main(["trajectory", *runs]) == 2
+    assert "expected runs with the same loss" in capsys.readouterr().err
 
 
 def test_a_run_without_a_record_of_its_checkpoint_is_refused_with_the_command_or_probed(
