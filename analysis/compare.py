@@ -25,6 +25,7 @@ from analysis.quantities import quantity
 from analysis.records import FILE, read_record
 from analysis.report import pictures_in, template_environment
 from analysis.training import CHECKPOINT, METRICS
+from analysis.verdict import of_budgets
 from splat.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
 PAGE, TABLE, INDEX, PROBE = "compare.html", "compare.csv", "compare.json", "probe"
@@ -103,7 +104,10 @@ def _probe(run: Path, device: DeviceName) -> None:
 def _metrics(run: Path) -> dict[str, Any]:
     """Nothing of a run that was stopped before it was scored."""
     path = run / METRICS
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    try:
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    except ValueError as error:
+        raise ValueError(f"expected the scores of landscape train in {path}, got a damaged file ({error})") from None
 
 
 def cautions(runs: Sequence[Run]) -> list[str]:
@@ -121,14 +125,18 @@ def cautions(runs: Sequence[Run]) -> list[str]:
     lines = [f"The {what} are not the same." if what.endswith("s") else f"The {what} is not the same."
              for what, of in settings.items() if any(of(run) != of(runs[0]) for run in runs)]  # fmt: skip
     found = [leaves(run.data["provenance"].get("settings", {})) for run in runs]
-    lines += [
-        f"The probes were run with different {name}: {', '.join(str(settings.get(name)) for settings in found)}."
+    different = [
+        f"{name} {', '.join(str(settings.get(name)) for settings in found)}"
         for name in dict.fromkeys(name for settings in found for name in settings)
         if any(settings.get(name) != found[0].get(name) for settings in found)
     ]
+    if different:
+        order = ", ".join(run.label for run in runs)
+        lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
     for run in runs:
         failed = [name.replace("_", " ") for name, check in run.data["checks"].items() if check["passed"] is False]
         lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]
+        lines += [f"{run.label}: {line.text}" for line in of_budgets(run.data["eigenvalues"])]
         lines += [f"{run.label} was not scored." for _ in range(not run.metrics)]
     if without := [run for run in runs if not run.data.get("split_control")]:
         lines.append(

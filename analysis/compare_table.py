@@ -117,10 +117,12 @@ def _method(method: Method) -> Entry:
     >>> from splat.regularizers.stablegs import StableGS
     >>> _method(StableGS(vsp_weight=0.0)).cell
     Cell(value='stablegs', bracket='vsp_weight 0.0', note='')
+    >>> _method(StableGS(vsp_weight=0.0, warm_up=50)).value
+    'stablegs warm_up 50, vsp_weight 0.0'
     """
     published, chosen = leaves(asdict(type(method)())), leaves(asdict(method))
-    changed = "\n".join(f"{name} {value}" for name, value in chosen.items() if value != published[name])
-    return Entry(f"{method.name} {changed}".strip(), Cell(method.name, changed))
+    changed = [f"{name} {value}" for name, value in chosen.items() if value != published[name]]
+    return Entry(f"{method.name} {', '.join(changed)}".strip(), Cell(method.name, "\n".join(changed)))
 
 
 def _plain(value: float | str | None, places: int | None = None) -> Entry:

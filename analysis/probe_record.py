@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import isnan, sqrt
+from math import isfinite, isnan, sqrt
 from typing import Any
 
 import numpy as np
@@ -114,10 +114,15 @@ def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
 
 
 def literal_index(ends: EigenEnds, power: EigenEnds) -> dict[str, Any]:
-    """The paper's index from its power iteration, where that arrived within the certain bracket; else that of the ends."""
+    """The paper's index from its power iteration, where that arrived within the certain bracket; else that of the ends.
+
+    Everything lies within a bracket without bound: there it has arrived where it stopped by itself.
+    """
     certain, paper, method = literal(ends), literal(power), ends.method.capitalize()
     value, note = paper.value, f"by power iteration, as the paper takes it; the bracket is that of {method}"
-    if value is None or not certain.low <= value <= certain.high:
+    bounded = isfinite(certain.low) and isfinite(certain.high)
+    ran_out = any(end.reason.endswith("budget") for end in (power.largest, power.smallest))
+    if value is None or not certain.low <= value <= certain.high or (ran_out and not bounded):
         value, note = certain.value, f"by {method}: the paper's power iteration did not arrive"
     if certain.note not in ("definite", "indefinite"):
         note += f" ({certain.note})"

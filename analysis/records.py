@@ -276,14 +276,26 @@ def check_layout(data: Mapping[str, Any], kind: Kind = PROBE) -> None:
             missing += [f"{section}.{name}.{key}" for key in required if key not in entry]
         if missing:
             raise ValueError(f'expected the key "{missing[0]}", got none')
-    plane = data.get("slice")
-    if plane is not None:
-        if not {"loss_scale", "center_loss"} <= set(plane) or len(plane.get("directions", ())) not in kind.axes:
-            axes = " or ".join(map(str, kind.axes))
-            raise ValueError(f'expected "slice" to hold "loss_scale", "center_loss" and {axes} "directions"')
-        for direction in plane["directions"]:
-            if missing := {"name", "curvature", "unit"} - set(direction):
-                raise ValueError(f'expected the key "slice.directions.{min(missing)}", got none')
+    for group, shapes in data["arrays"].items():
+        if not isinstance(shapes, Mapping):
+            raise ValueError(f'expected shapes by name at "arrays.{group}", got {type(shapes).__name__}')
+    if data.get("slice") is not None:
+        _check_slice(data["slice"], kind)
+
+
+def _check_slice(plane: Any, kind: Kind) -> None:
+    if not isinstance(plane, Mapping):
+        raise ValueError(f'expected an object "slice", got {type(plane).__name__}')
+    found = plane.get("directions")
+    directions = found if isinstance(found, list | tuple) else ()
+    if not {"loss_scale", "center_loss"} <= set(plane) or len(directions) not in kind.axes:
+        axes = " or ".join(map(str, kind.axes))
+        raise ValueError(f'expected "slice" to hold "loss_scale", "center_loss" and {axes} "directions"')
+    for direction in directions:
+        if not isinstance(direction, Mapping):
+            raise ValueError(f'expected objects in "slice.directions", got {type(direction).__name__}')
+        if missing := {"name", "curvature", "unit"} - set(direction):
+            raise ValueError(f'expected the key "slice.directions.{min(missing)}", got none')
 
 
 def _encoded(value: Any, where: str) -> Any:

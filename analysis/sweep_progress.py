@@ -29,7 +29,7 @@ class SweepProgress:
         self.sweep, self.to_do, self.jobs = sweep, to_do, jobs
         self.active: dict[str, Stage] = {}
         self.probes: list[float] = []
-        self._due: tuple[list[Spent], float | None] = ([], None)
+        self._due: tuple[tuple[list[Spent], int], float | None] = (([], 0), None)
         self._console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("sweep", table_column=Column(no_wrap=True)),
@@ -75,11 +75,12 @@ class SweepProgress:
         self._bar.update(self._task, completed=sum(each.step for each in spent.values()), state=state)
 
     def left(self) -> str:
-        """The time that is left, counted down between the checkpoints."""
+        """The time that is left, counted down between the checkpoints and the ends of stages."""
         now, spent = monotonic(), [Spent.read(cell.out) for cell in self.sweep.cells]
-        if spent != self._due[0]:
+        state = spent, sum(map(len, self.to_do.values()))
+        if state != self._due[0]:
             seconds = self.seconds(spent)
-            self._due = spent, None if seconds is None else now + seconds
+            self._due = state, None if seconds is None else now + seconds
         due = self._due[1]
         return "--" if due is None else str(timedelta(seconds=round(max(0.0, due - now))))
 

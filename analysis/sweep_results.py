@@ -4,7 +4,8 @@ OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or 
                   ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads;
                   wall_ratio, cpu_ratio: over the seconds of the first method, of the same scene and seed; where it was probed,
                   trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error (standard error or residual), and the
-                  anisotropy indices with _low and _high; with the split control, split_INDEX: its factor on the index
+                  anisotropy indices with _low and _high, without value where one of these is unbounded; with the split
+                  control, split_INDEX: its factor on the index
 OUT/summary.csv   scene, method, and of every number its _mean, its sample standard deviation _std and the count _n
 """
 
@@ -119,11 +120,16 @@ def _probe(run: Path) -> dict[str, float | None]:
         pair = data["eigenvalues"][end]
         row |= {f"lambda_{end}": pair["value"], f"lambda_{end}_error": pair["residual"]}
     for name, index in data["anisotropy"].items():
-        row |= {name: index["value"], f"{name}_low": index["low"], f"{name}_high": index["high"]}
+        row |= {name: _bounded(index), f"{name}_low": index["low"], f"{name}_high": index["high"]}
     whole = [
         e for e in data.get("split_control", {}).get("effects", []) if (e["operator"], e["block"]) == ("hessian", "all")
     ]
-    return row | {f"{SPLIT}{effect['index']}": effect["value"] for effect in whole}
+    return row | {f"{SPLIT}{effect['index']}": _bounded(effect) for effect in whole}
+
+
+def _bounded(index: Mapping[str, Any]) -> float | None:
+    """The value that a mean may be taken of: none where the number may be without bound."""
+    return None if index["low"] is None or index["high"] is None else index["value"]
 
 
 def tables(summary: pd.DataFrame) -> list[Table]:

@@ -16,11 +16,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from analysis.drawing import draw
+from analysis.family_table import bracketed
 from analysis.options import TrajectoryOptions
 from analysis.quantities import measured, quantity
 from analysis.verdict import ATTRIBUTES, attribute_name
 
 RECORDS = "trajectory.csv"  # in a run
+NO_TIME = "no time"  # how the note of a record begins that was skipped for that
 TABLE, PICTURE = "trajectories.csv", "trajectories.png"
 VALUES = {
     **{f"trace_{name}": f"trace of {attribute_name(name)}" for name in ATTRIBUTES},
@@ -33,6 +35,7 @@ INDICES = ("literal", "saddle", "share", "effective_rank")
 def run_trajectory(options: TrajectoryOptions) -> int:
     """Gather, draw, print; returns the exit code."""
     table = gathered(options.runs)
+    _require_same_function(options.runs)
     common = Path(os.path.commonpath([run.resolve() for run in options.runs]))
     out = options.out or common / "trajectory"
     out.mkdir(parents=True, exist_ok=True)
@@ -49,6 +52,17 @@ def run_trajectory(options: TrajectoryOptions) -> int:
         drawn = ""
     console.print(f"{drawn}numbers: {path}", soft_wrap=True, highlight=False)
     return 0
+
+
+def _require_same_function(runs: Sequence[Path]) -> None:
+    """ValueError where the curvatures of the runs that have a checkpoint are those of different functions."""
+    from analysis.compare import require_same  # these need torch, which no refusal above waits for
+    from analysis.training import CHECKPOINT
+    from splat.checkpoint import load_checkpoint
+
+    kept = {str(run): run / CHECKPOINT for run in runs if (run / CHECKPOINT).is_file()}
+    if len(kept) > 1:
+        require_same(list(kept), [load_checkpoint(path) for path in kept.values()])
 
 
 def gathered(runs: Sequence[Path]) -> pd.DataFrame:
@@ -69,7 +83,10 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
                 f"expected {RECORDS} in the run {run}, found none; train with --probe-every, as in "
                 f"landscape train SCENE --out {run} --probe-every 500"
             )
-        table = pd.read_csv(path)
+        try:
+            table = pd.read_csv(path)
+        except ValueError as error:  # pandas names no file
+            raise ValueError(f"expected the records of landscape train --probe-every in {path}, got {error}") from None
         if not {"step", "state", *VALUES, *INDICES} <= set(table.columns):
             raise ValueError(f"expected the records of landscape train --probe-every in {path}, got another table")
         name = folder.name if folder == common else folder.relative_to(common).as_posix()
@@ -77,9 +94,10 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
         tables.append(table)
     together = pd.concat(tables, ignore_index=True)
     if set(together["state"]) == {"skipped"}:
+        note = str(together["note"].iloc[-1])
+        remedy = "; train with a larger --probe-share" if note.startswith(NO_TIME) else ""
         raise ValueError(
-            f"expected at least one record that was not skipped, got {len(together)} skipped to stay within --probe-share; "
-            "train with a larger one"
+            f"expected at least one record that was not skipped, got {len(together)} skipped ({note}){remedy}"
         )
     return together
 
@@ -112,10 +130,9 @@ def first_and_last(table: pd.DataFrame) -> Table:
 
 def _bracketed(row: Mapping[str, Any], key: str) -> str:
     value, low, high = (_known(row[name]) for name in (key, f"{key}_low", f"{key}_high"))
-    if value is None:
-        return quantity(None)
-    ends = ["unbounded" if end is None else quantity(end) for end in (low, high)]
-    return f"{quantity(value)} ({ends[0]} to {ends[1]})"
+    if low is None or high is None:
+        return bracketed({"value": value, "low": low, "high": high, "note": ""}).value
+    return f"{quantity(value)} ({quantity(low)} to {quantity(high)})"
 
 
 def _known(number: float) -> float | None:

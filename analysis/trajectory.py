@@ -39,7 +39,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from analysis.trajectories import RECORDS
+from analysis.trajectories import NO_TIME, RECORDS
 from landscape import (
     CountingOperator,
     EigenSettings,
@@ -61,7 +61,7 @@ from splat.scenes.view import View
 from splat.traces import exact_traces
 from splat.train import Training
 
-START, NO_TIME = "start", "no time"
+START = "start"
 Row = dict[str, Any]
 LEAST = 32  # renders with their gradients, for each view, that the least record takes (measured on 8,000 Gaussians)
 FEWEST_MATVECS = 20  # from a warm start, for the largest eigenvalue

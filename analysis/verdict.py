@@ -38,6 +38,7 @@ def verdict(data: Mapping[str, Any]) -> list[Line]:
         *_of_checks(data["checks"]),
         *_of_traces(data["traces"]),
         *_of_ends(data["eigenvalues"]),
+        *of_budgets(data["eigenvalues"]),
         *_of_anisotropy(data["anisotropy"]),
         *_of_needles(data["eigenvalues"]["max"].get("lives_on"), data["counts"]),
         *_of_finite_probe(data.get("finite_probe")),
@@ -76,15 +77,7 @@ def _of_traces(traces: Mapping[str, Any]) -> list[Line]:
     ]
     total = sum(abs(entry["value"]) for entry in finite.values())
     if total > 0:
-        first, *others = sorted(finite, key=lambda name: -abs(finite[name]["value"]))
-        value, error = finite[first]["value"], finite[first]["standard_error"]
-        text = (
-            f"{attribute_name(first).capitalize()} carries most of the curvature: its trace, {measured(value, error)}, "
-        )
-        text += f"is {abs(value) / total:.0%} of the sum of all absolute traces (each in its own stored units)."
-        if others and _overlap(finite[first], finite[others[0]]):
-            text += f" Its error does not separate it from {attribute_name(others[0])}."
-        lines.append(Line(text))
+        lines.append(_of_largest_trace(finite, total))
     elif finite:
         lines.append(Line("Every trace is exactly 0."))
     signs = {"negative": "negative: on average the loss curves down there", "undetermined": "not decided by its error"}
@@ -92,6 +85,21 @@ def _of_traces(traces: Mapping[str, Any]) -> list[Line]:
         if named := [attribute_name(name) for name, entry in finite.items() if entry["sign"] == sign]:
             lines.append(Line(f"The sign of the trace of {' and '.join(named)} is {words}.", "caution"))
     return lines
+
+
+def _of_largest_trace(traces: Mapping[str, Any], total: float) -> Line:
+    """traces: those that are numbers; total: the sum of their magnitudes."""
+    first, *others = sorted(traces, key=lambda name: -abs(traces[name]["value"]))
+    value, share = traces[first]["value"], abs(traces[first]["value"]) / total
+    part = "most" if share > 0.5 else "the largest part"
+    text = (
+        f"{attribute_name(first).capitalize()} carries {part} of the curvature: its trace, "
+        f"{measured(value, traces[first]['standard_error'])}, is {share:.0%} of the sum of all absolute traces (each in its "
+        "own stored units)."
+    )
+    if near := [attribute_name(name) for name in others if _overlap(traces[first], traces[name])]:
+        text += f" Its error does not separate it from {' and '.join(near)}."
+    return Line(text)
 
 
 def _of_ends(ends: Mapping[str, Any]) -> list[Line]:
@@ -108,6 +116,16 @@ def _of_ends(ends: Mapping[str, Any]) -> list[Line]:
     if top["value"] + top["residual"] < 0:
         return [Line(f"No direction of positive curvature was found: {ends_text}.")]
     return [Line(f"Whether the Hessian is indefinite is not decided by the residuals: {ends_text}.", "caution")]
+
+
+def of_budgets(ends: Mapping[str, Any]) -> list[Line]:
+    """A residual says that an eigenvalue is near, not that none lies beyond: of that only a search that converged is a sign."""
+    reasons = {name: ends[end].get("reason") or "" for end, name in (("max", "largest"), ("min", "smallest"))}
+    return [
+        Line(f"The search for the {name} eigenvalue ended at its {reason}: the end may lie farther out.", "caution")
+        for name, reason in reasons.items()
+        if reason.endswith("budget")
+    ]
 
 
 def _of_anisotropy(family: Mapping[str, Any]) -> list[Line]:

@@ -23,14 +23,10 @@ from analysis.verdict import attribute_name
 from figures.plane import Plane, plane, same_scale
 from figures.style import (
     BLACK,
-    BLUE,
     COLUMN,
     FIELD_MAP,
-    GREEN,
     MISSING,
-    ORANGE,
-    PURPLE,
-    SKY,
+    RUNS,
     VERMILION,
     exponent_of,
     folder_script,
@@ -42,7 +38,6 @@ from figures.style import (
 )
 
 Records = Mapping[str, Record]
-COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)
 LINES = ("-", "--", ":")  # once the colours are used up
 LEVELS = 12
 ACROSS = 3  # panels in a row
@@ -204,8 +199,7 @@ def draw_sections(records: Records) -> Figure:
 def _looks(records: Records) -> list[dict[str, str]]:
     """Colour and line of each run."""
     return [
-        {"color": COLOURS[i % len(COLOURS)], "linestyle": LINES[i // len(COLOURS) % len(LINES)]}
-        for i in range(len(records))
+        {"color": RUNS[i % len(RUNS)], "linestyle": LINES[i // len(RUNS) % len(LINES)]} for i in range(len(records))
     ]
 
 

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
 
-from figures.fig7 import COLOURS, command_line, names_of
+from figures.fig7 import command_line, names_of
 from figures.manifold import Scale, contours, landscape_of, section, surface
-from figures.style import BLACK, literal, new_figure, style
+from figures.style import BLACK, RUNS, literal, new_figure, style
 
 RENDERS = "test"
 WIDTH = 4.8  # inches
@@ -32,10 +32,10 @@ def draw(runs: Sequence[Path]) -> Figure:
             surface(figure, (4, 2, 1 + i), landscape, scale, name)
             filled = contours(maps[i], landscape, scale)
             across = figure.add_subplot(4, 2, 5 + i)
-            section(across, landscape, scale, 0, color=COLOURS[i])
-            section(across, landscape, scale, 1, color=COLOURS[i], linestyle="--")
+            section(across, landscape, scale, 0, color=RUNS[i])
+            section(across, landscape, scale, 1, color=RUNS[i], linestyle="--")
             across.set(
-                xlabel=scale.step_label("e₁, e₂"), ylim=[end / 10.0**scale.loss for end in (scale.low, scale.high)]
+                xlabel=scale.flat_label("e₁, e₂"), ylim=[end / 10.0**scale.loss for end in (scale.low, scale.high)]
             )
             picture = figure.add_subplot(4, 2, 7 + i)
             picture.imshow(imread(run / RENDERS / view))

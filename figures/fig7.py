@@ -3,7 +3,8 @@
 `python -m figures.fig7 RUN_3DGS RUN_STABLEGS --out fig7.png`.  Above: |lambda_max / lambda_min| (Eq. (3); open: negative) with
 its bracket, and the loss around both checkpoints along the two steepest eigenvectors.  Below: the same around the start of the
 first run, and sections through all three along e_1 and e_2.  All axes are those of the two ends (`figures.manifold`), but for
-the start's surface, whose title says how much farther it reaches: a start may be hundreds of times wider than an end.
+the start's surface, whose title says how much farther it reaches (a start may be hundreds of times wider than an end), and the
+sections' losses, which hold the start's too: a slope is not cut off where it falls below its centre.
 """
 
 import argparse
@@ -17,12 +18,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from figures.manifold import Scale, landscape_of, section, start_of, surface
-from figures.style import BLUE, GREEN, VERMILION, literal, new_figure, save, style
-from figures.trajectory import below_zero, index_over_steps
+from figures.style import BLUE, RUNS, literal, new_figure, save, style
+from figures.trajectory import index_over_steps, marker_words
 
 RECORDS = "trajectory.csv"
 PAGE = 6.9  # inches
-COLOURS = (VERMILION, GREEN)
 BEGINNING = "start"
 BAR: dict[str, Any] = {"shrink": 0.6, "aspect": 14}  # without a name: the title above has it
 
@@ -33,11 +33,12 @@ def draw(runs: Sequence[Path]) -> Figure:
     measured = _measured(runs, names)
     ends, start = [landscape_of(run) for run in runs], start_of(runs[0])
     scale, wide = Scale.of(*ends), Scale.of(start)
+    across = scale.holding(start)
     with style():
         figure = new_figure(4.4)
         figure.set_figwidth(PAGE)
         index = figure.add_subplot(2, 3, 1)
-        index_over_steps(index, measured, dict(zip(names, COLOURS, strict=True)), "literal")
+        index_over_steps(index, measured, dict(zip(names, RUNS, strict=False)), "literal")
         index.set(xlabel="step", ylabel="|λmax / λmin|", title="Anisotropy index")
         index.xaxis.set_major_locator(MaxNLocator(4, integer=True))
         index.grid(True)
@@ -48,14 +49,14 @@ def draw(runs: Sequence[Path]) -> Figure:
         figure.colorbar(colours, ax=around, **BAR)
         for axis, direction in enumerate(("e₁", "e₂")):
             axes = figure.add_subplot(2, 3, 5 + axis)
-            section(axes, start, scale, axis, color=BLUE, linestyle="--")
-            for end, colour in zip(ends, COLOURS, strict=True):
-                section(axes, end, scale, axis, color=colour)
-            axes.set(xlabel=scale.step_label(direction), ylabel=scale.loss_label, title=f"Section along {direction}")
+            section(axes, start, across, axis, color=BLUE, linestyle="--")
+            for end, colour in zip(ends, RUNS, strict=False):
+                section(axes, end, across, axis, color=colour)
+            axes.set(xlabel=across.flat_label(direction), ylabel=across.loss_label, title=f"Section along {direction}")
         handles = [figure.axes[-1].lines[i] for i in (1, 2, 0)]
         for line, name in zip(handles, (*names, BEGINNING), strict=True):
             line.set_label(literal(name))
-        figure.legend(handles=[*handles, *below_zero(measured, "literal")], loc="outside lower center", ncols=4)
+        figure.legend(handles=[*handles, *marker_words(measured, "literal")], loc="outside lower center", ncols=4)
     return figure
 
 
@@ -77,6 +78,10 @@ def _measured(runs: Sequence[Path], names: Sequence[str]) -> pd.DataFrame:
         if not (run / RECORDS).is_file():
             raise FileNotFoundError(f"expected {RECORDS} in the run {run}, found none; train anew with --probe-every")
         table = pd.read_csv(run / RECORDS)
+        if not {"step", "state", "literal", "literal_low", "literal_high"} <= set(table.columns):
+            raise ValueError(
+                f"expected the records of landscape train --probe-every in {run / RECORDS}, got another table"
+            )
         table = pd.DataFrame(table[table["state"] != "skipped"]).assign(run=name)
         if table.empty:
             raise ValueError(

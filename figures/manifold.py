@@ -6,7 +6,7 @@ Where a slice was not recorded that far there is nothing.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -59,10 +59,26 @@ class Scale:
     def step_label(self, name: str) -> str:
         return f"step along {name}{unit_suffix(self.steps)}"
 
+    def flat_label(self, name: str) -> str:
+        """Of a horizontal axis, which has the room for the unit below."""
+        return f"{self.step_label(name)}\n(param. units)"
+
+    def holding(self, other: Plane) -> "Scale":
+        """The same steps, and the changes of another landscape's sections within them too."""
+        lines = [through_centre(other, axis) for axis in (0, 1)]
+        near = np.ma.concatenate([change[np.abs(steps) <= self.reach] for steps, change in lines])
+        return replace(self, low=min(self.low, float(near.min())), high=max(self.high, float(near.max())))
+
 
 def change_of(landscape: Plane) -> np.ma.MaskedArray:
     """The loss minus that at the centre."""
     return landscape.change * 10.0**landscape.exponent
+
+
+def through_centre(landscape: Plane, axis: int) -> tuple[np.ndarray, np.ma.MaskedArray]:
+    """Steps and change of the loss on the grid's line through the centre along the first (axis 0) or the second direction."""
+    along, other = (landscape.x, landscape.y) if axis == 0 else (landscape.y, landscape.x)
+    return along.steps, change_of(landscape).take(other.centre, axis=1 - axis)
 
 
 def landscape_of(run: Path) -> Plane:
@@ -145,16 +161,15 @@ def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
     axes.contour(x, y, change, levels=levels, colors=BLACK, linewidths=0.4)
     reach = scale.reach / steps
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    axes.set_xlabel(scale.step_label("e₁"))
+    axes.set_xlabel(scale.flat_label("e₁"))
     axes.set_ylabel(scale.step_label("e₂"))
     return filled
 
 
 def section(axes: Axes, landscape: Plane, scale: Scale, axis: int, **look: object) -> None:
     """The grid's line through the centre along the first (axis 0) or the second direction."""
-    along, other = (landscape.x, landscape.y) if axis == 0 else (landscape.y, landscape.x)
-    line = change_of(landscape).take(other.centre, axis=1 - axis) / 10.0**scale.loss
-    axes.plot(along.steps / 10.0**scale.steps, line, **look)  # pyright: ignore[reportArgumentType]
+    steps, change = through_centre(landscape, axis)
+    axes.plot(steps / 10.0**scale.steps, change / 10.0**scale.loss, **look)  # pyright: ignore[reportArgumentType]
     reach, loss = scale.reach / 10.0**scale.steps, 10.0**scale.loss
     axes.set(xlim=(-reach, reach), ylim=(scale.low / loss, scale.high / loss))
     axes.xaxis.set_major_locator(MaxNLocator(4))

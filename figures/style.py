@@ -35,6 +35,7 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
     "#D55E00",
     "#CC79A7",
 )
+RUNS = (VERMILION, GREEN, BLUE, ORANGE, PURPLE, SKY, BLACK)  # a run has the same colour in every figure
 POSITIVE, NEGATIVE, UNDETERMINED = BLUE, VERMILION, "0.45"
 
 _RC: dict[Any, Any] = {
@@ -80,6 +81,7 @@ def new_figure(height: float, width: float = COLUMN) -> Figure:
 def save(figure: Figure, path: str | Path) -> Path:
     """Write the figure (PNG, PDF or SVG by its suffix) so that `path` is the old file or the whole new one."""
     path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
     with style():
         if path.suffix == ".png":  # the same bytes as savefig's, which draws twice: once for the layout alone

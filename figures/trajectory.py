@@ -23,12 +23,7 @@ from analysis.quantities import power_of_ten
 from analysis.verdict import ATTRIBUTES, attribute_name
 from figures.style import (
     BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
+    RUNS,
     exponent_of,
     literal,
     new_figure,
@@ -37,9 +32,9 @@ from figures.style import (
     unit_suffix,
 )  # fmt: skip
 
-COLOURS = (VERMILION, GREEN, BLUE, ORANGE, PURPLE, SKY, BLACK)
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
 INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
+UNITS = "traces, eigenvalues: loss per squared parameter unit"
 PANEL = 1.12  # inches of height
 LEGEND_LINE = 0.14
 
@@ -54,9 +49,9 @@ def draw(table: pd.DataFrame) -> Figure:
         raise ValueError(
             "expected at least one record that was not skipped, got none; train with a larger --probe-share"
         )
-    runs = {str(name): COLOURS[i % len(COLOURS)] for i, name in enumerate(table["run"].unique())}
+    runs = {str(name): RUNS[i % len(RUNS)] for i, name in enumerate(table["run"].unique())}
     with style():
-        figure = new_figure(PANEL * 5 + LEGEND_LINE * (len(runs) + 3))
+        figure = new_figure(PANEL * 5 + LEGEND_LINE * (len(runs) + 5))
         panels = figure.subplots(5, 2)
         for axes, name in zip(panels.flat, ATTRIBUTES, strict=False):
             columns = f"trace_{name}", f"trace_{name}_low", f"trace_{name}_high"
@@ -74,7 +69,8 @@ def draw(table: pd.DataFrame) -> Figure:
             axes.grid(True)
             axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
         handles = [Line2D([], [], color=colour, label=literal(name)) for name, colour in runs.items()]
-        handles += below_zero(measured, *INDICES)
+        handles += marker_words(measured, *INDICES)
+        handles.append(Line2D([], [], linestyle="none", label=UNITS))
         figure.legend(handles=handles, loc="outside lower center", ncols=1)
     return figure
 
@@ -109,12 +105,15 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
     _few_decades(axes)
 
 
-def below_zero(measured: pd.DataFrame, *names: str) -> list[Line2D]:
-    """What hollow markers mean, for a legend, where one of the indices has any."""
-    if not (measured[list(names)] < 0).to_numpy().any():
-        return []
-    look: dict[str, Any] = {"marker": "o", "markersize": 3, "markerfacecolor": "white", "linestyle": "none"}
-    return [Line2D([], [], color=BLACK, label="open: the index is negative", **look)]
+def marker_words(measured: pd.DataFrame, *names: str) -> list[Line2D]:
+    """What hollow markers and triangles mean, for a legend, where one of the indices has any."""
+    values = measured[list(names)].to_numpy(float)
+    ends = np.stack([measured[[f"{name}{end}" for name in names]].to_numpy(float) for end in ("_low", "_high")])
+    bounds = np.isfinite(values) & ~np.isfinite(ends).all(axis=0)
+    look: dict[str, Any] = {"color": BLACK, "markersize": 3, "linestyle": "none"}
+    hollow = Line2D([], [], marker="o", markerfacecolor="white", label="open: the index is negative", **look)
+    triangle = Line2D([], [], marker="^", label="triangle: at least so large", **look)
+    return [hollow] * bool((values < 0).any()) + [triangle] * bool(bounds.any())
 
 
 def _bands(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], columns: tuple[str, str, str], title: str) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 import matplotlib as mpl
 import pytest
 
+from figures.style import RUNS
+
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
@@ -47,6 +49,13 @@ def test_the_comparison_trains_both_methods_and_gives_every_trace_with_its_error
     plain, stable = (names["trained"][name] for name in ("3DGS", "StableGS"))
     assert stable.regularizer.history and not plain.regularizer.history  # it has probed
     assert not (len(stable.gaussians) == len(plain.gaussians) and stable.gaussians.flat.equal(plain.gaussians.flat))
+
+
+def test_the_profiles_have_the_colours_and_names_of_the_figures(story):
+    _, names = story
+    lines = names["axes"].lines
+    assert [line.get_color() for line in lines] == [colour for colour in RUNS[:2] for _ in range(2)]
+    assert len({line.get_label() for line in lines}) == 4
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -16,6 +16,7 @@ from splat.checkpoint import load_checkpoint, save_checkpoint
 from splat.losses import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from tests.figures.test_trajectory_figure import rows
 from tests.recorded import synthetic
 
 ITERATIONS = 4
@@ -150,6 +151,16 @@ def test_other_functions_are_not_compared(runs, capsys):
     assert not (Path(runs[0]).parents[1] / "compare").exists()
 
 
+def test_trajectories_of_other_functions_are_not_drawn_into_one_picture(runs, capsys, monkeypatch):
+    monkeypatch.setattr("analysis.trajectories.draw", lambda module, target: [])
+    for run in runs:
+        rows().to_csv(Path(run) / "trajectory.csv", index=False)
+    assert main(["trajectory", *runs]) == 0
+    changed(runs[1], loss=LossSettings("l2"))
+    assert main(["trajectory", *runs]) == 2
+    assert "expected runs with the same loss" in capsys.readouterr().err
+
+
 def test_a_run_without_a_record_of_its_checkpoint_is_refused_with_the_command_or_probed(
     runs, capsys, monkeypatch, no_pictures
 ):
@@ -174,7 +185,11 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
     assert main(["compare", *runs]) == 0
     assert "not the same" not in capsys.readouterr().out
     data, arrays = synthetic()
-    data["provenance"] |= {"iteration": ITERATIONS, "dtype": "float64", "settings": {"eigen": {"rtol": 0.5}}}
+    data["provenance"] |= {
+        "iteration": ITERATIONS,
+        "dtype": "float64",
+        "settings": {"eigen": {"rtol": 0.5}, "quick": True},
+    }
     data["checks"]["symmetry"]["passed"] = False
     with record_folder(Path(runs[1]) / "probe") as partial:
         write_record(partial, data, arrays)
@@ -185,14 +200,21 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
     for part in (
         "The seed is not the same",
         "The precision is not the same",
-        "The probes were run with different eigen.rtol: None, 0.5.",
+        "The probes were run with different settings (those of plain/0, sam/0): eigen.rtol None, 0.5; quick None, True.",
         "sam/0: the check of symmetry failed",
         "sam/0 was not scored",
+        "sam/0: The search for the smallest eigenvalue ended at its time budget: the end may lie farther out.",
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",
     ):
         assert part in said and part in " ".join(
             (Path(runs[0]).parents[1] / "compare/compare.html").read_text().split()
         )
+
+
+def test_damaged_scores_are_named(runs, capsys):
+    path = Path(runs[1]) / "metrics.json"
+    path.write_text('{"test":')
+    refused(capsys, runs, f"expected the scores of landscape train in {path}, got a damaged file")
 
 
 def test_at_least_two_different_runs_are_asked_for(runs, capsys):

@@ -21,7 +21,7 @@ from analysis.options import ProbeOptions
 from analysis.probe import run_probe, scene_objective
 from analysis.probe_record import literal_index
 from analysis.records import Record, read_record
-from landscape import DenseOperator, PowerSettings, extreme_eigenpairs, power_ends
+from landscape import DenseOperator, EigenSettings, PowerSettings, extreme_eigenpairs, power_ends
 from splat.adam import Adam
 from splat.checkpoint import load_checkpoint, save_checkpoint
 from splat.densify import ScreenGradients
@@ -153,6 +153,20 @@ def test_a_power_iteration_that_did_not_arrive_gives_no_index(steps, says):
     index = literal_index(extreme_eigenpairs(operator, generator), power)
     assert index["value"] == pytest.approx(-3, rel=1e-2) and index["note"].startswith(says)
     assert index["low"] <= index["value"] <= index["high"]
+
+
+def test_within_a_bracket_without_bound_a_power_iteration_that_ran_out_has_not_arrived():
+    operator, generator = (
+        DenseOperator(torch.diag(torch.linspace(-1e-3, 3, 400, dtype=torch.float64))),
+        torch.Generator(),
+    )
+    ends = extreme_eigenpairs(operator, generator.manual_seed(0), EigenSettings(max_matvecs=7))
+    late, arrived = (
+        power_ends(operator, generator, PowerSettings(0.1, atol=1e-2, max_matvecs=steps)) for steps in (2, 3000)
+    )
+    index = literal_index(ends, late)
+    assert index["high"] is None and index["note"].startswith("by Lanczos: the paper's power iteration did not arrive")
+    assert literal_index(ends, arrived)["note"].startswith("by power iteration")
 
 
 def test_the_slice_is_made_of_true_losses_along_the_two_steepest_directions(record, dense):

@@ -83,6 +83,9 @@ def test_a_record_may_have_no_slice_and_no_arrays(tmp_path):
         (lambda d: d.pop("checks"), '"checks"'),
         (lambda d: d["slice"]["directions"][1].pop("unit"), "slice.directions.unit"),
         (lambda d: d["slice"].pop("center_loss"), "center_loss"),
+        (lambda d: d["slice"]["directions"].__setitem__(0, None), "slice.directions"),
+        (lambda d: d["slice"].update(directions=2), "2 .directions"),
+        (lambda d: d.update(slice=3), '"slice"'),
         (lambda d: d["anisotropy"].update(saddle=3.0), "anisotropy.saddle"),
         (lambda d: d["traces"]["quats"].update(value=np.zeros(3)), "traces.quats.value.*npz"),
         (lambda d: d["notes"].append("NaN"), r"notes\[1\]"),
@@ -215,6 +218,15 @@ def test_json_of_something_else_is_refused(tmp_path, foreign):
     (tmp_path / "probe.json").write_text(foreign)
     with pytest.raises(ValueError, match="expected a record of `landscape probe`"):
         read_record(tmp_path)
+
+
+@pytest.mark.parametrize("shapes", [None, 3, [4]])
+def test_arrays_that_are_no_shapes_by_name_are_refused(tmp_path, shapes):
+    path = written(tmp_path / "probe") / "probe.json"
+    raw = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps(raw | {"arrays": raw["arrays"] | {"spectrum": shapes}}), encoding="utf-8")
+    with pytest.raises(ValueError, match=r'"arrays\.spectrum".*probe again'):
+        read_record(path)
 
 
 def test_a_newer_format_is_refused_with_what_to_do(tmp_path):

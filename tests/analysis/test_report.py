@@ -147,6 +147,16 @@ def test_the_verdict_names_the_attribute_that_carries_the_curvature():
     assert "Rotation carries most" in sentences(data) and "separate" not in sentences(data)
 
 
+def test_most_of_the_curvature_is_more_than_half_of_it_and_whom_the_error_does_not_separate_is_named():
+    data, _ = synthetic()
+    data["traces"]["means"] |= {"value": 4.1e5, "standard_error": 1e4}
+    data["traces"]["quats"] |= {"value": 4e5, "standard_error": 4e4}
+    data["traces"]["sh"] |= {"value": -3.8e5, "standard_error": 4e4}
+    said = sentences(data)
+    assert "Position carries the largest part of the curvature" in said and "carries most" not in said
+    assert "does not separate it from rotation and colour (SH)." in said
+
+
 @pytest.mark.parametrize(
     ("low", "residual", "words"),
     [
@@ -159,6 +169,16 @@ def test_the_verdict_calls_indefinite_what_the_residual_proves(low, residual, wo
     data, _ = synthetic()
     data["eigenvalues"]["min"] |= {"value": low, "residual": residual}
     assert words in sentences(data)
+
+
+def test_an_end_that_the_budget_did_not_reach_is_a_bound_and_the_verdict_says_so():
+    data, _ = synthetic()
+    data["eigenvalues"]["min"] |= {"reason": "tolerance"}
+    assert "farther out" not in sentences(data)
+    data["eigenvalues"]["min"] |= {"reason": "time budget"}
+    assert "The search for the smallest eigenvalue ended at its time budget" in sentences(data, "caution")
+    data["eigenvalues"]["max"] |= {"reason": "matvec budget"}
+    assert "The search for the largest eigenvalue ended at its matvec budget" in sentences(data, "caution")
 
 
 def test_a_number_without_its_error_is_never_shown_as_exact(tmp_path):

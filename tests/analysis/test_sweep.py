@@ -21,8 +21,8 @@ from analysis.options import TrainOptions
 from analysis.records import record_folder, write_record
 from analysis.spent import Spent
 from analysis.sweep import _Cells, locked, missing, probe_arguments
-from analysis.sweep_file import Sweep, arguments, read_sweep
-from analysis.sweep_progress import SweepProgress
+from analysis.sweep_file import Cell, Sweep, arguments, read_sweep
+from analysis.sweep_progress import Stage, SweepProgress
 from analysis.sweep_results import results, summarize, tables
 from splat.checkpoint import load_checkpoint
 from splat.render import render
@@ -277,6 +277,19 @@ def test_the_results_are_the_runs_own_metrics(finished, folder):
         assert row["threads"] == max(1, int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0)))) // 2)
 
 
+def test_an_index_of_which_only_a_bound_is_known_is_not_averaged(tmp_path):
+    data, arrays = synthetic()
+    data["anisotropy"]["literal"] = {"value": 7.0, "low": 34.2, "high": None, "note": "lambda_min is not resolved"}
+    cell = Cell("still", "3dgs", TrainOptions(Path("still"), out=tmp_path / "0"))
+    with record_folder(cell.out / "probe") as partial:
+        write_record(partial, data, arrays)
+    (cell.out / "metrics.json").write_text(json.dumps({"test": {}, "train": {}, "gaussians": 9}))
+    rows = results([cell], {cell.name: "done"})
+    assert rows.iloc[0]["literal_low"] == 34.2 and rows.iloc[0]["saddle"] == pytest.approx(3.1e4 / 220)
+    summary = summarize(rows)
+    assert summary["saddle_n"].item() == 1 and summary["literal_n"].item() == 0
+
+
 def test_mean_deviation_and_ratio_are_taken_over_the_seeds_of_a_method():
     rows = pd.DataFrame(
         {
@@ -324,3 +337,15 @@ def test_the_time_left_follows_the_pace_of_each_method(folder, tmp_path):
     known = [Spent(step=12, wall=6.0), Spent(step=4, wall=8.0), Spent(), Spent()]
     assert progress.seconds(known) == pytest.approx((8 * 2 + 12 * 0.5 + 12 * 2) / 2)
     assert progress.seconds([Spent(step=12, wall=6.0)] + [Spent()] * 3) == pytest.approx(3 * 12 * 0.5 / 2)
+
+
+def test_the_time_left_goes_with_the_last_probe(folder, tmp_path, monkeypatch):
+    sweep = read_sweep(folder / "sweep.toml", tmp_path)
+    to_do: dict[str, list[Stage]] = {cell.name: ["probe"] for cell in sweep.cells}
+    progress = SweepProgress(sweep, to_do, jobs=1)
+    monkeypatch.setattr(Spent, "read", lambda run: Spent(step=12, wall=6.0))
+    progress.took("probe", 60.0)
+    assert progress.left() == "0:04:00"
+    for stages in to_do.values():
+        stages.pop()
+    assert progress.left() == "0:00:00"

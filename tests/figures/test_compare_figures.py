@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from analysis.records import Record
-from figures.compare import COLOURS, beyond, draw_comparison, draw_densities, draw_sections, draw_slices, draw_traces
+from figures.compare import beyond, draw_comparison, draw_densities, draw_sections, draw_slices, draw_traces
+from figures.style import RUNS
 from tests.recorded import synthetic
 
 
@@ -46,9 +47,9 @@ def test_a_trace_shows_its_sign_and_whether_its_interval_decides_it(tmp_path):
     looks = [(float(line.get_xdata()[0]), line.get_marker(), line.get_markerfacecolor()) for line in marked]  # pyright: ignore[reportIndexIssue, reportArgumentType]
     by_value = {round(value): (marker, face) for value, marker, face in looks}
     traces = record.data["traces"]
-    assert len(looks) == 4 and by_value[12] == ("X", COLOURS[0])
+    assert len(looks) == 4 and by_value[12] == ("X", RUNS[0])
     assert by_value[round(-traces["opacity_logits"]["value"])] == ("o", "white")
-    assert by_value[round(traces["quats"]["value"])] == ("o", COLOURS[0])
+    assert by_value[round(traces["quats"]["value"])] == ("o", RUNS[0])
 
 
 def test_a_density_is_shared_out_among_the_directions_on_both_sides_of_zero(tmp_path):
@@ -89,7 +90,7 @@ def test_a_run_without_slice_or_density_is_left_out_of_those_pictures_alone(tmp_
             label.replace("$", r"\$") for label in both
         ]
     colours = {line.get_color() for line in draw_sections(both).axes[0].lines}
-    assert colours == {COLOURS[0]}
+    assert colours == {RUNS[0]}
 
 
 def test_what_no_run_has_is_not_drawn(tmp_path, monkeypatch):

@@ -10,9 +10,10 @@ import pytest
 from matplotlib.colors import to_hex
 from PIL import Image
 
-from analysis.records import SLICE, record_folder, write_record
+from analysis.records import SLICE, read_record, record_folder, write_record
 from figures import fig1, fig7
 from figures.manifold import Scale, landscape_of, start_of
+from figures.style import RUNS
 from tests.figures.test_figures import POINT, laid_out
 from tests.figures.test_trajectory_figure import rows
 from tests.recorded import synthetic
@@ -67,6 +68,24 @@ def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
     assert first / start == pytest.approx(3) and second / first == pytest.approx(3)
 
 
+def test_a_start_that_slopes_down_is_not_cut_off_at_the_ends_own_limits(runs):
+    folder = runs[0] / "start" / "slice-eigenvectors-2d"
+    record = read_record(folder)
+    x = record.arrays["slice"]["x"]
+    record.arrays["slice"]["loss"][:] = record.data["slice"]["center_loss"] - 2e-2 * (x / x.max())[:, None]
+    with record_folder(folder, SLICE) as anew:
+        write_record(anew, {k: v for k, v in record.data.items() if k != "arrays"}, record.arrays, SLICE)
+    along_e1 = fig7.draw(runs).axes[-2]
+    start, *_ = (np.asarray(line.get_ydata(), float) for line in along_e1.lines)
+    assert along_e1.get_ylim()[0] <= np.nanmin(start) < 0
+
+
+@pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
+def test_steps_have_their_unit(runs, module):
+    flat = [axes for axes in module.draw(runs).axes if axes.get_xlabel().startswith("step along")]
+    assert all("param. units" in axes.get_xlabel() for axes in flat if not hasattr(axes, "get_zlim")) and flat
+
+
 @pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
 def test_ticks_of_steps_are_apart_from_each_other_and_from_the_names_of_their_axes(runs, module):
     figure = module.draw(runs)
@@ -92,10 +111,16 @@ def test_the_colours_of_the_surfaces_have_bars_and_open_dots_a_word(runs):
     assert words == ["3dgs", "stablegs", "start", "open: the index is negative"]
 
 
+def test_a_figure_makes_the_folder_that_it_is_written_to(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["fig1", *map(str, runs), "--out", str(tmp_path / "paper/figures/one.svg")])
+    fig1.main()
+    assert (tmp_path / "paper/figures/one.svg").is_file()
+
+
 def test_the_index_is_the_recorded_one_of_each_run(runs):
     index = fig7.draw(runs).axes[0]
     dots = [line for line in index.lines if line.get_marker() == "o" and len(np.asarray(line.get_xdata()))]
-    assert {to_hex(line.get_color()).upper() for line in dots} == set(fig7.COLOURS)
+    assert {to_hex(line.get_color()).upper() for line in dots} == set(RUNS[:2])
     assert [float(y) for line in dots for y in np.asarray(line.get_ydata())] == [4.0, 9.0, 16.0] * 2
     assert fig7.names_of(runs) == ["3dgs", "stablegs"]
 
@@ -114,6 +139,8 @@ def test_a_missing_record_is_named_with_the_command_that_makes_it(runs, tmp_path
     (runs[0] / "start" / "checkpoint.pt").unlink()
     refused(fig7, "train anew with --probe-every, which keeps it")
     table = pd.read_csv(runs[1] / "trajectory.csv")
+    table[["step", "gaussians"]].to_csv(runs[1] / "trajectory.csv", index=False)
+    refused(fig7, f"expected the records of landscape train --probe-every in {runs[1] / 'trajectory.csv'}")
     table.assign(state="skipped").to_csv(runs[1] / "trajectory.csv", index=False)
     refused(fig7, "train with a larger --probe-share")
     (runs[1] / "trajectory.csv").unlink()

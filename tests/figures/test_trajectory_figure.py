@@ -14,7 +14,8 @@ from analysis.cli import main
 from analysis.trajectories import gathered
 from analysis.trajectory import COLUMNS
 from figures import trajectory
-from figures.trajectory import COLOURS
+from figures.style import RUNS
+from figures.trajectory import UNITS
 from tests.figures.test_figures import require_layout
 from tests.recorded import ATTRIBUTES
 
@@ -57,7 +58,7 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
     table = gathered([run(tmp_path / "a"), run(tmp_path / "b", 3.0)])
     figure = trajectory.draw(table)
     panels = {axes.get_title(): axes for axes in figure.axes}
-    for name, colour, scale in (("a", COLOURS[0], 1.0), ("b", COLOURS[1], 3.0)):
+    for name, colour, scale in (("a", RUNS[0], 1.0), ("b", RUNS[1], 3.0)):
         (line,) = [x for x in panels["trace of position"].lines if to_hex(x.get_color()).upper() == colour]
         assert list(np.asarray(line.get_xdata())) == [1000, 1500, 2000], name  # the skipped record is left out
         assert np.asarray(line.get_ydata()) == pytest.approx([scale * (i - 2.5) for i in (2, 3, 4)])
@@ -75,10 +76,16 @@ def test_powers_of_ten_have_a_line_of_their_own_and_the_legend_says_what_is_open
     figure = trajectory.draw(rows(1e-4).assign(run="a"))
     titles = [axes.get_title() for axes in figure.axes]
     assert "smallest eigenvalue\n(×10⁻⁶)" in titles and "largest eigenvalue\n(×10⁻⁶)" in titles
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "open: the index is negative"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "a",
+        "open: the index is negative",
+        "triangle: at least so large",
+        UNITS,
+    ]
     positive = rows().assign(run="a")
     positive["literal"] = positive["literal"].abs()
-    assert [text.get_text() for text in trajectory.draw(positive).legends[0].get_texts()] == ["a"]
+    positive["effective_rank_high"] = 2 * positive["effective_rank"]
+    assert [text.get_text() for text in trajectory.draw(positive).legends[0].get_texts()] == ["a", UNITS]
 
 
 def test_of_an_index_without_any_bound_nothing_is_drawn(tmp_path):
@@ -101,6 +108,7 @@ def test_the_command_prints_the_first_and_last_values_and_writes_table_and_pictu
     assert ["3dgs/0", "(1", "skipped)", "step", "1,000", "(whole)", "step", "2,000", "(whole)"] in lines
     assert ["largest", "eigenvalue", "2.00", "±", "0.10", "4.00", "±", "0.10"] in lines
     assert ["literal", "−4.00", "(−4.40", "to", "−3.60)", "−16.0", "(−17.6", "to", "−14.4)"] in lines
+    assert ["effective", "rank", "≥", "10.0", "≥", "20.0"] in lines  # of which nothing else is certain
 
 
 @pytest.mark.parametrize(
@@ -121,13 +129,17 @@ def test_a_figures_script_that_is_given_something_else_says_what_it_expects(tmp_
 def test_a_run_without_records_or_named_twice_is_refused_with_what_to_do(tmp_path, capsys):
     kept = run(tmp_path / "kept")
     (tmp_path / "bare").mkdir()
-    (tmp_path / "brief").mkdir()
-    rows()[:1].to_csv(tmp_path / "brief" / "trajectory.csv", index=False)
+    for name, note in (("brief", "no time: 9 s were needed"), ("blind", "no Gaussian touches a pixel")):
+        run(tmp_path / name)
+        rows()[:1].assign(note=note).to_csv(tmp_path / name / "trajectory.csv", index=False)
+    (run(tmp_path / "empty") / "trajectory.csv").write_text("")
     for runs, told in (
         ([kept, tmp_path / "bare"], "train with --probe-every"),
         ([kept, kept], "every run once"),
         ([kept, tmp_path / "gone"], f"{tmp_path / 'gone'} does not exist"),
-        ([tmp_path / "brief"], "got 1 skipped to stay within --probe-share; train with a larger one"),
+        ([tmp_path / "brief"], "got 1 skipped (no time: 9 s were needed); train with a larger --probe-share"),
+        ([tmp_path / "blind"], "got 1 skipped (no Gaussian touches a pixel)"),
+        ([tmp_path / "empty"], f"in {tmp_path / 'empty' / 'trajectory.csv'}, got"),
     ):
         assert main(["trajectory", *map(str, runs)]) == 2
         said = capsys.readouterr().err
