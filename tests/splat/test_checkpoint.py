@@ -1,5 +1,6 @@
 """Checkpoints: whole or not at all, read back as they were, refused with the reason where they are not ours."""
 
+import errno
 import os
 import pickle
 import zipfile
@@ -61,11 +62,12 @@ def test_a_write_that_fails_leaves_what_was_there_and_nothing_beside_it(path, mo
     before = path.read_bytes()
 
     def full(*_):
-        raise OSError("no space left on device")
+        raise OSError(errno.ENOSPC, "no space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="no space left"):
+    with pytest.raises(OSError, match="no space left") as caught:
         write_atomically(path, b"something else")
+    assert caught.value.filename == str(path)
     assert path.read_bytes() == before and [file.name for file in path.parent.iterdir()] == [path.name]
 
 
