@@ -9,6 +9,7 @@
 Every rank runs the same estimator with the same seed.  An all-reduce hands the same bits to all, so all take the same steps;
 the numbers are those of one process but for the order of the sum.  What clocks decide may differ between ranks, so time
 budgets have to stay infinite.  Before a product the ranks compare their vectors, bit for bit: where they parted, all raise.
+Where a process fails the others do not wait for it: what they exchange next raises ConnectionError.
 """
 
 from collections.abc import Iterator, Sequence
@@ -71,7 +72,8 @@ class Ranks:
     def gather(self, x: Shaped[Tensor, "..."]) -> list[Shaped[Tensor, "..."]]:
         """x of every rank, in their order; all of one shape."""
         parts = [torch.empty_like(x, device=self.device) for _ in range(self.size)]
-        dist.all_gather(parts, x.to(self.device).contiguous(), group=self.group)
+        with _exchange():
+            dist.all_gather(parts, x.to(self.device).contiguous(), group=self.group)
         return [part.to(x.device) for part in parts]
 
     def require_same(self, name: str, value: object) -> None:
@@ -98,8 +100,20 @@ class Ranks:
 
     def _reduced(self, x: Tensor, operation: dist.ReduceOp.RedOpType) -> Tensor:
         total = x.to(self.device, copy=True).contiguous()
-        dist.all_reduce(total, operation, group=self.group)
+        with _exchange():
+            dist.all_reduce(total, operation, group=self.group)
         return total.to(x.device)
+
+
+@contextmanager
+def _exchange() -> Iterator[None]:
+    """The back end's own error, in a sentence that leads to the process that failed first."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise ConnectionError(
+            f"expected all processes to exchange numbers, lost one: see what it said ({error})"
+        ) from error
 
 
 @contextmanager

@@ -5,6 +5,7 @@ pixel (column i, row j) lies at (i + 0.5, j + 0.5); focal lengths and principal 
 """
 
 from dataclasses import dataclass, replace
+from math import isfinite
 
 import torch
 from jaxtyping import Float
@@ -34,6 +35,9 @@ class Camera:
             raise ValueError(
                 f"expected positive focal lengths and image size, got {self.fx}, {self.fy}, {self.width}, {self.height}"
             )
+        numbers = (*self.centre.tolist(), self.fx, self.fy, self.cx, self.cy)
+        if not all(map(isfinite, numbers)):
+            raise ValueError(f"expected a finite centre, focal lengths and principal point, got {numbers}")
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera with its image resampled to width x height pixels."""

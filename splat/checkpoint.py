@@ -1,7 +1,8 @@
 """Checkpoints: a training under way and where its scene lies, in one file.
 
 The file is a `torch.save` of tensors and plain types, loaded with `weights_only=True` (nothing in it can run code), and
-written whole or not at all.  The same training gives the same bytes.  Keys (p parameters, n Gaussians):
+written whole or not at all.  Its checksums are compared, which torch leaves out.  The same training gives the same bytes.
+Keys (p parameters, n Gaussians):
 
     format, version     "splat-landscape checkpoint", 2; version 1 knew no methods: it is 3DGS, and has no regularizer
     torch               version of torch that wrote it
@@ -18,9 +19,10 @@ written whole or not at all.  The same training gives the same bytes.  Keys (p p
 
 import io
 import os
-import pickle
 import sys
+import textwrap
 import warnings
+import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
@@ -194,8 +196,10 @@ def write_atomically(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
-    except BaseException:
+    except BaseException as error:
         partial.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno and error.filename is None:
+            error.filename = str(path)  # a full disk's error has none
         raise
 
 
@@ -204,13 +208,18 @@ def load_checkpoint(path: Path) -> Checkpoint:
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
         raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found {found}")
+    damaged = ValueError(
+        f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
+    )
     try:
+        with zipfile.ZipFile(path) as archive:
+            whole = archive.testzip() is None
         with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, OSError):
-        raise ValueError(
-            f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
-        ) from None
+    except Exception:  # what torch stumbles over in a file of another kind is of many kinds too
+        raise damaged from None
+    if not whole:
+        raise damaged
     try:
         return _checkpoint(content)
     except ValueError as error:
@@ -220,7 +229,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 def _checkpoint(content: Any) -> Checkpoint:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"it does not hold the format {FORMAT!r}")
-    version = content.get("version")
+    version = _get(content, "version", int)
     if version not in (1, VERSION):
         raise ValueError(f"its format version is {version!r}, this program reads up to {VERSION}")
     if version == 1:
@@ -239,6 +248,8 @@ def restored_training(content: dict[str, Any]) -> Training:
     """The training of a state.  ValueError that says what is wrong with it."""
     flat = _get(content, "flat", Tensor)
     gaussians = Gaussians(_tensor(content, "flat", (flat.numel(),), flat.dtype), _get(content, "sh_degree", int))
+    if not len(gaussians):
+        raise ValueError("it holds no Gaussian")
     gaussians.require_finite()
     config = _get(content, "config", dict)
     if isinstance(thresholds := config.get("render"), dict):
@@ -269,6 +280,8 @@ def restored_training(content: dict[str, Any]) -> Training:
         raise ValueError(f"its step {training.step} is not among its {config.iterations} iterations")
     if not 0 < training.extent < float("inf"):
         raise ValueError(f"its extent is {training.extent}")
+    if training.adam.updates < 0:
+        raise ValueError(f"its optimiser has made {training.adam.updates} updates")
     return training
 
 
@@ -286,8 +299,11 @@ def _get(content: dict, key: str, kind: type[T]) -> T:
 
 def _tensor(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     value = _get(content, key, Tensor)
-    if tuple(value.shape) != tuple(shape) or value.dtype != dtype or not dtype.is_floating_point:
-        raise ValueError(f"{key!r} is {value.dtype} of shape {tuple(value.shape)}, expected {dtype} {tuple(shape)}")
+    kind = f"{value.dtype} of shape {tuple(value.shape)}"
+    if tuple(value.shape) != tuple(shape) or value.dtype != dtype or dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"{key!r} is {kind}, expected {dtype} {tuple(shape)}")
+    if value.device.type != "cpu" or not value.is_contiguous():
+        raise ValueError(f"{key!r} is {kind} that does not hold its numbers one by one")
     return value
 
 
@@ -324,7 +340,7 @@ def _dataclass(kind: type[T], content: dict, where: str) -> T:
         if inner := _nested(hint, value, f"{where}.{key}"):
             value = _dataclass(inner, _get(content, key, dict), f"{where}.{key}")
         elif not _fits(value, hint):
-            raise ValueError(f"'{where}.{key}' is {value!r}, expected {getattr(hint, '__name__', hint)}")
+            raise ValueError(f"'{where}.{key}' is {_short(value)}, expected {getattr(hint, '__name__', hint)}")
         values[key] = value
     return kind(**values)
 
@@ -336,7 +352,12 @@ def _nested(hint: Any, value: Any, where: str) -> type | None:
     name = value.get("name") if isinstance(value, dict) else value
     if isinstance(name, str) and name in METHODS:
         return METHODS[name]
-    raise ValueError(f"'{where}' has the unknown name {name!r}")
+    raise ValueError(f"'{where}' has the unknown name {_short(name)}")
+
+
+def _short(value: Any) -> str:
+    """What a value is, in a line."""
+    return f"a {type(value).__name__}" if isinstance(value, Tensor) else textwrap.shorten(repr(value), 80)
 
 
 def _fits(value: Any, hint: Any) -> bool:

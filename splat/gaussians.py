@@ -151,5 +151,5 @@ class Gaussians:
         first = int((~good).nonzero()[0])
         raise ValueError(
             f"expected {quality} {name}{meaning}, got {self.attributes[name][first].tolist()} at Gaussian {first} "
-            f"({int((~good).sum())} of {len(self)} are not {quality}); remove them from the checkpoint"
+            f"({int((~good).sum())} of {len(self)} are not {quality}); remove them from the checkpoint, or lower its rates"
         )

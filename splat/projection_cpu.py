@@ -146,5 +146,5 @@ def require_sizes(lens: Lens, log_scales: np.ndarray, depths: np.ndarray, drawn:
         raise ValueError(
             f"expected log_scales of at most {limit - max(gain[first], 0.0):.1f} at depth {depths[first]:.3g} (a splat of "
             f"{LARGEST_SPLAT:.0e} px), got {log_scales[first].tolist()} at Gaussian {first} ({int(bad.sum())} of {len(bad)} "
-            "are larger); remove them from the checkpoint"
+            "are larger); remove them from the checkpoint, or lower its rates"
         )

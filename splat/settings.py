@@ -6,6 +6,7 @@ can measure what the thresholds do to the landscape.
 """
 
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Literal, get_args
 
 Sums = Literal["ordered", "atomic"]
@@ -47,8 +48,10 @@ class RenderSettings:
             raise ValueError(f"expected 0 <= alpha_min < alpha_max = {self.alpha_max}, got {self.alpha_min}")
         if not 0 <= self.transmittance_min < 1:
             raise ValueError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
-        if not (self.blur >= 0 and self.near > 0 and self.fov_clamp > 0):  # so that nan is refused too
-            raise ValueError(f"expected blur >= 0, near > 0, fov_clamp > 0, got {self}")
+        if not (
+            0 <= self.blur < inf and 0 < self.near < inf and 0 < self.fov_clamp < inf
+        ):  # so that nan is refused too
+            raise ValueError(f"expected blur >= 0, near > 0, fov_clamp > 0, all finite, got {self}")
         if self.contour_sigma is not None and not self.contour_sigma > 0:
             raise ValueError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
         if self.sums not in get_args(Sums):

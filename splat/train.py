@@ -15,7 +15,7 @@ is zero, and spares their cost.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from math import isfinite
+from math import inf, isfinite
 
 import torch
 from jaxtyping import Float
@@ -47,12 +47,14 @@ class LearningRates:
     sh_higher: float = 2.5e-3 / 20
 
     def __post_init__(self) -> None:
-        if not (self.position > 0 and self.position_final > 0):
+        if not (0 < self.position < inf and 0 < self.position_final < inf):
             raise ValueError(
-                f"expected position rates above 0 (decay is exponential), got {self.position}, {self.position_final}"
+                "expected finite position rates above 0 (decay is exponential), got "
+                f"{self.position}, {self.position_final}"
             )
-        if min(self.log_scales, self.quats, self.opacity_logits, self.sh_constant, self.sh_higher) < 0:
-            raise ValueError(f"expected learning rates of at least 0, got {self}")
+        others = self.log_scales, self.quats, self.opacity_logits, self.sh_constant, self.sh_higher
+        if not all(0 <= rate < inf for rate in others):
+            raise ValueError(f"expected finite learning rates of at least 0, got {self}")
 
 
 @dataclass(frozen=True)
@@ -247,17 +249,21 @@ def train(training: Training, views: Sequence[View]) -> Iterator[Progress]:
         camera, gaussians = step.camera, training.gaussians
         gain = regularizer.opacity_gain(step)
         base = photometric(gaussians, camera, step.loss, step.background, config.render, gain)
-        if not isfinite(base.loss):
-            gaussians.require_finite()
-            name = views[step.chosen].name
-            raise ValueError(
-                f"expected a finite loss, got {base.loss} at step {number} on view {name}; lower the rates"
-            )
-        training.descend(regularizer.gradient(step, base), number)
+        _require_finite("loss", base.loss, step)
+        gradient = regularizer.gradient(step, base)
+        _require_finite("gradient", float(gradient.sum()), step)  # before the Gaussians and their moments take it over
+        training.descend(gradient, number)
         training.control_density(number, camera, base)
         regularizer.after(step)
         training.step = number
         yield Progress(number, base.loss, len(training.gaussians), views[step.chosen].name)
+
+
+def _require_finite(what: str, value: float, step: Step) -> None:
+    """ValueError that names the step and its view, unless a loss, or the sum of a gradient, is finite."""
+    if not isfinite(value):
+        name = step.views[step.chosen].name
+        raise ValueError(f"expected a finite {what}, got {value} at step {step.number} on view {name}; lower the rates")
 
 
 def _next_step(training: Training, number: int, views: Sequence[View], losses: Sequence[ViewLoss]) -> Step:

@@ -17,6 +17,7 @@ from splat.scenes.view import Points
 MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 MODEL_FILES = ("cameras", "images", "points3D")
 SMALLEST_RECORD = {"cameras": 40, "images": 73, "points3D": 51}  # bytes in a binary model, after a count of 8 bytes
+LISTS = {"images": (64, 24), "points3D": (43, 8)}  # bytes of a record before its list (and a name's), and of an entry
 
 
 def find_model(root: Path) -> Path | None:
@@ -35,11 +36,12 @@ def read_colmap(
     _require_plausible_counts(model)
     try:
         reconstruction = pycolmap.Reconstruction(model)
+        registered = (reconstruction.images[i] for i in reconstruction.reg_image_ids())
+        posed = sorted(registered, key=lambda image: image.name)  # which may be no text
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
         raise ValueError(
             f"expected a COLMAP model, cannot read the one in {model}: {error}; export it again"
         ) from error
-    posed = sorted((reconstruction.images[i] for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
     if not posed:
         raise ValueError(
             f"expected images with poses in the COLMAP model {model}, got none among {len(reconstruction.images)}; "
@@ -55,17 +57,30 @@ def read_colmap(
 
 
 def _require_plausible_counts(model: Path) -> None:
-    """COLMAP allocates what a file's first 8 bytes promise, and ends the process when it is not one of its files."""
+    """COLMAP allocates what a file promises, reads on behind its end, and ends the process when it is not one of its files."""
     for name, record in SMALLEST_RECORD.items():
         path = model / f"{name}.bin"
-        if path.is_file():
-            with path.open("rb") as file:
-                count = int.from_bytes(file.read(8), "little")
-            if path.stat().st_size < 8 + count * record:
-                raise ValueError(
-                    f"expected a COLMAP model, {path} promises {count} {name} but has {path.stat().st_size} bytes; "
-                    "it is cut short or no COLMAP file: export the model again"
-                )
+        content = path.read_bytes() if path.is_file() else bytes(8)
+        count = int.from_bytes(content[:8], "little")
+        if len(content) < 8 + count * record or (name in LISTS and not _lists_fit(content, count, name)):
+            raise ValueError(
+                f"expected a COLMAP model, {path} promises {count} {name} with more in them than its {len(content)} bytes; "
+                "it is cut short or no COLMAP file: export the model again"
+            )
+
+
+def _lists_fit(content: bytes, count: int, name: str) -> bool:
+    """Whether the observations of so many images, or the tracks of so many points, end within the file."""
+    before, entry = LISTS[name]
+    end = 8
+    for _ in range(count):
+        start = end + before
+        if name == "images":
+            start = content.find(b"\0", start) + 1 or len(content)  # its name ends there
+        end = start + 8 + entry * int.from_bytes(content[start : start + 8], "little")
+        if end > len(content):
+            return False
+    return True
 
 
 def _paths(names: list[str], folder: Path) -> list[Path]:

@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +25,17 @@ import pycolmap
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from splat.camera import Camera
-from splat.scenes.layers import read_depth, read_mask
+from splat.scenes.layers import FORMATS, UNREADABLE, read_depth, read_mask
 from splat.scenes.view import Frame, Picture, Subset
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 UNDISTORTED_HERE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+LARGEST_SIDE = 2**31 - 1  # px; COLMAP ends with words of its own where it cannot count them
 SMALLEST = 4  # px a side of a reduced picture; smaller ones are a slip of the factor
 INSIDE = 1 - 1e-4  # share of a pixel's footprint that must be; below 1 by more than float32 sums can lose
 Warp = Callable[[Float[Tensor, "c h w"]], Float[Tensor, "c height width"]]
@@ -106,16 +108,27 @@ def require_files(paths: Sequence[Path]) -> None:
 def image_header(path: Path) -> tuple[tuple[int, int], bool]:
     """((width, height), whether it has an alpha channel), without reading the pixels."""
     try:
-        with Image.open(path) as file:
-            if file.mode.startswith(("I", "F")):
-                raise ValueError(f"expected an image of 8 bits a channel, got mode {file.mode} in {path}; convert it")
-            return file.size, _has_alpha(file)
-    except (UnidentifiedImageError, OSError) as error:
+        with Image.open(path, formats=FORMATS) as file:
+            mode, size, has_alpha = file.mode, file.size, _has_alpha(file)
+    except UNREADABLE as error:
         raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
+    if mode.startswith(("I", "F")):
+        raise ValueError(f"expected an image of 8 bits a channel, got mode {mode} in {path}; convert it")
+    return size, has_alpha
 
 
 def _has_alpha(file: Image.Image) -> bool:
     return "A" in file.getbands() or "transparency" in file.info
+
+
+def checked_lens(model: str, size: tuple[float, float], params: Sequence[float], name: str) -> pycolmap.Camera:
+    """The lens of a photograph of this (width, height).  ValueError where it cannot be one."""
+    if not (all(map(isfinite, params)) and all(1 <= side <= LARGEST_SIDE for side in size)):
+        raise ValueError(
+            f"the camera of image {name!r} cannot be: expected at least 1 px a side and finite numbers, got "
+            f"{size[0]:g} x {size[1]:g} px and {[float(value) for value in params]}"
+        )
+    return pycolmap.Camera(model=model, width=round(size[0]), height=round(size[1]), params=list(params))
 
 
 def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Frame:
@@ -165,6 +178,8 @@ def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> py
 
 def _same_shape(old: tuple[int, int], new: tuple[int, int]) -> bool:
     """Whether some scale s, rounded either way, brings (w, h) to the new size."""
+    if min(old) < 1:
+        return False
     low = max((side - 1) / before for side, before in zip(new, old))
     high = min((side + 1) / before for side, before in zip(new, old))
     return low < high
@@ -187,10 +202,10 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
 def _read(path: Path, warp: Warp, background: Float[Tensor, "3"]) -> Picture:
     """Composite over the background, undistort, downscale: in this order, no transparent colour bleeds in."""
     try:
-        with Image.open(path) as file:
+        with Image.open(path, formats=FORMATS) as file:
             has_alpha = _has_alpha(file)
             pixels = np.array(file.convert("RGBA" if has_alpha else "RGB"))
-    except OSError as error:
+    except UNREADABLE as error:
         raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
     layers = torch.from_numpy(pixels).permute(2, 0, 1).to(torch.float32) / 255
     if has_alpha:

@@ -9,13 +9,14 @@ scene (`train/r_3` in `train/r_3.npy` or `r_3.npy`); the masks of DTU by the num
 """
 
 import re
+import struct
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from splat.scenes.view import View
@@ -24,6 +25,15 @@ MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".npy", ".png")
 MASK_FOLDERS = ("mask", "masks")
 SIXTEEN_BITS = ("I;16", "I;16B", "I")
+# Pillow goes by what a file holds, whatever its name, and would start Ghostscript for one of PostScript
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+UNREADABLE = (
+    OSError,
+    SyntaxError,
+    EOFError,
+    struct.error,
+    Image.DecompressionBombError,
+)  # what it raises of damaged files
 
 
 def dtu_number(name: str) -> int | None:
@@ -62,9 +72,9 @@ def require_depths(views: Sequence[View], folder: Path) -> None:
 def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
     """1 inside, 0 outside."""
     try:
-        with Image.open(path) as file:
+        with Image.open(path, formats=FORMATS) as file:
             pixels = np.array(file if file.mode in ("1", "L") else file.convert("RGB"))
-    except (UnidentifiedImageError, OSError) as error:
+    except UNREADABLE as error:
         raise ValueError(f"expected a mask, cannot read {path}: {error}; replace the file") from error
     lowest = pixels.reshape(*pixels.shape[:2], -1).min(axis=2)
     if not lowest.any():
@@ -75,13 +85,14 @@ def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
 def read_depth(path: Path) -> Float[Tensor, "1 h w"]:
     """The numbers of the file, checked."""
     try:
-        values = np.load(path, allow_pickle=False) if path.suffix == ".npy" else _read_png(path)
-    except (UnidentifiedImageError, OSError, ValueError, EOFError) as error:
+        values = read_array(path) if path.suffix == ".npy" else _read_png(path)
+    except (*UNREADABLE, ValueError) as error:
         raise ValueError(f"expected a depth map, cannot read {path}: {error}; write it again") from error
     shape, values = values.shape, values.squeeze()
-    if values.ndim != 2 or values.dtype.kind not in "fiu":
+    if values.ndim != 2 or not values.size:
         raise ValueError(f"expected a depth map of shape (h, w), got {values.dtype} of shape {shape} in {path}")
-    values = values.astype(np.float32)
+    with np.errstate(over="ignore"):  # what becomes infinite is refused
+        values = values.astype(np.float32)
     if not np.isfinite(values).all():
         raise ValueError(
             f"expected finite depths, got {(~np.isfinite(values)).sum()} that are not in {path}; fill them"
@@ -91,8 +102,20 @@ def read_depth(path: Path) -> Float[Tensor, "1 h w"]:
     return torch.from_numpy(values)[None]
 
 
+def read_array(path: Path) -> np.ndarray:
+    """Real numbers that `numpy.save` wrote.  ValueError or OSError where the file holds none."""
+    with path.open("rb") as file:
+        try:
+            values = np.lib.format.read_array(file, allow_pickle=False)
+        except Exception as error:  # NumPy has Python read the header, whose errors are of many kinds
+            raise ValueError(f"no array of numbers ({error})") from error
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"an array of {values.dtype}, not of real numbers")
+    return values
+
+
 def _read_png(path: Path) -> np.ndarray:
-    with Image.open(path) as file:
+    with Image.open(path, formats=FORMATS) as file:
         if file.mode not in SIXTEEN_BITS:
             raise ValueError(f"mode {file.mode} instead of 16 bits, too few levels for depth")
         return np.array(file)

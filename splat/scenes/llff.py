@@ -8,10 +8,10 @@ computed from, principal point in the middle.  The last two are the nearest and 
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import torch
 
-from splat.scenes.images import Photo, image_files, image_folder
+from splat.scenes.images import Photo, checked_lens, image_files, image_folder
+from splat.scenes.layers import read_array
 
 POSES = "poses_bounds.npy"
 
@@ -20,8 +20,8 @@ def read_llff(root: Path, images: str | None = None) -> list[Photo]:
     """Photographs sorted by name, with the depth range of each."""
     path = root / POSES
     try:
-        rows = np.load(path, allow_pickle=False).astype(np.float64)
-    except (ValueError, EOFError, OSError) as error:
+        rows = read_array(path).astype(np.float64)
+    except (ValueError, OSError) as error:
         raise ValueError(
             f"expected an array in {path}, cannot read it: {error}; make it again with LLFF's imgs2poses"
         ) from error
@@ -40,9 +40,7 @@ def read_llff(root: Path, images: str | None = None) -> list[Photo]:
 def _photo(path: Path, row: np.ndarray) -> Photo:
     matrix = row[:15].reshape(3, 5)
     down, right, backwards, centre, (height, width, focal) = matrix.T
-    lens = pycolmap.Camera(
-        model="SIMPLE_PINHOLE", width=round(width), height=round(height), params=[focal, width / 2, height / 2]
-    )
+    lens = checked_lens("SIMPLE_PINHOLE", (width, height), [focal, width / 2, height / 2], path.name)
     rotation = torch.from_numpy(np.stack([right, down, -backwards]))
     depth_range = (float(row[15]), float(row[16]))
     return Photo(path.name, path, lens, rotation, torch.from_numpy(centre.copy()), depth_range=depth_range)

@@ -131,7 +131,8 @@ def load_scene(
 
 
 def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
-    if len(values) != 3 or not all(isinstance(v, (int, float)) and 0 <= v <= 1 for v in values):
+    three = isinstance(values, list | tuple) and len(values) == 3
+    if not (three and all(isinstance(v, (int, float)) and 0 <= v <= 1 for v in values)):
         raise ValueError(f"expected a background of three numbers in [0, 1], got {values!r}")
     return torch.tensor(values, dtype=torch.float32)
 

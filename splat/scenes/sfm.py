@@ -22,6 +22,7 @@ import pycolmap
 from PIL import ExifTags, Image
 
 from splat.scenes.images import IMAGE_SUFFIXES, image_files, image_header
+from splat.scenes.layers import FORMATS
 from splat.scenes.scene import load_scene
 from splat.scenes.triangulation import SEED, matching, quiet, verification
 
@@ -141,7 +142,7 @@ def _by_camera(files: Sequence[Path]) -> list[list[int]]:
     """The places of photographs that may share a camera."""
     groups: dict[tuple, list[int]] = {}
     for i, path in enumerate(files):
-        with Image.open(path) as file:
+        with Image.open(path, formats=FORMATS) as file:
             exif = file.getexif()
             focal = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
             key = file.size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), focal

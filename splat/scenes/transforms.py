@@ -17,7 +17,7 @@ files, because the sparse-view protocols count them.  Frames of a single file ar
 
 import json
 from collections.abc import Mapping
-from math import tan
+from math import isfinite, pi, tan
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,15 @@ import torch
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
-from splat.scenes.images import PINHOLE_MODELS, UNDISTORTED_HERE, Photo, image_folder, image_header, require_files
+from splat.scenes.images import (
+    PINHOLE_MODELS,
+    UNDISTORTED_HERE,
+    Photo,
+    checked_lens,
+    image_folder,
+    image_header,
+    require_files,
+)
 from splat.scenes.view import Points, Subset
 
 BLENDER_FILES: tuple[tuple[Subset, str], ...] = (("train", "transforms_train.json"), ("test", "transforms_test.json"))
@@ -58,15 +66,15 @@ def read_transforms(
         paths = [_image_path(folder, Path(frame["file_path"]).name) for frame in data["frames"]]
     photos = _photos(path, data, paths, None)
     points = None
-    if "ply_file_path" in data:
-        points = read_points(root / data["ply_file_path"], tuple(photo.name for photo in photos))
+    if cloud := _file(data, "ply_file_path", path):
+        points = read_points(root / cloud, tuple(photo.name for photo in photos))
     return photos, points, data.get("background")
 
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+        data = json.loads(path.read_text(encoding="utf-8"), parse_int=float)  # of which the largest is infinite
+    except (ValueError, OSError, RecursionError) as error:
         raise ValueError(f"expected a JSON file with frames, cannot read {path}: {error}") from error
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
@@ -92,9 +100,17 @@ def _photos(path: Path, data: dict[str, Any], paths: list[Path], subset: Subset 
         name = Path(frame["file_path"]).as_posix()
         rotation, centre = _pose(frame["transform_matrix"], name, path)
         lens = _lens({**shared, **frame}, image_header(image)[0], name, path)
-        mask = path.parent / frame["mask_path"] if "mask_path" in frame else None
-        photos.append(Photo(name, image, lens, rotation, centre, subset, mask=mask))
+        mask = _file(frame, "mask_path", path)
+        photos.append(Photo(name, image, lens, rotation, centre, subset, mask=path.parent / mask if mask else None))
     return photos
+
+
+def _file(values: Mapping[str, Any], key: str, path: Path) -> str | None:
+    """The name of a file, where there is one."""
+    name = values.get(key)
+    if name is not None and not isinstance(name, str):
+        raise ValueError(f"expected the name of a file, got {key} = {name!r} in {path}")
+    return name
 
 
 def _pose(matrix: Any, name: str, path: Path) -> tuple[Tensor, Tensor]:
@@ -111,9 +127,9 @@ def _pose(matrix: Any, name: str, path: Path) -> tuple[Tensor, Tensor]:
 
 def _lens(values: Mapping[str, Any], size: tuple[int, int], name: str, path: Path) -> pycolmap.Camera:
     """The pycolmap camera of one frame's intrinsics."""
-    wrong = [key for key in NUMBERS if key in values and not isinstance(values[key], (int, float))]
+    wrong = [key for key in NUMBERS if key in values and not (isinstance(values[key], float) and isfinite(values[key]))]
     if wrong:
-        raise ValueError(f"expected a number, got {wrong[0]} = {values[wrong[0]]!r} for {name!r} in {path}")
+        raise ValueError(f"expected a finite number, got {wrong[0]} = {values[wrong[0]]!r} for {name!r} in {path}")
     model = str(values.get("camera_model", "OPENCV"))
     if values.get("is_fisheye") or model not in PINHOLE_MODELS + UNDISTORTED_HERE:
         kind = "a fisheye lens" if values.get("is_fisheye") else f"camera_model {model}"
@@ -133,16 +149,18 @@ def _lens(values: Mapping[str, Any], size: tuple[int, int], name: str, path: Pat
     centre = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
     k1, k2, p1, p2, k3 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3"))
     if not any((k1, k2, p1, p2, k3)):
-        return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, *centre])
-    params = [fx, fy, *centre, k1, k2, p1, p2, k3, 0, 0, 0]
-    return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+        return checked_lens("PINHOLE", (width, height), [fx, fy, *centre], name)
+    return checked_lens("FULL_OPENCV", (width, height), [fx, fy, *centre, k1, k2, p1, p2, k3, 0, 0, 0], name)
 
 
 def _focal(values: Mapping[str, Any], width: int, name: str, path: Path) -> float:
     if "fl_x" in values:
         return float(values["fl_x"])
     if "camera_angle_x" in values:
-        return width / (2 * tan(float(values["camera_angle_x"]) / 2))
+        angle = float(values["camera_angle_x"])
+        if not 0 < angle < pi:
+            raise ValueError(f"expected camera_angle_x above 0 and below pi, got {angle} for {name!r} in {path}")
+        return width / (2 * tan(angle / 2))
     raise ValueError(f"expected fl_x or camera_angle_x for {name!r} in {path}, got neither; add the focal length in px")
 
 
@@ -160,6 +178,6 @@ def read_points(path: Path, names: tuple[str, ...]) -> Points:
             seen = [np.asarray(views, dtype=np.int64) for views in vertex["views"]]
             point = np.repeat(np.arange(len(seen)), [len(views) for views in seen])
             observations = torch.from_numpy(np.stack([point, np.concatenate(seen)], axis=1)) if seen else None
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
+    except (OSError, PlyParseError, KeyError, ValueError, TypeError, MemoryError) as error:
         raise ValueError(f"expected a PLY file of points, cannot read {path}: {error}; restore or remove it") from error
     return Points(torch.from_numpy(xyz), torch.from_numpy(rgb), observations, names)

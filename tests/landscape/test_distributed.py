@@ -89,6 +89,23 @@ def test_ranks_that_disagree_all_say_so(found):
         assert "at least one item for each of 2 ranks, got 1" in rank["few"]
 
 
+def lost(ranks):
+    """What the first rank is told where the second leaves before it has had its share of an exchange."""
+    if ranks.rank == 1:
+        return {}
+    said = {}
+    for name in ("sum", "gather"):
+        with pytest.raises(ConnectionError) as caught:
+            getattr(ranks, name)(torch.ones(3))
+        said[name] = str(caught.value)
+    return said
+
+
+def test_a_process_that_leaves_is_not_waited_for(tmp_path):
+    told = on_ranks(2, tmp_path, lost)[0]
+    assert all("expected all processes to exchange numbers, lost one" in told[name] for name in ("sum", "gather"))
+
+
 def test_masks_and_tensors_meet_in_the_order_of_ranks(found):
     for rank in found:
         assert rank["any"].tolist() == [False, True, True] and rank["gathered"].tolist() == [0, 1]

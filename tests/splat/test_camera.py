@@ -53,6 +53,16 @@ def test_sizes_and_focal_lengths_are_positive(wrong):
         replace(random_camera(), **wrong)
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [{"cx": float("nan")}, {"cy": -float("inf")}, {"fx": float("inf")}, {"centre": torch.tensor([0, 0, float("nan")])}],
+    ids=["cx", "cy", "fx", "centre"],
+)
+def test_a_camera_without_finite_numbers_is_refused(wrong):
+    with pytest.raises(ValueError, match="expected a finite centre, focal lengths and principal point"):
+        replace(random_camera(), **wrong)
+
+
 def test_a_camera_cannot_be_changed():
     camera: Camera = random_camera()
     with pytest.raises(AttributeError):

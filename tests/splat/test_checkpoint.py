@@ -1,7 +1,9 @@
 """Checkpoints: whole or not at all, read back as they were, refused with the reason where they are not ours."""
 
+import errno
 import os
 import pickle
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,11 +62,12 @@ def test_a_write_that_fails_leaves_what_was_there_and_nothing_beside_it(path, mo
     before = path.read_bytes()
 
     def full(*_):
-        raise OSError("no space left on device")
+        raise OSError(errno.ENOSPC, "no space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="no space left"):
+    with pytest.raises(OSError, match="no space left") as caught:
         write_atomically(path, b"something else")
+    assert caught.value.filename == str(path)
     assert path.read_bytes() == before and [file.name for file in path.parent.iterdir()] == [path.name]
 
 
@@ -91,6 +94,30 @@ def test_a_truncated_checkpoint_is_refused(path, share):
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
     refused(path, "not one or is damaged")
+
+
+def test_a_bit_that_flipped_anywhere_among_the_numbers_is_noticed(path, training):
+    content = bytearray(path.read_bytes())
+    numbers = training.gaussians.flat.numpy().tobytes()
+    place = bytes(content).index(numbers)
+    for byte in (place, place + len(numbers) // 2):
+        content[byte] ^= 1
+        path.write_bytes(content)
+        refused(path, "not one or is damaged")
+        content[byte] ^= 1
+    path.write_bytes(content)
+    load_checkpoint(path)
+
+
+def test_an_archive_that_torch_stumbles_over_in_its_own_way_is_refused(path):
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    pickled = next(name for name in members if name.endswith("data.pkl"))
+    for start in (b"\x80\x02.", b"\x80\x02]Q.", b"\x80\x02K\x01Q."):  # nothing on the stack; things that are no storage
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in members.items():
+                archive.writestr(name, start if name == pickled else content)
+        refused(path, "not one or is damaged")
 
 
 def test_a_file_that_would_run_code_is_refused_and_runs_nothing(tmp_path):
@@ -133,6 +160,8 @@ def test_every_key_is_checked(path, key):
     value, message = CHANGES[key]
     torch.save({**content, key: value}, path)
     refused(path, message)
+    torch.save({**content, key: torch.zeros(3, 40)}, path)
+    refused(path, "tensor|Tensor|torch|format")
     del content[key]
     torch.save(content, path)
     refused(path, "missing|format")
@@ -155,6 +184,9 @@ def test_a_checkpoint_from_before_sums_had_a_name_has_ordered_ones(path):
         ("method", {"name": "magic"}, "'config.method' has the unknown name 'magic'"),
         ("method", {"name": "stablegs"}, "'config.method' has missing or unknown keys"),
         ("method", "3dgs", "'config.method' has the unknown name '3dgs'|is str, expected dict"),
+        ("method", {"name": torch.zeros(2000)}, "'config.method' has the unknown name a Tensor"),
+        ("iterations", torch.zeros(50, 50), "'config.iterations' is a Tensor, expected int"),
+        ("iterations", "many " * 100, r"'config.iterations' is 'many .{,80}, expected int"),
     ],
 )
 def test_settings_in_a_checkpoint_are_checked_like_any_others(path, key, value, message):
@@ -169,6 +201,27 @@ def test_parameters_that_are_not_finite_are_refused_by_name(path):
     content["flat"][4] = torch.nan
     torch.save(content, path)
     refused(path, "expected finite means.*at Gaussian 1")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"flat": torch.zeros(0)}, "it holds no Gaussian"),
+        ({"flat": torch.zeros(14, dtype=torch.float16)}, "'flat' is torch.float16"),
+        ({"flat": torch.ones(1).expand(23 * 10**12)}, "does not hold its numbers one by one"),
+        ({"flat": torch.zeros(23, device="meta")}, "does not hold its numbers one by one"),
+    ],
+)
+def test_parameters_that_are_no_plain_numbers_are_refused_before_they_are_looked_at(path, change, message):
+    torch.save({**torch.load(path, weights_only=True), **change}, path)
+    refused(path, message)
+
+
+def test_an_optimiser_that_made_less_than_no_update_is_refused(path):
+    content = torch.load(path, weights_only=True)
+    content["adam"]["updates"] = -1
+    torch.save(content, path)
+    refused(path, "has made -1 updates")
 
 
 def test_a_checkpoint_of_float64_comes_back_in_float64(tmp_path):

@@ -30,6 +30,7 @@ def test_smooth_switches_off_every_threshold_that_can_be():
         ({"contour_sigma": 0.0}, "expected contour_sigma > 0 or None, got 0.0"),
         ({"alpha_max": float("nan")}, "expected 0 < alpha_max < 1"),
         ({"blur": float("nan")}, "expected blur >= 0"),
+        ({"near": float("inf")}, "all finite"),
         ({"contour_sigma": float("nan")}, "expected contour_sigma > 0 or None, got nan"),
         ({"sums": "fast"}, "expected sums 'ordered' or 'atomic', got 'fast'"),
     ],

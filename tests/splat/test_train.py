@@ -243,6 +243,10 @@ def test_rates_that_make_no_sense_are_refused():
         LearningRates(position_final=0.0)
     with pytest.raises(ValueError, match="at least 0"):
         LearningRates(quats=-1.0)
+    with pytest.raises(ValueError, match="finite position rates"):
+        LearningRates(position=torch.inf)
+    with pytest.raises(ValueError, match="finite learning rates"):
+        LearningRates(opacity_logits=torch.nan)
 
 
 def test_a_start_that_cannot_be_trained_is_refused():
@@ -274,6 +278,24 @@ def test_a_loss_that_is_not_finite_names_the_step_and_the_view():
     training = Training.start(tiny_gaussians(), EXTENT, TrainConfig(1, loss=LossSettings(ssim_weight=0.0)))
     with pytest.raises(ValueError, match=r"finite loss, got inf at step 1 on view view\d"):
         next(train(training, views))
+
+
+def test_a_gradient_that_is_not_finite_is_refused_before_anything_takes_it_over(monkeypatch):
+    training, views = Training.start(tiny_gaussians(), EXTENT, tiny_config()), tiny_views()
+    steps = train(training, views)
+    next(steps)
+    before = [each.flat.clone() for each in (training.gaussians, training.adam.first, training.adam.second)]
+
+    def broken(_step, base):
+        gradient = base.gradient.clone()
+        gradient[5] = torch.nan
+        return gradient
+
+    monkeypatch.setattr(training.regularizer, "gradient", broken)
+    with pytest.raises(ValueError, match=r"finite gradient, got nan at step 2 on view view\d; lower the rates"):
+        next(steps)
+    after = [each.flat for each in (training.gaussians, training.adam.first, training.adam.second)]
+    assert all(map(torch.equal, after, before)) and training.step == training.adam.updates == 1
 
 
 def test_gaussians_that_no_view_shows_are_left_alone():

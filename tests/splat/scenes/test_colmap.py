@@ -102,11 +102,42 @@ def test_a_damaged_colmap_file_is_refused_before_it_can_end_the_process(tmp_path
             load_scene(tmp_path)
 
 
-def test_a_colmap_model_cut_short_inside_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["images", "points3D"])
+def test_a_colmap_model_cut_short_inside_is_refused(tmp_path: Path, name: str) -> None:
+    folders.write_colmap(tmp_path)
+    path = tmp_path / f"sparse/0/{name}.bin"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=f"{name}.bin promises"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "place"), [("images", 8 + 64 + len("a.png") + 1), ("points3D", 8 + 43)])
+def test_a_list_longer_than_its_file_is_refused_before_colmap_reads_on_behind_the_end(
+    tmp_path: Path, name: str, place: int
+) -> None:
+    folders.write_colmap(tmp_path)
+    path = tmp_path / f"sparse/0/{name}.bin"
+    content = bytearray(path.read_bytes())
+    assert 0 < int.from_bytes(content[place : place + 8], "little") < 10
+    content[place + 6] = 1  # 2^48 more
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"{name}.bin promises"):
+        load_scene(tmp_path)
+
+
+def test_a_camera_without_pixels_is_refused(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path, text=True)
+    path = tmp_path / "sparse/0/cameras.txt"
+    path.write_text(path.read_text().replace("PINHOLE 24 18", "PINHOLE 0 18"))
+    with pytest.raises(ValueError, match=r"'a\.png' at the 0 x 18 px of its camera"):
+        load_scene(tmp_path)
+
+
+def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
     folders.write_colmap(tmp_path)
     path = tmp_path / "sparse/0/images.bin"
-    path.write_bytes(path.read_bytes()[:-150])
-    with pytest.raises(ValueError, match="cannot read the one in"):
+    path.write_bytes(path.read_bytes().replace(b"b.png", b"\x80.png"))
+    with pytest.raises(ValueError, match="expected a COLMAP model, cannot read"):
         load_scene(tmp_path)
 
 

@@ -144,8 +144,10 @@ def test_depth_maps_keep_their_numbers_at_any_scale_of_the_picture(tmp_path: Pat
         (np.full((4, 5), 2.0), "depths that vary, got 2.0 everywhere"),
         (np.array([[1.0, np.nan], [np.inf, 2.0]]), "finite depths, got 2 that are not"),
         (np.zeros((3, 4, 5)), r"of shape \(h, w\), got float64 of shape \(3, 4, 5\)"),
-        (np.array([["a", "b"], ["c", "d"]]), r"of shape \(h, w\), got <U1"),
+        (np.array([["a", "b"], ["c", "d"]]), "an array of <U1, not of real numbers"),
         (np.array([[None, 1], [2, 3]]), "cannot read"),
+        (np.zeros((0, 3)), r"of shape \(h, w\), got float64 of shape \(0, 3\)"),
+        (np.array([[1e39, 0.0], [0.0, 1.0]]), "finite depths, got 1 that are not"),
     ],
 )
 def test_depth_maps_that_cannot_be_are_refused(tmp_path: Path, values: np.ndarray, message: str) -> None:

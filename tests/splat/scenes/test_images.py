@@ -1,6 +1,8 @@
 """Photographs: found, fitted to their cameras, undistorted, composited and reduced."""
 
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import folders
@@ -163,6 +165,32 @@ def test_files_that_are_no_pictures_or_have_more_than_8_bits_are_refused(tmp_pat
         load_scene(tmp_path)
     Image.fromarray(np.zeros((SIZE[1], SIZE[0]), dtype=np.uint16)).save(path)
     with pytest.raises(ValueError, match=r"8 bits a channel, got mode I;16 in .*c\.png"):
+        load_scene(tmp_path)
+
+
+def png(width: int, height: int, *chunks: bytes) -> bytes:
+    """The bytes of a PNG file of 8-bit colours with these chunks after its header."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in (header, *chunks)
+    )
+
+
+def test_pictures_that_promise_too_much_or_are_damaged_inside_are_refused(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    path = tmp_path / "images/c.png"
+    path.write_bytes(png(160_000, 120_000, b"IDAT"))
+    with pytest.raises(ValueError, match=r"cannot read .*c\.png.*exceeds limit"):
+        load_scene(tmp_path)
+    path.write_bytes(png(*SIZE, b"IDAT" + zlib.compress(b"x"), b"\x91\x02\xe3|", b"IEND"))
+    with pytest.raises(ValueError, match=r"cannot read .*c\.png.*broken PNG"):
+        load_scene(tmp_path).load()
+
+
+def test_a_picture_of_a_format_that_another_program_would_read_is_refused(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    Image.new("RGB", SIZE).save(tmp_path / "images/c.png", format="EPS")
+    with pytest.raises(ValueError, match=r"cannot read .*c\.png: cannot identify"):
         load_scene(tmp_path)
 
 

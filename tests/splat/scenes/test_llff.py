@@ -37,6 +37,25 @@ def test_llff_files_that_are_no_arrays_or_hold_objects_are_refused(tmp_path: Pat
     np.save(tmp_path / "poses_bounds.npy", np.array([{}], dtype=object), allow_pickle=True)
     with pytest.raises(ValueError, match="cannot read it"):
         load_scene(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17), dtype=complex))
+    with pytest.raises(ValueError, match="cannot read it: an array of complex128"):
+        load_scene(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))
+    whole = (tmp_path / "poses_bounds.npy").read_bytes()
+    for damaged in (whole.replace(b"(3, 17)", b"(3, 17 "), whole.replace(b"(3,", b"(10**15,"), b"PK\x03\x04" + whole):
+        (tmp_path / "poses_bounds.npy").write_bytes(damaged)
+        with pytest.raises(ValueError, match="cannot read it"):
+            load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(("column", "value"), [(4, 0.0), (9, -24.0), (9, 1e300)])
+def test_llff_sizes_that_cannot_be_are_refused(tmp_path: Path, column: int, value: float) -> None:
+    folders.write_llff(tmp_path)
+    rows = np.load(tmp_path / "poses_bounds.npy")
+    rows[1, column] = value
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    with pytest.raises(ValueError, match=r"'b.png' cannot be: expected at least 1 px a side"):
+        load_scene(tmp_path)
 
 
 def test_llff_needs_an_image_for_each_pose(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import torch
 from folders import CENTRE, FOCAL, NAMES, SIZE, intrinsics, poses, require_poses
 
 from splat.scenes.scene import load_scene
+from splat.scenes.transforms import read_points
 from splat.scenes.view import pixel_coordinates
 
 
@@ -68,9 +69,24 @@ def test_lenses_that_a_pinhole_cannot_stand_for_are_refused(
         ),
         (lambda c: c["frames"][1].update(file_path="images/a.png"), "'images/a.png' more than once"),
         (lambda c: c.update(ply_file_path="none.ply"), "cannot read .*none.ply"),
-        (lambda c: c.update(fl_x=None), "expected a number, got fl_x = None for 'images/a.png'"),
+        (lambda c: c.update(fl_x=None), "expected a finite number, got fl_x = None for 'images/a.png'"),
         (lambda c: c.update(fl_x=-3.0), "camera of image 'images/a.png' cannot be: expected positive focal lengths"),
+        (lambda c: c.update(fl_x=True), "expected a finite number, got fl_x = True"),
+        (lambda c: c.update(cx=float("nan")), "expected a finite number, got cx = nan"),
+        (lambda c: c.update(w=float("inf")), "expected a finite number, got w = inf"),
+        (lambda c: c.update(h=10**400), "expected a finite number, got h = inf"),
+        (lambda c: c.update(w=0), "'images/a.png' cannot be: expected at least 1 px a side"),
+        (lambda c: c.update(h=-18), "'images/a.png' cannot be: expected at least 1 px a side"),
+        (lambda c: c.update(w=1e30), "'images/a.png' cannot be: .* got 1e\\+30 x 18 px"),
+        (
+            lambda c: (c.pop("fl_x"), c.update(camera_angle_x=0)),
+            "expected camera_angle_x above 0 and below pi, got 0.0",
+        ),
         (lambda c: c.update(background="white"), "three numbers in"),
+        (lambda c: c.update(background=1), "three numbers in"),
+        (lambda c: c.update(ply_file_path=5), "expected the name of a file, got ply_file_path = 5"),
+        (lambda c: c["frames"][1].update(mask_path=["a.png"]), "expected the name of a file, got mask_path"),
+        (lambda c: c["frames"][2]["transform_matrix"][0].__setitem__(3, 10**400), "finite 4 x 4 transform_matrix"),
         (lambda c: c["frames"][2]["transform_matrix"][0].__setitem__(0, 2.0), "'images/c.png' cannot be: .*rotation"),
     ],
 )
@@ -86,10 +102,30 @@ def test_bad_transforms_are_refused_in_one_sentence(
     assert "\n" not in str(caught.value)
 
 
-def test_a_transforms_file_that_is_no_json_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "transforms.json").write_text("{")
+@pytest.mark.parametrize("text", ["{", 100_000 * "["])
+def test_a_transforms_file_that_is_no_json_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "transforms.json").write_text(text)
     with pytest.raises(ValueError, match="expected a JSON file with frames"):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["ply_file_path", "mask_path"])
+def test_null_names_no_file(tmp_path: Path, key: str) -> None:
+    folders.write_transforms(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content[key] = content["frames"][0][key] = None
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert load_scene(tmp_path).names == tuple(f"images/{name}" for name in folders.NAMES)
+
+
+@pytest.mark.parametrize(
+    "header", ["element vertex 1000000000000\nproperty float x", "element vertex 1\nproperty int views"]
+)
+def test_points_that_promise_what_cannot_be_are_refused(tmp_path: Path, header: str) -> None:
+    coordinates = "".join(f"property float {axis}\n" for axis in "xyz" if f"float {axis}" not in header)
+    (tmp_path / "p.ply").write_text(f"ply\nformat ascii 1.0\n{header}\n{coordinates}end_header\n0 0 0 0\n")
+    with pytest.raises(ValueError, match="expected a PLY file of points, cannot read"):
+        read_points(tmp_path / "p.ply", ("a",))
 
 
 def test_blender_cameras_have_the_focal_length_of_their_angle_of_view(tmp_path: Path) -> None:
