@@ -151,7 +151,7 @@ def test_products_that_are_not_finite_are_an_error_that_names_the_block(method):
         def apply(self, V):
             return super().apply(V) / 0
 
-    with pytest.raises(ValueError, match=r"expected finite products H v.*in all"):
+    with pytest.raises(ValueError, match=r"expected finite products H V.*in all"):
         estimate_traces(Broken(INDEFINITE), generator(), TraceSettings.fixed(30, method=method))
 
 
