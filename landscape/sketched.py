@@ -67,12 +67,19 @@ def hutch_plus_plus(
     deadline: float = inf,
     name: str = "all",
 ) -> TraceEstimate:
-    """The trace of an operator; a third of max_probes goes into the sketch, an adaptive run saves probes on the rest."""
+    """The trace of an operator.
+
+    A third of max_probes, or of the time, goes into the sketch; an adaptive run saves probes on the rest.
+    """
     if operator.dim <= settings.max_probes:
         return by_identity(operator, settings, name)
-    rank = settings.max_probes // 3
-    sketch = draw_probes(operator.dim, rank, generator, operator.dtype, settings.distribution)
-    Q = torch.linalg.qr(_products(operator, sketch, settings)).Q
+    sketch = draw_probes(operator.dim, settings.max_probes // 3, generator, operator.dtype, settings.distribution)
+    start, Y = monotonic(), sketch[:, :0]
+    for vectors in sketch.split(settings.batch, dim=1):
+        Y = torch.cat([Y, _products(operator, vectors, settings)], dim=1)
+        if monotonic() - start > (deadline - start) / 3:
+            break
+    Q, rank = torch.linalg.qr(Y).Q, Y.shape[1]
     known = float((Q.double() * _products(operator, Q, settings).double()).sum())
     rest = ProjectedOperator(operator, lambda V: V - Q @ (Q.T @ V))
     most = settings.max_probes - 2 * rank
