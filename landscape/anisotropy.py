@@ -106,6 +106,11 @@ def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float
     A residual says that an eigenvalue is near, not that none is farther out: an end that ran out of its budget reaches
     out by `ends.beyond`.
     """
+    if not (len(ends.largest) and len(ends.smallest)):
+        raise ValueError(
+            f"expected an eigenpair at each end, got {len(ends.largest)} of the largest and {len(ends.smallest)} of the "
+            "smallest; ask for one of each in EigenSettings"
+        )
     (a, b), (c, d) = ends.largest.interval(), ends.smallest.interval()
     slack = torch.finfo(ends.largest.vectors.dtype).eps * max(abs(a), abs(b), abs(c), abs(d))
     above, below = (0.0 if end.reason in ARRIVED else ends.beyond for end in (ends.largest, ends.smallest))

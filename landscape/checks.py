@@ -9,7 +9,7 @@ objective   |v.H v - (L(theta + h v) - 2 L(theta) + L(theta - h v)) / h^2| / |v.
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, nan
+from math import inf, isfinite, isnan, nan
 
 import torch
 from jaxtyping import Float
@@ -171,7 +171,8 @@ def _best_step(
             continue
         difference = discrepancy(step)
         kept.append(step)
-        errors.append(difference / size if size else (inf if difference else 0.0))
+        error = difference / size if size else (inf if difference else 0.0)
+        errors.append(inf if isnan(error) else error)  # beyond where the objective is finite
     best = min(range(len(kept)), key=errors.__getitem__, default=None)
     error, step = (nan, nan) if best is None else (errors[best], kept[best])
     return DerivativeCheck(error, step, tuple(kept), tuple(errors), skipped)

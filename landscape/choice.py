@@ -99,10 +99,10 @@ class _Choosing(Hutchinson):
     def leaves(self, estimates: Mapping[str, TraceEstimate]) -> bool:
         (estimate,) = estimates.values()
         probes, needed = estimate.probes, self._needed(estimate)
-        if self.kept and 2 * probes <= needed:
-            second = probes * estimate.standard_error**2 / 2
-            if WORSE * sketch_leaves(self.test_vectors()[1]) < second:
-                self.way = "sketch"
+        error = estimate.standard_error
+        if self.kept and 2 * probes <= needed and error > 0:
+            left = sketch_leaves(self.test_vectors()[1] / error)  # so that no square leaves the range of floats
+            self.way = "sketch" if WORSE * left < probes / 2 else "on"  # p_2 = k error^2 / 2
         if self.way == "on" and probes + self.operator.dim <= needed:
             self.way = "exact"
         return self.way != "on"

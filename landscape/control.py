@@ -15,6 +15,9 @@ from torch import Tensor
 
 from landscape.operator import RestrictedOperator, SymmetricOperator
 
+EPS = torch.finfo(torch.float64).eps
+ROUND_OFFS = 10  # of the sum of squares, which is all that is left of the others' spread where they do not vary
+
 
 @runtime_checkable
 class PartlyKnown(SymmetricOperator, Protocol):
@@ -61,9 +64,9 @@ def controlled(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], m
     """samples - c (control - mean), c the least-squares slope through the other samples (0 where they do not vary)."""
     if len(samples) < 3:
         return samples
-    count = len(samples) - 1
-    rest_x, rest_y = (samples.sum() - samples) / count, (control.sum() - control) / count
-    cross = (samples * control).sum() - samples * control - count * rest_x * rest_y
-    spread = control.square().sum() - control.square() - count * rest_y.square()
-    slope = torch.where(spread > 0, cross / spread.clamp_min(1e-300), torch.zeros_like(cross))
+    x, y = samples - samples.mean(), control - control.mean()
+    left = len(samples) / (len(samples) - 1)  # as the means move, too, when a sample is left out
+    cross, spread = (x * y).sum() - left * x * y, y.square().sum() - left * y.square()
+    varies = spread > ROUND_OFFS * EPS * y.square().sum()
+    slope = torch.where(varies, cross / spread.clamp_min(1e-300), torch.zeros_like(cross))
     return samples - slope * (control - mean)

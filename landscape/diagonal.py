@@ -28,7 +28,7 @@ from torch import Tensor
 
 from landscape.choice import WORSE, sketch_leaves
 from landscape.control import PartlyKnown
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, product
 from landscape.probes import draw_probes
 from landscape.quadratic import gram
 from landscape.results import Progress
@@ -117,10 +117,10 @@ def estimate_diagonal(
     while (done := samples.shape[1]) < probes:
         Z = draw_probes(operator.dim, min(batch, probes - done), generator, operator.dtype, "rademacher")
         Z = Z[:, : half - done] if choosing and done < half else Z
-        Y = _finite(operator.apply(Z))
+        Y = product(operator, Z)
         samples = torch.cat([samples, Z.double() * Y.double()], dim=1)
         if isinstance(operator, PartlyKnown):
-            control = (Z * operator.known.apply(Z)).double() - operator.known_diagonal().double()[:, None]
+            control = (Z * product(operator.known, Z)).double() - operator.known_diagonal().double()[:, None]
             controls = torch.cat([controls, control], dim=1)
         if progress:
             progress(samples.shape[1], probes, f"diagonal: {samples.shape[1]} probes")
@@ -136,12 +136,6 @@ def estimate_diagonal(
 def _mean(samples: Float64[Tensor, "n k"], operator: SymmetricOperator, matvecs: int, method: str) -> DiagonalEstimate:
     errors = samples.std(dim=1) / sqrt(samples.shape[1])
     return DiagonalEstimate(samples.mean(dim=1), errors, samples, operator.blocks, matvecs, method)
-
-
-def _finite(Y: Tensor) -> Tensor:
-    if not torch.isfinite(Y).all():
-        raise ValueError("expected finite products H z, got NaN or infinite entries")
-    return Y
 
 
 def _pays(samples: Float64[Tensor, "n k"], kept: list[tuple[Tensor, Tensor]]) -> bool:
@@ -162,7 +156,7 @@ def _sketched(
     Q = added_directions(Y[:, :0], Y)
     HQ, done = torch.empty_like(Q), Z.shape[1]
     for columns in torch.arange(Q.shape[1]).split(batch):
-        HQ[:, columns] = _finite(operator.apply(Q[:, columns].contiguous()))
+        HQ[:, columns] = product(operator, Q[:, columns].contiguous())
         done += len(columns)
         if progress:
             progress(done, most, f"diagonal: a sketch of {Q.shape[1]} directions")

@@ -8,7 +8,8 @@ truncation  |c(d) - v.H v| as far as neighbouring steps tell it: the term in d^2
             across a kink, a jump or a crossed sort, where c(d) is no derivative at all but still what the probe sees
 noise       standard deviation of L's own error, from differences of order k = 4 of values at close, even steps along v, which
             what is smooth does not pass: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and Wild 2011, Sec. 2);
-            at least the resolution of the numbers that the objective returns
+            at least the resolution of the numbers that the objective returns (float32 also where it hands them on as
+            Python's floats, which it does where none of them needs more digits)
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from landscape.grid_evaluations import Loss
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, product
 from landscape.results import Number, Progress, finite_or_none
 
 ORDER, NOISE_POINTS = 4, 24  # of the differences; the values they are taken of
@@ -92,14 +93,14 @@ def finite_probe(
     """
     _require_probe(center, direction, steps)
     origin, v = center.detach().double(), direction.detach().double()
-    done, total, resolution = 0, 2 * len(steps) + 1 + noise_points, torch.finfo(torch.float64).eps
+    done, total, coarsest = 0, 2 * len(steps) + 1 + noise_points, torch.finfo(torch.float64).eps
 
     def at(step: float) -> tuple[float, object]:
-        nonlocal done, resolution
+        nonlocal done, coarsest
         found = loss((origin + step * v).to(center.dtype))
         value, signature = found if isinstance(found, tuple) else (found, None)
         if isinstance(value, Tensor) and value.is_floating_point():
-            resolution = max(resolution, torch.finfo(value.dtype).eps)
+            coarsest = max(coarsest, torch.finfo(value.dtype).eps)
         done += 1
         if progress:
             progress(done, total, "finite steps")
@@ -112,25 +113,39 @@ def finite_probe(
     rounding = torch.finfo(center.dtype).eps * float((origin * v).norm() / v.square().norm())
     spacing = max(steps[0] / CLOSER, ROUNDINGS * rounding)
     close = [at((k - (noise_points - 1) / 2) * spacing)[0] for k in range(noise_points)]
-    noise = max(evaluation_noise(close), resolution * abs(middle))
     ends = [(at(step), at(-step)) for step in steps]
+    seen = [middle, *close, *(value for pair in ends for value, _ in pair)]
+    noise = max(evaluation_noise(close), max(coarsest, resolution(seen)) * abs(middle))
     d = torch.tensor(steps, dtype=torch.float64)
     rises = torch.tensor([(ahead[0] - middle) + (behind[0] - middle) for ahead, behind in ends], dtype=torch.float64)
     other = torch.tensor([ahead[1] != here or behind[1] != here for ahead, behind in ends])
     curvatures = rises / d.square()
-    product = operator.apply(direction.to(operator.dtype)[:, None])[:, 0].double()
-    slope = torch.finfo(center.dtype).eps * float((origin * product).norm()) / sqrt(12)
+    Hv = product(operator, direction.to(operator.dtype)[:, None])[:, 0].double()
+    slope = torch.finfo(center.dtype).eps * float((origin * Hv).norm()) / sqrt(12)
     return FiniteProbe(
         steps=d,
         curvatures=curvatures,
         round_off=4 * (6 * noise**2 + 2 * (d * slope).square()).sqrt() / d.square(),
         truncation=_truncation(d, curvatures),
         crossed=None if here is None else other,
-        infinitesimal=float(torch.dot(v, product)),
+        infinitesimal=float(torch.dot(v, Hv)),
         center_loss=middle,
         noise=noise,
         evaluations=total,
     )
+
+
+def resolution(values: Sequence[float]) -> float:
+    """The eps of float32 where values that differ are all float32 numbers; else that of float64.
+
+    >>> resolution([0.5, 0.1]) < resolution([0.5, 0.10000000149011612])
+    True
+    """
+    exact = np.asarray(values, dtype=np.float64)
+    with np.errstate(over="ignore"):
+        coarse = exact.astype(np.float32)
+    single = np.array_equal(coarse, exact, equal_nan=True) and len(set(values)) > 1
+    return float(np.finfo(np.float32 if single else np.float64).eps)
 
 
 def evaluation_noise(values: Sequence[float]) -> float:

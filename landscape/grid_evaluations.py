@@ -1,8 +1,9 @@
 """True evaluations of an objective at points of a slice's grid: in parallel, and kept in a file from which a killed run
 continues.
 
-The file names the slice by a SHA-256 digest of (center, directions, coordinates) and holds the loss at the centre,
-which is evaluated anew and compared when the file is read: another slice's values, or another objective's, are refused.
+The file names the slice by a SHA-256 digest of (center, directions, coordinates) and holds the loss at the centre.  That and
+the value which is farthest from it are evaluated anew and compared when the file is read: another slice's values, or another
+objective's, are refused.
 """
 
 import hashlib
@@ -10,7 +11,7 @@ import os
 import zipfile
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from math import isclose, isfinite
+from math import isfinite
 from pathlib import Path
 from time import monotonic
 
@@ -138,13 +139,20 @@ class GridEvaluations:
                 f"expected evaluations of this slice in {self._store}, got another center, other directions or "
                 f"coordinates; {advice}"
             )
-        same = isclose(center_loss, self.center_loss, rel_tol=SAME_LOSS * torch.finfo(self._center.dtype).eps)
-        if not same or has_signature != self.has_signature:
-            raise ValueError(
-                f"expected evaluations of this objective in {self._store}, which is {self.center_loss} at the centre, "
-                f"got one that is {center_loss}; {advice}"
-            )
+        self._require_same("at the centre", self.center_loss, center_loss, has_signature == self.has_signature, advice)
+        finite = {point: value for point, (value, _) in stored.items() if isfinite(value)}
+        if finite:
+            point = max(finite, key=lambda point: abs(finite[point] - center_loss))
+            self._require_same(f"at point {point}", self._at(point)[0], finite[point], True, advice)
         return stored
+
+    def _require_same(self, where: str, here: float, stored: float, alike: bool, advice: str) -> None:
+        room = SAME_LOSS * torch.finfo(self._center.dtype).eps * max(abs(here), abs(self.center_loss))
+        if not (alike and abs(here - stored) <= room):
+            raise ValueError(
+                f"expected evaluations of this objective in {self._store}, which is {here} {where}, got one that is {stored}; "
+                f"{advice}"
+            )
 
 
 def slice_digest(center: Tensor, directions: Tensor, points: Tensor) -> str:

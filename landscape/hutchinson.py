@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from landscape.control import PartlyKnown, controlled, slope
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, product
 from landscape.probes import Distribution, draw_probes
 from landscape.quadratic import FEWEST, PowerSums, column_dots, mean_interval, power_sums
 from landscape.results import Progress, StopReason, TraceEstimate
@@ -65,10 +65,11 @@ class TraceSettings:
                 f"expected {LEAST} <= min_probes <= max_probes and max_probes >= {self.least} with the method {self.method!r}, "
                 f"got {self.min_probes} and {self.max_probes}"
             )
-        if self.rtol < 0 or self.atol < 0 or not 0 < self.confidence < 1 or self.batch < 1 or self.memory <= 0:
+        positive = self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and self.batch >= 1 and self.memory > 0
+        if not (positive and 0 < self.confidence < 1):
             raise ValueError(
-                f"expected rtol, atol >= 0, confidence in (0, 1), batch >= 1 and memory > 0, "
-                f"got {self.rtol}, {self.atol}, {self.confidence}, {self.batch} and {self.memory}"
+                f"expected rtol, atol >= 0, confidence in (0, 1), max_seconds >= 0, batch >= 1 and memory > 0, "
+                f"got {self.rtol}, {self.atol}, {self.confidence}, {self.max_seconds}, {self.batch} and {self.memory}"
             )
 
     @classmethod
@@ -172,12 +173,9 @@ class Hutchinson:
         """Probes and their products with H, taken into account."""
         Z = draw_probes(self.operator.dim, count, self.generator, self.operator.dtype, self.settings.distribution)
         # kept below, and an operator may give the same buffer again
-        forms = [form.apply(Z).clone() for form in (self.operator, self.part) if form is not None]
+        forms = [product(form, Z).clone() for form in (self.operator, self.part) if form is not None]
         sums = torch.stack([torch.stack([column_dots(Z[r], Y[r]) for r in self.rows.values()]) for Y in forms])
-        sums = sums.cpu()
-        if not torch.isfinite(sums).all():
-            raise ValueError(f"expected finite products H z, got z.Hz = {sums[0].tolist()} in {', '.join(self.rows)}")
-        self.samples = torch.cat([self.samples, sums], dim=2)
+        self.samples = torch.cat([self.samples, sums.cpu()], dim=2)
         self.current.append((Z, *forms))
         if self.samples.shape[2] % GROUP == 0:
             for name, group in self._open_groups().items():

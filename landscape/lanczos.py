@@ -9,13 +9,16 @@ entries of T ("twice is enough", Kahan and Parlett).  Rows of the workspaces are
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import inf, isfinite
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, product
 from landscape.results import Progress
+
+SMALLEST = 1e-140  # a length whose square has all its digits, and those of its parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +43,14 @@ def orthogonalise(
 
 
 def norm(vector: Tensor) -> float:
-    """Euclidean length, added up in float64."""
-    return float(torch.linalg.vector_norm(vector, dtype=torch.float64))
+    """Euclidean length, added up in float64; where squares leave its range, in units of the largest entry."""
+    length = float(torch.linalg.vector_norm(vector, dtype=torch.float64))
+    if SMALLEST < length < inf or not vector.numel():
+        return length
+    unit = float(vector.abs().max())
+    if unit == 0 or not isfinite(unit):
+        return unit
+    return unit * float(torch.linalg.vector_norm(vector / unit, dtype=torch.float64))
 
 
 def unit_columns(vectors: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
@@ -90,9 +99,9 @@ def lanczos(
             basis[i, j] = remainders[i]
             if j:
                 T[i, j - 1, j] = T[i, j, j - 1] = lengths[i]
-        products = operator.apply(torch.stack([basis[i, j] for i in running], dim=1)).T
-        for i, product in zip(list(running), products, strict=True):
-            w = product.clone()[None]
+        products = product(operator, torch.stack([basis[i, j] for i in running], dim=1)).T
+        for i, column in zip(list(running), products, strict=True):
+            w = column.clone()[None]
             size = max(scale, norm(w))
             T[i, j, j] = orthogonalise(w, basis[i, : j + 1])[j, 0]
             sizes[i], lengths[i] = j + 1, norm(w)

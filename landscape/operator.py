@@ -45,6 +45,22 @@ def require_vectors(V: Tensor, n: int) -> None:
         raise ValueError(f"expected V of shape (n, k) with n = {n}, got {tuple(V.shape)}")
 
 
+def product(operator: SymmetricOperator, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """H V, which the next call may overwrite.  ValueError where it has another shape or dtype than V, or is not finite."""
+    HV = operator.apply(V)
+    if HV.shape != V.shape or HV.dtype != V.dtype:
+        raise ValueError(
+            f"expected products H V of the shape {tuple(V.shape)} and dtype {V.dtype} of V, got {tuple(HV.shape)} and "
+            f"{HV.dtype} in {', '.join(operator.blocks)}"
+        )
+    if not torch.isfinite(HV).all():
+        raise ValueError(
+            f"expected finite products H V, got NaN or infinity in {', '.join(operator.blocks)}; check the parameters with "
+            "check_operator"
+        )
+    return HV
+
+
 def finished(tensor: Tensor) -> Tensor:
     """The tensor, once it is computed: a GPU is still at work when the call that launched it returns."""
     if tensor.is_cuda:

@@ -7,13 +7,13 @@ distances to it.  `landscape.eigen` needs far fewer products; this is the baseli
 """
 
 from dataclasses import dataclass
-from math import inf, isfinite, nan
+from math import inf, nan
 from time import monotonic
 
 import torch
 
 from landscape.lanczos import norm
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, product
 from landscape.probes import draw_probes
 from landscape.results import EigenEnds, Eigenpairs, Progress, StopReason
 
@@ -28,9 +28,10 @@ class PowerSettings:
     max_seconds: float = inf
 
     def __post_init__(self) -> None:
-        if self.rtol < 0 or self.atol < 0 or self.max_matvecs < 1:
+        if not (self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and self.max_matvecs >= 1):
             raise ValueError(
-                f"expected rtol, atol >= 0 and max_matvecs >= 1, got {self.rtol}, {self.atol} and {self.max_matvecs}"
+                f"expected rtol, atol, max_seconds >= 0 and max_matvecs >= 1, got {self.rtol}, {self.atol}, "
+                f"{self.max_seconds} and {self.max_matvecs}"
             )
 
 
@@ -52,13 +53,9 @@ def power_iteration(
     while True:
         v /= norm(v)
         step += 1
-        w = operator.apply(v[:, None])[:, 0] - shift * v
+        w = product(operator, v[:, None])[:, 0] - shift * v
         moved = float(torch.dot(v.double(), w.double()))
         value, residual = moved + shift, norm(w.double() - moved * v.double())
-        if not isfinite(residual):
-            raise ValueError(
-                "expected finite products H v, got NaN or infinity; check the parameters with check_operator"
-            )
         if progress:
             progress(step, settings.max_matvecs, f"eigenvalue {value:.4g} +- {residual:.1e}")
         reason = _power_reason(settings, step, value, residual, epsilon * max(abs(moved), abs(shift)), deadline)

@@ -259,7 +259,7 @@ class SpectralDensity:
         """
         shift = torch.zeros(len(self.nodes), dtype=torch.float64)
         squares = float((self.weights * self.nodes.square()).sum())
-        if self.trace is None or squares == 0:
+        if self.trace is None or not isfinite(self.trace[1]) or squares == 0:
             return shift, 0.0
         trace, error = self.trace
         starts = len(self.nodes)

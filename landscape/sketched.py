@@ -40,7 +40,7 @@ are no part of Q and cost nothing: a matrix of low rank r is exact after s + r p
 """
 
 from dataclasses import replace
-from math import inf, isfinite, sqrt
+from math import inf, sqrt
 from time import monotonic
 
 import torch
@@ -48,8 +48,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.hutchinson import LEAST, Hutchinson, Looks, TraceSettings
-from landscape.lanczos import is_dust
-from landscape.operator import ProjectedOperator, SymmetricOperator
+from landscape.lanczos import is_dust, norm
+from landscape.operator import ProjectedOperator, SymmetricOperator, product
 from landscape.probes import draw_probes
 from landscape.quadratic import column_dots, gram
 from landscape.results import StopReason, TraceEstimate, t_quantile
@@ -67,13 +67,20 @@ def hutch_plus_plus(
     deadline: float = inf,
     name: str = "all",
 ) -> TraceEstimate:
-    """The trace of an operator; a third of max_probes goes into the sketch, an adaptive run saves probes on the rest."""
+    """The trace of an operator.
+
+    A third of max_probes, or of the time, goes into the sketch; an adaptive run saves probes on the rest.
+    """
     if operator.dim <= settings.max_probes:
         return by_identity(operator, settings, name)
-    rank = settings.max_probes // 3
-    sketch = draw_probes(operator.dim, rank, generator, operator.dtype, settings.distribution)
-    Q = torch.linalg.qr(_products(operator, sketch, settings, name)).Q
-    known = float((Q.double() * _products(operator, Q, settings, name).double()).sum())
+    sketch = draw_probes(operator.dim, settings.max_probes // 3, generator, operator.dtype, settings.distribution)
+    start, Y = monotonic(), sketch[:, :0]
+    for vectors in sketch.split(settings.batch, dim=1):
+        Y = torch.cat([Y, _products(operator, vectors, settings)], dim=1)
+        if monotonic() - start > (deadline - start) / 3:
+            break
+    Q, rank = torch.linalg.qr(Y).Q, Y.shape[1]
+    known = float((Q.double() * _products(operator, Q, settings).double()).sum())
     rest = ProjectedOperator(operator, lambda V: V - Q @ (Q.T @ V))
     most = settings.max_probes - 2 * rank
     probing = replace(settings, min_probes=min(settings.min_probes, most), max_probes=most, method="hutchinson")
@@ -105,10 +112,10 @@ def xtrace(
     looks = Looks(count, most, CONFIRMATION)
     while True:
         Z = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, kind) if start is None else start[0]
-        HZ = _products(operator, Z, settings, name) if start is None else start[1]
+        HZ = _products(operator, Z, settings) if start is None else start[1]
         start, Omega, Y = None, torch.cat([Omega, Z], dim=1), torch.cat([Y, HZ], dim=1)
         new = added_directions(Q, HZ)
-        Q, HQ = torch.cat([Q, new], dim=1), torch.cat([HQ, _products(operator, new, settings, name)], dim=1)
+        Q, HQ = torch.cat([Q, new], dim=1), torch.cat([HQ, _products(operator, new, settings)], dim=1)
         samples, without = _leave_out(Omega, Y, Q, HQ, kind == "gaussian")
         value, error, spent = float(samples.mean()), _error(samples, without), count + Q.shape[1]
         half = t_quantile(count - 1, settings.confidence) * error
@@ -136,16 +143,17 @@ def added_directions(Q: Float[Tensor, "n r"], Y: Float[Tensor, "n s"]) -> Float[
         rest -= Q @ (Q.T @ rest)
     basis, R = torch.linalg.qr(rest)
     U, sigma, _ = torch.linalg.svd(R.double())
-    scale = float(torch.linalg.vector_norm(Y, dim=0, dtype=torch.float64).max())
+    scale = max(norm(y) for y in Y.T)
     return basis @ U[:, [not is_dust(float(x), scale, Y.dtype) for x in sigma]].to(basis.dtype)
 
 
 def _error(samples: Tensor, without: Tensor) -> float:
     """The root of the spread of the mean and the modulus of the covariance."""
     count = len(samples)
-    changes = (samples - without).fill_diagonal_(0)
+    unit = float(samples.abs().max()) or 1.0  # of squares that leave the range of floats
+    samples, changes = samples / unit, ((samples - without) / unit).fill_diagonal_(0)
     covariance = float((changes * changes.T).sum()) / (count * (count - 1))
-    return sqrt(float(samples.var()) / count + abs(covariance))
+    return unit * sqrt(float(samples.var()) / count + abs(covariance))
 
 
 def _leave_out(
@@ -162,7 +170,7 @@ def _leave_out(
     S, less = R.new_zeros(rank, count), 0
     if rank == count:
         U, sigma, Vh = torch.linalg.svd(R)
-        S, less = U @ (Vh / sigma.clamp_min(EPS * float(sigma[0]))[:, None]), 1  # R^-T
+        S, less = U @ (Vh / (sigma / sigma[0]).clamp_min(EPS)[:, None]), 1  # R^-T, but for its length
         S = S / S.norm(dim=0)
     angles, b, pull, inner = S.T @ S, S.T @ W, S.T @ (T - core @ W), S.T @ core @ S
     squares = column_dots(Omega, Omega) - W.square().sum(dim=0)
@@ -185,17 +193,15 @@ def _leave_out(
 def by_identity(operator: SymmetricOperator, settings: TraceSettings, name: str, spent: int = 0) -> TraceEstimate:
     """Where all of a small matrix costs no more than the estimate.  spent: matvecs that it took to know."""
     identity = torch.eye(operator.dim, dtype=operator.dtype)
-    value = float(_products(operator, identity, settings, name).diagonal().double().sum()) if operator.dim else 0.0
+    value = float(_products(operator, identity, settings).diagonal().double().sum()) if operator.dim else 0.0
     return TraceEstimate.exact(name, operator.dim, value, settings.confidence, spent + operator.dim)
 
 
-def _products(operator: SymmetricOperator, V: Tensor, settings: TraceSettings, name: str) -> Tensor:
+def _products(operator: SymmetricOperator, V: Tensor, settings: TraceSettings) -> Tensor:
     """H V, `batch` vectors at a time."""
     if V.shape[1] == 0:
         return V
     result = torch.empty_like(V)
     for part, vectors in zip(result.split(settings.batch, dim=1), V.split(settings.batch, dim=1), strict=True):
-        part.copy_(operator.apply(vectors))
-    if not isfinite(float(result.double().sum())):
-        raise ValueError(f"expected finite products H v, got NaN or infinite entries in {name}")
+        part.copy_(product(operator, vectors))
     return result

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.grid_evaluations import GridEvaluations, Loss
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, product
 from landscape.refinement import SliceSettings, evaluate_adaptively
 from landscape.results import Progress, Slice, StopReason
 
@@ -125,7 +125,7 @@ def _derivatives(
     slope = (spans.T @ gradient.double()).cpu()
     if isinstance(operator, Tensor):
         return slope, operator.cpu()
-    curvature = (spans.T @ operator.apply(directions.to(operator.dtype)).double()).cpu()
+    curvature = (spans.T @ product(operator, directions.to(operator.dtype)).double()).cpu()
     return slope, (curvature + curvature.T) / 2
 
 

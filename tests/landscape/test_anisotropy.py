@@ -141,3 +141,12 @@ def test_an_end_that_the_budget_left_behind_is_not_claimed(seed):
     found, down, truth = literal(ends), saddle(ends), 10 / -0.02
     assert found.low <= abs(truth) if "for |A|" in found.note else found.low <= truth <= found.high
     assert down.low <= abs(truth) <= down.high
+
+
+def test_an_end_that_was_not_looked_for_is_asked_for():
+    H = operator("both tails")
+    top = extreme_eigenpairs(H, generator(), EigenSettings(largest=1, smallest=0))
+    with pytest.raises(ValueError, match="eigenpair at each end, got 1 of the largest and 0 of the smallest"):
+        literal(top)
+    with pytest.raises(ValueError, match="eigenpair at each end"):
+        anisotropy(top, spectral_density(H, generator(), 24))

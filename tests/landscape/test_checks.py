@@ -1,3 +1,5 @@
+from math import inf
+
 import numpy as np
 import pytest
 import torch
@@ -135,3 +137,17 @@ def test_steps_must_be_positive():
 def test_one_vector_cannot_show_symmetry():
     with pytest.raises(ValueError, match="at least 2 vectors"):
         check_operator(H, generator(), vectors=1)
+
+
+def test_a_step_where_the_loss_is_not_finite_proves_nothing():
+    def walled(x):
+        return loss(x) if float((x - POINT) @ DIRECTION) < 5e-3 else torch.tensor(torch.nan)
+
+    def steep(x):
+        return gradient(x) * (1.0 if float((x - POINT) @ DIRECTION) < 5e-3 else torch.nan)
+
+    by_loss, by_gradient = check_objective(H, walled, POINT, DIRECTION), check_gradient(H, steep, POINT, DIRECTION)
+    assert by_loss.error < 1e-5 and by_loss.errors[:2] == (inf, inf)
+    assert by_gradient.error < 1e-8 and by_gradient.errors[0] == inf
+    enough = check_gradient(H, steep, POINT, DIRECTION, enough=by_gradient.errors[2])
+    assert enough.steps == (1e-2, 1e-3, 1e-4)

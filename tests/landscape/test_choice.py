@@ -113,5 +113,5 @@ def test_products_that_are_not_finite_are_an_error_that_names_the_block():
         def apply(self, V):
             return super().apply(V) / 0
 
-    with pytest.raises(ValueError, match=r"expected finite products H z.*in all"):
+    with pytest.raises(ValueError, match=r"expected finite products H V.*in all"):
         estimate_traces(Broken(MATRICES["flat"]), generator())

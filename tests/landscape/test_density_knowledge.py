@@ -209,3 +209,10 @@ def test_the_trace_of_all_blocks_has_the_errors_of_all():
 
     value, error = total_trace({"a": block(3.0, 0.1), "b": block(-1.0, 0.3)})
     assert value == 2.0 and error == pytest.approx(0.4 / 1.959964, rel=1e-6)
+
+
+def test_a_trace_of_which_nothing_is_known_changes_nothing():
+    H = operator("both tails")
+    plain, told = (spectral_density(H, generator(), 48, 4, trace=trace) for trace in (None, (3.0, float("inf"))))
+    for integral in (absolute_sum, lambda density: density.integral(torch.square)):
+        assert integral(told) == integral(plain)

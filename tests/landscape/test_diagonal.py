@@ -89,7 +89,7 @@ def test_bad_input_is_refused():
         def apply(self, V):
             return super().apply(V) / 0
 
-    with pytest.raises(ValueError, match="expected finite products H z"):
+    with pytest.raises(ValueError, match="expected finite products H V"):
         estimate_diagonal(Broken(INDEFINITE), generator())
 
 

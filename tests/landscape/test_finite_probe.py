@@ -109,3 +109,11 @@ def test_bad_probes_are_refused():
             probed(quartic, steps=steps)
     with pytest.raises(ValueError, match="finite objective at the centre"):
         probed(lambda theta: float("nan"))
+
+
+@pytest.mark.parametrize("rounded", [float, np.float32, lambda value: value.item()], ids=["float", "numpy", "item"])
+def test_values_that_were_float32_before_bound_the_round_off_as_such(rounded):
+    found = probed(lambda theta: rounded(quartic(theta).float()))
+    assert found.noise >= torch.finfo(torch.float32).eps * found.center_loss
+    expected = float(V @ A @ V) + 2 * QUARTIC * found.steps.square()
+    assert ((found.curvatures - expected).abs() <= found.round_off).all()

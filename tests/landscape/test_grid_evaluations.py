@@ -44,12 +44,12 @@ def test_a_killed_slice_continues_and_ends_as_if_it_had_not_been(tmp_path, setti
     for name in ("loss", "evaluated", "holdout", "crossed"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
     assert found.evaluations == expected.evaluations == whole.calls
-    # the centre is evaluated anew; what other workers had finished of the batch behind the one that died is lost
+    # the centre and one point are evaluated anew; what other workers had finished of the batch behind the one that died is lost
     lost = SliceSettings().batch if "workers" in settings else 0
-    assert whole.calls - 49 <= rest.calls <= whole.calls - 49 + lost
+    assert whole.calls - 48 <= rest.calls <= whole.calls - 48 + lost
     again = Objective()
     sliced(again, store, **settings)
-    assert again.calls == 1
+    assert again.calls == 2
     assert [path.name for path in store.parent.iterdir()] == ["slice.npz"]
 
 
@@ -91,6 +91,17 @@ def test_the_evaluations_of_another_objective_are_refused(tmp_path):
         sliced(shifted, store)
     with pytest.raises(ValueError, match="evaluations of this objective"):
         sliced(lambda theta: Objective()(theta)[0], store)
+
+
+@pytest.mark.parametrize("offset", [0.0, 3.0])
+def test_an_objective_that_is_another_one_but_for_the_centre_is_refused(tmp_path, offset):
+    """One that is least at the centre, say, times a factor."""
+    store = tmp_path / "slice.npz"
+    sliced(lambda theta: offset + Objective()(theta)[0], store, tolerance=0.1)
+    before = store.read_bytes()
+    with pytest.raises(ValueError, match=r"evaluations of this objective.*at point [0-9]+, got one that is.*delete"):
+        sliced(lambda theta: offset + Objective(factor=1.001)(theta)[0], store)
+    assert store.read_bytes() == before
 
 
 def test_a_damaged_file_is_refused(tmp_path):

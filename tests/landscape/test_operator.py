@@ -2,6 +2,9 @@ import numpy as np
 import pytest
 import torch
 
+from landscape.density import spectral_density
+from landscape.diagonal import estimate_diagonal
+from landscape.finite_probe import finite_probe
 from landscape.operator import (
     CountingOperator,
     DenseOperator,
@@ -11,6 +14,8 @@ from landscape.operator import (
     SumOperator,
     SymmetricOperator,
 )
+from landscape.power import power_iteration
+from landscape.trace import TraceSettings, estimate_traces
 from tests.oracles import symmetric_matrix
 
 N = 7
@@ -134,3 +139,39 @@ def test_scales_must_fit_and_be_finite():
         ScaledOperator(DenseOperator(A), SCALE[:3])
     with pytest.raises(ValueError, match="7 finite scales"):
         ScaledOperator(DenseOperator(A), SCALE / 0)
+
+
+class Wrong(DenseOperator):
+    """Products that are wrong in one way."""
+
+    def __init__(self, change, dim=60):
+        super().__init__(torch.diag(torch.linspace(-1.0, 2.0, dim, dtype=torch.float64)))
+        self.change = change
+
+    def apply(self, V):
+        return self.change(super().apply(V))
+
+
+ESTIMATORS = {
+    "hutchinson": lambda H, g: estimate_traces(H, g, TraceSettings.fixed(24)),
+    "hutch++": lambda H, g: estimate_traces(H, g, TraceSettings.fixed(24, method="hutch++")),
+    "xtrace": lambda H, g: estimate_traces(H, g, TraceSettings.fixed(24, method="xtrace")),
+    "diagonal": lambda H, g: estimate_diagonal(H, g),
+    "density": lambda H, g: spectral_density(H, g, matvecs=24),
+    "power": lambda H, g: power_iteration(H, g),
+    "finite probe": lambda H, g: finite_probe(torch.sum, torch.zeros(60).double(), torch.ones(60).double(), H),
+}
+MISTAKES = {
+    "a row for all": (lambda W: W[:1], r"expected products H V of the shape \(60, .*got \(1, .*in all"),
+    "no columns": (lambda W: W[:, 0], r"expected products H V of the shape \(60, .*got \(60,\) and.*in all"),
+    "another dtype": (lambda W: W.float(), "dtype torch.float64 of V, got .* and torch.float32 in all"),
+    "infinite": (lambda W: W / 0, "expected finite products H V, got NaN or infinity in all"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_no_estimator_makes_a_number_of_products_that_are_none(estimator, mistake):
+    change, expected = MISTAKES[mistake]
+    with pytest.raises(ValueError, match=expected):
+        ESTIMATORS[estimator](Wrong(change), torch.Generator().manual_seed(0))

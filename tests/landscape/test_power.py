@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -55,3 +57,19 @@ def test_bad_power_settings_are_refused():
 def test_products_that_are_not_finite_are_an_error():
     with pytest.raises(ValueError, match="finite products"):
         power_iteration(Broken(torch.eye(5)), generator())
+
+
+@pytest.mark.parametrize("wrong", ["rtol", "atol", "max_seconds"])
+def test_a_power_setting_that_is_no_number_is_refused(wrong):
+    with pytest.raises(ValueError, match=r"got .*nan"):
+        replace(PowerSettings(), **{wrong: float("nan")})
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1e200])
+def test_power_iteration_knows_no_scale(scale):
+    H = operator("clustered")
+    pair, steps = power_iteration(DenseOperator(scale * H.matrix), generator(), PowerSettings(rtol=1e-4))
+    plain, expected = power_iteration(H, generator(), PowerSettings(rtol=1e-4))
+    assert steps == expected and pair.reason == plain.reason
+    assert float(pair.values) == pytest.approx(scale * float(plain.values), rel=1e-9, abs=0)
+    assert float(pair.residuals) == pytest.approx(scale * float(plain.residuals), rel=1e-6, abs=0)

@@ -122,7 +122,7 @@ def test_bad_input_is_refused():
             self.calls += 1
             return super().apply(V) / (self.calls <= 4)
 
-    with pytest.raises(ValueError, match="expected finite products H z"):
+    with pytest.raises(ValueError, match="expected finite products H V"):
         estimate_diagonal(Late(POWER), generator(), 32)  # the sketch's own products, after four of four probes
 
 

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from math import sqrt
 
 import numpy as np
@@ -153,7 +154,7 @@ def test_products_that_are_not_finite_are_an_error_that_names_the_block():
         def apply(self, V):
             return super().apply(V) / 0
 
-    with pytest.raises(ValueError, match=r"expected finite products H z.*in a"):
+    with pytest.raises(ValueError, match=r"expected finite products H V.*in a"):
         estimate_traces(Broken(INDEFINITE, BLOCKS), generator())
 
 
@@ -190,3 +191,21 @@ def test_an_operator_may_give_the_same_memory_at_every_call(method):
     assert torch.allclose(plain.samples, buffered.samples, rtol=1e-9)
     assert (plain.low, plain.high) == pytest.approx((buffered.low, buffered.high), rel=1e-9)
     assert plain.method == buffered.method == ("xtrace" if method == "auto" else method)
+
+
+@pytest.mark.parametrize("wrong", ["rtol", "atol", "memory", "max_seconds"])
+def test_a_setting_that_is_no_number_is_refused(wrong):
+    with pytest.raises(ValueError, match=r"got .*nan"):
+        replace(TraceSettings(), **{wrong: float("nan")})
+
+
+@pytest.mark.parametrize("method", ["hutchinson", "hutch++", "xtrace", "auto"])
+@pytest.mark.parametrize("power", [-664, -300, 250, 664])
+def test_intervals_know_no_scale(power, method):
+    """Powers of two, which round nothing off: squares and fourth powers leave the range of float64 at 1e+-154 and 1e+-77."""
+    matrix = torch.from_numpy(symmetric_matrix(1 / np.arange(1, 121.0) ** 1.5, seed=1))
+    settings = TraceSettings.fixed(40, method=method)
+    plain, scaled = (estimate_traces(DenseOperator(2.0**e * matrix), generator(), settings)["all"] for e in (0, power))
+    expected = [2.0**power * x for x in (plain.value, plain.low, plain.high, plain.standard_error)]
+    assert [scaled.value, scaled.low, scaled.high, scaled.standard_error] == pytest.approx(expected, rel=1e-9, abs=0)
+    assert scaled.method == plain.method
