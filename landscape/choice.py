@@ -55,11 +55,11 @@ def chosen(
 ) -> TraceEstimate:
     """The trace of an operator by the method that its first probes recommend."""
     if operator.dim <= settings.min_probes:
-        return by_identity(operator, settings, name)
+        return by_identity(operator, settings, name, generator.device)
     run = _Choosing(operator, generator, settings, deadline, name)
     estimate = run.estimate()[name]
     if run.way == "exact":
-        return by_identity(operator, settings, name, estimate.matvecs)
+        return by_identity(operator, settings, name, generator.device, estimate.matvecs)
     if run.way == "sketch":
         return xtrace(operator, generator, settings, deadline, name, run.test_vectors())
     return estimate

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from landscape.checks import SCALE
 from landscape.lanczos import is_dust, norm, orthogonalise, unit_columns
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, product
 from landscape.probes import draw_probes
 from landscape.results import EigenEnds, Eigenpairs, StopReason
 from landscape.ritz import EigenSettings, Goal, Ritz, rayleigh, recombine, turned
@@ -137,14 +137,10 @@ class Krylov:
         V = self.basis[self.size : self.size + self.width].T
         if near_noise and isnan(self.noise):
             V = torch.cat([V, SCALE * V[:, :1]], dim=1)
-        W = self.operator.apply(V.contiguous()).T.clone(memory_format=torch.contiguous_format)
+        W = product(self.operator, V.contiguous()).T.clone(memory_format=torch.contiguous_format)
         self.matvecs += len(W)
         if len(W) > self.width:
             self.noise, W = norm(W[-1].double() / SCALE - W[0].double()), W[:-1]
-        if not torch.isfinite(W).all():
-            raise ValueError(
-                "expected finite products H v, got NaN or infinity; check the parameters with check_operator"
-            )
         return W
 
     def project(self, components: Float64[Tensor, "new width"]) -> None:
@@ -198,7 +194,9 @@ class Krylov:
 
         def end(part: slice, descending: bool) -> Eigenpairs:
             reason: StopReason = budget
-            if (reached | stuck)[part].all():
+            if not len(values[part]):
+                reason = "not asked for"
+            elif (reached | stuck)[part].all():
                 reason = "tolerance" if reached[part].all() else "noise floor"
             order = torch.argsort(values[part], descending=descending)
             pairs = [quantity[part][order] for quantity in (values, residuals, errors)]
@@ -231,7 +229,7 @@ class Krylov:
     def _together(self, ritz: Ritz, vectors: Float[Tensor, "n k"]) -> Float64[Tensor, " k"]:
         """Residuals of all pairs from one product; measures the noise."""
         signs = draw_probes(len(ritz.wanted), 1, self.generator, torch.float64, "rademacher")[:, 0]
-        unknown = self.operator.apply((vectors @ signs.to(vectors.dtype))[:, None])[:, 0].double()
+        unknown = product(self.operator, (vectors @ signs.to(vectors.dtype))[:, None])[:, 0].double()
         self.matvecs += 1
         known = self.remainders(ritz)
         for i, value in enumerate(ritz.values[ritz.wanted]):

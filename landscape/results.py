@@ -4,8 +4,8 @@
     standard error  of a mean over probe vectors: s / sqrt(probes)
     residual        |H v - lambda v| for a unit v: an eigenvalue lies within it of lambda, whatever v is
     reason          why the work ended: "tolerance" (the error asked for is reached), "noise floor" (more work would not
-                    help: the error left is the matvec's own), "matvec budget", "evaluation budget", "time budget", or
-                    "exact"
+                    help: the error left is the matvec's own), "matvec budget", "evaluation budget", "time budget", "exact",
+                    or "not asked for"
 
 `record()` gives the scalars of a result as plain Python values for JSON; what is infinite or undefined is None there.
 """
@@ -21,7 +21,9 @@ from jaxtyping import Bool, Float, Float64
 from scipy.special import stdtrit
 from torch import Tensor
 
-StopReason = Literal["tolerance", "noise floor", "matvec budget", "evaluation budget", "time budget", "exact"]
+StopReason = Literal[
+    "tolerance", "noise floor", "matvec budget", "evaluation budget", "time budget", "exact", "not asked for"
+]
 Sign = Literal["positive", "negative", "zero", "undetermined"]
 Number = float | None
 

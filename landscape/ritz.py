@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.lanczos import norm
-from landscape.operator import SymmetricOperator
+from landscape.operator import SymmetricOperator, product
 
 NEAR = 30.0  # of a product's noise, from which on a residual is near it
 NEAREST = 3e-4  # of the largest value: root of the eps of float32, which rounding stays below in either precision
@@ -47,9 +47,10 @@ class EigenSettings:
                 f"expected largest, smallest >= 0 (not both 0) and block >= 1, "
                 f"got {self.largest}, {self.smallest} and {self.block}"
             )
-        if self.rtol < 0 or self.atol < 0 or self.noise <= 0:
+        if not (self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and 0 < self.noise < inf):
             raise ValueError(
-                f"expected rtol and atol >= 0 and noise > 0, got {self.rtol}, {self.atol} and {self.noise}"
+                f"expected rtol, atol, max_seconds >= 0 and a finite noise > 0, got {self.rtol}, {self.atol}, "
+                f"{self.max_seconds} and {self.noise}"
             )
         if self.basis < self.wanted + 3 * self.block:
             raise ValueError(f"expected a basis of at least {self.wanted + 3 * self.block} vectors, got {self.basis}")
@@ -128,7 +129,7 @@ def rayleigh(
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
     """Rayleigh quotients and residuals of k vectors that are near to unit length, added up in float64."""
     values, residuals = [], []
-    for v, w in zip(vectors.T, operator.apply(vectors.contiguous()).T, strict=True):
+    for v, w in zip(vectors.T, product(operator, vectors.contiguous()).T, strict=True):
         length = norm(v)
         value = float(torch.dot(v.double(), w.double())) / length**2
         values.append(value)

@@ -72,7 +72,7 @@ def hutch_plus_plus(
     A third of max_probes, or of the time, goes into the sketch; an adaptive run saves probes on the rest.
     """
     if operator.dim <= settings.max_probes:
-        return by_identity(operator, settings, name)
+        return by_identity(operator, settings, name, generator.device)
     sketch = draw_probes(operator.dim, settings.max_probes // 3, generator, operator.dtype, settings.distribution)
     start, Y = monotonic(), sketch[:, :0]
     for vectors in sketch.split(settings.batch, dim=1):
@@ -102,7 +102,7 @@ def xtrace(
     """
     n, most = operator.dim, most_test_vectors(operator, settings)
     if start is None and n <= settings.max_probes:
-        return by_identity(operator, settings, name)
+        return by_identity(operator, settings, name, generator.device)
     if most < LEAST:
         raise ValueError(f"expected memory for {VECTORS * LEAST} vectors of {n} numbers, got {settings.memory:g} GiB")
     kind = "gaussian" if start is None else settings.distribution
@@ -127,7 +127,7 @@ def xtrace(
             return TraceEstimate(name, n, *interval, count, spent, reason, samples, "xtrace")
         count = looks.next
         if spent + n <= 2 * count:
-            return by_identity(operator, settings, name, spent)
+            return by_identity(operator, settings, name, generator.device, spent)
 
 
 def most_test_vectors(operator: SymmetricOperator, settings: TraceSettings) -> int:
@@ -190,9 +190,11 @@ def _leave_out(
     return t.cpu(), (left + length * quadratic).cpu()
 
 
-def by_identity(operator: SymmetricOperator, settings: TraceSettings, name: str, spent: int = 0) -> TraceEstimate:
+def by_identity(
+    operator: SymmetricOperator, settings: TraceSettings, name: str, device: torch.device, spent: int = 0
+) -> TraceEstimate:
     """Where all of a small matrix costs no more than the estimate.  spent: matvecs that it took to know."""
-    identity = torch.eye(operator.dim, dtype=operator.dtype)
+    identity = torch.eye(operator.dim, dtype=operator.dtype, device=device)
     value = float(_products(operator, identity, settings).diagonal().double().sum()) if operator.dim else 0.0
     return TraceEstimate.exact(name, operator.dim, value, settings.confidence, spent + operator.dim)
 

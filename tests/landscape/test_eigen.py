@@ -1,5 +1,6 @@
+from dataclasses import replace
 from functools import cache
-from math import log, sqrt
+from math import log, nan, sqrt
 
 import pytest
 import torch
@@ -97,7 +98,7 @@ def test_restarts_are_exercised_and_the_memory_is_kept():
 def test_one_end_alone_may_be_asked_for():
     true = eigenvalues(operator("both tails"))
     ends = extreme_eigenpairs(operator("both tails"), generator(), EigenSettings(0, 2, rtol=1e-8))
-    assert len(ends.largest) == 0
+    assert len(ends.largest) == 0 and ends.largest.reason == "not asked for"
     assert torch.allclose(ends.smallest.values, true[:2], rtol=0, atol=1e-8)
 
 
@@ -297,6 +298,16 @@ def test_operators_of_one_and_two_rows_are_solved_exactly():
     assert two.largest.values.tolist() == pytest.approx([2.0]) and two.smallest.values.tolist() == pytest.approx([-2.0])
 
 
+@pytest.mark.parametrize("power", [-665, 665])
+def test_pairs_know_no_scale(power):
+    matrix, settings = operator("indefinite").matrix, EigenSettings(2, 1, rtol=1e-3, basis=12)
+    plain, scaled = (extreme_eigenpairs(DenseOperator(2.0**e * matrix), generator(), settings) for e in (0, power))
+    for here, there in ((plain.largest, scaled.largest), (plain.smallest, scaled.smallest)):
+        assert here.reason == there.reason == "tolerance"
+        assert torch.allclose(2.0**-power * there.values, here.values, rtol=1e-9, atol=0)
+        assert torch.allclose(2.0**-power * there.residuals, here.residuals, rtol=1e-2, atol=0)
+
+
 def test_progress_counts_matvecs_up_to_the_budget():
     seen = []
     ends = extreme_eigenpairs(operator("indefinite"), generator(), progress=lambda *state: seen.append(state))
@@ -320,6 +331,9 @@ def test_bad_requests_are_refused():
         extreme_eigenpairs(DenseOperator(torch.eye(2)), generator(), EigenSettings(2, 1))
     with pytest.raises(ValueError, match="start vectors that are not zero"):
         extreme_eigenpairs(operator("zero"), generator(), start=torch.zeros(N))
+    for name in ("rtol", "atol", "noise", "max_seconds"):
+        with pytest.raises(ValueError, match=f"{name}.* got .*nan"):
+            replace(EigenSettings(), **{name: nan})
 
 
 @pytest.mark.parametrize("block", [1, 2])

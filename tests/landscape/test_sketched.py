@@ -1,12 +1,15 @@
 from math import sqrt
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from landscape.choice import chosen
 from landscape.hutchinson import TraceSettings
 from landscape.operator import CountingOperator, DenseOperator
-from landscape.sketched import _leave_out, xtrace
+from landscape.sketched import _leave_out, hutch_plus_plus, xtrace
 from landscape.trace import estimate_traces
 from tests.landscape.spectra import generator
 from tests.oracles import symmetric_matrix
@@ -21,6 +24,22 @@ ROUND_OFF = N * torch.finfo(torch.float64).eps
 def runs(matrix, settings, seeds):
     operator = DenseOperator(matrix)
     return [estimate_traces(operator, generator(seed), settings)["all"] for seed in range(seeds)]
+
+
+class Placed:
+    """Says where the vectors lie that it is given."""
+
+    dim, blocks, dtype = 5, {"all": slice(0, 5)}, torch.float32
+
+    def apply(self, V):
+        raise RuntimeError(f"on {V.device}")
+
+
+@pytest.mark.parametrize("estimator", [chosen, hutch_plus_plus, xtrace])
+def test_the_identity_lies_where_the_generator_draws(estimator):
+    there: Any = SimpleNamespace(device=torch.device("meta"))
+    with pytest.raises(RuntimeError, match="on meta"):
+        estimator(Placed(), there, TraceSettings())
 
 
 def root_mean_square(estimates, truth):
