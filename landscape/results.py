@@ -234,7 +234,11 @@ class SpectralDensity:
         return torch.cat([self.nodes, everywhere], dim=1), torch.cat(weights, dim=1) / self.dim
 
     def integral(self, function: Callable[[Tensor], Tensor], confidence: float = 0.95) -> Bracket:
-        """sum_i f(lambda_i) with the interval of its spread over start vectors (the rule's own error is not in it)."""
+        """sum_i f(lambda_i) with the interval of its spread over start vectors (the rule's own error is not in it).
+
+        Student's interval, which takes samples for normal: of squares, which are skewed, it covers 86 to 95% at the nominal 95%
+        with four start vectors (eight spectra, 200 seeds); `effective_rank`, which asks it for more, 93 to 100%.
+        """
         samples = self.rest * (self.weights * function(self.nodes)).sum(dim=1) + function(self.known).sum()
         shift, error = self.by_trace(function, confidence)
         value, _, low, high = t_interval(samples + shift, confidence)
