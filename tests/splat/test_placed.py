@@ -94,7 +94,8 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         hessian = SceneHessian(objective)
         V = placed.on_gpu(random_like((hessian.dim, 2), 1))
         hessian.apply(V)
-        placed.waits.clear(), placed.brought.clear()
+        placed.waits.clear()
+        placed.brought.clear()
         hessian.apply(V)
         assert not +placed.waits and not +placed.brought  # so that they can be recorded
         _ = objective.gradient, objective.block_diagonal(), objective.loss(flat), scene_units(objective)
