@@ -196,6 +196,31 @@ def test_settings_in_a_checkpoint_are_checked_like_any_others(path, key, value, 
     refused(path, message)
 
 
+@pytest.mark.parametrize("number", [2**63, 10**30, 10**400], ids=["2^63", "10^30", "10^400"])
+@pytest.mark.parametrize(("part", "key"), [("rates", "position"), ("render", "contour_sigma"), ("densify", "stop")])
+def test_whole_numbers_that_no_machine_number_holds_are_refused_in_a_sentence(path, part, key, number):
+    content = torch.load(path, weights_only=True)
+    content["config"][part][key] = number
+    torch.save(content, path)
+    refused(path, f"'config.{part}.{key}' is .*, expected (int|float)")
+
+
+def test_whole_numbers_in_place_of_real_ones_are_taken(path):
+    content = torch.load(path, weights_only=True)
+    content["config"]["render"]["contour_sigma"] = 2**62
+    content["config"]["rates"]["quats"] = 1
+    torch.save(content, path)
+    config = load_checkpoint(path).training.config
+    assert config.render.contour_sigma == 2**62 and config.rates.quats == 1
+
+
+def test_an_optimiser_that_made_more_updates_than_steps_is_refused(path):
+    content = torch.load(path, weights_only=True)
+    content["adam"]["updates"] = 10**400
+    torch.save(content, path)
+    refused(path, "optimiser has made .* updates in 8 steps")
+
+
 def test_parameters_that_are_not_finite_are_refused_by_name(path):
     content = torch.load(path, weights_only=True)
     content["flat"][4] = torch.nan
