@@ -204,13 +204,14 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint.  FileNotFoundError where there is none; ValueError that says what is wrong with it."""
+    """Read a checkpoint.  OSError where there is none or it may not be read; ValueError that says what is wrong with it."""
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
         raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found {found}")
     damaged = ValueError(
         f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
     )
+    path.open("rb").close()  # what the system does not open, it says itself
     try:
         with zipfile.ZipFile(path) as archive:
             whole = archive.testzip() is None

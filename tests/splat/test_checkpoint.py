@@ -1,6 +1,8 @@
 """Checkpoints: whole or not at all, read back as they were, refused with the reason where they are not ours."""
 
+import builtins
 import errno
+import io
 import os
 import pickle
 import zipfile
@@ -87,6 +89,22 @@ def test_a_file_of_another_kind_is_refused(tmp_path, content):
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(content)
     refused(path, "expected a checkpoint written by landscape train")
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO])
+def test_a_checkpoint_that_the_system_does_not_open_is_reported_in_its_words(path, monkeypatch, number):
+    opened = io.open
+
+    def refuse(file, *arguments, **settings):
+        if str(file) == str(path):
+            raise OSError(number, os.strerror(number), str(file))
+        return opened(file, *arguments, **settings)
+
+    for module in (io, builtins):  # the root, who may read everything, runs tests too
+        monkeypatch.setattr(module, "open", refuse)
+    with pytest.raises(OSError, match=os.strerror(number)) as caught:
+        load_checkpoint(path)
+    assert caught.value.filename == str(path)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
