@@ -18,6 +18,9 @@ from landscape.operator import require_blocks, require_vectors
 class ObjectiveHessian:
     """The Hessian of loss(theta) at `point`, in the dtype of point.
 
+    A loss that torch does not trace back to the point is refused: it would look flat.  One that is constant or linear in
+    the point, piece by piece at least, has the Hessian 0.
+
     >>> def rosenbrock(x):
     ...     return (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2
     >>> H = ObjectiveHessian(rosenbrock, torch.tensor([1.0, 1.0], dtype=torch.float64))
@@ -42,12 +45,8 @@ class ObjectiveHessian:
         self.blocks = require_blocks({"all": slice(0, self.dim)} if blocks is None else blocks, self.dim)
         self._point = point.detach().clone().requires_grad_()
         value = loss(self._point)
-        if value.ndim != 0 or not torch.isfinite(value):
-            raise ValueError(f"expected a finite scalar loss at the point, got {value.detach()}")
-        self.value = float(value.detach())
-        self._gradient = torch.zeros_like(self._point)
-        if value.requires_grad:
-            (self._gradient,) = torch.autograd.grad(value, self._point, create_graph=True, materialize_grads=True)
+        _require_loss(value)
+        self.value, self._gradient = float(value.detach()), _traced_gradient(value, self._point)
 
     @property
     def gradient(self) -> Float[Tensor, " n"]:
@@ -63,3 +62,29 @@ class ObjectiveHessian:
             for v in V.unbind(dim=1)
         ]
         return torch.stack(columns, dim=1) if columns else torch.zeros_like(V)
+
+
+def _require_loss(value: object) -> None:
+    """ValueError unless it is a tensor of one finite number."""
+    if not isinstance(value, Tensor):
+        kind = type(value).__name__
+        raise ValueError(
+            f"expected one scalar tensor as loss, got {kind}; keep to torch, without .item(), float or numpy"
+        )
+    if value.ndim != 0:
+        raise ValueError(f"expected one scalar tensor as loss, got {value.dtype} of shape {tuple(value.shape)}")
+    if not torch.isfinite(value):
+        raise ValueError(f"expected a finite scalar loss at the point, got {value.detach()}")
+
+
+def _traced_gradient(value: Tensor, point: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """dL/dtheta, with the graph for its own derivative.  ValueError where the loss has none that leads to the point."""
+    gradient = None
+    if value.requires_grad:
+        (gradient,) = torch.autograd.grad(value, point, create_graph=True, allow_unused=True)
+    if gradient is None:
+        raise ValueError(
+            "expected a loss computed from the point, got one that torch does not trace back to it; leave out .detach(), "
+            "torch.tensor(...) and torch.no_grad(), or add 0 * point.sum() to a loss that is constant"
+        )
+    return gradient

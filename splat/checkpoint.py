@@ -204,13 +204,14 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint.  FileNotFoundError where there is none; ValueError that says what is wrong with it."""
+    """Read a checkpoint.  OSError where there is none or it may not be read; ValueError that says what is wrong with it."""
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
         raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found {found}")
     damaged = ValueError(
         f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
     )
+    path.open("rb").close()  # what the system does not open, it says itself
     try:
         with zipfile.ZipFile(path) as archive:
             whole = archive.testzip() is None
@@ -280,8 +281,8 @@ def restored_training(content: dict[str, Any]) -> Training:
         raise ValueError(f"its step {training.step} is not among its {config.iterations} iterations")
     if not 0 < training.extent < float("inf"):
         raise ValueError(f"its extent is {training.extent}")
-    if training.adam.updates < 0:
-        raise ValueError(f"its optimiser has made {training.adam.updates} updates")
+    if not 0 <= training.adam.updates <= training.step:
+        raise ValueError(f"its optimiser has made {_short(training.adam.updates)} updates in {training.step} steps")
     return training
 
 
@@ -361,7 +362,7 @@ def _short(value: Any) -> str:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a plain value is of a type: int, float (or an int), bool, str, list, tuple, Literal, X | None."""
+    """Whether a plain value is of a type: int (of 64 bits), float (or an int), bool, str, list, tuple, Literal, X | None."""
     if get_origin(hint) in (Union, UnionType):
         return any(_fits(value, option) for option in get_args(hint))
     if get_origin(hint) is Literal:
@@ -373,4 +374,6 @@ def _fits(value: Any, hint: Any) -> bool:
         if options[1:] == (Ellipsis,):
             return type(value) is tuple and all(_fits(item, options[0]) for item in value)
         return type(value) is tuple and len(value) == len(options) and all(map(_fits, value, options))
-    return type(value) is hint or (hint is float and type(value) is int)
+    if type(value) is int:  # of any size, of which neither a tensor nor a float holds all
+        return hint in (int, float) and abs(value) < 2**63
+    return type(value) is hint

@@ -33,6 +33,10 @@ MOST_VECTORS = 8  # beyond it a block of vectors gains no more: it has left the 
 RECORDED = 1 << 28  # bytes of workspace, up to which a GPU has made a view's product before its kernels are launched
 
 
+class NothingInSight(ValueError):
+    """No view sees any of the Gaussians: there is no Hessian."""
+
+
 def free_memory(device: torch.device) -> int:
     """Bytes, where the Gaussians are; of a GPU's also those that torch holds for tensors to come."""
     if device.type != "cuda":
@@ -74,7 +78,7 @@ class SceneObjective:
     a pixel of some view, with unit quaternions; `mask` says which of the given ones they are.  memory: bytes that
     linearised views and the workspace of their products may take (half of what is free by default); see `memory_plan`.
     keep_unseen: all Gaussians are active, for steps so long that they may bring into sight what no view sees here.
-    Raises ValueError where no Gaussian is seen or a parameter is not finite.
+    Raises NothingInSight where no Gaussian is seen, ValueError where a parameter is not finite.
     """
 
     def __init__(
@@ -101,7 +105,7 @@ class SceneObjective:
         everyone = gaussians.select(torch.arange(len(gaussians)), degree)
         self.mask: Bool[Tensor, " n"] = self._support(everyone)
         if not self.mask.any():
-            raise ValueError(f"expected Gaussians in sight, got {len(gaussians)} of which no view sees any")
+            raise NothingInSight(f"expected Gaussians in sight, got {len(gaussians)} of which no view sees any")
         if keep_unseen:
             self.mask = torch.ones_like(self.mask)
         active = everyone.select(self.mask)

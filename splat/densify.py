@@ -7,7 +7,8 @@ At an interval, after `start` and before `stop`, a Gaussian whose mean screen-sp
 
 Then Gaussians that are nearly transparent are removed, and, once opacities have been reset, those larger than
 prune_scale x extent.  (The published code also means to remove what is large on screen, but zeroes the radii before it
-looks at them, so that it never does.)  Opacities are lowered to reset_opacity every `reset_every` steps before `stop`.
+looks at them, so that it never does.)  Opacities are lowered to reset_opacity every `reset_every` steps before `stop`;
+on a white background, which the first Gaussians are quick to stand in for, also at the step `start`.
 
 The screen-space gradient is the norm of dL / d(mean) in normalised device coordinates, in which the image is 2 wide and
 2 high, averaged over the renders in which the Gaussian's 3-sigma box meets the image.  Splat means here are in pixels,
@@ -15,7 +16,7 @@ so that gradient is (w/2 dL/dx, h/2 dL/dy).  extent: radius of the cameras' boun
 """
 
 from dataclasses import dataclass
-from math import log
+from math import floor, log
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -71,13 +72,19 @@ class DensifySettings:
         """Whether density control is under way, and wants the screen-space gradient, at a step (1, 2, ...)."""
         return self.enabled and step < min(self.stop, self.stop_share * iterations)
 
+    def begins(self, iterations: int) -> int:
+        """The last step before Gaussians are cloned, split and removed."""
+        return floor(min(self.start, self.start_share * iterations))
+
     def densifies(self, step: int, iterations: int) -> bool:
-        begun = step > min(self.start, self.start_share * iterations)
+        begun = step > self.begins(iterations)
         interval = max(1, min(self.every, round(self.every_share * iterations)))
         return begun and step % interval == 0 and self.collects(step, iterations)
 
-    def resets_opacity(self, step: int, iterations: int) -> bool:
-        return step % self.reset_every == 0 and self.collects(step, iterations)
+    def resets_opacity(self, step: int, iterations: int, *, white: bool) -> bool:
+        """white: whether that is what the views are seen against."""
+        due = step % self.reset_every == 0 or (white and step == self.begins(iterations))
+        return due and self.collects(step, iterations)
 
     def prunes_large(self, step: int) -> bool:
         """3DGS removes large Gaussians only after the first opacity reset."""

@@ -158,6 +158,11 @@ def _random_batch(
 
 def _range_around_target(views: Sequence[View], camera: Camera) -> tuple[float, float]:
     """Depths round the point that is nearest to all optical axes."""
+    if len(views) == 1:
+        raise ValueError(
+            "expected at least 2 training views for random points, got 1: one alone does not say how far away the scene is; "
+            "take more views, or start from points (COLMAP), or give depth ranges (poses_bounds.npy)"
+        )
     target = common_target([view.camera for view in views])
     if target is not None:
         depth = float((target - camera.centre) @ camera.forward)

@@ -11,8 +11,14 @@ co-regularisation   after `pseudo_start` steps, at every step, for both fields:
     L = L_recon + weight l(I(P), I'(P))     I, I' the two fields' images, the other's constant; l the loss of training
 
 P, the pseudo-view, is a random training camera m: its intrinsics, the rotation half way to that of the camera that is
-nearest to it, n, and the centre t_m + noise r N(0, 1), r the cameras' mean distance from their centroid.  (The published code
-draws the centre from the box of the cameras and looks at a common focus, for which it needs a depth range.)
+nearest to it, n, and the centre t_m + noise r N(0, 1), r the cameras' mean distance from their centroid.
+
+The published code (jiaw-z/CoR-GS) has the whole weight from the first step of the co-regularisation on: it works out FSGS's
+ramp over 500 steps and does not apply it.  It differs from this in that it
+
+    draws the centre of P from the box of the cameras and looks at a common focus, for which it needs a depth range;
+    co-regularises at the steps 2000 to 10,000, here from 2001 to the end;
+    resets opacities at the steps 2001, 5001, 8001, ..., and raises the SH degree every 500: here both are those of 3DGS.
 
 distance 5 is the published threshold, in the units of COLMAP's reconstructions; it has to be chosen for scenes of another
 size.  A step costs two of 3DGS and two renders at the pseudo-view.

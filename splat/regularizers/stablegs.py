@@ -9,7 +9,8 @@ Eq. (14).  L_recon is the sampled view's, as Algorithm 1 has it.
 
 Probing starts after `warm_up` steps.  Every `every` steps the magnitudes rho are worked out anew from the traces of the
 Hessian's blocks over all training views, and with them the dominant occlusion edge of each view; both change slowly.  Density
-control sees the sampled view's own gradient alone.
+control sees the sampled view's own gradient alone.  Where no training view sees a Gaussian, as 3DGS goes on, so does this:
+with the last magnitudes and edges, or none.  The history notes it, and counts the probed viewpoints that see none.
 
 Left out because it cannot matter: the traces of attributes that are not probed; the probed copy where every rho is 0; each
 loss of weight 0; viewpoints that see nothing; the edges where nothing turns about them.
@@ -25,7 +26,7 @@ from torch import Tensor
 
 from landscape.trace import PAPER, estimate_traces
 from splat.camera import Camera
-from splat.curvature import SceneHessian
+from splat.curvature import NothingInSight, SceneHessian
 from splat.densify import on_screen
 from splat.losses_cpu import consistency_loss
 from splat.photometric import Photometric, photometric
@@ -113,13 +114,20 @@ class StableRegularizer(Regularizer):
             again = photometric(probed.gaussians, step.camera, step.loss, step.background, step.config.render)
             total.add_(probed.pull(again.gradient), alpha=settings.asp_weight)
         for pose in poses:
-            total.add_(_disagreement(step, probed, pose), alpha=settings.vsp_weight / len(poses))
+            if (disagreement := _disagreement(step, probed, pose)) is None:
+                self._count_unseen(step)
+            else:
+                total.add_(disagreement, alpha=settings.vsp_weight / len(poses))
         return total
 
     def _diagnose(self, step: Step) -> None:
         """Magnitudes from the traces, and the edges."""
         settings, config, names = self.settings, step.config, self.settings.probe.on
-        objective = config.objective(step.gaussians, step.views)
+        try:
+            objective = config.objective(step.gaussians, step.views)
+        except NothingInSight:
+            self.history.append({"step": step.number, "note": "no Gaussian in sight: magnitudes kept"})
+            return
         if not names:
             estimates = {}
         elif settings.traces == "exact":
@@ -146,6 +154,13 @@ class StableRegularizer(Regularizer):
             )
         if settings.vsp_weight and settings.viewpoint.edge_rotation:
             self.normals = [_edge_normal(step, view.camera) for view in step.views]
+
+    def _count_unseen(self, step: Step) -> None:
+        """One more probed viewpoint that sees nothing, in a row of its own after the last diagnosis."""
+        if not self.history or "count" not in self.history[-1]:
+            note = "probed viewpoints without a Gaussian in sight, until the next diagnosis"
+            self.history.append({"step": step.number, "note": note, "count": 0})
+        self.history[-1]["count"] += 1
 
     def _poses(self, step: Step) -> list[Camera]:
         """The viewpoints of this step."""
@@ -178,12 +193,15 @@ def _edge_normal(step: Step, camera: Camera) -> Float[Tensor, "2"]:
         return dominant_edge(*render_depth(step.gaussians, camera, step.config.render))[0]
 
 
-def _disagreement(step: Step, probed: Probed, pose: Camera) -> Float[Tensor, " p"]:
-    """The gradient of the loss between the images of the Gaussians and of their probed copy at a pose (Eq. (21))."""
+def _disagreement(step: Step, probed: Probed, pose: Camera) -> Float[Tensor, " p"] | None:
+    """The gradient of the loss between the images of the Gaussians and of their probed copy at a pose (Eq. (21)).
+
+    None where neither has a Gaussian in sight there.
+    """
     flats = [gaussians.flat.detach().requires_grad_() for gaussians in (step.gaussians, probed.gaussians)]
     renders = [render(step.gaussians.with_flat(flat), pose, step.background, step.config.render) for flat in flats]
     if not any(on_screen(each.splats.detach(), pose).any() for each in renders):
-        return torch.zeros_like(flats[0])
+        return None
     loss = consistency_loss(renders[0].image, renders[1].image, step.config.loss)
     own, other = torch.autograd.grad(loss, flats)
     return own.add_(probed.pull(other))

@@ -37,6 +37,7 @@ PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 UNDISTORTED_HERE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 LARGEST_SIDE = 2**31 - 1  # px; COLMAP ends with words of its own where it cannot count them
 SMALLEST = 4  # px a side of a reduced picture; smaller ones are a slip of the factor
+LARGEST_DISPLACEMENT = 2  # of a corner, in half diagonals; the strongest lenses stay below 1
 INSIDE = 1 - 1e-4  # share of a pixel's footprint that must be; below 1 by more than float32 sums can lose
 Warp = Callable[[Float[Tensor, "c h w"]], Float[Tensor, "c height width"]]
 
@@ -196,7 +197,23 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
             f"{model} for image {photo.name!r}; make pinhole images first: colmap image_undistorter --image_path "
             f"{photo.path.parent} --input_path MODEL --output_path NEW_SCENE, where MODEL is the folder of cameras.bin"
         )
-    return lens if lens.is_undistorted() else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+    if lens.is_undistorted():
+        return lens
+    if not _displacement(lens) <= LARGEST_DISPLACEMENT:
+        raise ValueError(
+            f"the camera of image {photo.name!r} cannot be: expected distortion that moves no corner by more than "
+            f"{LARGEST_DISPLACEMENT} half diagonals of the picture, got {model} with {lens.params_to_string()}"
+        )
+    return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+
+
+def _displacement(lens: pycolmap.Camera) -> float:
+    """How far the distortion moves a corner of the picture, at most, in units of the picture's half diagonal."""
+    size = np.array([lens.width, lens.height])
+    corners = size * [[0, 0], [1, 0], [0, 1], [1, 1]]
+    (fx, _, cx), (_, fy, cy), _ = lens.calibration_matrix()
+    rays = np.column_stack([(corners - (cx, cy)) / (fx, fy), np.ones(4)])
+    return float(np.hypot(*(np.asarray(lens.img_from_cam(rays)) - corners).T).max() / np.hypot(*size / 2))
 
 
 def _read(path: Path, warp: Warp, background: Float[Tensor, "3"]) -> Picture:

@@ -34,6 +34,12 @@ def read_llff(root: Path, images: str | None = None) -> list[Photo]:
             f"expected one image for each of the {len(rows)} poses in {path}, got {len(files)} in {folder}; "
             "restore the images that the poses were computed from, or choose their folder with images=..."
         )
+    for file, (near, far) in zip(files, rows[:, 15:]):
+        if not 0 < near < far:
+            raise ValueError(
+                f"expected 0 < nearest < farthest depth at the end of each row of {path}, got {near:g} and {far:g} for "
+                f"{file.name!r}; make it again with LLFF's imgs2poses"
+            )
     return [_photo(path, row) for path, row in zip(files, rows)]
 
 

@@ -34,9 +34,33 @@ def test_float32_agrees_with_float64_to_its_round_off():
     assert (single - exact).norm() < 20 * torch.finfo(torch.float32).eps * exact.norm()
 
 
-@pytest.mark.parametrize("flat", [lambda x: 3 * x.sum(), lambda x: torch.tensor(2.0)])
+@pytest.mark.parametrize("flat", [lambda x: 3 * x.sum(), lambda x: 2 + 0 * x.sum(), lambda x: (x - 0.1).abs().sum()])
 def test_an_objective_without_curvature_has_a_zero_hessian(flat):
     assert not ObjectiveHessian(flat, POINT).apply(torch.eye(5, dtype=torch.float64)).any()
+
+
+@pytest.mark.parametrize("number", [lambda x: float(loss(x).detach()), lambda x: loss(x).detach().numpy()[()]])
+def test_a_loss_that_is_no_tensor_is_refused(number):
+    with pytest.raises(ValueError, match=r"one scalar tensor as loss, got float(64)?; keep to torch"):
+        ObjectiveHessian(number, POINT)
+
+
+WEIGHTS = torch.ones(5, dtype=torch.float64, requires_grad=True)
+
+
+@pytest.mark.parametrize(
+    "cut",
+    [
+        lambda x: loss(x).detach(),
+        torch.no_grad()(loss),
+        lambda x: torch.tensor(2.0),
+        lambda x: torch.tensor(float(loss(x)), requires_grad=True),
+        lambda x: (WEIGHTS * x.detach() ** 2).sum(),  # it has a graph, in which the point is not
+    ],
+)
+def test_a_loss_that_is_cut_off_from_the_point_is_refused_and_not_taken_for_a_flat_one(cut):
+    with pytest.raises(ValueError, match=r"computed from the point.*\.detach\(\).*no_grad"):
+        ObjectiveHessian(cut, POINT)
 
 
 def test_bad_points_and_losses_are_refused():
@@ -44,7 +68,7 @@ def test_bad_points_and_losses_are_refused():
         ObjectiveHessian(loss, POINT[:, None])
     with pytest.raises(ValueError, match="one flat vector of floats"):
         ObjectiveHessian(loss, POINT.long())
-    with pytest.raises(ValueError, match="finite scalar loss"):
+    with pytest.raises(ValueError, match=r"one scalar tensor as loss, got torch.float64 of shape \(5,\)$"):
         ObjectiveHessian(lambda x: x, POINT)
     with pytest.raises(ValueError, match="finite scalar loss"):
         ObjectiveHessian(lambda x: (x - 3).log().sum(), POINT)

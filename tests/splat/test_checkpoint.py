@@ -1,6 +1,8 @@
 """Checkpoints: whole or not at all, read back as they were, refused with the reason where they are not ours."""
 
+import builtins
 import errno
+import io
 import os
 import pickle
 import zipfile
@@ -87,6 +89,22 @@ def test_a_file_of_another_kind_is_refused(tmp_path, content):
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(content)
     refused(path, "expected a checkpoint written by landscape train")
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO])
+def test_a_checkpoint_that_the_system_does_not_open_is_reported_in_its_words(path, monkeypatch, number):
+    opened = io.open
+
+    def refuse(file, *arguments, **settings):
+        if str(file) == str(path):
+            raise OSError(number, os.strerror(number), str(file))
+        return opened(file, *arguments, **settings)
+
+    for module in (io, builtins):  # the root, who may read everything, runs tests too
+        monkeypatch.setattr(module, "open", refuse)
+    with pytest.raises(OSError, match=os.strerror(number)) as caught:
+        load_checkpoint(path)
+    assert caught.value.filename == str(path)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
@@ -194,6 +212,31 @@ def test_settings_in_a_checkpoint_are_checked_like_any_others(path, key, value, 
     content["config"][key] = value
     torch.save(content, path)
     refused(path, message)
+
+
+@pytest.mark.parametrize("number", [2**63, 10**30, 10**400], ids=["2^63", "10^30", "10^400"])
+@pytest.mark.parametrize(("part", "key"), [("rates", "position"), ("render", "contour_sigma"), ("densify", "stop")])
+def test_whole_numbers_that_no_machine_number_holds_are_refused_in_a_sentence(path, part, key, number):
+    content = torch.load(path, weights_only=True)
+    content["config"][part][key] = number
+    torch.save(content, path)
+    refused(path, f"'config.{part}.{key}' is .*, expected (int|float)")
+
+
+def test_whole_numbers_in_place_of_real_ones_are_taken(path):
+    content = torch.load(path, weights_only=True)
+    content["config"]["render"]["contour_sigma"] = 2**62
+    content["config"]["rates"]["quats"] = 1
+    torch.save(content, path)
+    config = load_checkpoint(path).training.config
+    assert config.render.contour_sigma == 2**62 and config.rates.quats == 1
+
+
+def test_an_optimiser_that_made_more_updates_than_steps_is_refused(path):
+    content = torch.load(path, weights_only=True)
+    content["adam"]["updates"] = 10**400
+    torch.save(content, path)
+    refused(path, "optimiser has made .* updates in 8 steps")
 
 
 def test_parameters_that_are_not_finite_are_refused_by_name(path):

@@ -132,13 +132,14 @@ def test_screen_gradients_are_means_of_ndc_norms_over_the_renders_that_show_a_ga
     torch.testing.assert_close(gradients.mean, expected)
 
 
-def steps(iterations: int, what: str) -> list[int]:
-    return [step for step in range(1, iterations + 1) if getattr(SETTINGS, what)(step, iterations)]
+def steps(iterations: int, what: str, **how: bool) -> list[int]:
+    return [step for step in range(1, iterations + 1) if getattr(SETTINGS, what)(step, iterations, **how)]
 
 
 def test_a_run_of_30000_steps_densifies_and_resets_when_3dgs_does():
     assert steps(30_000, "densifies") == list(range(600, 15_000, 100))
-    assert steps(30_000, "resets_opacity") == [3000, 6000, 9000, 12_000]
+    assert steps(30_000, "resets_opacity", white=False) == [3000, 6000, 9000, 12_000]
+    assert steps(30_000, "resets_opacity", white=True) == [500, 3000, 6000, 9000, 12_000]
     assert not SETTINGS.prunes_large(3000) and SETTINGS.prunes_large(3001)
 
 
@@ -146,13 +147,22 @@ def test_short_runs_densify_in_their_second_quarter():
     assert steps(2000, "densifies") == [600, 700, 800, 900]
     assert steps(400, "densifies") == [120, 140, 160, 180]
     assert steps(4, "densifies") == []
-    assert steps(2000, "resets_opacity") == []
+    assert steps(2000, "resets_opacity", white=False) == []
+
+
+@pytest.mark.parametrize(("iterations", "last"), [(2000, 500), (400, 100), (30, 7), (3, None)])
+def test_on_white_opacities_are_reset_at_the_last_step_before_density_control_begins(iterations, last):
+    assert steps(iterations, "resets_opacity", white=True) == ([] if last is None else [last])
+    begun = replace(SETTINGS, every=1)
+    later = [step for step in range(1, iterations + 1) if begun.densifies(step, iterations)]
+    assert last is None or later[0] == last + 1
 
 
 def test_density_control_that_is_switched_off_does_nothing():
     off = DensifySettings(enabled=False)
     assert not any(
-        off.collects(s, 2000) or off.densifies(s, 2000) or off.resets_opacity(s, 2000) for s in range(1, 2001)
+        off.collects(s, 2000) or off.densifies(s, 2000) or off.resets_opacity(s, 2000, white=True)
+        for s in range(1, 2001)
     )
 
 

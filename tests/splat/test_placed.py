@@ -50,7 +50,7 @@ def put_on_gpu(training: Training, placed: Placed) -> None:
     sums.total, sums.renders = placed.on_gpu(sums.total), placed.on_gpu(sums.renders)
 
 
-def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_five_times(monkeypatch):
+def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_six_times(monkeypatch):
     views = tiny_views()
     config = replace(tiny_config(), random_background=False)  # which would compare with another picture every step
     training = Training.start(tiny_gaussians(6), EXTENT, config)
@@ -60,8 +60,8 @@ def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_five_times(mo
         put_on_gpu(training, placed)
         steps = train(training, views)
         next(steps)
-        # whether the parameters are finite, the largest scale, how many strips and entries, the loss
-        assert +placed.waits == Counter({"_local_scalar_dense": 5})
+        # whether the parameters are finite, the largest scale, how many strips and entries, the loss, the sum of the gradient
+        assert +placed.waits == Counter({"_local_scalar_dense": 6})
         next(steps)  # with density control
     assert not +placed.mixed
 
@@ -94,7 +94,8 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         hessian = SceneHessian(objective)
         V = placed.on_gpu(random_like((hessian.dim, 2), 1))
         hessian.apply(V)
-        placed.waits.clear(), placed.brought.clear()
+        placed.waits.clear()
+        placed.brought.clear()
         hessian.apply(V)
         assert not +placed.waits and not +placed.brought  # so that they can be recorded
         _ = objective.gradient, objective.block_diagonal(), objective.loss(flat), scene_units(objective)

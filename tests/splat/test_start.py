@@ -160,6 +160,15 @@ def test_parallel_cameras_need_a_depth_range() -> None:
     assert len(points_in_common_volume(views(parallel=True), 10, torch.Generator(), ranges)) == 10
 
 
+def test_one_view_alone_needs_a_depth_range_and_says_so() -> None:
+    with pytest.raises(
+        ValueError, match=r"at least 2 training views for random points, got 1: .*; take more views, or"
+    ) as caught:
+        points_in_common_volume(views((0,)), 10, torch.Generator())
+    assert "parallel" not in str(caught.value)
+    assert len(points_in_common_volume(views((0,)), 10, torch.Generator(), [(3.0, 5.0)])) == 10
+
+
 def test_views_with_nothing_in_common_are_refused() -> None:
     apart = views((0, 90))
     with pytest.raises(ValueError, match="got 0 such places"):

@@ -115,6 +115,26 @@ def test_the_tiny_run_clones_splits_prunes_resets_and_raises_the_degree(monkeypa
     assert training.gaussians.sh_degree == 2
 
 
+@pytest.mark.parametrize(
+    ("background", "drawn", "resets"),
+    [
+        ((1.0, 1.0, 1.0), False, [3, 5]),
+        ((1.0, 1.0, 1.0), True, [5]),
+        ((0.0, 0.0, 0.0), False, [5]),
+        ((1.0, 1.0, 0.9), False, [5]),
+    ],
+)
+def test_on_a_white_background_opacities_are_also_reset_before_density_control_begins(background, drawn, resets):
+    config = replace(tiny_config(), background=background, random_background=drawn)
+    training = Training.start(tiny_gaussians(), EXTENT, config)
+    highest = {
+        done.step: training.gaussians.opacity_logits.sigmoid().max().item() for done in train(training, tiny_views())
+    }
+    assert [
+        step for step, opacity in highest.items() if opacity <= 0.010001
+    ] == resets  # the next update lifts some again
+
+
 def checkpoint_bytes(config: TrainConfig, path: Path) -> bytes:
     training, _ = run(config)
     save_checkpoint(path, training, REFERENCE)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from splat.checkpoint import load_checkpoint, save_checkpoint
+from splat.densify import DensifySettings
 from splat.losses import photometric_loss
 from splat.losses_cpu import ViewLoss
 from splat.photometric import photometric
@@ -122,6 +123,45 @@ def test_a_viewpoint_that_sees_nothing_adds_nothing(monkeypatch):
     monkeypatch.setattr(stablegs, "consistency_loss", None)
     base = base_of(step)
     assert torch.equal(step.training.regularizer.gradient(step, base), base.gradient)
+
+
+def test_a_viewpoint_that_sees_nothing_is_counted_in_the_history_until_the_next_diagnosis(monkeypatch):
+    config = replace(tiny_config(), method=StableGS(warm_up=3, every=4, probe=PROBE))
+    posing = stablegs.composite_pose
+
+    def away(cameras, m, *others, **settings):
+        pose = posing(cameras, m, *others, **settings)
+        return replace(pose, centre=pose.centre + 50 * pose.forward) if m else pose
+
+    monkeypatch.setattr(stablegs, "composite_pose", away)
+    training = Training.start(tiny_gaussians(), EXTENT, config)
+    for _ in train(training, tiny_views()):
+        pass
+    notes = [row for row in training.regularizer.history if "note" in row]
+    # two of three views, at the steps 4 to 7, 8 to 11, and 12
+    note = "probed viewpoints without a Gaussian in sight, until the next diagnosis"
+    assert notes == [{"step": step, "note": note, "count": count} for step, count in ((4, 8), (8, 8), (12, 2))]
+
+
+def looking_away(gaussians):
+    """What the tiny views do not see; undone by a second call."""
+    gaussians.means[:, 2] *= -1
+
+
+def test_a_diagnosis_without_a_gaussian_in_sight_keeps_the_magnitudes_and_says_so():
+    method = StableGS(warm_up=2, every=2, probe=PROBE)
+    config = replace(tiny_config(iterations=8), method=method, densify=DensifySettings(enabled=False))
+    training = Training.start(tiny_gaussians(), EXTENT, config)
+    regularizer, kept = training.regularizer, []
+    assert isinstance(regularizer, stablegs.StableRegularizer)
+    looking_away(training.gaussians)
+    for done in train(training, tiny_views()):
+        kept.append(dict(regularizer.magnitudes))
+        if done.step in (4, 6):  # in sight for the steps 5 and 6, with the diagnosis of step 5
+            looking_away(training.gaussians)
+    assert not any(kept[:4]) and kept[4] and all(magnitudes == kept[4] for magnitudes in kept[4:])
+    found = {row["step"]: row.get("note", "") for row in regularizer.history if "count" not in row}
+    assert found == {step: "" if step == 5 else "no Gaussian in sight: magnitudes kept" for step in (3, 5, 7)}
 
 
 def test_the_history_says_what_was_negative_and_what_was_capped():

@@ -59,6 +59,26 @@ def test_a_distorted_picture_becomes_what_the_pinhole_camera_would_have_seen(tmp
         assert pixel.min() > -0.5 and pixel.max() < side + 0.5  # the corners lie in the photograph, or on its edge
 
 
+@pytest.mark.parametrize("absurd", [{"k1": 1e30}, {"k1": -1e30}, {"k1": -20.0}, {"p2": 1e6}, {"k3": 1e300}])
+def test_distortion_that_is_no_lens_is_refused(tmp_path: Path, absurd: dict[str, float]) -> None:
+    folders.write_transforms(tmp_path / "transforms", **absurd)
+    if "k3" not in absurd:
+        lens = {**dict.fromkeys(LENS, 0.0), **absurd}
+        folders.write_colmap(
+            tmp_path / "colmap", model=folders.reconstruction("OPENCV", (*FOCAL, *CENTRE, *lens.values()))
+        )
+    for folder in tmp_path.iterdir():
+        with pytest.raises(ValueError, match=r"'(images/)?a.png' cannot be: expected distortion .*OPENCV"):
+            load_scene(folder)
+
+
+def test_lenses_as_strong_as_they_are_made_are_taken(tmp_path: Path) -> None:
+    """An action camera's barrel distortion, and a pincushion; both with corners about a half off the axis."""
+    for name, lens in (("barrel", {"k1": -0.45, "k2": 0.25, "k3": -0.08}), ("pincushion", {"k1": 0.8, "k2": 0.3})):
+        folders.write_transforms(tmp_path / name, **lens)
+        assert len(load_scene(tmp_path / name).frames) == 3
+
+
 def test_a_distorted_picture_stored_smaller_than_its_camera_is_scaled_first(tmp_path: Path) -> None:
     twice = [2 * value for value in LENS_INTRINSICS]
     model = folders.reconstruction("OPENCV", (*twice, *LENS.values()))

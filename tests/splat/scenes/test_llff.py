@@ -58,6 +58,17 @@ def test_llff_sizes_that_cannot_be_are_refused(tmp_path: Path, column: int, valu
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("bounds", [(4.5, 2.0), (-1.0, 4.5), (0.0, 4.5), (2.0, 2.0)])
+def test_llff_depth_ranges_that_cannot_be_are_refused(tmp_path: Path, bounds: tuple[float, float]) -> None:
+    folders.write_llff(tmp_path)
+    rows = np.load(tmp_path / "poses_bounds.npy")
+    rows[1, 15:] = bounds
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    found = rf"{tmp_path}/poses_bounds.npy, got {bounds[0]:g} and {bounds[1]:g} for 'b.png'"
+    with pytest.raises(ValueError, match=f"expected 0 < nearest < farthest depth .* {found}"):
+        load_scene(tmp_path)
+
+
 def test_llff_needs_an_image_for_each_pose(tmp_path: Path) -> None:
     folders.write_llff(tmp_path)
     (tmp_path / "images/b.png").unlink()
