@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.operator import SymmetricOperator, product
+from landscape.operator import SymmetricOperator, product, require_finite
 from landscape.results import Progress
 
 SMALLEST = 1e-140  # a length whose square has all its digits, and those of its parts
@@ -99,10 +99,12 @@ def lanczos(
             basis[i, j] = remainders[i]
             if j:
                 T[i, j - 1, j] = T[i, j, j - 1] = lengths[i]
-        products = product(operator, torch.stack([basis[i, j] for i in running], dim=1)).T
+        products = product(operator, torch.stack([basis[i, j] for i in running], dim=1), finite=False).T
         for i, column in zip(list(running), products, strict=True):
             w = column.clone()[None]
-            size = max(scale, norm(w))
+            length = norm(w)
+            require_finite(operator, isfinite(length))
+            size = max(scale, length)
             T[i, j, j] = orthogonalise(w, basis[i, : j + 1])[j, 0]
             sizes[i], lengths[i] = j + 1, norm(w)
             if is_dust(lengths[i], max(size, float(T[i].abs().max())), operator.dtype):

@@ -45,20 +45,29 @@ def require_vectors(V: Tensor, n: int) -> None:
         raise ValueError(f"expected V of shape (n, k) with n = {n}, got {tuple(V.shape)}")
 
 
-def product(operator: SymmetricOperator, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """H V, which the next call may overwrite.  ValueError where it has another shape or dtype than V, or is not finite."""
+def product(operator: SymmetricOperator, V: Float[Tensor, "n k"], finite: bool = True) -> Float[Tensor, "n k"]:
+    """H V, which the next call may overwrite.  ValueError where it has another shape or dtype than V, or is not finite.
+
+    finite: whether the latter is looked at, for which the host waits; else by `require_finite`, in what comes to it anyway.
+    """
     HV = operator.apply(V)
     if HV.shape != V.shape or HV.dtype != V.dtype:
         raise ValueError(
             f"expected products H V of the shape {tuple(V.shape)} and dtype {V.dtype} of V, got {tuple(HV.shape)} and "
             f"{HV.dtype} in {', '.join(operator.blocks)}"
         )
-    if not torch.isfinite(HV).all():
+    if finite:
+        require_finite(operator, bool(torch.isfinite(HV).all()))
+    return HV
+
+
+def require_finite(operator: SymmetricOperator, finite: bool) -> None:
+    """ValueError that says of whose products it is, unless they are finite."""
+    if not finite:
         raise ValueError(
             f"expected finite products H V, got NaN or infinity in {', '.join(operator.blocks)}; check the parameters with "
             "check_operator"
         )
-    return HV
 
 
 def finished(tensor: Tensor) -> Tensor:

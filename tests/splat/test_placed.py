@@ -100,7 +100,7 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         assert not +placed.waits and not +placed.brought  # so that they can be recorded
         _ = objective.gradient, objective.block_diagonal(), objective.loss(flat), scene_units(objective)
         known = OwnDirections(objective, *objective.own_blocks)
-        _ = known.steepest(1, 1), known.pairs
+        known.steepest(1, 1)
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
         split_control(objective.active, [views[0].camera])
     assert not +placed.mixed
