@@ -32,7 +32,7 @@ from analysis.options import SweepOptions
 from analysis.records import FILE, read_record
 from analysis.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.sweep_progress import Stage, SweepProgress
-from analysis.sweep_results import PROBE, tables, write_results
+from analysis.sweep_results import PROBE, summarize, tables, unfinished, write_results
 from analysis.training import CHECKPOINT, METRICS, planned, resumed
 
 CELL_FAILED = 1
@@ -203,8 +203,11 @@ def _environment(jobs: int) -> dict[str, str]:
 def _conclude(cells: _Cells, stopped: bool) -> int:
     """The tables, and what did not go well; returns the exit code."""
     sweep, console = cells.sweep, Console()
-    for table in tables(write_results(sweep, cells.statuses)):
+    rows = write_results(sweep, cells.statuses)
+    for table in tables(summarize(rows)):
         console.print(table)
+    for line in unfinished(rows):
+        console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
     for line in cells.failed.values():
         console.print(line, style="red", soft_wrap=True, highlight=False, markup=False)
     done = sum(status == "done" for status in cells.statuses.values())
