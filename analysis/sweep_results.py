@@ -10,7 +10,6 @@ OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or 
 OUT/summary.csv   scene, method, and of every number its _mean, its sample standard deviation _std and the count _n
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,8 +22,8 @@ from rich.table import Table
 from analysis.family_table import INDICES
 from analysis.quantities import PLACES, SCORES, quantity
 from analysis.records import read_record
+from analysis.run_files import read_scores
 from analysis.sweep_file import Cell, Sweep
-from analysis.training import METRICS
 from analysis.verdict import attribute_name, of_budgets
 from splat.checkpoint import write_atomically
 
@@ -88,13 +87,13 @@ def summarize(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _metrics(run: Path) -> dict[str, float]:
-    metrics = json.loads((run / METRICS).read_text(encoding="utf-8"))
+    metrics = read_scores(run)
     scores = {
-        f"{prefix}{key}": _scores(metrics[part])[key]
+        f"{prefix}{key}": _scores(metrics.get(part))[key]
         for part, prefix in (("test", ""), ("train", "train_"))
         for key in ("psnr", "ssim", "lpips")
     }
-    seconds = metrics.get("seconds", {})
+    seconds = metrics.get("seconds") or {}
     return {
         **scores,
         "gaussians": metrics["gaussians"],
@@ -104,7 +103,7 @@ def _metrics(run: Path) -> dict[str, float]:
 
 
 def _scores(part: Mapping[str, Any] | None) -> dict[str, float]:
-    """Of the held-out views, where there are any; "Infinity" is a number too."""
+    """Of the held-out views, where there are any."""
     part = part or {}
     return {key: math.nan if part.get(key) is None else float(part[key]) for key in ("psnr", "ssim", "lpips")}
 

@@ -23,7 +23,7 @@ from analysis.spent import Spent
 from analysis.sweep import _Cells, locked, missing, probe_arguments
 from analysis.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.sweep_progress import Stage, SweepProgress
-from analysis.sweep_results import results, summarize, tables, unfinished
+from analysis.sweep_results import REASONS, results, summarize, tables, unfinished
 from splat.checkpoint import load_checkpoint
 from splat.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -240,6 +240,13 @@ def test_a_cell_that_fails_does_not_end_the_sweep(finished, folder, tmp_path, mo
     assert statuses.loc[("3dgs", 1)] == "failed" and statuses.loc[("asp only", 1)] == "done"
 
 
+def test_damaged_scores_end_a_sweep_before_it_starts(finished, folder, tmp_path, no_commands, capsys):
+    path = Path(shutil.copytree(folder / "out", tmp_path / "out")) / "still/3dgs/1/metrics.json"
+    path.write_text("")
+    assert main(["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert f"in {path}, got a damaged file" in " ".join(capsys.readouterr().err.split()) and no_commands == []
+
+
 def test_two_sweeps_do_not_work_in_one_folder(folder, tmp_path, no_commands, capsys):
     with locked(tmp_path):
         assert main(["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path)]) == 2
@@ -307,7 +314,7 @@ def test_ends_whose_search_ran_out_are_said_with_the_cells_and_have_their_reason
         "still/3dgs/0, still/3dgs/1: The search for the smallest eigenvalue ended at its time budget"
     )
     assert "lambda_min_n" in summarize(rows) and not [name for name in summarize(rows) if "reason" in name]
-    assert unfinished(rows[["scene", "method", "seed"]]) == []
+    assert unfinished(rows.drop(columns=list(REASONS))) == []
 
 
 def test_mean_deviation_and_ratio_are_taken_over_the_seeds_of_a_method():
