@@ -11,8 +11,8 @@ Losses are dimensionless; curvatures are loss per squared parameter unit, with r
 Keys (frozen: within a format version keys may be added, none renamed or removed; * marks those that must be there):
 
 format*           name*, version*: see `FORMAT`
-objective         loss: its name; operator: "hessian" or "gauss-newton"; value: L at the checkpoint;
-                  gradient_norm: |dL/dTheta|
+objective         loss: its name; sizes: [width, height] of each view; background: [r, g, b];
+                  operator: "hessian" or "gauss-newton"; value: L at the checkpoint; gradient_norm: |dL/dTheta|
 traces*           one entry per attribute (means, log_scales, quats, opacity_logits, sh):
     value*            trace of the attribute's diagonal block over its active parameters
     standard_error*   of value; 0 where the method is exact
