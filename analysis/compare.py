@@ -24,14 +24,16 @@ from analysis.overrides import leaves
 from analysis.quantities import quantity
 from analysis.records import FILE, read_record
 from analysis.report import pictures_in, template_environment
-from analysis.training import CHECKPOINT, METRICS
+from analysis.run_files import METRICS, read_scores
+from analysis.training import CHECKPOINT
 from analysis.verdict import of_budgets
 from splat.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
 PAGE, TABLE, INDEX, PROBE = "compare.html", "compare.csv", "compare.json", "probe"
 PICTURES = {
     "compare_traces": "Traces by attribute, with their intervals. Filled: positive; open: negative; crossed: not decided.",
-    "compare_densities": "How many directions are at least so curved, down (left) and up (right); dashed: the ends found.",
+    "compare_densities": "How many directions are at least so curved, down (left) and up (right). Thin: each start "
+    "vector's quadrature alone: where these lie apart, its few steps do not decide. Dashed: the ends found.",
     "compare_slices": "The plane of the two steepest directions of each run, in the window that all have, the same colours.",
     "compare_sections": "The loss along the two steepest directions of each run, in steps of parameter units.",
 }
@@ -103,11 +105,7 @@ def _probe(run: Path, device: DeviceName) -> None:
 
 def _metrics(run: Path) -> dict[str, Any]:
     """Nothing of a run that was stopped before it was scored."""
-    path = run / METRICS
-    try:
-        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    except ValueError as error:
-        raise ValueError(f"expected the scores of landscape train in {path}, got a damaged file ({error})") from None
+    return read_scores(run) if (run / METRICS).is_file() else {}
 
 
 def cautions(runs: Sequence[Run]) -> list[str]:

@@ -64,7 +64,7 @@ def comparison(runs: Sequence[Run]) -> list[Row]:
 
 def _about(runs: Sequence[Run]) -> Iterable[Row]:
     configs = [run.checkpoint.training.config for run in runs]
-    seconds = [run.metrics.get("seconds", {}) for run in runs]
+    seconds = [run.metrics.get("seconds") or {} for run in runs]
     yield Row("run", "method", tuple(_method(config.method) for config in configs))
     yield Row("run", "steps", tuple(_plain(run.checkpoint.training.step) for run in runs))
     yield Row("run", "Gaussians", tuple(_plain(run.data["counts"]["gaussians"]) for run in runs))
@@ -129,7 +129,7 @@ def _plain(value: float | str | None, places: int | None = None) -> Entry:
     match value:
         case None:
             return MISSING
-        case str() if value != "Infinity":  # as the metrics have it
+        case str():
             return Entry(value, Cell(value))
         case int():
             return Entry(value, Cell(f"{value:,}"))

@@ -231,7 +231,7 @@ class BenchOptions:
         arg(metavar="[SUBJECT]", help_behavior_hint=""),
     ] = None
     """kernels: the compositing kernels by themselves.
-    stress: errors at the limits of the renderer, against bounds; exit code 1 where one is missed.
+    stress: errors at the limits of the renderer, against bounds; exit code 1 where one is exceeded.  Takes minutes.
     accuracy: work against true error of every estimator, beside peers.
     A scene's folder or a checkpoint: first and second order on it.
     Default: a synthetic scene."""

@@ -24,7 +24,7 @@ def probe_data(findings: Findings, objective: SceneObjective, loss: LossSettings
     """All scalars save timing and provenance."""
     return {
         "objective": {
-            "loss": loss_name(loss),
+            **objective_of(objective, loss),
             "operator": "hessian",
             "value": findings.value,
             "gradient_norm": findings.gradient_norm,
@@ -71,6 +71,15 @@ def loss_name(loss: LossSettings) -> str:
         return pixel
     weighted = pixel if loss.pixel_weight == 1 else f"{loss.pixel_weight:g} {pixel}"
     return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM)"
+
+
+def objective_of(objective: SceneObjective, loss: LossSettings) -> dict[str, Any]:
+    """What, beside the training views, makes the function whose curvature is measured."""
+    return {
+        "loss": loss_name(loss),
+        "sizes": [[view.camera.width, view.camera.height] for view in objective.views],
+        "background": objective.background.tolist(),
+    }
 
 
 def _trace(trace: TraceEstimate) -> dict[str, Any]:

@@ -11,8 +11,8 @@ Losses are dimensionless; curvatures are loss per squared parameter unit, with r
 Keys (frozen: within a format version keys may be added, none renamed or removed; * marks those that must be there):
 
 format*           name*, version*: see `FORMAT`
-objective         loss: its name; operator: "hessian" or "gauss-newton"; value: L at the checkpoint;
-                  gradient_norm: |dL/dTheta|
+objective         loss: its name; sizes: [width, height] of each view; background: [r, g, b];
+                  operator: "hessian" or "gauss-newton"; value: L at the checkpoint; gradient_norm: |dL/dTheta|
 traces*           one entry per attribute (means, log_scales, quats, opacity_logits, sh):
     value*            trace of the attribute's diagonal block over its active parameters
     standard_error*   of value; 0 where the method is exact
@@ -100,9 +100,10 @@ import secrets
 import shutil
 import time
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +153,7 @@ _REQUIRED_KEYS = {
     "timing": ("total",),
     "provenance": ("created", "seed", "versions", "machine"),
 }
+_POINTS = ("points", "evaluated_points", "crossed_points", "holdout_points")
 _NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _ABANDONED_AFTER = 3600.0  # seconds; filling a folder takes seconds: an older partial one is a killed process's
 
@@ -259,7 +261,7 @@ def read_record(folder: str | Path) -> Record:
     except ValueError as error:
         raise ValueError(f"{path}: {error}; {again}") from None
     arrays = {group: _read_arrays(folder / f"{group}.npz", shapes, kind) for group, shapes in raw["arrays"].items()}
-    return Record(folder, _decoded(raw), arrays)
+    return Record(folder, decoded(raw), arrays)
 
 
 def check_layout(data: Mapping[str, Any], kind: Kind = PROBE) -> None:
@@ -276,11 +278,22 @@ def check_layout(data: Mapping[str, Any], kind: Kind = PROBE) -> None:
             missing += [f"{section}.{name}.{key}" for key in required if key not in entry]
         if missing:
             raise ValueError(f'expected the key "{missing[0]}", got none')
+    _require_numbers(data["counts"], "counts", _REQUIRED_KEYS["counts"])
+    notes = data.get("notes", [])
+    if not isinstance(notes, list | tuple) or not all(isinstance(note, str) for note in notes):
+        raise ValueError(f'expected a list of sentences "notes", got {notes!r}')
     for group, shapes in data["arrays"].items():
         if not isinstance(shapes, Mapping):
             raise ValueError(f'expected shapes by name at "arrays.{group}", got {type(shapes).__name__}')
     if data.get("slice") is not None:
         _check_slice(data["slice"], kind)
+
+
+def _require_numbers(entries: Mapping[str, Any], section: str, keys: Iterable[str]) -> None:
+    """Those of the keys that are there."""
+    for key in keys:
+        if not isinstance(entries.get(key, 0), Real):
+            raise ValueError(f'expected a number "{section}.{key}", got {entries[key]!r}')
 
 
 def _check_slice(plane: Any, kind: Kind) -> None:
@@ -291,6 +304,7 @@ def _check_slice(plane: Any, kind: Kind) -> None:
     if not {"loss_scale", "center_loss"} <= set(plane) or len(directions) not in kind.axes:
         axes = " or ".join(map(str, kind.axes))
         raise ValueError(f'expected "slice" to hold "loss_scale", "center_loss" and {axes} "directions"')
+    _require_numbers(plane, "slice", _POINTS)
     for direction in directions:
         if not isinstance(direction, Mapping):
             raise ValueError(f'expected objects in "slice.directions", got {type(direction).__name__}')
@@ -327,14 +341,15 @@ def _encoded(value: Any, where: str) -> Any:
     )
 
 
-def _decoded(value: Any) -> Any:
+def decoded(value: Any) -> Any:
+    """JSON with non-finite numbers as floats."""
     match value:
         case str():
             return _NOT_FINITE.get(value, value)
         case dict():
-            return {key: _decoded(item) for key, item in value.items()}
+            return {key: decoded(item) for key, item in value.items()}
         case list():
-            return [_decoded(item) for item in value]
+            return [decoded(item) for item in value]
     return value
 
 

@@ -28,7 +28,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from analysis.probe_record import counts, loss_name
+from analysis.probe_record import counts, objective_of
 from analysis.slice_directions import Direction
 from landscape import FiniteProbe, Slice
 from splat.curvature import SceneObjective
@@ -57,7 +57,7 @@ def slice_data(found: Found, objective: SceneObjective, loss: LossSettings) -> d
     evaluations = grid.evaluations + (0 if probe is None else probe.evaluations)
     return {
         "objective": {
-            "loss": loss_name(loss),
+            **objective_of(objective, loss),
             "operator": "hessian",
             "value": grid.center_loss,
             "gradient_norm": float(objective.gradient.double().norm()),

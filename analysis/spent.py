@@ -13,10 +13,9 @@ from time import perf_counter, process_time
 
 import torch
 
+from analysis.run_files import SECONDS, read_seconds
 from splat.checkpoint import write_atomically
 from splat.train import Progress
-
-FILE = "seconds.json"
 
 
 @dataclass
@@ -31,11 +30,10 @@ class Spent:
     @classmethod
     def read(cls, run: Path) -> "Spent":
         """That of a run folder; none where it has not been saved yet."""
-        path = run / FILE
-        return cls(**json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else cls()
+        return cls(**read_seconds(run)) if (run / SECONDS).is_file() else cls()
 
     def write(self, run: Path) -> None:
-        write_atomically(run / FILE, (json.dumps(asdict(self)) + "\n").encode())
+        write_atomically(run / SECONDS, (json.dumps(asdict(self)) + "\n").encode())
 
     def timed(self, steps: Iterable[Progress]) -> Iterator[Progress]:
         """The steps, each added up as it is made."""

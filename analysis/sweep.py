@@ -30,10 +30,11 @@ from analysis.drawing import module_environment
 from analysis.interruption import interruption
 from analysis.options import SweepOptions
 from analysis.records import FILE, read_record
+from analysis.run_files import METRICS
 from analysis.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.sweep_progress import Stage, SweepProgress
-from analysis.sweep_results import PROBE, tables, write_results
-from analysis.training import CHECKPOINT, METRICS, planned, resumed
+from analysis.sweep_results import PROBE, summarize, tables, unfinished, write_results
+from analysis.training import CHECKPOINT, planned, resumed
 
 CELL_FAILED = 1
 LOCK = ".lock"
@@ -112,6 +113,7 @@ class _Cells:
 
     def run(self) -> None:
         """All that is missing, so many cells at once, until it is done or Ctrl-C stopped it."""
+        write_results(self.sweep, self.statuses)  # a file that is damaged is refused before hours are spent
         told: set[int] = set()
         cells = [cell for cell in self.sweep.cells if self.to_do[cell.name]]
         with ThreadPoolExecutor(self.jobs) as pool, self.progress:
@@ -203,8 +205,11 @@ def _environment(jobs: int) -> dict[str, str]:
 def _conclude(cells: _Cells, stopped: bool) -> int:
     """The tables, and what did not go well; returns the exit code."""
     sweep, console = cells.sweep, Console()
-    for table in tables(write_results(sweep, cells.statuses)):
+    rows = write_results(sweep, cells.statuses)
+    for table in tables(summarize(rows)):
         console.print(table)
+    for line in unfinished(rows):
+        console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
     for line in cells.failed.values():
         console.print(line, style="red", soft_wrap=True, highlight=False, markup=False)
     done = sum(status == "done" for status in cells.statuses.values())

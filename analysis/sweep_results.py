@@ -3,13 +3,13 @@
 OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or "to do"); of what has been trained: psnr (dB),
                   ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads;
                   wall_ratio, cpu_ratio: over the seconds of the first method, of the same scene and seed; where it was probed,
-                  trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error (standard error or residual), and the
-                  anisotropy indices with _low and _high, without value where one of these is unbounded; with the split
-                  control, split_INDEX: its factor on the index
+                  trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error (standard error or residual), of the latter
+                  also the _reason why the search ended ("... budget": the end may lie farther out), and the anisotropy
+                  indices with _low and _high, without value where one of these is unbounded; with the split control,
+                  split_INDEX: its factor on the index
 OUT/summary.csv   scene, method, and of every number its _mean, its sample standard deviation _std and the count _n
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,26 +22,26 @@ from rich.table import Table
 from analysis.family_table import INDICES
 from analysis.quantities import PLACES, SCORES, quantity
 from analysis.records import read_record
+from analysis.run_files import read_scores
 from analysis.sweep_file import Cell, Sweep
-from analysis.training import METRICS
-from analysis.verdict import attribute_name
+from analysis.verdict import attribute_name, of_budgets
 from splat.checkpoint import write_atomically
 
 RESULTS, SUMMARY, PROBE = "results.csv", "summary.csv", "probe"
 TRAINING = SCORES | {"gaussians": "Gaussians", "wall_ratio": "time ×", "cpu_ratio": "CPU time ×"}
 DECIMALS = PLACES | {"gaussians": 0, "wall_ratio": 2, "cpu_ratio": 2}
 SPLIT = "split_"
+REASONS = {"lambda_max_reason": "max", "lambda_min_reason": "min"}
 ACROSS = 3  # quantities in a table, each with its deviation: as many as 80 columns hold beside scene and method
 
 
 def write_results(sweep: Sweep, statuses: Mapping[str, str]) -> pd.DataFrame:
-    """Write both files from what lies in the folders; returns the summary.  statuses: of each cell, by name."""
+    """Write both files from what lies in the folders; returns the rows.  statuses: of each cell, by name."""
     rows = results(sweep.cells, statuses)
-    summary = summarize(rows)
     sweep.out.mkdir(parents=True, exist_ok=True)
-    for name, frame in ((RESULTS, rows), (SUMMARY, summary)):
+    for name, frame in ((RESULTS, rows), (SUMMARY, summarize(rows))):
         write_atomically(sweep.out / name, frame.to_csv(index=False).encode())
-    return summary
+    return rows
 
 
 def results(cells: Sequence[Cell], statuses: Mapping[str, str]) -> pd.DataFrame:
@@ -78,7 +78,7 @@ def summarize(rows: pd.DataFrame) -> pd.DataFrame:
     >>> summarize(rows).round(3).to_dict("records")
     [{'scene': 'fern', 'method': 'sam', 'psnr_mean': 19.0, 'psnr_std': 1.414, 'psnr_n': 2}]
     """
-    numbers = [name for name in rows if name not in ("scene", "method", "seed", "status")]
+    numbers = [name for name in rows if name not in ("scene", "method", "seed", "status", *REASONS)]
     if not numbers:
         return rows.filter(items=["scene", "method"]).drop_duplicates()
     grouped = rows.groupby(["scene", "method"], sort=False)[numbers].agg(["mean", "std", "count"])
@@ -87,13 +87,13 @@ def summarize(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _metrics(run: Path) -> dict[str, float]:
-    metrics = json.loads((run / METRICS).read_text(encoding="utf-8"))
+    metrics = read_scores(run)
     scores = {
-        f"{prefix}{key}": _scores(metrics[part])[key]
+        f"{prefix}{key}": _scores(metrics.get(part))[key]
         for part, prefix in (("test", ""), ("train", "train_"))
         for key in ("psnr", "ssim", "lpips")
     }
-    seconds = metrics.get("seconds", {})
+    seconds = metrics.get("seconds") or {}
     return {
         **scores,
         "gaussians": metrics["gaussians"],
@@ -103,22 +103,23 @@ def _metrics(run: Path) -> dict[str, float]:
 
 
 def _scores(part: Mapping[str, Any] | None) -> dict[str, float]:
-    """Of the held-out views, where there are any; "Infinity" is a number too."""
+    """Of the held-out views, where there are any."""
     part = part or {}
     return {key: math.nan if part.get(key) is None else float(part[key]) for key in ("psnr", "ssim", "lpips")}
 
 
-def _probe(run: Path) -> dict[str, float | None]:
+def _probe(run: Path) -> dict[str, float | str | None]:
     """Traces, ends and indices of the run's record; nothing without one."""
     if not (run / PROBE).is_dir():
         return {}
     data = read_record(run / PROBE).data
-    row: dict[str, float | None] = {}
+    row: dict[str, float | str | None] = {}
     for name, trace in data["traces"].items():
         row |= {f"trace_{name}": trace["value"], f"trace_{name}_error": trace["standard_error"]}
     for end in ("max", "min"):
         pair = data["eigenvalues"][end]
         row |= {f"lambda_{end}": pair["value"], f"lambda_{end}_error": pair["residual"]}
+    row |= {name: data["eigenvalues"][end].get("reason") or "" for name, end in REASONS.items()}
     for name, index in data["anisotropy"].items():
         row |= {name: _bounded(index), f"{name}_low": index["low"], f"{name}_high": index["high"]}
     whole = [
@@ -130,6 +131,15 @@ def _probe(run: Path) -> dict[str, float | None]:
 def _bounded(index: Mapping[str, Any]) -> float | None:
     """The value that a mean may be taken of: none where the number may be without bound."""
     return None if index["low"] is None or index["high"] is None else index["value"]
+
+
+def unfinished(rows: pd.DataFrame) -> list[str]:
+    """Which ends of the spectrum may lie farther out than the means have them, with the cells."""
+    cells: dict[str, list[str]] = {}
+    for row in rows.reindex(columns=["scene", "method", "seed", *REASONS]).dropna().to_dict("records"):
+        for line in of_budgets({end: {"reason": row[name]} for name, end in REASONS.items()}):
+            cells.setdefault(line.text, []).append(f"{row['scene']}/{row['method']}/{row['seed']}")
+    return [f"{', '.join(names)}: {text}" for text, names in cells.items()]
 
 
 def tables(summary: pd.DataFrame) -> list[Table]:

@@ -35,6 +35,7 @@ from analysis.interruption import interruption
 from analysis.options import TrainOptions
 from analysis.overrides import assignments, leaves, overridden
 from analysis.provenance import provenance
+from analysis.run_files import METRICS
 from analysis.spent import Spent
 from analysis.trajectory import START, Trajectory, TrajectorySettings
 from splat.checkpoint import SceneReference, load_checkpoint, save_checkpoint, write_atomically
@@ -52,7 +53,7 @@ from splat.scenes.view import View
 from splat.start import initial_gaussians
 from splat.train import TrainConfig, Training, train
 
-CHECKPOINT, METRICS, HISTORY, RENDERS = "checkpoint.pt", "metrics.json", "history.csv", "test"
+CHECKPOINT, HISTORY, RENDERS = "checkpoint.pt", "history.csv", "test"
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 OPTIONS = {  # settings of the training that have an option of their own
     "iterations": "iterations",
@@ -109,6 +110,8 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
             **WARNING,
         )
     trajectory = None if along is None else Trajectory(out, training, views, along)
+    if trajectory and (hopeless := trajectory.hopeless):
+        console.print(hopeless, **WARNING)
     if not _follow(training, views, out / CHECKPOINT, reference, options.checkpoint_every, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])
         console.print(f"stopped after step {training.step}; to continue: {again}", soft_wrap=True, highlight=False)
@@ -212,7 +215,7 @@ def _follow(
 ) -> bool:
     """Train to the end with a progress bar and checkpoints; False where a signal ended it, after a checkpoint."""
     total, spent = training.config.iterations, Spent.read(path.parent)
-    warned = trajectory.skipped if trajectory else ""
+    warned = (trajectory.skipped or trajectory.hopeless) if trajectory else ""
     with interruption() as interrupted, _progress(console) as progress:
         bar = progress.add_task("training", total=total, completed=training.step, loss=math.nan, gaussians=0)
         loss = math.nan

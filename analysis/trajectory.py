@@ -156,6 +156,20 @@ class Trajectory:
         remedy = "; --probe-share inf sets no limit to their time" if notes[-1].startswith(NO_TIME) else ""
         return f"{len(notes)} of {len(self.rows)} records of the landscape were skipped ({notes[-1]}){remedy}"
 
+    @property
+    def hopeless(self) -> str:
+        """Before the first record: why every one of this run will be skipped, and what to do; empty where that is not sure.
+
+        The first record's time is that of so many steps, whatever a step takes.
+        """
+        first, last = LEAST * len(self.views) / self.settings.share, self.training.config.iterations
+        if self.rows or last >= first:
+            return ""
+        return (
+            f"every record of the landscape will be skipped: at a share of {self.settings.share:g} of the time of the steps, "
+            f"none fits before step {first:,.0f}, and this run has {last:,}; --probe-share inf sets no limit to their time"
+        )
+
     def _expected(self, step: float) -> float:
         """Seconds that the next record takes at least, where a step takes so many."""
         if isinf(self.settings.share):

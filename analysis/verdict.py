@@ -153,12 +153,15 @@ def _of_needles(where: Mapping[str, Any] | None, counts: Mapping[str, int]) -> l
     """The paper's claim that Gaussians with an ill-conditioned projection dominate the steepest directions."""
     if where is None:
         return []
-    text = (
-        f"The {where['needle_count']:,} of {counts['visible_gaussians']:,} Gaussians in sight with a condition number above "
-        f"100 hold {where['needles']:.0%} of the steepest direction, which is spread over about "
-        f"{quantity(where['participation'])} Gaussians."
-    )
-    return [Line(text)]
+    count, share, spread = where["needle_count"], where["needles"], quantity(where["participation"])
+    among = f"of {counts['visible_gaussians']:,} Gaussians in sight"
+    if not count:
+        text = f"None {among} has a condition number above 100; the steepest direction is spread over about {spread}."
+        return [Line(text)]
+    has, holds = ("has", "holds") if count == 1 else ("have", "hold")
+    held = "under 1%" if 0 < share < 0.005 else f"{share:.0%}"
+    text = f"{count:,} {among} {has} a condition number above 100 and {holds} {held} of the steepest direction"
+    return [Line(f"{text}, which is spread over about {spread} Gaussians.")]
 
 
 def _of_finite_probe(probe: Mapping[str, Any] | None) -> list[Line]:

@@ -2,7 +2,8 @@
 
 compare_traces      |trace| of every attribute with its interval; filled: positive, open: negative, crossed: not decided
 compare_densities   the share of directions whose curvature is at most -x (left) or at least x (right), both axes logarithmic;
-                    means over the start vectors of the quadrature; dashed: the ends of the spectrum
+                    means over the start vectors of the quadrature, thin: each of these alone; dashed: the ends of the
+                    spectrum
 compare_slices      the planes of the two steepest directions, cut to the steps that all slices reach, with the same levels
 compare_sections    the loss along each of these directions, as far as each slice goes
 """
@@ -43,6 +44,7 @@ LEVELS = 12
 ACROSS = 3  # panels in a row
 WIDTH = 5.0  # inches for the panels of a row
 END: dict[str, Any] = {"linestyle": (0, (2, 2)), "linewidth": 0.6}
+ALONE: dict[str, Any] = {"linewidth": 0.4, "alpha": 0.5, "zorder": 1}
 ENDS_ALONE = "the density found none;\nthe ends alone are known"
 BEHIND = {"color": "white", "pad": 1.0}
 TALLEST = 3.0  # inches of a panel
@@ -92,7 +94,10 @@ def draw_densities(records: Records) -> Figure:
             spectrum, found = record.arrays.get("spectrum", {}), record.data["eigenvalues"]
             for axes, sign, end in zip(panels, (-1, 1), ("min", "max"), strict=True):
                 if "nodes" in spectrum and (sign * spectrum["nodes"] > 0).any():
-                    axes.step(*beyond(sign * spectrum["nodes"], spectrum["weights"]), where="pre", **look)
+                    nodes, weights = sign * spectrum["nodes"], spectrum["weights"]
+                    axes.step(*beyond(nodes, weights), where="pre", **look)
+                    for one in range(len(nodes)):
+                        axes.step(*beyond(nodes[one : one + 1], weights[one : one + 1]), where="pre", **look, **ALONE)
                 if sign * (found[end]["value"] or 0) > 0:
                     ends.append(axes.axvline(sign * found[end]["value"], color=look["color"], **END))
         for axes, words in zip(panels, ("down", "up"), strict=True):

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from matplotlib.lines import Line2D
 
 from figures.fig7 import command_line, names_of
-from figures.manifold import Scale, contours, landscape_of, section, surface
+from figures.manifold import Scale, contours, landscape_of, require_same_function, section, surface
 from figures.style import BLACK, RUNS, literal, new_figure, style
 
 RENDERS = "test"
@@ -22,7 +22,9 @@ WIDTH = 4.8  # inches
 
 def draw(runs: Sequence[Path]) -> Figure:
     """Of two runs.  FileNotFoundError or ValueError name the record that is missing and the command that makes it."""
-    names, landscapes, view = names_of(runs), [landscape_of(run) for run in runs], common_view(runs)
+    names, landscapes = names_of(runs), [landscape_of(run) for run in runs]
+    require_same_function(runs)
+    view = common_view(runs)
     scale = Scale.of(*landscapes)
     with style():
         figure = new_figure(7.4)

@@ -17,7 +17,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from figures.manifold import Scale, landscape_of, section, start_of, surface
+from figures.manifold import Scale, landscape_of, require_same_function, section, start_of, surface
 from figures.style import BLUE, RUNS, literal, new_figure, save, style
 from figures.trajectory import index_over_steps, marker_words
 
@@ -31,6 +31,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     """Of two runs.  FileNotFoundError or ValueError name the record that is missing and the command that makes it."""
     names = names_of(runs)
     measured = _measured(runs, names)
+    require_same_function(runs)
     ends, start = [landscape_of(run) for run in runs], start_of(runs[0])
     scale, wide = Scale.of(*ends), Scale.of(start)
     across = scale.holding(start)

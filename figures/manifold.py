@@ -6,6 +6,7 @@ Where a slice was not recorded that far there is nothing.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from analysis.records import PROBE, SLICE, read_record
+from analysis.records import PROBE, SLICE, Record, read_record
 from figures.plane import Plane, plane
 from figures.style import BLACK, FIELD_MAP, MISSING, exponent_of, literal, unit_suffix
 
@@ -27,6 +28,7 @@ ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
 SLICES = (("slice-eigenvectors-2d", SLICE), ("probe", PROBE))  # beside a checkpoint, the first that is there
 LEVELS = 10
 NAMES = ("e₁", "e₂")
+FUNCTION = {"views": "training views", "sizes": "sizes of the views", "loss": "loss", "background": "background"}
 
 
 @dataclass(frozen=True)
@@ -81,17 +83,37 @@ def through_centre(landscape: Plane, axis: int) -> tuple[np.ndarray, np.ma.Maske
     return along.steps, change_of(landscape).take(other.centre, axis=1 - axis)
 
 
+def require_same_function(runs: Sequence[Path]) -> None:
+    """ValueError where the runs' landscapes are those of different functions; what an older record lacks is not compared."""
+    records = [_record_of(run).data for run in runs]
+    found = [record.get("objective", {}) | {"views": record["provenance"].get("views")} for record in records]
+    for key, what in FUNCTION.items():
+        known = {run: each[key] for run, each in zip(runs, found, strict=True) if each.get(key) is not None}
+        for run, value in known.items():
+            first, of_first = next(iter(known.items()))
+            if value != of_first:
+                raise ValueError(
+                    f"expected runs with the same {what}, as their landscapes are not comparable else, got {of_first} in "
+                    f"{first} and {value} in {run}; draw them apart"
+                )
+
+
 def landscape_of(run: Path) -> Plane:
     """The recorded slice around a run's checkpoint, along its two steepest eigenvectors.
 
     FileNotFoundError or ValueError name the record that is missing and the command that makes it.
     """
+    return plane(_record_of(run))
+
+
+def _record_of(run: Path) -> Record:
     if not (run / CHECKPOINT).is_file():
         raise FileNotFoundError(f"expected a run of `landscape train` in {run}, found no {CHECKPOINT} there")
     for name, kind in SLICES:
         if (run / name / kind.file).is_file():
-            found = plane(read_record(run / name))
-            if (found.x.name, found.y.name) != NAMES:
+            found = read_record(run / name)
+            directions = found.data["slice"]["directions"] if found.data["slice"] else ()
+            if tuple(direction["name"] for direction in directions) != NAMES:
                 raise ValueError(
                     f"expected a slice along {' and '.join(NAMES)} in {run / name}, got others; {_slice(run)}"
                 )

@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.transforms import Affine2D
 
 from analysis.quantities import power_of_ten
 from analysis.verdict import ATTRIBUTES, attribute_name
@@ -37,6 +38,7 @@ INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
 UNITS = "traces, eigenvalues: loss per squared parameter unit"
 PANEL = 1.12  # inches of height
 LEGEND_LINE = 0.14
+APART = 0.03  # of a panel's width, between the bars of two runs at the same step, which would hide each other
 
 
 def draw(table: pd.DataFrame) -> Figure:
@@ -81,7 +83,7 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
     Hollow where it is negative.  Of one that has only a lower bound, the bound is drawn, as a triangle; without one, nothing.
     """
     axes.set_yscale("log")
-    for run, colour in runs.items():
+    for i, (run, colour) in enumerate(runs.items()):
         part = pd.DataFrame(measured[(measured["run"] == run) & measured[name].notna()])
         steps, values = part["step"].to_numpy(float), part[name].to_numpy(float)
         magnitudes = np.abs(values)
@@ -91,17 +93,21 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
         shown = np.where(unbounded, low, magnitudes)
         shown[shown == 0] = np.nan  # of which a logarithmic axis has no place
         high = np.where(unbounded, shown, np.fmax(ends.max(axis=0), magnitudes))
-        axes.errorbar(
+        bars = axes.errorbar(
             steps, shown, yerr=np.stack([shown - low, high - shown]), color=colour, linewidth=1.0, elinewidth=0.6,
             capsize=1.2, capthick=0.6,
         )  # fmt: skip
+        drawn = bars.get_children()
         for kind, marker in ((~unbounded, "o"), (unbounded, "^")):
             for sign, face in ((values >= 0, colour), (values < 0, "white")):
                 chosen = kind & sign
-                axes.plot(
+                drawn += axes.plot(
                     steps[chosen], shown[chosen], marker, color=colour, markerfacecolor=face, markersize=3,
                     linestyle="none",
                 )  # fmt: skip
+        aside = Affine2D().translate(APART * (i - (len(runs) - 1) / 2), 0)
+        for artist in drawn:
+            artist.set_transform(axes.transScale + axes.transLimits + aside + axes.transAxes)
     _few_decades(axes)
 
 

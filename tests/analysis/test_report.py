@@ -235,5 +235,11 @@ def test_needles_are_counted_and_notes_are_sentences():
     data["eigenvalues"]["max"]["lives_on"] = {"needles": 0.78, "needle_count": 1, "participation": 1.8}
     data["notes"] = ["the slice was left out"]
     said = sentences(data)
-    assert "The 1 of 9,874 Gaussians in sight with a condition number above 100 hold 78% of the steepest" in said
+    assert "1 of 9,874 Gaussians in sight has a condition number above 100 and holds 78% of the steepest" in said
+    data["eigenvalues"]["max"]["lives_on"] |= {"needles": 0.004, "needle_count": 2}
+    assert "2 of 9,874 Gaussians in sight have a condition number above 100 and hold under 1% of the" in sentences(data)
+    data["eigenvalues"]["max"]["lives_on"] |= {"needles": 0.0, "needle_count": 0}
+    assert "None of 9,874 Gaussians in sight has a condition number above 100; the steepest direction" in sentences(
+        data
+    )
     assert "The slice was left out." in said

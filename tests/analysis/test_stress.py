@@ -70,8 +70,9 @@ def test_the_command_prints_and_writes_every_case_and_says_whether_all_is_well(o
     table = pd.read_csv(tmp_path / "stress.csv")
     assert set(table["case"]) == {one_case, *REFUSALS} and set(table["precision"]) == set(PRECISIONS)
     assert list(table.columns) == list(Finding.__annotations__)
-    shown = capsys.readouterr().out
-    assert "0 missed" in shown and one_case in shown
+    shown = capsys.readouterr()
+    assert "0 outside their bounds" in shown.out and one_case in shown.out
+    assert f"1 of 1: {one_case}" in shown.err.splitlines()
 
 
 def test_one_digit_too_few_is_an_exit_code(one_case, tmp_path, monkeypatch, capsys):

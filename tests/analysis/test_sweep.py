@@ -23,7 +23,7 @@ from analysis.spent import Spent
 from analysis.sweep import _Cells, locked, missing, probe_arguments
 from analysis.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.sweep_progress import Stage, SweepProgress
-from analysis.sweep_results import results, summarize, tables
+from analysis.sweep_results import REASONS, results, summarize, tables, unfinished
 from splat.checkpoint import load_checkpoint
 from splat.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -240,6 +240,13 @@ def test_a_cell_that_fails_does_not_end_the_sweep(finished, folder, tmp_path, mo
     assert statuses.loc[("3dgs", 1)] == "failed" and statuses.loc[("asp only", 1)] == "done"
 
 
+def test_damaged_scores_end_a_sweep_before_it_starts(finished, folder, tmp_path, no_commands, capsys):
+    path = Path(shutil.copytree(folder / "out", tmp_path / "out")) / "still/3dgs/1/metrics.json"
+    path.write_text("")
+    assert main(["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert f"in {path}, got a damaged file" in " ".join(capsys.readouterr().err.split()) and no_commands == []
+
+
 def test_two_sweeps_do_not_work_in_one_folder(folder, tmp_path, no_commands, capsys):
     with locked(tmp_path):
         assert main(["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path)]) == 2
@@ -288,6 +295,26 @@ def test_an_index_of_which_only_a_bound_is_known_is_not_averaged(tmp_path):
     assert rows.iloc[0]["literal_low"] == 34.2 and rows.iloc[0]["saddle"] == pytest.approx(3.1e4 / 220)
     summary = summarize(rows)
     assert summary["saddle_n"].item() == 1 and summary["literal_n"].item() == 0
+
+
+def test_ends_whose_search_ran_out_are_said_with_the_cells_and_have_their_reason_in_the_file(tmp_path):
+    data, arrays = synthetic()  # the smallest eigenvalue's ended at its time
+    cells = [Cell("still", "3dgs", TrainOptions(Path("still"), out=tmp_path / str(i), seed=i)) for i in range(3)]
+    for cell, reason in zip(cells, ("tolerance", "noise floor", None), strict=True):
+        data["eigenvalues"]["max"]["reason"] = reason
+        with record_folder(cell.out / "probe") as partial:
+            write_record(partial, data, arrays)
+        (cell.out / "metrics.json").write_text(json.dumps({"test": {}, "train": {}, "gaussians": 9}))
+    shutil.rmtree(cells[2].out / "probe")
+    rows = results(cells, {cell.name: "done" for cell in cells})
+    assert rows["lambda_min_reason"].tolist()[:2] == ["time budget"] * 2
+    assert rows["lambda_max_reason"].tolist()[:2] == ["tolerance", "noise floor"]
+    (line,) = unfinished(rows)
+    assert line.startswith(
+        "still/3dgs/0, still/3dgs/1: The search for the smallest eigenvalue ended at its time budget"
+    )
+    assert "lambda_min_n" in summarize(rows) and not [name for name in summarize(rows) if "reason" in name]
+    assert unfinished(rows.drop(columns=list(REASONS))) == []
 
 
 def test_mean_deviation_and_ratio_are_taken_over_the_seeds_of_a_method():

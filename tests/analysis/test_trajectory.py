@@ -9,7 +9,7 @@ import torch
 
 from analysis import training as command
 from analysis.cli import main
-from analysis.trajectory import COLUMNS, Trajectory, TrajectorySettings, measure
+from analysis.trajectory import COLUMNS, LEAST, Trajectory, TrajectorySettings, measure
 from splat.checkpoint import load_checkpoint, save_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
 from splat.densify import Densified
@@ -163,14 +163,32 @@ def test_what_does_not_fit_is_skipped_and_time_that_ends_a_record_is_said(run, a
     assert counts.iloc[-1].isdigit()  # beside rows that have none
 
 
-def test_a_training_warns_of_the_first_record_that_it_skips_and_counts_all_at_the_end(scene, capsys):
-    assert main([*arguments(scene, "short"), "--probe-every", str(EVERY), "--probe-share", "1e-9"]) == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if "were skipped" in line]
-    count = len(rows(scene.parent / "short"))
-    assert len(said) == 2 and all("--probe-share inf" in line for line in said)
-    assert said[0].startswith(f"after step {EVERY}: 1 of 1 records") and said[1].startswith(
-        f"{count} of {count} records"
-    )
+def warnings(scene, capsys, name: str) -> list[str]:
+    """What a training whose records do not fit says about them."""
+    assert main([*arguments(scene, name), "--probe-every", str(EVERY), "--probe-share", "1e-9"]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
+    assert all("--probe-share inf" in line for line in said)
+    count = len(rows(scene.parent / name))
+    assert said[-1].startswith(f"{count} of {count} records of the landscape were skipped")
+    return said[:-1]
+
+
+def test_a_training_says_beforehand_that_no_record_will_fit_and_counts_them_at_the_end(scene, capsys):
+    (before,) = warnings(scene, capsys, "hopeless")
+    assert before.startswith("every record of the landscape will be skipped: at a share of 1e-09")
+
+
+def test_a_training_warns_of_the_first_record_that_it_skips(scene, capsys, monkeypatch):
+    monkeypatch.setattr(Trajectory, "hopeless", "")  # one that may fit, as far as is known
+    (after,) = warnings(scene, capsys, "short")
+    assert after.startswith(f"after step {EVERY}: 1 of 1 records")
+
+
+def test_it_is_known_beforehand_from_which_step_on_a_record_may_fit(at_the_end, tmp_path):
+    training, views, _ = at_the_end
+    for share, sure in ((LEAST * len(views) / training.config.iterations, False), (1e-3, True), (float("inf"), False)):
+        trajectory = Trajectory(tmp_path / f"{share}", training, views, TrajectorySettings(EVERY, share))
+        assert bool(trajectory.hopeless) == sure
 
 
 def test_vectors_follow_their_gaussians_and_new_ones_begin_at_zero(at_the_end, tmp_path):

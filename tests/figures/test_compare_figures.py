@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.records import Record
-from figures.compare import beyond, draw_comparison, draw_densities, draw_sections, draw_slices, draw_traces
+from figures.compare import ALONE, beyond, draw_comparison, draw_densities, draw_sections, draw_slices, draw_traces
 from figures.style import RUNS
 from tests.recorded import synthetic
 
@@ -61,6 +61,15 @@ def test_a_density_is_shared_out_among_the_directions_on_both_sides_of_zero(tmp_
     assert up[len(values) // 2] == pytest.approx(np.where(nodes >= middle, weights, 0).sum(axis=1).mean(), rel=1e-12)
     left, right = draw_densities({"one": record, "two": record}).axes
     assert left.get_xlim()[::-1] == right.get_xlim()
+
+
+def test_a_density_shows_how_far_its_start_vectors_lie_apart(tmp_path):
+    (record,) = records(tmp_path, 1.0).values()
+    spectrum = record.arrays["spectrum"]
+    thin = [line for line in draw_densities({"one": record}).axes[1].lines if line.get_alpha() == ALONE["alpha"]]
+    assert len(thin) == len(spectrum["nodes"]) == 3
+    for line, nodes, weights in zip(thin, spectrum["nodes"], spectrum["weights"], strict=True):
+        assert float(np.asarray(line.get_ydata())[0]) == pytest.approx(weights[nodes > 0].sum())
 
 
 def test_a_side_of_which_only_ends_are_known_says_so_and_the_legend_names_them(tmp_path):

@@ -125,6 +125,34 @@ def test_the_index_is_the_recorded_one_of_each_run(runs):
     assert fig7.names_of(runs) == ["3dgs", "stablegs"]
 
 
+@pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
+@pytest.mark.parametrize(
+    ("section", "key", "first", "second", "words"),
+    [
+        ("provenance", "views", ["a", "b"], ["a", "c"], "same training views"),
+        ("objective", "sizes", [[12, 9]], [[24, 18]], "same sizes of the views"),
+        ("objective", "loss", "L1", "L2", "same loss"),
+        ("objective", "background", [0, 0, 0], [1, 1, 1], "same background"),
+    ],
+)
+def test_landscapes_of_different_functions_are_not_drawn_beside_each_other(
+    runs, module, section, key, first, second, words
+):
+    def recorded(run: Path, value: object) -> None:
+        folder = run / "slice-eigenvectors-2d"
+        record = read_record(folder)
+        record.data[section][key] = value
+        with record_folder(folder, SLICE) as anew:
+            write_record(anew, {k: v for k, v in record.data.items() if k != "arrays"}, record.arrays, SLICE)
+
+    recorded(runs[0], first)
+    recorded(runs[1], None)
+    module.draw(runs)  # an older record does not say
+    recorded(runs[1], second)
+    with pytest.raises(ValueError, match=f"expected runs with the {words}.*draw them apart"):
+        module.draw(runs)
+
+
 def test_a_missing_record_is_named_with_the_command_that_makes_it(runs, tmp_path, capsys, monkeypatch):
     def refused(module, words: str) -> None:
         monkeypatch.setattr(sys, "argv", ["figure", *map(str, runs), "--out", str(tmp_path / "out.png")])

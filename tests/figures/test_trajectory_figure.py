@@ -15,7 +15,7 @@ from analysis.trajectories import gathered
 from analysis.trajectory import COLUMNS
 from figures import trajectory
 from figures.style import RUNS
-from figures.trajectory import UNITS
+from figures.trajectory import APART, UNITS
 from tests.figures.test_figures import require_layout
 from tests.recorded import ATTRIBUTES
 
@@ -70,6 +70,22 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
     assert [float(y) for x in bounds for y in np.asarray(x.get_ydata())] == [10.0, 15.0, 20.0] * 2
     gaussians = panels["Gaussians"].lines[0]
     assert list(np.asarray(gaussians.get_ydata())) == [1000, 2000, 3000, 4000]
+
+
+def test_runs_at_the_same_steps_stand_symmetrically_beside_each_other():
+    table = pd.concat([rows().assign(run=name) for name in "abc"])
+    axes = {each.get_title(): each for each in trajectory.draw(table).axes}["|λmax / λmin|"]
+    width = axes.get_window_extent().width
+    at = [
+        (x.get_transform().transform((1000, 4.0)) - axes.transData.transform((1000, 4.0))) / width
+        for x in axes.lines
+        if x.get_linestyle() == "-"
+    ]
+    assert np.asarray(at) == pytest.approx(np.array([[-APART, 0], [0, 0], [APART, 0]]), abs=1e-9)
+    bars = [c.get_transform().transform((1000, 4.0)) for c in axes.collections]
+    assert len({round(float(x), 3) for x, _ in bars}) == 3
+    low, high = axes.get_xlim()
+    assert low < 1000 < 2000 < high
 
 
 def test_powers_of_ten_have_a_line_of_their_own_and_the_legend_says_what_is_open():
