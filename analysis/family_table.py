@@ -7,7 +7,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from analysis.quantities import UNDETERMINED, measured, quantity
+from analysis.quantities import UNDETERMINED, limits, measured, quantity
 from analysis.verdict import attribute_name
 
 INDICES = ("literal", "saddle", "share", "effective_rank", "mass_quantile")
@@ -103,7 +103,7 @@ def bracketed(index: Mapping[str, Any]) -> Cell:
         return Cell(f"≥ {quantity(low)}" if high is None else f"≤ {quantity(high)}", "", note)
     if value is not None and low <= value <= high and high - low < NARROW * abs(value):
         return Cell(measured(value, max(high - value, value - low)), "", note)
-    return Cell(quantity(value), f"{quantity(low)} … {quantity(high)}", note)
+    return Cell(quantity(value), " … ".join(limits(low, high)), note)
 
 
 def _line(row: Mapping[str, Any], several: bool) -> Line:

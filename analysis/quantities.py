@@ -9,6 +9,7 @@ from decimal import Decimal
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
+FINEST = 10  # significant digits
 SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}  # of metrics.json
 PLACES = {"psnr": 2, "ssim": 4, "lpips": 4}
 
@@ -26,7 +27,7 @@ def quantity(value: float | None, error: float | None = None) -> str:
     if error is None or not math.isfinite(error) or error <= 0:
         return _plain(value) if error is None or error == 0 else f"{_plain(value)} ± ?"
     if error < 1e-9 * abs(value):
-        return f"{_plain(value, 10)} ± {_plain(error, 2)}"
+        return f"{_plain(value, FINEST)} ± {_plain(error, 2)}"
     exponent = _exponent(max(abs(value), error))
     places = 1 - _exponent(error)
     if -3 <= exponent <= 3:
@@ -42,6 +43,22 @@ def measured(value: float | None, error: float | None) -> str:
     ('5.00 ± ?', '5.00', '–')
     """
     return quantity(value, math.inf if error is None else error)
+
+
+def limits(low: float | None, high: float | None) -> tuple[str, str]:
+    """Both ends of an interval, to three significant digits or to as many as tell them apart.
+
+    >>> limits(0.17504, 0.17531), limits(None, 2.0), limits(1.0, 1.0)
+    (('0.1750', '0.1753'), ('–', '2.00'), ('1.00', '1.00'))
+    """
+    texts = quantity(low), quantity(high)
+    if low is None or high is None or low == high:
+        return texts
+    for digits in range(4, FINEST + 1):
+        if texts[0] != texts[1]:
+            break
+        texts = _plain(low, digits), _plain(high, digits)
+    return texts
 
 
 def power_of_ten(exponent: int) -> str:

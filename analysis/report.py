@@ -16,7 +16,7 @@ import plotly.io
 from plotly.offline import get_plotlyjs
 
 from analysis.family_table import INDICES, family_lines
-from analysis.quantities import measured, quantity
+from analysis.quantities import limits, measured, quantity
 from analysis.records import Record, read_record
 from analysis.verdict import attribute_name, verdict
 
@@ -57,7 +57,13 @@ def template_environment() -> jinja2.Environment:
 def render_report(record: Record, surface: str | None = None) -> str:
     """The page as text; surface: as for `write_report`."""
     environment = template_environment()
-    environment.filters |= {"quantity": quantity, "measured": measured, "attribute": attribute_name, "cell": _cell}
+    environment.filters |= {
+        "quantity": quantity,
+        "limits": limits,
+        "measured": measured,
+        "attribute": attribute_name,
+        "cell": _cell,
+    }
     surface = embedded_surface(record) if surface is None else surface
     return environment.get_template("report.html.jinja").render(
         data=record.data,

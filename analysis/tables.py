@@ -6,7 +6,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from analysis.quantities import measured, quantity
+from analysis.quantities import limits, measured, quantity
 from analysis.verdict import attribute_name
 
 ENDS = {
@@ -67,7 +67,7 @@ def _index(index: Mapping[str, Any]) -> tuple[str, str, str]:
             return measured(value, max(high - value, value - low)), "", note
         bracket = measured((low + high) / 2, (high - low) / 2)
     else:
-        bracket = f"{quantity(low)} to {quantity(high)}"
+        bracket = " to ".join(limits(low, high))
     return quantity(value), "", f"{bracket} ({note})" if note else bracket
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from analysis.quantities import UNDETERMINED, measured, quantity
+from analysis.quantities import UNDETERMINED, limits, measured, quantity
 
 ATTRIBUTES = {
     "means": "position",
@@ -246,9 +246,11 @@ def _overlap(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
     return abs(abs(first["value"]) - abs(second["value"])) < 2 * math.hypot(*errors)
 
 
-def _bracket(entry: Mapping[str, Any], written: Callable[[float], str] = quantity) -> str:
-    ends = [UNDETERMINED if entry[end] is None else written(entry[end]) for end in ("low", "high")]
-    return "" if ends == [UNDETERMINED] * 2 else f" (between {ends[0]} and {ends[1]})"
+def _bracket(entry: Mapping[str, Any], written: Callable[[float], str] | None = None) -> str:
+    """Between which numbers it lies.  written: how one of them is, where not as `limits` has them."""
+    ends = entry["low"], entry["high"]
+    texts = limits(*ends) if written is None else [UNDETERMINED if end is None else written(end) for end in ends]
+    return "" if ends == (None, None) else f" (between {texts[0]} and {texts[1]})"
 
 
 def _in_brackets(entry: Mapping[str, Any]) -> str:

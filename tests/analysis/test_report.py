@@ -224,6 +224,12 @@ def test_an_unbounded_ratio_is_given_by_its_bound():
     assert "is not determined (the small end is not resolved)" in sentences(data)
 
 
+def test_the_ends_of_a_narrow_interval_are_told_apart():
+    data, _ = synthetic()
+    data["anisotropy"]["saddle"] |= {"value": 2.602, "low": 2.6012, "high": 2.6034}
+    assert "(between 2.601 and 2.603)" in sentences(data)
+
+
 def test_a_share_and_its_bracket_have_the_same_unit():
     data, _ = synthetic()
     data["anisotropy"]["share"] = {"value": 0.008, "low": 0.00627, "high": 0.00954, "note": ""}
