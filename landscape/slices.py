@@ -77,8 +77,7 @@ def evaluate_slice(
     (tensor([4., 1., 0., 1., 4.], dtype=torch.float64), 13, 'tolerance')
     """
     _require_slice(center, directions, coordinates)
-    if (gradient is None) != (operator is None):
-        raise ValueError("expected both gradient and operator for the quadratic model, or neither; got one of them")
+    _require_model(gradient, operator, directions)
     if settings.tolerance is not None and generator is None:
         raise ValueError(
             "expected a generator for the hold-out points of an adaptive slice, got none; "
@@ -124,9 +123,24 @@ def _derivatives(
     spans = directions.detach().double()
     slope = (spans.T @ gradient.double()).cpu()
     if isinstance(operator, Tensor):
-        return slope, operator.cpu()
+        return slope, operator.double().cpu()
     curvature = (spans.T @ product(operator, directions.to(operator.dtype)).double()).cpu()
     return slope, (curvature + curvature.T) / 2
+
+
+def _require_model(
+    gradient: Tensor | None, operator: SymmetricOperator | Float64[Tensor, "d d"] | None, directions: Tensor
+) -> None:
+    if (gradient is None) != (operator is None):
+        raise ValueError("expected both gradient and operator for the quadratic model, or neither; got one of them")
+    n, d = directions.shape
+    for name, given, shape in (("gradient", gradient, (n,)), ("E^T H E", operator, (d, d))):
+        if not isinstance(given, Tensor):
+            continue
+        if given.shape != shape:
+            raise ValueError(f"expected {name} of shape {shape} for the quadratic model, got {tuple(given.shape)}")
+        if not torch.isfinite(given).all():
+            raise ValueError(f"expected finite {name} for the quadratic model, got NaN or infinity")
 
 
 def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Tensor]) -> None:

@@ -120,6 +120,14 @@ def test_bad_slices_are_refused():
         evaluate_slice(quadratic, CENTER, 0 * EIGENVECTORS[:, :2], AXES)
     with pytest.raises(ValueError, match="both gradient and operator"):
         evaluate_slice(quadratic, CENTER, EIGENVECTORS[:, :2], AXES, gradient=G)
+    for gradient, curvature, message in (
+        (torch.nan * G, torch.eye(2), "finite gradient"),
+        (G[:-1], torch.eye(2), "gradient of shape"),
+        (G, torch.inf * torch.eye(2), "finite E.T H E"),
+        (G, torch.eye(3), r"E.T H E of shape \(2, 2\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            evaluate_slice(quadratic, CENTER, EIGENVECTORS[:, :2], AXES, gradient, curvature)
     with pytest.raises(ValueError, match="generator for the hold-out points"):
         evaluate_slice(quadratic, CENTER, EIGENVECTORS[:, :2], AXES)
     with pytest.raises(ValueError, match="coordinates that increase"):
