@@ -28,6 +28,7 @@ from torch import Tensor
 
 from landscape.choice import WORSE, sketch_leaves
 from landscape.control import PartlyKnown
+from landscape.groups import group_sums
 from landscape.operator import SymmetricOperator, product
 from landscape.probes import draw_probes
 from landscape.quadratic import gram
@@ -77,14 +78,13 @@ class DiagonalEstimate:
             raise ValueError(
                 f"expected a group in 0..{count - 1} for each of {len(self.values)} rows, got shape {tuple(groups.shape)}"
             )
-        groups, zero = groups.to(self.values.device), self.values.new_zeros(count)
-        sums = zero.index_add(0, groups, self.values.abs())
+        groups = groups.to(self.values.device)
+        sums = group_sums(self.values.abs(), groups, count)
         probes = self.samples.shape[1]
         if probes == 0:
-            return GroupSums(sums, zero, zero)
-        signed = self.values.new_zeros(count, probes)
-        signed.index_add_(0, groups, self.values.sign()[:, None] * self.samples)
-        excess = zero.index_add(0, groups, _folded_excess(self.values.abs(), self.standard_errors))
+            return GroupSums(sums, torch.zeros_like(sums), torch.zeros_like(sums))
+        signed = group_sums(self.values.sign()[:, None] * self.samples, groups, count)
+        excess = group_sums(_folded_excess(self.values.abs(), self.standard_errors), groups, count)
         return GroupSums(sums, signed.std(dim=1) / sqrt(probes), excess)
 
 

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from landscape.groups import group_sums
 from landscape.operator import require_blocks
 
 SMALLEST_SINE = 1e-6  # of the angle between two directions that span a plane; round-off makes up most of one below
@@ -65,7 +66,7 @@ def random_directions(
 def _lengths(rows: Float[Tensor, "n k"], groups: Int[Tensor, " n"]) -> Float[Tensor, "g k"]:
     """The norm over each group; 1 for numbers that are no parameter's."""
     number = int(groups.max()) + 1
-    squares = rows.new_zeros(number, rows.shape[1]).index_add_(0, groups, rows.square())
+    squares = group_sums(rows.square(), groups, number)
     used = rows.new_zeros(number, dtype=torch.bool).index_fill_(0, groups, True)
     return torch.where(used[:, None], squares.sqrt(), 1.0)
 

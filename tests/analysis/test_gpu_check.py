@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from rich.console import Console
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
-from analysis.gpu_check import Check, agreement, checks_of, in_turn, main, probe, recordings, table, training
+from analysis.gpu_check import PARTS, Check, agreement, checks_of, in_turn, main, probe, recordings, table, training
 from analysis.meters import HostMeter
 from analysis.workloads import Workload
 from splat.curvature import SceneHessian, SceneObjective
@@ -40,6 +41,12 @@ def test_a_device_agrees_with_the_cpu(device, monkeypatch):
     checks = agreement(toy(torch.float64), device)  # in single precision so few Gaussians' traces cancel
     assert [check.name for check in checks][:3] == ["loss", "gradient", "H v"] and len(checks) == 8
     assert all(check.holds for check in checks), checks
+
+
+def test_a_trained_scene_is_compared_in_double_precision_where_no_decision_hangs_on_round_off(monkeypatch):
+    monkeypatch.setattr("analysis.gpu_check.workload_of", lambda path: toy())
+    monkeypatch.setattr("analysis.gpu_check.agreement", lambda workload, device: [workload.gaussians.flat.dtype])
+    assert PARTS["checkpoint"][1](torch.device("cpu"), Path("checkpoint.pt")) == [torch.float64]
 
 
 @pytest.mark.parametrize("off", [0.0, 1.0])

@@ -38,6 +38,13 @@ def test_random_directions_scale_with_the_parameters_and_repeat_with_the_seed():
     assert torch.equal(one, random_directions(CENTER, GROUPS, torch.Generator().manual_seed(2)))
 
 
+def test_on_a_gpu_a_random_direction_is_not_summed_in_the_order_in_which_threads_come(monkeypatch):
+    here = random_directions(CENTER, GROUPS, torch.Generator().manual_seed(0))
+    monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda _tensor: True))
+    monkeypatch.setattr(torch.Tensor, "index_add_", None)
+    assert torch.allclose(random_directions(CENTER, GROUPS, torch.Generator().manual_seed(0)), here, rtol=1e-14, atol=0)
+
+
 def test_a_group_of_zeros_does_not_move_and_numbers_may_be_left_out():
     center = torch.tensor([0.0, 0.0, 2.0])
     d = random_directions(center, torch.tensor([7, 7, 3]), torch.Generator().manual_seed(0))

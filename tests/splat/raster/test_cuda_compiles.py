@@ -26,7 +26,7 @@ def kernels() -> list[tuple]:
     from splat.raster import cuda_binning, cuda_blocks, cuda_compositing, cuda_packing
     from splat.raster.cuda import BLOCK, LAUNCH, ROWS, TILE, TOGETHER
 
-    single = types("fp32")
+    single, double = types("fp32"), types("fp64")  # the latter for a probe's own check and `analysis.gpu_check`
     tiled, blocked = LAUNCH["num_warps"], {"BLOCK": BLOCK}
     strips = {"BLOCK": cuda_binning.BLOCK, "WIDTH": cuda_binning.WIDTH}
     slots = {"WIDTH": cuda_packing.SUMS, "PADDED": 16, "BLOCK": ROWS}
@@ -41,18 +41,22 @@ def kernels() -> list[tuple]:
         (cuda_packing.reduce_gradient, single, blocked, 4),
         (cuda_packing.reduce_curvature, single, blocked, 4),
         (cuda_compositing.forward, single, TILE, tiled),
-        (cuda_compositing.forward, types("fp64"), TILE, tiled),
+        (cuda_compositing.forward, double, TILE, tiled),
         (cuda_compositing.backward, single, TILE | {"ATOMIC": False}, tiled),
         (cuda_compositing.backward, single, TILE | {"ATOMIC": True}, tiled),
         (cuda_compositing.tangent, single, TILE | {"K": TOGETHER}, tiled),
         (cuda_compositing.curvature, single, TILE | {"K": TOGETHER, "ATOMIC": False}, tiled),
         (cuda_blocks.block_moments, single | {"gradient": "*fp32"}, TILE | {"ATOMIC": False}, tiled),
+        (cuda_compositing.backward, double, TILE | {"ATOMIC": False}, tiled),
+        (cuda_compositing.tangent, double, TILE | {"K": TOGETHER}, tiled),
+        (cuda_compositing.curvature, double, TILE | {"K": TOGETHER, "ATOMIC": False}, tiled),
+        (cuda_blocks.block_moments, double, TILE | {"ATOMIC": False}, tiled),
     ]
 
 
 def test_every_kernel_compiles_and_keeps_its_loops_in_registers():
     lines = run_as_script(__file__)
-    assert len(lines) == 15
+    assert len(lines) == 19
     # a number or two, kept outside the loops; Triton 3.6 puts 176 bytes of two curvatures at once there
     most = 16 if tuple(map(int, version("triton").split(".")[:2])) >= (3, 9) else 176
     for line in lines:
