@@ -1,6 +1,6 @@
 """What people use today, on the same operators: SciPy, curvlinops, PyHessian and hessian-eigenthings, as they are published.
 
-SciPy always runs.  The others run where they are installed (`pip install 'splat-landscape[peers]'`); `peer_methods` says which
+SciPy always runs.  The others run where they are installed (`pip install -e '.[peers]'`); `peer_methods` says which
 are not.  Each is given an operator of its own kind around ours, so that its products are counted like ours; nothing of
 its algorithm is changed.  Where a peer finds one end of the spectrum or the eigenvalue of largest magnitude, it is run as its
 users would for both: a run an end, or a second run on H less the eigenvalue found.  Blocks' traces are a run a block.
@@ -41,7 +41,7 @@ def peer_methods(budgets: tuple[int, ...] = BUDGETS) -> tuple[list[Method], list
         try:
             module = importlib.import_module(name)
         except ImportError as error:
-            missing.append(f"{PACKAGES[name]} is left out ({error}); pip install 'splat-landscape[peers]' adds it")
+            missing.append(f"{PACKAGES[name]} is left out ({error}); pip install -e '.[peers]' adds it")
             continue
         methods += build(module, budgets)
     return methods, missing
