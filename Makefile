@@ -1,6 +1,7 @@
 # make demo   install, train and probe a small synthetic scene
 # make test   install, also the developers' tools, then ruff, pyright and pytest
 # make setup  the shared first half: an environment in .venv with everything that the commands need
+# make clean  remove the environment, builds, and all of runs/, trainings too
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin

@@ -63,7 +63,7 @@ from rich.progress import Progress
 from rich.table import Table
 from torch import Tensor
 
-from analysis.accuracy_cases import Case, Meter, matrix_cases, splat_cases
+from analysis.accuracy_cases import Case, MeteredOperator, matrix_cases, splat_cases
 from analysis.accuracy_checkpoint import BUDGETS as FEW_BUDGETS
 from analysis.accuracy_checkpoint import affordable, checkpoint_case
 from analysis.accuracy_methods import BUDGETS, Answer, Method, own_methods
@@ -114,7 +114,7 @@ class Run:
 
 def measure(case: Case, method: Method, seed: int) -> list[Run]:
     """Run a method on a case and compare its answers with the truth."""
-    meter = Meter(case)
+    meter = MeteredOperator(case)
     start = perf_counter()
     answers = method.run(case, meter, seed)
     seconds = perf_counter() - start - meter.spent + meter.seconds

@@ -102,7 +102,7 @@ class Case:
         return extreme_eigenpairs(self.operator, torch.Generator().manual_seed(0))
 
 
-class Meter:
+class MeteredOperator:
     """H itself; counts what is applied and what that costs.
 
     matvecs: vectors applied, and whatever was charged; seconds: in products, at the case's price where there is one;

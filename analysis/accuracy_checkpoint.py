@@ -23,7 +23,6 @@ from landscape.absolute_sum import absolute_sum
 from landscape.anisotropy import effective_rank, mass_quantile
 from landscape.density import ActiveSpace, spectral_density
 from landscape.eigen import EigenSettings, extreme_eigenpairs
-from landscape.results import Progress
 from landscape.trace import TraceSettings, total_trace
 from splat.checkpoint import write_atomically
 from splat.curvature import SceneHessian, SceneObjective
@@ -45,7 +44,7 @@ STARTS, STEPS = 6, 24
 TRUTH = "truth.json"
 
 
-def checkpoint_case(path: Path, out: Path, downscale: float = 1.0, progress: Progress | None = None) -> Case:
+def checkpoint_case(path: Path, out: Path, downscale: float = 1.0) -> Case:
     """The case of a checkpoint; its truth is read from OUT/truth.json, or computed and written there."""
     if not path.is_file():
         raise FileNotFoundError(f"expected a checkpoint as written by `landscape train`, got no file {path}")
@@ -60,7 +59,7 @@ def checkpoint_case(path: Path, out: Path, downscale: float = 1.0, progress: Pro
     stored = out / TRUTH
     kept = json.loads(stored.read_text()) if stored.is_file() else {}
     if kept.get("of") != key:
-        kept = {"of": key, "truth": asdict(_truth(objective, hessian, progress))}
+        kept = {"of": key, "truth": asdict(_truth(objective, hessian))}
         write_atomically(stored, json.dumps(kept, indent=1).encode())
     active = ActiveSpace(hessian.project, hessian.rank)
     return Case(workload.name, "checkpoint", hessian, Truth(**kept["truth"]), None, objective, active)
@@ -71,30 +70,15 @@ def affordable(method: Method) -> bool:
     return method.quantity != "diagonal" and not any(name in method.name for name in LEFT_OUT)
 
 
-def _truth(objective: SceneObjective, hessian: SceneHessian, progress: Progress | None) -> Truth:
+def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:
     def generator(stream: int) -> torch.Generator:
         return torch.Generator().manual_seed(1_000_000 + stream)  # far from the seeds of what is compared
 
-    traces = exact_traces(objective, generator(0), TraceSettings.fixed(SAMPLES), progress)
-    own = objective.block_diagonal()
-    diagonal = own.geometry.double().diagonal(dim1=1, dim2=2).abs()
-    columns = {"means": (0, 3), "log_scales": (3, 6), "quats": (6, 10), "opacity_logits": (10, 11)}
-    scales = {name: float(diagonal[:, a:b].sum()) for name, (a, b) in columns.items()}
-    scales["sh"] = float(own.sh.double().abs().sum())
-    ends = extreme_eigenpairs(
-        hessian, generator(1), EigenSettings(rtol=FINE, basis=128, max_matvecs=MOST), progress=progress
-    )
-    active = ActiveSpace(hessian.project, hessian.rank)
-    density = spectral_density(
-        hessian,
-        generator(2),
-        STARTS * STEPS,
-        STARTS,
-        progress=progress,
-        active=active,
-        ends=ends,
-        trace=total_trace(traces),
-    )
+    traces = exact_traces(objective, generator(0), TraceSettings.fixed(SAMPLES))
+    scales = {name: float(part.abs().sum()) for name, part in objective.block_diagonal().diagonals.items()}
+    ends = extreme_eigenpairs(hessian, generator(1), EigenSettings(rtol=FINE, basis=128, max_matvecs=MOST))
+    active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)
+    density = spectral_density(hessian, generator(2), STARTS * STEPS, STARTS, active=active, ends=ends, trace=trace)
     rank, quantile = effective_rank(ends, density).value, mass_quantile(ends, density).value
     assert rank is not None and quantile is not None
     return Truth(

@@ -23,7 +23,7 @@ from jaxtyping import Float64
 from scipy.stats import t as student
 from torch import Tensor
 
-from analysis.accuracy_cases import Case, Meter
+from analysis.accuracy_cases import Case, MeteredOperator
 from analysis.bench_scene import OPERATIONS
 from landscape.absolute_sum import absolute_sum
 from landscape.anisotropy import effective_rank, mass_quantile
@@ -71,7 +71,7 @@ class Method:
     quantity: str
     name: str
     settings: str
-    run: Callable[[Case, Meter, int], list[Answer]]
+    run: Callable[[Case, MeteredOperator, int], list[Answer]]
     origin: Origin = "own"
     applies: Callable[[Case], bool] = lambda case: True
     estimator: str = ""
@@ -128,7 +128,7 @@ def _traces(
     origin: Origin = "own",
     applies: Callable[[Case], bool] = lambda case: True,
 ) -> Method:
-    def run(_: Case, operator: Meter, seed: int) -> list[Answer]:
+    def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         found = estimate_traces(operator, generator(seed), settings)
         return [Answer(part, x.value, x.standard_error, x.low, x.high) for part, x in found.items()]
 
@@ -136,7 +136,7 @@ def _traces(
 
 
 def _exact(text: str, settings: TraceSettings, origin: Origin = "own") -> Method:
-    def run(case: Case, operator: Meter, seed: int) -> list[Answer]:
+    def run(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         assert case.objective is not None
         found = exact_traces(case.objective, generator(seed), settings)
         passes = 2 if case.objective.couples_pixels else 1
@@ -168,14 +168,14 @@ def _lanczos(
     origin: Origin = "own",
     applies: Callable[[Case], bool] = lambda case: True,
 ) -> Method:
-    def run(_: Case, operator: Meter, seed: int) -> list[Answer]:
+    def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         return end_answers(extreme_eigenpairs(operator, generator(seed), settings))
 
     name = "Lanczos, both ends"
     return Method("ends", name if settings.block == 1 else f"{name}, in blocks", text, run, origin, applies)
 
 
-def _from_own_blocks(case: Case, operator: Meter, seed: int) -> list[Answer]:
+def _from_own_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
     """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
     assert case.objective is not None
     start = OwnDirections(case.objective, case.objective.block_diagonal()).steepest(1, 1)
@@ -183,8 +183,8 @@ def _from_own_blocks(case: Case, operator: Meter, seed: int) -> list[Answer]:
     return end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
 
 
-def _power(settings: PowerSettings) -> Callable[[Case, Meter, int], list[Answer]]:
-    def run(_: Case, operator: Meter, seed: int) -> list[Answer]:
+def _power(settings: PowerSettings) -> Callable[[Case, MeteredOperator, int], list[Answer]]:
+    def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         return end_answers(power_ends(operator, generator(seed), settings))
 
     return run
@@ -212,7 +212,7 @@ def density_methods() -> Iterator[Method]:
 def _density(text: str, origin: Origin, known: bool = False, **division: int) -> Method:
     """known: as a probe has it, which needs traces and ends for themselves: their products do not count."""
 
-    def run(case: Case, operator: Meter, seed: int) -> list[Answer]:
+    def run(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         before = {"ends": case.ends, "trace": (sum(case.truth.traces.values()), 0.0)} if known else {}
         density = spectral_density(operator, generator(seed + 1), active=case.active, **division, **before)
         found = {
@@ -238,7 +238,7 @@ def diagonal_methods() -> Iterator[Method]:
     for probes, (method, name) in product((32, *PROBES), names.items()):
 
         def run(
-            _: Case, operator: Meter, seed: int, probes: int = probes, method: DiagonalMethod = method
+            _: Case, operator: MeteredOperator, seed: int, probes: int = probes, method: DiagonalMethod = method
         ) -> list[Answer]:
             found = estimate_diagonal(operator, generator(seed), probes, method=method)
             freedom = found.samples.shape[1] - 1
@@ -248,7 +248,7 @@ def diagonal_methods() -> Iterator[Method]:
         origin: Origin = "default" if (probes, method) == (32, "auto") else "own"
         yield Method("diagonal", name, f"{probes} probes", run, origin)
 
-    def own_blocks(case: Case, operator: Meter, _: int) -> list[Answer]:
+    def own_blocks(case: Case, operator: MeteredOperator, _: int) -> list[Answer]:
         assert case.objective is not None
         values = block_diagonal(case)
         operator.charge(PASS)

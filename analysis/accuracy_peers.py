@@ -1,6 +1,6 @@
 """What people use today, on the same operators: SciPy, curvlinops, PyHessian and hessian-eigenthings, as they are published.
 
-SciPy always runs.  The others run where they are installed (`pip install 'splat-landscape[peers]'`); `peer_methods` says which
+SciPy always runs.  The others run where they are installed (`pip install -e '.[peers]'`); `peer_methods` says which
 are not.  Each is given an operator of its own kind around ours, so that its products are counted like ours; nothing of
 its algorithm is changed.  Where a peer finds one end of the spectrum or the eigenvalue of largest magnitude, it is run as its
 users would for both: a run an end, or a second run on H less the eigenvalue found.  Blocks' traces are a run a block.
@@ -17,7 +17,7 @@ import torch
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, lobpcg
 from torch import Tensor
 
-from analysis.accuracy_cases import Case, Meter, weighted_quantile
+from analysis.accuracy_cases import Case, MeteredOperator, weighted_quantile
 from analysis.accuracy_methods import BUDGETS, DENSITIES, Answer, Method
 from landscape.operator import RestrictedOperator, SymmetricOperator
 
@@ -41,18 +41,22 @@ def peer_methods(budgets: tuple[int, ...] = BUDGETS) -> tuple[list[Method], list
         try:
             module = importlib.import_module(name)
         except ImportError as error:
-            missing.append(f"{PACKAGES[name]} is left out ({error}); pip install 'splat-landscape[peers]' adds it")
+            missing.append(f"{PACKAGES[name]} is left out ({error}); pip install -e '.[peers]' adds it")
             continue
         methods += build(module, budgets)
     return methods, missing
 
 
 def _method(
-    quantity: str, name: str, settings: str, run: Callable[[Case, Meter, int], list[Answer]], estimator: str = ""
+    quantity: str,
+    name: str,
+    settings: str,
+    run: Callable[[Case, MeteredOperator, int], list[Answer]],
+    estimator: str = "",
 ) -> Method:
     """A peer that draws from torch's global generator draws what the seed says; the generator's state is put back."""
 
-    def seeded(case: Case, operator: Meter, seed: int) -> list[Answer]:
+    def seeded(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             return run(case, operator, seed)
@@ -60,14 +64,14 @@ def _method(
     return Method(quantity, name, settings, seeded, "peer", estimator=estimator)
 
 
-def _by_block(trace: Callable[[SymmetricOperator], Any]) -> Callable[[Case, Meter, int], list[Answer]]:
+def _by_block(trace: Callable[[SymmetricOperator], Any]) -> Callable[[Case, MeteredOperator, int], list[Answer]]:
     def of(operator: SymmetricOperator) -> float:
         try:
             return float(trace(operator))
         except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]; where a sketch is singular
             return nan
 
-    def run(_: Case, operator: Meter, __: int) -> list[Answer]:
+    def run(_: Case, operator: MeteredOperator, __: int) -> list[Answer]:
         return [Answer(name, of(RestrictedOperator(operator, name))) for name in operator.blocks]
 
     return run
@@ -89,15 +93,15 @@ def scipy_operator(operator: SymmetricOperator) -> LinearOperator:
 def scipy_methods() -> Iterator[Method]:
     for tol in (1e-1, 1e-2, 1e-3):
 
-        def both(_: Case, operator: Meter, seed: int, tol: float = tol) -> list[Answer]:
+        def both(_: Case, operator: MeteredOperator, seed: int, tol: float = tol) -> list[Answer]:
             values = _eigsh(operator, seed, 2, "BE", tol)
             return [Answer("largest", values[-1]), Answer("smallest", values[0])]
 
-        def each(_: Case, operator: Meter, seed: int, tol: float = tol) -> list[Answer]:
+        def each(_: Case, operator: MeteredOperator, seed: int, tol: float = tol) -> list[Answer]:
             found = {part: _eigsh(operator, seed, 1, which, tol)[0] for part, which in ENDS.items()}
             return [Answer(part, value) for part, value in found.items()]
 
-        def local(case: Case, operator: Meter, seed: int, tol: float = tol) -> list[Answer]:
+        def local(case: Case, operator: MeteredOperator, seed: int, tol: float = tol) -> list[Answer]:
             start = (
                 np.random.default_rng(seed).standard_normal((operator.dim, 1)).astype(scipy_operator(operator).dtype)
             )
@@ -120,7 +124,7 @@ def scipy_methods() -> Iterator[Method]:
 ENDS = {"largest": "LA", "smallest": "SA"}
 
 
-def _eigsh(operator: Meter, seed: int, k: int, which: str, tol: float) -> list[float]:
+def _eigsh(operator: MeteredOperator, seed: int, k: int, which: str, tol: float) -> list[float]:
     start = np.random.default_rng(seed).standard_normal(operator.dim)
     try:
         options: dict[str, Any] = {"which": which, "v0": start, "tol": tol, "return_eigenvectors": False}
@@ -171,7 +175,7 @@ def _curvlinops(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Method
         for function, name in {"hutchinson_diag": "Hutchinson", "xdiag": "XDiag"}.items():
 
             def diagonal(
-                _: Case, operator: Meter, __: int, function: str = function, probes: int = probes
+                _: Case, operator: MeteredOperator, __: int, function: str = function, probes: int = probes
             ) -> list[Answer]:
                 return [Answer("all", getattr(module, function)(Wrapped(operator), fewer(probes, operator)).double())]
 
@@ -206,7 +210,7 @@ def _pyhessian(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Method]
             yield _method("traces", name, f"{budget} matvecs", _by_block(trace), alike)
     for tol in (1e-2, 1e-3, 1e-5):
 
-        def ends(_: Case, operator: Meter, __: int, tol: float = tol) -> list[Answer]:
+        def ends(_: Case, operator: MeteredOperator, __: int, tol: float = tol) -> list[Answer]:
             first = OnOperator(operator).eigenvalues(maxIter=300, tol=tol)[0][0]
             other = first + OnOperator(operator, first).eigenvalues(maxIter=300, tol=tol)[0][0]
             return _ordered(first, other)
@@ -228,10 +232,18 @@ def _eigenthings(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Metho
 
         return module.LambdaOperator(product, operator.dim, dtype=operator.dtype)
 
+    yield from _eigenthings_traces(module, wrapped, budgets)
+    yield from _eigenthings_ends(module, wrapped)
+    yield from _eigenthings_sums(module, wrapped)
+
+
+def _eigenthings_traces(module: ModuleType, wrapped: Callable[..., Any], budgets: tuple[int, ...]) -> Iterator[Method]:
     for budget in budgets:
         for method, name in {"hutchinson": "Hutchinson", "hutch++": "Hutch++"}.items():
 
-            def traces(_: Case, operator: Meter, seed: int, method: str = method, budget: int = budget) -> list[Answer]:
+            def traces(
+                _: Case, operator: MeteredOperator, seed: int, method: str = method, budget: int = budget
+            ) -> list[Answer]:
                 answers = []
                 for name in operator.blocks:
                     block = wrapped(RestrictedOperator(operator, name))
@@ -240,9 +252,12 @@ def _eigenthings(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Metho
                 return answers
 
             yield _method("traces", f"hessian-eigenthings {name}", f"{budget} matvecs", traces, ALIKE[name])
+
+
+def _eigenthings_ends(module: ModuleType, wrapped: Callable[..., Any]) -> Iterator[Method]:
     for steps in STEPS:
 
-        def each(_: Case, operator: Meter, seed: int, steps: int = steps) -> list[Answer]:
+        def each(_: Case, operator: MeteredOperator, seed: int, steps: int = steps) -> list[Answer]:
             answers = []
             for part, which in ENDS.items():
                 found = module.lanczos(
@@ -251,7 +266,7 @@ def _eigenthings(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Metho
                 answers.append(Answer(part, float(found.eigenvalues[0]), float(found.residuals[0])))
             return answers
 
-        def one_run(_: Case, operator: Meter, seed: int, steps: int = steps) -> list[Answer]:
+        def one_run(_: Case, operator: MeteredOperator, seed: int, steps: int = steps) -> list[Answer]:
             most = min(steps, operator.dim)
             found = module.lanczos(wrapped(operator), k=most, max_iter=most, which="LA", seed=seed)
             ends = {"largest": 0, "smallest": -1}
@@ -261,15 +276,20 @@ def _eigenthings(module: ModuleType, budgets: tuple[int, ...]) -> Iterator[Metho
         yield _method("ends", "hessian-eigenthings Lanczos, all Ritz pairs", f"{steps} steps", one_run)
     for steps in POWER_STEPS:
 
-        def power(_: Case, operator: Meter, seed: int, steps: int = steps) -> list[Answer]:
+        def power(_: Case, operator: MeteredOperator, seed: int, steps: int = steps) -> list[Answer]:
             first = module.power_iteration_one(wrapped(operator), max_iter=steps, seed=seed)[0]
             other = module.power_iteration_one(wrapped(operator, first), max_iter=steps, seed=seed)[0]
             return _ordered(first, first + other)
 
         yield _method("ends", "hessian-eigenthings power iteration", f"{steps} steps an end", power)
+
+
+def _eigenthings_sums(module: ModuleType, wrapped: Callable[..., Any]) -> Iterator[Method]:
     for starts, steps in (*DENSITIES, (6, 32)):
 
-        def sums(case: Case, operator: Meter, seed: int, starts: int = starts, steps: int = steps) -> list[Answer]:
+        def sums(
+            case: Case, operator: MeteredOperator, seed: int, starts: int = starts, steps: int = steps
+        ) -> list[Answer]:
             # it seeds its start vectors one after the other: those of two seeds must not overlap
             found = module.spectral_density(
                 wrapped(operator), num_runs=starts, lanczos_steps=steps, num_grid_points=2, seed=1000 * seed

@@ -1,6 +1,7 @@
 """`landscape bench`: speed and memory of the kernels (`bench_kernels`) and of a scene's first and second order (`bench_scene`).
 
 OUT/kernels.csv   a line a stage and size: milliseconds, and over the prototype's where one was measured
+OUT/kernel_bounds.csv   products over gradients, from the same times
 OUT/bench.csv     a line a time: what was timed (`stage`), why (`study`: stages, or what was scaled), on what, milliseconds
 OUT/bounds.csv    the ratios that the project promises, measured, with their bounds
 OUT/precision.csv what float32 costs at a scene or checkpoint, view by view (`precision`)

@@ -31,8 +31,8 @@ from landscape.operator import SymmetricOperator, finished
 from landscape.probes import split
 from landscape.results import Progress, finite_or_none
 from landscape.trace import total_trace
+from splat.active_spaces import active_spaces
 from splat.curvature import SceneHessian, SceneObjective
-from splat.families import active_spaces
 from splat.metrics import Metric, optimiser_units, scene_size, scene_units
 from splat.own_directions import OwnDirections
 from splat.split_control import SplitControl, split_control

@@ -21,8 +21,8 @@ REPETITIONS = 7  # of the calls that measure a ceiling
 
 
 class Meter(Protocol):
-    """device: where; seconds(call): that a call takes; allocated(call): bytes that it holds at most beside what there was, when
-    it is made for the second time, since some things are made once."""
+    """device: where calls run; seconds(call): the time that a call takes; allocated(call): the most bytes that it allocates at
+    a time, when it is made for the second time: some things are allocated once; fma_peak(): fused multiply-adds a second."""
 
     device: torch.device
 

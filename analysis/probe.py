@@ -21,12 +21,12 @@ from analysis.family_table import family_table
 from analysis.measurement import ProbeSettings, measure
 from analysis.options import ProbeOptions
 from analysis.probe_record import probe_arrays, probe_data
+from analysis.probe_table import probe_table
 from analysis.provenance import provenance, require_seed
 from analysis.recording import write_with_pictures
 from analysis.records import FILE, PROBE, Record, record_folder, require_replaceable
 from analysis.skips import estimator_skips, product_skips
 from analysis.stages import Stages
-from analysis.tables import probe_table
 from analysis.verdict import verdict
 from landscape.distributed import Ranks, torchrun_ranks
 from landscape.probes import split

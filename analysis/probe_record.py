@@ -62,7 +62,8 @@ def probe_arrays(findings: Findings) -> dict[str, dict[str, np.ndarray]]:
 
 
 def loss_name(loss: LossSettings) -> str:
-    """
+    """The loss as a formula in words.
+
     >>> loss_name(LossSettings()), loss_name(LossSettings("charbonnier", 0.0, eps=0.001))
     ('0.8 L1 + 0.2 (1 − SSIM)', 'Charbonnier (eps 0.001)')
     """

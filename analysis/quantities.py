@@ -62,7 +62,8 @@ def limits(low: float | None, high: float | None) -> tuple[str, str]:
 
 
 def power_of_ten(exponent: int) -> str:
-    """
+    """10 to this power, in superscript digits.
+
     >>> power_of_ten(-12)
     '10⁻¹²'
     """

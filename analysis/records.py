@@ -16,17 +16,17 @@ objective         loss: its name; sizes: [width, height] of each view; backgroun
 traces*           one entry per attribute (means, log_scales, quats, opacity_logits, sh):
     value*            trace of the attribute's diagonal block over its active parameters
     standard_error*   of value; 0 where the method is exact
-    low, high         the ends of a t interval at `confidence`, e.g. 0.95
+    low, high         the ends of the interval at `confidence`, e.g. 0.95
     confidence
     sign*             "positive", "negative", "zero", or "undetermined" where the interval does not decide it
     tau*              sqrt(max(value, 0) / dim): the attribute's curvature scale
     dim*              parameters over which tau takes the mean
     probes*           probe vectors used; 0 where the method is exact
     matvecs           products H v spent
-    method*           e.g. "rademacher", "gaussian", "exact"
+    method*           "exact", or "exact, the coupling of pixels sampled with random signs"
     reason            why it stopped: "tolerance", "noise floor", "matvec budget", "time budget" or "exact"
     note              why value is null, what was capped, ...
-eigenvalues*      max*, min* (of the active operator, signed) and power_max, power_min (the paper's power iteration):
+eigenvalues*      max*, second, min* (of the active operator, signed) and power_max, power_min (the paper's power iteration):
     value*            the eigenvalue (Ritz value)
     residual*         |H v - value v| with |v| = 1: a true eigenvalue lies within it
     vector_error      about the sine of the angle between v and the true eigenvector
@@ -68,14 +68,14 @@ slice             null, or:
 counts*           gaussians*, visible_gaussians*, parameters*, active_parameters*, sh_degree_stored*, sh_degree_active*,
                   views*; any further integer under a name that says what was counted
 skipped           what the scene did not need (`analysis.skips`) -> count, seconds_saved (measured, not reproducible; null: not)
-checks*           e.g. symmetry, repeatability, finite_difference, finiteness, each with:
+checks*           symmetry, round_off, finiteness, finite_difference, each with:
     value*, bound*    what was measured and what it must not exceed
     passed*           true, false, or null where the check could not run (see note)
     note
 timing*           stage -> seconds, in the order run; total*
 notes             sentences: what was skipped, capped, or not reached
-provenance*       created*, seed*, versions*, machine* (see `analysis.provenance`); checkpoint, scene, iteration,
-                  command, settings
+provenance*       created*, seed*, versions*, machine* (see `analysis.provenance`); checkpoint, scene, scene_folder, views,
+                  iteration, dtype, threads, command, settings; families: the settings of these, where they were measured
 arrays*           written by `write_record`: group -> name -> shape, one file `group.npz` each
 
 Arrays (all optional):

@@ -15,7 +15,7 @@ import torch
 
 from analysis.run_files import SECONDS, read_seconds
 from splat.checkpoint import write_atomically
-from splat.train import Progress
+from splat.train import StepResult
 
 
 @dataclass
@@ -35,8 +35,8 @@ class Spent:
     def write(self, run: Path) -> None:
         write_atomically(run / SECONDS, (json.dumps(asdict(self)) + "\n").encode())
 
-    def timed(self, steps: Iterable[Progress]) -> Iterator[Progress]:
-        """The steps, each added up as it is made."""
+    def timed(self, steps: Iterable[StepResult]) -> Iterator[StepResult]:
+        """The same steps; the time that each takes is added up as it is made."""
         iterator = iter(steps)
         self.threads = torch.get_num_threads()
         while True:

@@ -34,13 +34,13 @@ def exactly(x: Tensor) -> Tensor:
     return x
 
 
-def roundings(seed: int, step: float = STEP) -> Rounded:
-    """x -> x (1 + step s), s random signs: the relative error of every number, of a known size."""
+def roundings(seed: int) -> Rounded:
+    """x -> x (1 + STEP s), s random signs: the relative error of every number, of a known size."""
     generator = torch.Generator().manual_seed(seed)
 
     def rounded(x: Tensor) -> Tensor:
         signs = torch.randint(0, 2, x.shape, generator=generator, dtype=x.dtype) * 2 - 1
-        return x * (1 + step * signs)
+        return x * (1 + STEP * signs)
 
     return rounded
 

@@ -29,6 +29,7 @@ from rich.console import Console
 from analysis.drawing import module_environment
 from analysis.interruption import interruption
 from analysis.options import SweepOptions
+from analysis.provenance import usable_cores
 from analysis.records import FILE, read_record
 from analysis.run_files import METRICS
 from analysis.sweep_file import Cell, Sweep, arguments, read_sweep
@@ -197,7 +198,7 @@ def _environment(jobs: int) -> dict[str, str]:
     environment = module_environment()
     if jobs > 1:
         given = os.environ.get("OMP_NUM_THREADS", "")
-        share = max(1, (int(given) if given.isdigit() else len(os.sched_getaffinity(0))) // jobs)
+        share = max(1, (int(given) if given.isdigit() else usable_cores()) // jobs)
         environment |= dict.fromkeys(THREADS, str(share))
     return environment
 

@@ -1,7 +1,8 @@
 """How far a sweep is, and about how long it will take: a line for every cell that ends, and a bar.
 
-The rest is estimated from the pace of the steps so far, seconds by the clock up to the last checkpoint, of the same scene and
-method where one is known, else of those that are known; a probe's from those before it, else from the time that it may take.
+The time left is estimated from the pace of the steps up to each run's last checkpoint: that of the same scene and method where
+it is known, else the mean of those that are known.  The time of a probe is estimated from the probes before it, else from the
+time that it may take.
 """
 
 from collections.abc import Mapping

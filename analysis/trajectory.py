@@ -9,9 +9,10 @@ record's eigenvectors: a Gaussian's rows follow it through density control, thos
 from generators of their own, seeded by the run's seed and the step: they change no bit of the training, and do not depend on
 each other but through the start.
 
-Time.  The records together may take `share` of the seconds that the steps have taken so far.  What is not used is left to later
-ones.  A record that is expected not to fit (by what the last one's least work took, before the first by the time of a step) is
-skipped.  The numbers depend on the seed alone where no time ran out, and with share = inf it never does.
+Time.  The records together may take `share` of the seconds that the steps have taken so far.  What one does not use is left to
+later ones.  A record that is not expected to fit is skipped; how long it will take is judged by the last one's least work, and
+before the first one by the time of a step.  The numbers depend on the seed alone where no time ran out; with share = inf it
+never does.
 
 Columns:
 
@@ -39,6 +40,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from analysis.family_table import INDICES
 from analysis.trajectories import NO_TIME, RECORDS
 from landscape import (
     CountingOperator,
@@ -66,7 +68,6 @@ Row = dict[str, Any]
 LEAST = 32  # renders with their gradients, for each view, that the least record takes (measured on 8,000 Gaussians)
 FEWEST_MATVECS = 20  # from a warm start, for the largest eigenvalue
 FEWEST_OF_DENSITY = 16  # products that are worth their time
-INDICES = ("literal", "saddle", "share", "effective_rank", "mass_quantile")
 COLUMNS = (
     "step", "gaussians", "state", "note", "seconds", "time_share", "visible_gaussians", "parameters", "start", "matvecs",
     *(f"trace_{name}{key}" for name in ATTRIBUTES for key in ("", "_error", "_low", "_high", "_dim", "_reason")),
@@ -288,9 +289,8 @@ def _read_rows(path: Path, step: int) -> list[Row]:
     if not path.is_file():
         return []
     with path.open(encoding="utf-8", newline="") as stream:
-        rows: list[Row] = [
-            dict(row) for row in csv.DictReader(stream)
-        ]  # as text, which is written back to the same bits
+        # as text, which is written back to the same bits
+        rows: list[Row] = [dict(row) for row in csv.DictReader(stream)]
     return [row | {"seconds": float(row["seconds"])} for row in rows if int(row["step"]) <= step]
 
 

@@ -5,8 +5,9 @@ which is T with any number a for its last diagonal entry (Golub 1973).  The leas
 measures with these moments are among theirs, as a polynomial of degree 2m - 2 on one side of |x| touches it in m points at
 most.  The least has a node at 0: T(a) is singular.
 
-The value is the mean of the Gauss rule of m - 1 points, which is off to either side as 0 lies between its nodes, and its
-anti-Gauss rule, of T with its last off-diagonal entries times the root of 2, which is off as far to the other (Laurie 1996).
+The value is the mean of two rules.  The Gauss rule of m - 1 points is off to one side or the other, depending on where 0 lies
+between its nodes; its anti-Gauss rule, that of T with its last off-diagonal entries times the root of 2, is off about as far to
+the other side (Laurie 1996).
 
 **Cover** of 95%, over 100 to 300 seeds: 93 to 100% on the spectra of the tests.  Where a few equal eigenvalues are far above
 all others (5 of 100 among 95 of 1), what start vectors see of these is skewed, and Student's interval covers 91 to 94%.

@@ -6,7 +6,7 @@ one vector at a time (the median over spectra with gaps, dense ends and clusters
     time(b) / b * PRODUCTS[b]  <  time(1)
 
 by a tenth at least, which single timings may be off by; else the answer is 1.  Multiple eigenvalues are another reason for
-blocks, that no clock shows.
+blocks, and are not looked for here.
 """
 
 from collections.abc import Callable

@@ -18,15 +18,14 @@ simple.  Uneven ones see directions about 0.03 apart, 30 times what SAME tells f
 
 **Eigenvalues that are known.**  A few eigenvalues that dominate are most of the variance over start vectors.  Eigenpairs that
 were found before are projected out as a null space is, and each is counted as the one eigenvalue that it is, instead of
-(z . v)^2 times.  So are those that the recurrence finds first.  A Ritz pair with a residual of at most SETTLED times its
-distance to the others is an eigenpair; its eigenvalue is simple where two start vectors come to the same eigenvector (of a
-multiple one each sees another).  Its node is
-taken out of the rules of the start vectors that found it, what is left of them being the Gauss rules of what is left of their
-measures, and the start vectors to come are projected off v.
+(z . v)^2 times.  The same is done with those that the first runs find.  A Ritz pair with a residual of at most SETTLED times
+its distance to the others is an eigenpair; its eigenvalue is simple where two start vectors come to the same eigenvector (of a
+multiple one each sees another).  Its node is taken out of the rules of the start vectors that found it; what remains of each is
+the Gauss rule of what remains of its measure.  The start vectors to come are projected off v.
 
-**Few long runs or many short ones.**  For so many products, sum |lambda| is the better known the longer each run is where its
-bounds (`absolute_sum`) are wide or runs still find eigenvalues, and the more runs there are where start vectors differ.
-`Lengths` looks at both while the first runs are under way.
+**Few long runs or many short ones.**  For a given number of products, longer runs make sum |lambda| better known where its
+bounds (`absolute_sum`) are wide or runs still find eigenvalues; more runs do where start vectors differ.  `Lengths` looks at
+both while the first runs are under way.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,9 +46,8 @@ UNEVEN = 0.1  # spread of the squares of a start vector's entries about 1
 SETTLED = 1e-4  # the error of an eigenvector that runs find
 FOUND, CLOSE = 1e-2, 0.1  # of one that was found before, and its residual, as a share of the eigenvalue
 SAME = 1e-6  # by which the squared cosine between two of them may miss 1
-FEWEST_STARTS = (
-    4  # where their number is free: Student's interval of three is half as long again, and kernels like blocks of four
-)
+# where their number is free: Student's interval of three is half as long again, and kernels like blocks of four
+FEWEST_STARTS = 4
 FIRST_LOOK, GROWTH = 12, 4 / 3  # steps
 CONFIDENCE = 0.95  # of the interval that is to be short
 
@@ -80,11 +78,11 @@ def spectral_density(
 ) -> SpectralDensity:
     """Gauss rules of random start vectors.
 
-    matvecs: at most, in all.  starts: so many of them, with runs of equal length; None: runs as long as pays (`Lengths`), and
-    as many as then fit.  longest: the most steps of a run.  batch: vectors at a time (memory: (batch + 1) * longest vectors);
-    runs find eigenvalues where it is 2 or more.  active: leaves the eigenvalues of a known null space out; `dim` of the result
-    is then the rank.  ends: eigenpairs found before.  trace: of the operator, with its standard error, where it is known
-    better than from so few start vectors.
+    matvecs: products in all, at most.  starts: the number of start vectors, with runs of equal length; None: runs as long as
+    pays (`Lengths`), and as many of these as fit.  longest: the most steps of a run.  batch: vectors at a time (memory:
+    (batch + 1) * longest vectors); only where it is 2 or more do runs find eigenvalues.  active: leaves the eigenvalues of a
+    known null space out; `dim` of the result is then the rank.  ends: eigenpairs found before.  trace: of the operator, with
+    its standard error, where it is known better than from so few start vectors.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([5.0, -1.0, *[2.0] * 98], dtype=torch.float64)))

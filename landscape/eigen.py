@@ -3,10 +3,10 @@
 `extreme_eigenpairs` grows one subspace for both ends by a Lanczos recurrence (`krylov`).  A run ends when every
 wanted pair has a residual under max(rtol |lambda|, atol), or under the round-off of the matvec, or at its budget.
 
-A recurrence comes across the ends by itself.  A subspace that grows where the blocks of single Gaussians point (Davidson's
-method, preconditioned by them) takes half the products and less, but may settle beside an end that couplings make: of a scene
-of 13,000 Gaussians (400 steps on lego) it took -0.0149 for the least eigenvalue, -0.0646, in 5 of 6 runs, of one of 1,356 its
-second least in 4 of 6; recurrences from the same starts took both for what they are in all 12.
+Why not Davidson's method?  Preconditioned by the blocks of single Gaussians it takes half the products or less, but it may
+settle beside an end that only the couplings between Gaussians make.  On a scene of 13,000 Gaussians (400 steps on lego) it took
+-0.0149 for the least eigenvalue, which is -0.0646, in 5 of 6 runs; on one of 1,356 it took the second least for the least in 4
+of 6.  A recurrence comes across such ends by itself: from the same starts it found them in all 12 runs.
 """
 
 from time import monotonic

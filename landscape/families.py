@@ -2,8 +2,8 @@
 
 A block's operator is E^T H E: a product with it costs a product with H.  So the budget of a block is small by default: about a
 hundred products.  What it does not resolve shows in the brackets, as `>= ...` where that is the small end.  Runs start from
-random vectors where nothing else leads: what the whole's eigenvectors have in a block saves a tenth of the products, but may
-hide its own end.
+random vectors unless a `Lead` is given.  To start a block from the whole's eigenvectors would save a tenth of the products, but
+may hide the block's own end.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ class FamilySettings:
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """What is known of a part before: where the search for both ends begins, and the trace with its standard error."""
+    """What is known of a part beforehand: where the search for both ends begins, and the trace with its standard error."""
 
     start: Float[Tensor, "n k"] | None = None
     trace: tuple[float, float] | None = None
@@ -70,8 +70,8 @@ def families(
 ) -> dict[str, Family]:
     """The family of each part: "all" and every block by default; a block without rows is left out.
 
-    active: what a known null space leaves of a part; leads: to what is sought.  Every part has random numbers of its own,
-    whatever the others need.
+    active: what a known null space leaves of a part; leads: what is known of it beforehand.  Every part has random numbers of
+    its own, however many the others need.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([4.0, -1.0, 2.0, 1.0]).double()), {"a": slice(0, 2), "b": slice(2, 4)})
@@ -103,7 +103,7 @@ def family(
     progress: Progress | None = None,
     lead: Lead = Lead(),
 ) -> Family:
-    """The family of one operator; active: what its known null space leaves; lead: to what is sought."""
+    """The family of one operator; active: what its known null space leaves; lead: what is known beforehand."""
     rank = operator.dim if active is None else active.rank
     eigen = settings.eigen if rank >= settings.eigen.wanted else EigenSettings(1, 0, rtol=settings.eigen.rtol)
     ends = extreme_eigenpairs(operator, generator, eigen, lead.start, progress)

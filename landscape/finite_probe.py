@@ -93,19 +93,8 @@ def finite_probe(
     """
     _require_probe(center, direction, steps)
     origin, v = center.detach().double(), direction.detach().double()
-    done, total, coarsest = 0, 2 * len(steps) + 1 + noise_points, torch.finfo(torch.float64).eps
-
-    def at(step: float) -> tuple[float, object]:
-        nonlocal done, coarsest
-        found = loss((origin + step * v).to(center.dtype))
-        value, signature = found if isinstance(found, tuple) else (found, None)
-        if isinstance(value, Tensor) and value.is_floating_point():
-            coarsest = max(coarsest, torch.finfo(value.dtype).eps)
-        done += 1
-        if progress:
-            progress(done, total, "finite steps")
-        return float(value), signature
-
+    total = 2 * len(steps) + 1 + noise_points
+    at = _Line(loss, origin, v, center.dtype, total, progress)
     middle, here = at(0.0)
     if not isfinite(middle):
         raise ValueError(f"expected a finite objective at the centre, got {middle}")
@@ -115,7 +104,7 @@ def finite_probe(
     close = [at((k - (noise_points - 1) / 2) * spacing)[0] for k in range(noise_points)]
     ends = [(at(step), at(-step)) for step in steps]
     seen = [middle, *close, *(value for pair in ends for value, _ in pair)]
-    noise = max(evaluation_noise(close), max(coarsest, resolution(seen)) * abs(middle))
+    noise = max(evaluation_noise(close), max(at.coarsest, resolution(seen)) * abs(middle))
     d = torch.tensor(steps, dtype=torch.float64)
     rises = torch.tensor([(ahead[0] - middle) + (behind[0] - middle) for ahead, behind in ends], dtype=torch.float64)
     other = torch.tensor([ahead[1] != here or behind[1] != here for ahead, behind in ends])
@@ -133,6 +122,28 @@ def finite_probe(
         noise=noise,
         evaluations=total,
     )
+
+
+class _Line:
+    """The objective along the direction.  coarsest: the largest eps of the numbers that it has returned so far."""
+
+    def __init__(
+        self, loss: Loss, origin: Tensor, v: Tensor, dtype: torch.dtype, total: int, progress: Progress | None
+    ) -> None:
+        self.loss, self.origin, self.v, self.dtype = loss, origin, v, dtype
+        self.done, self.total, self.progress = 0, total, progress
+        self.coarsest = torch.finfo(torch.float64).eps
+
+    def __call__(self, step: float) -> tuple[float, object]:
+        """Value and signature at this step, in multiples of the direction."""
+        found = self.loss((self.origin + step * self.v).to(self.dtype))
+        value, signature = found if isinstance(found, tuple) else (found, None)
+        if isinstance(value, Tensor) and value.is_floating_point():
+            self.coarsest = max(self.coarsest, torch.finfo(value.dtype).eps)
+        self.done += 1
+        if self.progress:
+            self.progress(self.done, self.total, "finite steps")
+        return float(value), signature
 
 
 def resolution(values: Sequence[float]) -> float:

@@ -137,9 +137,8 @@ class Hutchinson:
         forms = 1 if self.part is None else 2  # H, and the part of it that is known
         self.samples = torch.empty(forms, len(rows), 0, dtype=torch.float64)
         self.groups: dict[str, list[PowerSums]] = {name: [] for name in rows}
-        self.current: list[
-            tuple[Tensor, ...]
-        ] = []  # Z, H Z and where there is a known part K Z, that are in no group yet
+        # Z, H Z and, where there is a known part, K Z of the probes that are in no group yet
+        self.current: list[tuple[Tensor, ...]] = []
 
     def estimate(
         self, done_before: int = 0, most: int = 0, progress: Progress | None = None

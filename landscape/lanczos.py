@@ -30,12 +30,10 @@ class LanczosFactorization:
     r: Float[Tensor, " n"]
 
 
-def orthogonalise(
-    vectors: Float[Tensor, "b n"], basis: Float[Tensor, "m n"], passes: int = 2
-) -> Float64[Tensor, "m b"]:
+def orthogonalise(vectors: Float[Tensor, "b n"], basis: Float[Tensor, "m n"]) -> Float64[Tensor, "m b"]:
     """Remove from vectors, in place, their components along the orthonormal rows of basis; return these, on the CPU."""
     components = basis.new_zeros(basis.shape[0], vectors.shape[0], dtype=torch.float64)
-    for _ in range(passes):
+    for _ in range(2):  # "twice is enough"
         part = basis @ vectors.T
         vectors.addmm_(part.T, basis, alpha=-1)
         components += part.double()

@@ -147,8 +147,8 @@ class EigenEnds:
 
     beyond: with the probability 0.99 over the random start, no eigenvalue lies farther than this outside
         [smallest[0], largest[0]] (a worst-case bound over all spectra, far from sharp; infinite where there is none).
-    noise: of one matvec of a unit vector, round-off for one: measured where a goal was near it; else as the asymmetry of its
-        components shows it (nan: not seen).
+    noise: the error of one matvec of a unit vector, its round-off and any other: measured where a goal was near it; else as
+        the asymmetry of its components shows it (nan: not seen).
     ritz: all approximate eigenvalues of the last basis, ascending, and estimates of their residuals, as two rows; None
         where the method has no basis.
     """

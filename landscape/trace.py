@@ -42,7 +42,7 @@ def total_trace(traces: Mapping[str, TraceEstimate]) -> tuple[float, float]:
 
     Of few samples it is that of a normal law with the same interval.
     """
-    errors = [(x.high - x.low) / 2 / NormalDist().inv_cdf((1 + x.confidence) / 2) for x in traces.values()]
+    errors = [x.half_width / NormalDist().inv_cdf((1 + x.confidence) / 2) for x in traces.values()]
     return sum(x.value for x in traces.values()), sum(errors)
 
 

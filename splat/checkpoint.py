@@ -110,9 +110,9 @@ class Checkpoint:
     torch_version: str
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
-        """The scene of the checkpoint at path, or the one in the folder scene, with the views of the training; without a
-        COLMAP model's points, which gave the Gaussians their start.
+        """The scene of the checkpoint at path, or the one in the folder scene, with the views of the training.
 
+        A COLMAP model's points, from which the Gaussians started, are not read again.
         FileNotFoundError where there is none; ValueError where it lacks a view or has one of another size.
         """
         reference = self.scene

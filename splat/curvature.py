@@ -38,7 +38,7 @@ class NothingInSight(ValueError):
 
 
 def free_memory(device: torch.device) -> int:
-    """Bytes, where the Gaussians are; of a GPU's also those that torch holds for tensors to come."""
+    """Free bytes where the Gaussians are; on a GPU with those that torch holds for tensors to come."""
     if device.type != "cuda":
         return psutil.virtual_memory().available
     held = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
@@ -132,7 +132,7 @@ class SceneObjective:
         return seen
 
     def of_views(self, count: int) -> "SceneObjective":
-        """The mean over the first so many views alone; what is held still is shared."""
+        """The objective over the first `count` views alone; what is held still is shared."""
         part = copy(self)
         part.views, part._losses = self.views[:count], self._losses[:count]
         for name in ("gradient", "own_blocks", "pixelwise_blocks"):  # those of all views

@@ -57,7 +57,7 @@ def _lack() -> str | None:
     if not torch.cuda.is_available():
         return "none that torch can use; look whether nvidia-smi lists one and its driver is new enough"
     if find_spec("triton") is None:
-        return "no triton to compile its kernels; pip install splat-landscape[gpu]"
+        return "no triton to compile its kernels; pip install -e '.[gpu]'"
     return None
 
 

@@ -75,9 +75,6 @@ class OwnBlocks:
     def __add__(self, other: "OwnBlocks") -> "OwnBlocks":
         return OwnBlocks(self.geometry + other.geometry, self.sh + other.sh)
 
-    def __mul__(self, factor: float) -> "OwnBlocks":
-        return OwnBlocks(self.geometry * factor, self.sh * factor)
-
     def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
         """Trace of each attribute's block, summed in double precision; without the radial directions of unit quats.
 

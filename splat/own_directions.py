@@ -1,4 +1,4 @@
-"""The Hessian's blocks of single Gaussians, taken apart: where the search for the ends of the spectrum begins.
+"""Eigenvectors of the Hessian's blocks of single Gaussians: where the search for the ends of the spectrum begins.
 
 Steep eigenvectors of a scene live on one or two Gaussians, and the block of a Gaussian's own rows, but for its colours, is
 known exactly (`linearize.OwnBlocks`).  Their eigenvectors, at right angles to the quaternions' lengths as in
@@ -7,16 +7,16 @@ known exactly (`linearize.OwnBlocks`).  Their eigenvectors, at right angles to t
 Where the loss couples pixels, its curvature l'' is known pixel by pixel only, which is too much: SSIM does not care for what
 changes a window evenly.  Of an image u the window's blur B keeps the share rho = |B u|^2 / |u|^2, and that share of the
 pixelwise part does not count.  A splat that is moved across its narrower axis changes by the slope of a Gaussian, so with its
-conic C, c the larger eigenvalue of C, and the window's sigma
+conic C (c: its larger eigenvalue) and the window's sigma
 
     rho = 1 / ((1 + sigma^2 c) sqrt(det(1 + sigma^2 C)))
 
-on average over the views.  Of the pixelwise part (1 - rho) / (1 - rho_1) is kept, rho_1 of a single pixel, which the diagonal
-of l'' leaves out already (of an L2 loss's curvature beside SSIM's too much is left out: the pass does not tell them apart).  On
-twelve scenes of 50 to 100 Gaussians the six steepest values at either end are so off by 4% of the steepest on average, by 27%
-as they are pixel by pixel; fern's largest (8,000 Gaussians, 3 views) is 254 for 252.
+on average over the views.  Of the pixelwise part (1 - rho) / (1 - rho_1) is kept; rho_1 is that of a single pixel, which the
+diagonal of l'' leaves out already.  (Of an L2 loss's curvature beside SSIM's too much is left out: the pass does not tell them
+apart.)  On twelve scenes of 50 to 100 Gaussians this puts the six steepest values at either end off by 4% of the steepest on
+average, in place of 27% without it; fern's largest (8,000 Gaussians, 3 views) is estimated as 254 and is 252.
 
-On those twelve scenes a recurrence from the steepest takes 12.4 products, from a random vector 15.2.
+On those twelve scenes a recurrence from the steepest takes 12.4 products, one from a random vector 15.2.
 """
 
 from math import inf, pi
@@ -42,10 +42,10 @@ Ends = tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]
 
 
 class OwnDirections:
-    """Of the scene's Hessian, or of its block of one attribute but colours; in a metric, of D H D.
+    """Eigenpairs of the Gaussians' own blocks of the scene's Hessian H; in a metric, of D H D.
 
-    own: of the Hessian, or of its Gauss-Newton part; pixelwise: of that part, where the loss couples pixels.  attribute: all by
-    default; scale: D, above 0, 1 by default.
+    own: the blocks of H, or of its Gauss-Newton part; pixelwise: those of that part, where the loss couples pixels.  attribute:
+    any but "sh"; all of these by default.  scale: D, above 0; 1 by default.
     """
 
     def __init__(

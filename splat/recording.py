@@ -37,10 +37,10 @@ class _Recording:
 
 
 class Recordings:
-    """Of one function of blocks of vectors (p, k): one for every k, made at the third call with as many.
+    """The recordings of one function of blocks of vectors (p, k): one for every k, made at the third call with that k.
 
-    capture: runs a call without arguments and gives its result and what repeats its launches.  Where that fails a warning says
-    so, and the function is called from then on.
+    capture: runs a call without arguments and gives its result and a function that repeats its launches.  Where that fails, a
+    warning says so, and the function itself is called from then on.
     """
 
     def __init__(self, capture: Capture):

@@ -14,7 +14,7 @@ from splat.raster.functions import project_by_kernel, rasterize_by_kernel
 from splat.raster.reference import rasterize_reference
 from splat.settings import RenderSettings
 
-Backend = Literal["cpu", "reference"]
+Backend = Literal["kernels", "reference"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +39,12 @@ def render(
     *,
     depth: bool = False,
     opacity_gain: Float[Tensor, " n"] | None = None,
-    backend: Backend = "cpu",
+    backend: Backend = "kernels",
 ) -> Rendering:
     """Colour, accumulated alpha and, if asked for, expected depth of one view; twice differentiable.
 
     background: black where None.  opacity_gain: multiplies the opacities, may exceed 1, 0 hides a Gaussian; a constant.
-    backend: "cpu" the kernels, "reference" plain torch (slow, any number of derivatives).
+    backend: "kernels" those of where the Gaussians are, "reference" plain torch (slow, any number of derivatives).
     Raises ValueError where a parameter is not finite.
     """
     gaussians.require_finite()

@@ -38,6 +38,7 @@ NEIGHBOURS = 3
 SMALLEST_SCALE = sqrt(1e-7)  # of the median scale: for points that coincide with three others
 NEAR, FAR = 0.5, 1.5  # of the distance to the cameras' common target; Blender's 4 gives its usual 2 and 6
 MAX_DRAWS = 200  # per random point wanted
+SEEN_BY = 2  # views at least, or all if they are fewer
 
 
 def initial_gaussians(
@@ -47,26 +48,23 @@ def initial_gaussians(
     *,
     generator: torch.Generator,
     random_points: int = 10_000,
-    min_views: int = 2,
     source: Source = "scene",
 ) -> Gaussians:
     """From the points of the source.  Same generator state, same Gaussians."""
     if source == "points" and scene.points is None:
         raise ValueError(f"expected a scene with points, {scene.root} has none; start from triangulated or random ones")
     if source == "triangulated":
-        return gaussians_from_points(triangulated_points(views), views, sh_degree, min_views)
+        return gaussians_from_points(triangulated_points(views), views, sh_degree)
     if source != "random" and scene.points is not None:
-        return gaussians_from_points(scene.points, views, sh_degree, min_views)
+        return gaussians_from_points(scene.points, views, sh_degree)
     ranges = [frame.depth_range for frame in scene.select([view.name for view in views])]
-    points = points_in_common_volume(views, random_points, generator, ranges, min_views)
-    return gaussians_from_points(points, views, sh_degree, min_views)
+    points = points_in_common_volume(views, random_points, generator, ranges)
+    return gaussians_from_points(points, views, sh_degree)
 
 
-def gaussians_from_points(
-    points: Points, views: Sequence[View | Frame], sh_degree: int = 3, min_views: int = 2
-) -> Gaussians:
-    """float32 Gaussians at the points that at least min_views (or all, if they are fewer) of the views see."""
-    needed = min(min_views, len(views))
+def gaussians_from_points(points: Points, views: Sequence[View | Frame], sh_degree: int = 3) -> Gaussians:
+    """float32 Gaussians at the points that SEEN_BY of the views see."""
+    needed = min(SEEN_BY, len(views))
     seen = points.sightings(views) >= needed
     kept, n = points.xyz[seen], int(seen.sum())
     if n <= NEIGHBOURS:
@@ -102,9 +100,8 @@ def points_in_common_volume(
     n: int,
     generator: torch.Generator,
     depth_ranges: Sequence[tuple[float, float] | None] | None = None,
-    min_views: int = 2,
 ) -> Points:
-    """n random points that at least min_views (or all, if they are fewer) of the views see, and none as transparent.
+    """n random points that SEEN_BY of the views see, and none as transparent.
 
     depth_ranges: (near, far) of each view, world units; None derives it from where the cameras look.
     """
@@ -112,7 +109,7 @@ def points_in_common_volume(
         raise ValueError(f"expected at least 1 random point, got {n}")
     given = depth_ranges or [None] * len(views)
     ranges = [own or _range_around_target(views, view.camera) for view, own in zip(views, given, strict=True)]
-    needed, kept, draws = min(min_views, len(views)), [], 0
+    needed, kept, draws = min(SEEN_BY, len(views)), [], 0
     while (found := sum(len(xyz) for xyz, _ in kept)) < n:
         if draws >= MAX_DRAWS * n:
             raise ValueError(

@@ -124,8 +124,11 @@ class _Block:
 
 
 def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> float:
-    """The standard error of samples at control = mean on the line through them: for few samples often more than the spread of
-    the controlled ones says, because their slopes share it.  0 where the control does not vary."""
+    """The standard error of the regression line through (control, samples) at control = mean.
+
+    With few samples it is often larger than the spread of the controlled samples, whose slopes have much of it in common.  0
+    where the control does not vary.
+    """
     count, centred = len(samples), control - control.mean()
     spread = float(centred.square().sum())
     if count < 3 or spread == 0:

@@ -114,7 +114,7 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
-class Progress:
+class StepResult:
     """One step done: its number, the loss before its update, the Gaussians after it, and the view's name."""
 
     step: int
@@ -247,7 +247,7 @@ def with_background(view: View, old: Float[Tensor, "3"], new: Float[Tensor, "3"]
     return view.image + (1 - view.alpha) * (new - old)[:, None, None]
 
 
-def train(training: Training, views: Sequence[View]) -> Iterator[Progress]:
+def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
     """Make the steps that are left of config.iterations, one each time the next item is asked for.
 
     Between two items `training` is whole, so that it can be saved, evaluated or left there.
@@ -271,7 +271,7 @@ def train(training: Training, views: Sequence[View]) -> Iterator[Progress]:
         training.control_density(number, camera, base)
         regularizer.after(step)
         training.step = number
-        yield Progress(number, base.loss, len(training.gaussians), views[step.chosen].name)
+        yield StepResult(number, base.loss, len(training.gaussians), views[step.chosen].name)
 
 
 def _require_finite(what: str, value: float, step: Step) -> None:

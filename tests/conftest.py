@@ -37,5 +37,5 @@ def lego() -> Path:
 @pytest.fixture
 def device() -> torch.device:
     """Where the kernels for GPUs run: a GPU, or else the CPU with Triton's interpreter."""
-    pytest.importorskip("triton", reason="the kernels for GPUs need triton; install splat-landscape[gpu]")
+    pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip install -e '.[gpu]'")
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -52,7 +52,7 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
         },
         "checks": {
             "symmetry": {"value": 3e-7, "bound": 1e-5, "passed": True},
-            "repeatability": {"value": 0.0, "bound": 1e-6, "passed": True},
+            "round_off": {"value": 0.0, "bound": 1e-6, "passed": True},
             "finite_difference": {
                 "value": None,
                 "bound": 1e-3,

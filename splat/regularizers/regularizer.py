@@ -68,7 +68,7 @@ class Regularizer:
         self.history: list[Row] = []
 
     def begin(self, training: "Training", views: Sequence[View]) -> None:
-        """Steps are about to be made on these views; said once more changes nothing.  ValueError where they lack what the
+        """Steps are about to be made on these views; a second call changes nothing.  ValueError where the views lack what the
         method needs."""
 
     def opacity_gain(self, step: Step) -> Float[Tensor, " n"] | None:

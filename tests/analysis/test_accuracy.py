@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import analysis.accuracy as accuracy
 from analysis.accuracy import Run, measure, precision_runs, truth_of
-from analysis.accuracy_cases import Case, Meter, Truth, matrix_cases, spectra, splat_case, splat_cases
+from analysis.accuracy_cases import Case, MeteredOperator, Truth, matrix_cases, spectra, splat_case, splat_cases
 from analysis.accuracy_methods import JACOBIAN, PASS, Answer, Method, own_methods
 from analysis.accuracy_peers import PACKAGES, peer_methods, scipy_methods
 from analysis.accuracy_ratios import needed, points, ratios
@@ -121,7 +121,7 @@ def test_fixed_budgets_are_spent(matrix):
 
 
 def test_products_with_a_block_are_those_of_the_whole(matrix):
-    meter, V = Meter(matrix), torch.zeros(60, 2, dtype=torch.float64)
+    meter, V = MeteredOperator(matrix), torch.zeros(60, 2, dtype=torch.float64)
     V[24:60] = torch.randn(36, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert float((meter.apply(V) - matrix.operator.matrix @ V).abs().max()) < 1e-13 * 27 * 8
     assert not meter.apply(torch.zeros(60, 1, dtype=torch.float64)).any() and meter.matvecs == 3

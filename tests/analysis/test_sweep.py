@@ -18,6 +18,7 @@ from rich.console import Console
 
 from analysis.cli import main
 from analysis.options import TrainOptions
+from analysis.provenance import usable_cores
 from analysis.records import record_folder, write_record
 from analysis.spent import Spent
 from analysis.sweep import _Cells, locked, missing, probe_arguments
@@ -281,7 +282,7 @@ def test_the_results_are_the_runs_own_metrics(finished, folder):
         assert (row["psnr"], row["train_ssim"]) == (metrics["test"]["psnr"], metrics["train"]["ssim"])
         assert row["gaussians"] == len(load_checkpoint(cell.out / "checkpoint.pt").training.gaussians)
         assert row["wall_seconds"] == metrics["seconds"]["wall"] > 0 and metrics["seconds"]["step"] == 12
-        assert row["threads"] == max(1, int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0)))) // 2)
+        assert row["threads"] == max(1, int(os.environ.get("OMP_NUM_THREADS", usable_cores())) // 2)
 
 
 def test_an_index_of_which_only_a_bound_is_known_is_not_averaged(tmp_path):

@@ -35,7 +35,7 @@ def compile_kernel(kernel: Any, types: dict[str, str], constants: dict[str, Any]
 
 def run_as_script(path: str) -> list[str]:
     """The lines that a test file prints when it is run as a script, where kernels can be compiled."""
-    triton = pytest.importorskip("triton", reason="the kernels for GPUs need triton; install splat-landscape[gpu]")
+    triton = pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip install -e '.[gpu]'")
     if not (Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "ptxas").exists():
         pytest.skip("this build of triton has no assembler for NVIDIA GPUs")
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}

@@ -15,7 +15,7 @@ def test_the_cpu_is_the_cpu_and_no_work_for_triton():
     [
         (None, False, True, "got torch .*, which was built without CUDA; install"),
         ("13.0", False, True, "got none that torch can use; look whether nvidia-smi"),
-        ("13.0", True, False, r"got no triton to compile its kernels; pip install splat-landscape\[gpu\]"),
+        ("13.0", True, False, r"got no triton to compile its kernels; pip install -e '\.\[gpu\]'"),
     ],
 )
 def test_a_gpu_that_cannot_be_used_is_one_clear_sentence_or_the_cpu_where_that_is_left_open(

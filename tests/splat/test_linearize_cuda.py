@@ -111,7 +111,7 @@ def test_images_on_the_gpu_are_twice_differentiable(gpu):
     view, gaussians = views()[0], scene(torch.float64)
     weight = random_like((3, 12, 18), 4)
     found = []
-    cases: list[tuple[Backend, Gaussians]] = [("reference", gaussians), ("cpu", on(gaussians, gpu))]
+    cases: list[tuple[Backend, Gaussians]] = [("reference", gaussians), ("kernels", on(gaussians, gpu))]
     for backend, at in cases:
         flat = at.flat.clone().requires_grad_()
         image = render(at.with_flat(flat), view.camera, BACKGROUND, backend=backend).image

@@ -44,7 +44,7 @@ def everything(gaussians: Gaussians, camera: Camera, backend: Backend, settings:
 @pytest.mark.parametrize("settings", [RenderSettings(), SMOOTH], ids=["default", "smooth"])
 def test_kernels_and_plain_torch_agree_to_the_second_derivative(size, settings):
     gaussians, camera = random_gaussians(40, 3, logit=1.0), random_camera(*size, focal=30.0)
-    got, expected = (everything(gaussians, camera, backend, settings) for backend in ("cpu", "reference"))
+    got, expected = (everything(gaussians, camera, backend, settings) for backend in ("kernels", "reference"))
     for name in ("image", "alpha", "depth"):
         assert relative_error(got[name], expected[name]) < IMAGE[torch.float64], name
     for name in ("gradient", "product"):
@@ -54,7 +54,7 @@ def test_kernels_and_plain_torch_agree_to_the_second_derivative(size, settings):
 
 def test_float32_renders_and_differentiates_within_its_tolerance():
     gaussians, camera = random_gaussians(40, 3, logit=-1.0), random_camera(focal=30.0)
-    got = everything(gaussians.to(torch.float32), camera, "cpu", SMOOTH)
+    got = everything(gaussians.to(torch.float32), camera, "kernels", SMOOTH)
     expected = everything(gaussians, camera, "reference", SMOOTH)
     for name in ("image", "alpha", "depth"):
         assert got[name].dtype == torch.float32 and relative_error(got[name], expected[name]) < IMAGE[torch.float32]
@@ -95,17 +95,17 @@ def test_a_third_derivative_by_the_kernels_is_refused():
 def test_screen_space_gradients_are_reachable_for_densification():
     gaussians, camera = random_gaussians(20, logit=1.0), random_camera(focal=30.0)
     weights, gradients = random_like((3, camera.height, camera.width), 1), {}
-    for backend in ("cpu", "reference"):
+    for backend in ("kernels", "reference"):
         flat = gaussians.flat.clone().requires_grad_()
         shown = render(gaussians.with_flat(flat), camera, backend=backend)
         (gradients[backend],) = torch.autograd.grad((shown.image * weights).sum(), shown.splats.means)
-    assert relative_error(gradients["cpu"], gradients["reference"]) < 1e-12
+    assert relative_error(gradients["kernels"], gradients["reference"]) < 1e-12
 
 
 def test_a_camera_that_sees_nothing_shows_the_background():
     gaussians, camera = random_gaussians(4), random_camera(16, 12)
     gaussians.means[:, 2] = -9.0
-    for backend in ("cpu", "reference"):
+    for backend in ("kernels", "reference"):
         shown = render(gaussians, camera, BACKGROUND, depth=True, backend=backend)
         assert (shown.image == BACKGROUND[:, None, None]).all() and shown.depth is not None
         assert not shown.alpha.any() and not shown.depth.any() and not shown.splats.drawn.any()
@@ -131,6 +131,6 @@ def test_order_within_the_set_does_not_matter_unless_depths_are_equal():
 def test_a_parameter_that_is_not_finite_is_named(name):
     gaussians = random_gaussians(6, 1)
     gaussians.attributes[name][4] = float("nan")
-    for backend in ("cpu", "reference"):
+    for backend in ("kernels", "reference"):
         with pytest.raises(ValueError, match=f"expected finite {name}, got .*nan.* at Gaussian 4"):
             render(gaussians, random_camera(16, 12), backend=backend)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-pytest.importorskip("triton", reason="the kernels for GPUs need triton; install splat-landscape[gpu]")
+pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip install -e '.[gpu]'")
 
 from splat.projection import Splats
 from splat.raster import functions

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("triton", reason="the kernels for GPUs need triton; install splat-landscape[gpu]")
+pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip install -e '.[gpu]'")
 
 from splat.raster.cuda_binning import HEIGHT, WIDTH, bin_splats, number_slots, repeated, starts
 from tests.splat.raster.compositing_cases import CASES, truth

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("triton", reason="the kernels for GPUs need triton; install splat-landscape[gpu]")
+pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip install -e '.[gpu]'")
 
 import triton.language as tl
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from landscape import ScaledOperator, families
+from splat.active_spaces import active_spaces
 from splat.curvature import SceneHessian, SceneObjective
-from splat.families import active_spaces
 from splat.losses import LossSettings
 from splat.metrics import optimiser_units
 from splat.train import LearningRates

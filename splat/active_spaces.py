@@ -1,4 +1,4 @@
-"""What is left out of the anisotropy family of a scene, of all attributes together and of each (`landscape.families`).
+"""What the exact null space of a scene's Hessian leaves, of all attributes together and of each: for `landscape.families`.
 
 Exactly null (`null_space.py`): the lengths of the quaternions, SH directions that no view sees and,
 of Gauss-Newton as a whole, all that no view sees.  In another metric (`metrics.py`) the operator is D P H P D, and what is not
@@ -18,9 +18,8 @@ from splat.curvature import SceneHessian
 def active_spaces(hessian: SceneHessian, scale: Float[Tensor, " p"] | None = None) -> dict[str, ActiveSpace]:
     """What the exact null space leaves of the whole and of each attribute.  hessian: exact, or its Gauss-Newton part.
 
-    scale: D, above 0; 1 by default.
-
-    Of Gauss-Newton's attributes, what it leaves of the Hessian's: they may be flat along more.
+    scale: D, above 0; 1 by default.  Gauss-Newton's attributes are given the spaces of the Hessian's: they may be flat along
+    more.
     """
     if hessian.keep_null:
         return {}
