@@ -1,7 +1,7 @@
 # make demo   install, train and probe a small synthetic scene
 # make test   install, also the developers' tools, then ruff, pyright and pytest
 # make setup  the shared first half: an environment in .venv with everything that the commands need
-# make clean  remove the environment, builds, and all of runs/, trainings too
+# make clean  remove the environment and builds; what you trained and measured, in runs/, stays
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -34,4 +34,4 @@ test: $(TOOLS)
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
 clean:
-	rm -rf $(VENV) build *.egg-info runs
+	rm -rf $(VENV) build *.egg-info
