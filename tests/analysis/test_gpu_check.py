@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,19 @@ from rich.console import Console
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
-from analysis.gpu_check import PARTS, Check, agreement, checks_of, in_turn, main, probe, recordings, table, training
+from analysis.gpu_check import (
+    PARTS,
+    Check,
+    _with_other_last_bits,
+    agreement,
+    checks_of,
+    in_turn,
+    main,
+    probe,
+    recordings,
+    table,
+    training,
+)
 from analysis.meters import HostMeter
 from analysis.workloads import Workload
 from splat.curvature import SceneHessian, SceneObjective
@@ -29,24 +42,60 @@ def toy(dtype: torch.dtype = torch.float32) -> Workload:
     return Workload("toy", gaussians, tuple(two_views(16, 12)[:1]), torch.zeros(3), LossSettings("charbonnier", 0.0))
 
 
-def test_a_device_agrees_with_the_cpu(device, monkeypatch):
-    if device.type == "cpu":  # the second of the two devices that are compared is the interpreter's
-        interpreted = iter([False, True])
+def last_interpreted(device, monkeypatch, runs: int) -> None:
+    """Without a GPU the last of so many runs is the interpreter's."""
+    if device.type == "cpu":
+        interpreted = iter([False] * (runs - 1) + [True])
 
         def stay(workload: Workload, at: torch.device) -> Workload:
             monkeypatch.setattr("splat.device.INTERPRETED", next(interpreted))
             return workload
 
         monkeypatch.setattr(Workload, "to", stay)
+
+
+def test_a_device_agrees_with_the_cpu(device, monkeypatch):
+    last_interpreted(device, monkeypatch, 2)
     checks = agreement(toy(torch.float64), device)  # in single precision so few Gaussians' traces cancel
     assert [check.name for check in checks][:3] == ["loss", "gradient", "H v"] and len(checks) == 8
     assert all(check.holds for check in checks), checks
+    assert [check.bound for check in checks] == [1e-10] + [1e-9] * 7
 
 
-def test_a_trained_scene_is_compared_in_double_precision_where_no_decision_hangs_on_round_off(monkeypatch):
+def test_what_the_last_bits_change_on_the_cpu_is_no_disagreement(device, monkeypatch):
+    last_interpreted(device, monkeypatch, 3)
+    moved = []
+
+    def twice_as_dense(workload: Workload, seed: int) -> Workload:
+        moved.append(seed)
+        gaussians = workload.gaussians.with_flat(workload.gaussians.flat.clone())
+        gaussians.opacity_logits.add_(0.1)
+        return replace(workload, gaussians=gaussians)
+
+    monkeypatch.setattr("analysis.gpu_check._with_other_last_bits", twice_as_dense)
+    checks = agreement(toy(torch.float64), device, neighbours=1)
+    assert moved == [0] and all(1e-3 < check.bound < 10 for check in checks), checks
+
+
+def test_other_last_bits_are_those_next_to_them():
+    workload = toy()
+    logits = workload.gaussians.opacity_logits.clone()
+    moved = [_with_other_last_bits(workload, seed).gaussians.opacity_logits for seed in range(8)]
+    assert torch.equal(workload.gaussians.opacity_logits, logits)
+    steps = torch.stack(moved) - logits
+    assert (steps != 0).all() and steps.abs().max() <= torch.finfo(logits.dtype).eps * logits.abs().max()
+    assert (steps > 0).any() and (steps < 0).any()
+
+
+def test_a_trained_scene_is_compared_in_both_precisions_and_in_single_to_its_round_off(monkeypatch):
     monkeypatch.setattr("analysis.gpu_check.workload_of", lambda path: toy())
-    monkeypatch.setattr("analysis.gpu_check.agreement", lambda workload, device: [workload.gaussians.flat.dtype])
-    assert PARTS["checkpoint"][1](torch.device("cpu"), Path("checkpoint.pt")) == [torch.float64]
+
+    def stand_in(workload, device, neighbours=0):
+        return [Check(f"{workload.gaussians.flat.dtype} {neighbours}", 0.0, 1.0)]
+
+    monkeypatch.setattr("analysis.gpu_check.agreement", stand_in)
+    found = PARTS["checkpoint"][1](torch.device("cpu"), Path("checkpoint.pt"))
+    assert [check.name for check in found] == ["torch.float64 0, float64", "torch.float32 3, float32"]
 
 
 @pytest.mark.parametrize("off", [0.0, 1.0])
