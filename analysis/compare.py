@@ -24,8 +24,7 @@ from analysis.overrides import leaves
 from analysis.quantities import quantity
 from analysis.records import FILE, read_record
 from analysis.report import pictures_in, template_environment
-from analysis.run_files import METRICS, read_scores
-from analysis.training import CHECKPOINT
+from analysis.run_files import CHECKPOINT, METRICS, read_scores
 from analysis.verdict import of_budgets
 from splat.checkpoint import Checkpoint, load_checkpoint, write_atomically
 

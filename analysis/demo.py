@@ -12,7 +12,8 @@ from rich.console import Console
 
 from analysis.options import DemoOptions, ProbeOptions, TrainOptions
 from analysis.probe import run_probe
-from analysis.training import CHECKPOINT, run_training
+from analysis.run_files import CHECKPOINT
+from analysis.training import run_training
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 

@@ -1,6 +1,6 @@
-"""The small JSON files of a run, its scores and seconds: what is damaged is refused by the name of the file, with what to do.
+"""The files of a run: their names, and its scores and seconds, small JSON files.
 
-Needs no torch.
+What is damaged is refused by the name of the file, with what to do.  Needs no torch.
 """
 
 import json
@@ -11,7 +11,7 @@ from typing import Any
 
 from analysis.records import decoded
 
-METRICS, SECONDS = "metrics.json", "seconds.json"
+CHECKPOINT, METRICS, SECONDS = "checkpoint.pt", "metrics.json", "seconds.json"
 NUMBER, MAYBE = int | float, int | float | None
 _OF_VIEWS = {"psnr": MAYBE, "ssim": MAYBE, "lpips": MAYBE}
 _METRICS = {

@@ -31,11 +31,11 @@ from analysis.interruption import interruption
 from analysis.options import SweepOptions
 from analysis.provenance import usable_cores
 from analysis.records import FILE, read_record
-from analysis.run_files import METRICS
+from analysis.run_files import CHECKPOINT, METRICS
 from analysis.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.sweep_progress import Stage, SweepProgress
 from analysis.sweep_results import PROBE, summarize, tables, unfinished, write_results
-from analysis.training import CHECKPOINT, planned, resumed
+from analysis.training import planned, resumed
 
 CELL_FAILED = 1
 LOCK = ".lock"

@@ -35,7 +35,7 @@ from analysis.interruption import interruption
 from analysis.options import TrainOptions
 from analysis.overrides import assignments, leaves, overridden
 from analysis.provenance import provenance
-from analysis.run_files import METRICS
+from analysis.run_files import CHECKPOINT, METRICS
 from analysis.spent import Spent
 from analysis.trajectory import START, Trajectory, TrajectorySettings
 from splat.checkpoint import SceneReference, load_checkpoint, save_checkpoint, write_atomically
@@ -53,7 +53,7 @@ from splat.scenes.view import View
 from splat.start import initial_gaussians
 from splat.train import TrainConfig, Training, train
 
-CHECKPOINT, HISTORY, RENDERS = "checkpoint.pt", "history.csv", "test"
+HISTORY, RENDERS = "history.csv", "test"
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 OPTIONS = {  # settings of the training that have an option of their own
     "iterations": "iterations",

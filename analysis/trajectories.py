@@ -19,6 +19,7 @@ from analysis.drawing import draw
 from analysis.family_table import bracketed
 from analysis.options import TrajectoryOptions
 from analysis.quantities import measured, quantity
+from analysis.run_files import CHECKPOINT
 from analysis.verdict import ATTRIBUTES, attribute_name
 
 RECORDS = "trajectory.csv"  # in a run
@@ -57,7 +58,6 @@ def run_trajectory(options: TrajectoryOptions) -> int:
 def _require_same_function(runs: Sequence[Path]) -> None:
     """ValueError where the curvatures of the runs that have a checkpoint are those of different functions."""
     from analysis.compare import require_same  # these need torch, which no refusal above waits for
-    from analysis.training import CHECKPOINT
     from splat.checkpoint import load_checkpoint
 
     kept = {str(run): run / CHECKPOINT for run in runs if (run / CHECKPOINT).is_file()}

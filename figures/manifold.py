@@ -19,10 +19,11 @@ from matplotlib.ticker import FixedLocator, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
 from analysis.records import PROBE, SLICE, Record, read_record
+from analysis.run_files import CHECKPOINT
 from figures.plane import Plane, plane
 from figures.style import BLACK, FIELD_MAP, MISSING, exponent_of, literal, unit_suffix
 
-CHECKPOINT, START = "checkpoint.pt", "start"
+START = "start"
 INNER = 0.65  # of the reach of a surface: no tick farther out
 ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
 SLICES = (("slice-eigenvectors-2d", SLICE), ("probe", PROBE))  # beside a checkpoint, the first that is there
