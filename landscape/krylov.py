@@ -21,7 +21,7 @@ is measured once before, with one vector more, when a residual that is still abo
 seen of it: from there on steps might be made in vain.
 """
 
-from math import inf, isnan, log, nan, sqrt
+from math import inf, isfinite, isnan, log, nan, sqrt
 
 import torch
 from jaxtyping import Float, Float64
@@ -29,7 +29,7 @@ from torch import Tensor
 
 from landscape.checks import SCALE
 from landscape.lanczos import is_dust, norm, orthogonalise, unit_columns
-from landscape.operator import SymmetricOperator, product
+from landscape.operator import SymmetricOperator, product, require_finite
 from landscape.probes import draw_probes
 from landscape.results import EigenEnds, Eigenpairs, StopReason
 from landscape.ritz import EigenSettings, Goal, Ritz, rayleigh, recombine, turned
@@ -70,7 +70,9 @@ class Krylov:
         """Apply H to the rows that come next; near_noise: and measure the noise, if it is not known yet."""
         old, new = self.size, self.size + self.width
         W = self.products(near_noise)
-        self.scale = max(self.scale if old else 0.0, *(norm(w) for w in W))
+        lengths = [norm(w) for w in W]
+        require_finite(self.operator, all(map(isfinite, lengths)))
+        self.scale = max(self.scale if old else 0.0, *lengths)
         components = orthogonalise(W, self.basis[:new])
         self.surprise += float((components[:old] - self.foreseen).square().sum())
         self.pairs += self.foreseen.numel()
@@ -133,11 +135,11 @@ class Krylov:
         return torch.finfo(self.basis.dtype).eps * float(ritz.values.abs().max())
 
     def products(self, near_noise: bool) -> Float[Tensor, "width n"]:
-        """H times the rows that come next."""
+        """H times the rows that come next, whatever numbers it has."""
         V = self.basis[self.size : self.size + self.width].T
         if near_noise and isnan(self.noise):
             V = torch.cat([V, SCALE * V[:, :1]], dim=1)
-        W = product(self.operator, V.contiguous()).T.clone(memory_format=torch.contiguous_format)
+        W = product(self.operator, V.contiguous(), finite=False).T.clone(memory_format=torch.contiguous_format)
         self.matvecs += len(W)
         if len(W) > self.width:
             self.noise, W = norm(W[-1].double() / SCALE - W[0].double()), W[:-1]
