@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from analysis.workloads import Workload
-from splat.losses_cpu import view_loss
+from splat.loss_functions import view_loss
 from splat.scenes.view import View
 
 

@@ -34,8 +34,8 @@ from analysis.workloads import Workload
 from landscape.probes import draw_probes
 from splat.device import by_triton
 from splat.linearize import LinearizedView, OwnBlocks
-from splat.losses_cpu import loss_against, view_loss
-from splat.projection_cpu import lens_of
+from splat.loss_functions import loss_against, view_loss
+from splat.projection_formulas import lens_of
 from splat.raster.functions import held_raster, projected, pulled
 from splat.render import render
 from splat.settings import Sums

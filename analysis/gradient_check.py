@@ -24,8 +24,8 @@ from landscape.checks import ROUND_OFFS
 from landscape.results import Progress
 from splat.curvature import SceneHessian, SceneObjective
 from splat.gaussians import Gaussians
+from splat.loss_functions import loss_against, view_loss
 from splat.losses import LossSettings
-from splat.losses_cpu import loss_against, view_loss
 from splat.projection import project
 from splat.raster.functions import rasterize_by_kernel
 

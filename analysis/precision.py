@@ -23,8 +23,8 @@ from torch import Tensor
 from analysis.workloads import Workload
 from splat.gaussians import Gaussians
 from splat.linearize import LinearizedView, rasterize_view
-from splat.losses_cpu import loss_against
-from splat.projection_cpu import lens_of
+from splat.loss_functions import loss_against
+from splat.projection_formulas import lens_of
 from splat.raster.binning import depth_order
 from splat.raster.functions import projected
 from splat.scenes.view import View

@@ -274,13 +274,6 @@ class SpectralDensity:
         seen = self.rest * (self.weights * self.nodes).sum(dim=1) + self.known.sum()
         return slope * (trace - seen), abs(slope) * error * NormalDist().inv_cdf((1 + confidence) / 2)
 
-    def smoothed(self, at: Float64[Tensor, " m"], width: float) -> Float64[Tensor, "starts m"]:
-        """The density at `at`, one row a start vector, each node blurred by a Gaussian of standard deviation width."""
-        nodes, weights = self.table()
-        offset = (at[None, :, None] - nodes[:, None, :]) / width
-        kernel = torch.exp(-offset.square() / 2) / (width * sqrt(2 * torch.pi))
-        return (kernel * weights[:, None, :]).sum(dim=2)
-
 
 @dataclass(frozen=True)
 class Anisotropy:

@@ -22,8 +22,8 @@ from torch import Tensor
 from landscape.operator import require_vectors
 from splat.gaussians import Gaussians
 from splat.linearize import LinearizedView, OwnBlocks, rasterize_view, touches
+from splat.loss_functions import loss_against
 from splat.losses import LossSettings
-from splat.losses_cpu import loss_against
 from splat.null_space import RowSpace, seen_harmonics, seen_parameters
 from splat.recording import CudaGraphs, Recordings
 from splat.scenes.view import View

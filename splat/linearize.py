@@ -26,7 +26,7 @@ from torch import Tensor
 
 from splat.camera import Camera
 from splat.gaussians import Gaussians
-from splat.projection_cpu import lens_of
+from splat.projection_formulas import lens_of
 from splat.projection_linear import Held
 from splat.raster.functions import held_projection, held_raster, native, projected
 from splat.settings import RenderSettings
@@ -103,7 +103,7 @@ class OwnBlocks:
 class LinearizedView:
     """A view's loss at fixed Gaussians: `.value`, `.image`, `.gradient`, `.jvp(U)`, `.vjp(G)`, `.hvp(U)`, `.ggn(U)`.
 
-    loss: of the view's images, `losses_cpu.loss_against`.
+    loss: of the view's images, `loss_functions.loss_against`.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ from splat.camera import Camera
 from splat.curvature import SceneObjective
 from splat.linearize import GEOMETRY_COLUMNS, OwnBlocks
 from splat.losses import SIGMA
-from splat.projection_cpu import lens_of
+from splat.projection_formulas import lens_of
 from splat.raster.functions import projected
 from splat.raster.threads import over_batch
 

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from splat.camera import Camera
 from splat.gaussians import Gaussians
-from splat.losses_cpu import ViewLoss, view_loss
+from splat.loss_functions import view_loss
+from splat.losses_cpu import ViewLoss
 from splat.projection import Splats
 from splat.render import render
 from splat.settings import RenderSettings

@@ -8,7 +8,6 @@ from math import exp, log
 
 import numpy as np
 
-from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.projection_formulas import (
     Lens,
@@ -22,25 +21,8 @@ from splat.projection_formulas import (
 )
 from splat.raster.jit import formula, kernel
 from splat.raster.threads import over_range
-from splat.settings import RenderSettings
 
 LARGEST_SPLAT = 2.0**60  # px, and world units: 1 / det of a needle is this squared over blur, which float32 still holds
-
-
-def lens_of(camera: Camera, settings: RenderSettings) -> Lens:
-    """The camera as the kernels read it."""
-    return Lens(
-        camera.rotation.double().reshape(-1).numpy().copy(),
-        camera.centre.double().numpy().copy(),
-        float(camera.fx),
-        float(camera.fy),
-        float(camera.cx),
-        float(camera.cy),
-        settings.fov_clamp * camera.width / (2 * camera.fx),
-        settings.fov_clamp * camera.height / (2 * camera.fy),
-        float(settings.blur),
-        float(settings.near),
-    )
 
 
 def attribute_arrays(gaussians: Gaussians) -> tuple[np.ndarray, ...]:

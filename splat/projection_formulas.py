@@ -17,9 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from splat.camera import Camera
 from splat.dual import exp, select, sqrt, value_of
 from splat.harmonics import Y00, Y1, Y2A, Y2B, Y2C, Y3A, Y3B, Y3C, Y3D
 from splat.raster.jit import formula
+from splat.settings import RenderSettings
 
 
 class Lens(NamedTuple):
@@ -35,6 +37,22 @@ class Lens(NamedTuple):
     limit_y: float
     blur: float
     near: float
+
+
+def lens_of(camera: Camera, settings: RenderSettings) -> Lens:
+    """The camera as the kernels read it."""
+    return Lens(
+        camera.rotation.double().reshape(-1).numpy().copy(),
+        camera.centre.double().numpy().copy(),
+        float(camera.fx),
+        float(camera.fy),
+        float(camera.cx),
+        float(camera.cy),
+        settings.fov_clamp * camera.width / (2 * camera.fx),
+        settings.fov_clamp * camera.height / (2 * camera.fy),
+        float(settings.blur),
+        float(settings.near),
+    )
 
 
 @formula

@@ -48,9 +48,8 @@ class RenderSettings:
             raise ValueError(f"expected 0 <= alpha_min < alpha_max = {self.alpha_max}, got {self.alpha_min}")
         if not 0 <= self.transmittance_min < 1:
             raise ValueError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
-        if not (
-            0 <= self.blur < inf and 0 < self.near < inf and 0 < self.fov_clamp < inf
-        ):  # so that nan is refused too
+        finite = 0 <= self.blur < inf and 0 < self.near < inf and 0 < self.fov_clamp < inf
+        if not finite:  # nan fails every comparison
             raise ValueError(f"expected blur >= 0, near > 0, fov_clamp > 0, all finite, got {self}")
         if self.contour_sigma is not None and not self.contour_sigma > 0:
             raise ValueError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")

@@ -36,8 +36,9 @@ from splat.camera import Camera
 from splat.curvature import SceneObjective
 from splat.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.gaussians import Gaussians
+from splat.loss_functions import loss_against
 from splat.losses import LossSettings
-from splat.losses_cpu import ViewLoss, loss_against
+from splat.losses_cpu import ViewLoss
 from splat.photometric import Photometric, photometric
 from splat.regularizers.regularizer import Method, Regularizer, Step, ThreeDGS
 from splat.scenes.view import View

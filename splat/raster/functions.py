@@ -16,8 +16,8 @@ from splat.camera import Camera
 from splat.device import by_triton
 from splat.gaussians import Gaussians
 from splat.projection import Splats
-from splat.projection_cpu import attribute_arrays, lens_of, project_adjoint, project_arrays
-from splat.projection_formulas import Lens
+from splat.projection_cpu import attribute_arrays, project_adjoint, project_arrays
+from splat.projection_formulas import Lens, lens_of
 from splat.projection_linear import Projection
 from splat.raster.cpu import Raster
 from splat.raster.threads import over_range

@@ -37,7 +37,7 @@ from torch import Tensor
 from splat.camera import Camera
 from splat.densify import Densified
 from splat.gaussians import Gaussians
-from splat.losses_cpu import consistency_loss
+from splat.loss_functions import consistency_loss
 from splat.photometric import Photometric, photometric
 from splat.regularizers.regularizer import Method, Regularizer, Step, ThreeDGS
 from splat.regularizers.viewpoint_probe import slerp

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.losses_cpu import consistency_loss
+from splat.loss_functions import consistency_loss
 from splat.photometric import Photometric
 from splat.regularizers.dropgaussian import dropout
 from splat.regularizers.regularizer import Method, Regularizer, Step

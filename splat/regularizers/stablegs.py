@@ -28,7 +28,7 @@ from landscape.trace import PAPER, estimate_traces
 from splat.camera import Camera
 from splat.curvature import NothingInSight, SceneHessian
 from splat.densify import on_screen
-from splat.losses_cpu import consistency_loss
+from splat.loss_functions import consistency_loss
 from splat.photometric import Photometric, photometric
 from splat.regularizers.attribute_probe import (
     Magnitude,

@@ -20,7 +20,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.camera import Camera
-from splat.scenes.capture import forward_facing
 from splat.scenes.colmap import MODEL_FOLDERS, find_model, read_colmap
 from splat.scenes.dtu import is_dtu, mask_folder, read_dtu
 from splat.scenes.images import Photo, frame, image_header, require_files
@@ -67,11 +66,6 @@ class Scene:
     def extent(self, names: Sequence[str] | None = None) -> float:
         """`camera_extent` of these frames (all by default)."""
         return camera_extent([frame.camera for frame in (self.frames if names is None else self.select(names))])
-
-    @property
-    def forward_facing(self) -> bool:
-        """Whether all cameras look the same way: within 45 degrees of their mean viewing direction."""
-        return forward_facing([frame.camera for frame in self.frames])
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:

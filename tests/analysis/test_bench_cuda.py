@@ -19,7 +19,7 @@ from analysis.meters import HostMeter
 from analysis.options import BenchOptions
 from analysis.peak_cuda import BLOCK, UNROLLED, WARPS, multiply_add, multiply_adds
 from analysis.timing import Timing
-from splat.losses_cpu import loss_against
+from splat.loss_functions import loss_against
 from splat.raster.triton_formulas import launch
 from tests.analysis.test_gpu_check import toy
 from tests.splat.random_scenes import relative_error

@@ -9,7 +9,8 @@ import torch
 from analysis.precision import precision, same_decisions
 from analysis.workloads import Size, Workload, synthetic_workload
 from splat.losses_cpu import ViewLoss
-from splat.projection_cpu import lens_of, project_arrays
+from splat.projection_cpu import project_arrays
+from splat.projection_formulas import lens_of
 from splat.settings import RenderSettings
 
 

@@ -9,8 +9,8 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 from splat.curvature import SceneHessian, SceneObjective
 from splat.gaussians import Gaussians
 from splat.linearize import LinearizedView
+from splat.loss_functions import loss_against
 from splat.losses import LossSettings
-from splat.losses_cpu import loss_against
 from splat.render import Backend, render
 from splat.scenes.view import View
 from splat.settings import RenderSettings

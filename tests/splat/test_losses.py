@@ -10,8 +10,9 @@ import torch
 from scipy.ndimage import correlate1d
 from torch import Tensor
 
+from splat.loss_functions import consistency_loss, view_loss
 from splat.losses import WINDOW, LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map, window
-from splat.losses_cpu import ViewLoss, consistency_loss, view_loss
+from splat.losses_cpu import ViewLoss
 from tests.oracles import similarity_by_windows
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, random_like, relative_error
 

@@ -5,8 +5,8 @@ import torch
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
+from splat.loss_functions import consistency_loss, loss_against, view_loss
 from splat.losses import LossSettings, photometric_loss
-from splat.losses_cpu import consistency_loss, loss_against, view_loss
 from splat.losses_cuda import CudaImageLoss, CudaViewLoss
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, random_like, relative_error
 from tests.splat.test_losses import SETTINGS, image_and_target, truth, truth_of_both

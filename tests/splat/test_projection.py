@@ -12,7 +12,8 @@ from splat.camera import Camera
 from splat.gaussians import Gaussians
 from splat.harmonics import harmonics
 from splat.projection import Splats, project, rotation_matrices
-from splat.projection_cpu import attribute_arrays, lens_of, project_adjoint, project_arrays
+from splat.projection_cpu import attribute_arrays, project_adjoint, project_arrays
+from splat.projection_formulas import lens_of
 from splat.projection_linear import GEOMETRY, Projection
 from splat.raster.threads import over_range
 from splat.settings import RenderSettings

@@ -8,8 +8,8 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from splat.gaussians import Gaussians
 from splat.projection import project as specified
-from splat.projection_cpu import lens_of
 from splat.projection_cuda import CudaProjection, project, project_adjoint
+from splat.projection_formulas import lens_of
 from splat.settings import RenderSettings
 from tests.splat.random_scenes import (
     DERIVATIVE,

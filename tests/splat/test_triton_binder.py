@@ -56,8 +56,8 @@ def launch_all(n: int, m: int, K: int) -> None:
     """All kernels, for n Gaussians of which m are in sight, and K vectors."""
     from splat.adam_cuda import update
     from splat.linearize import LinearizedView
+    from splat.loss_functions import loss_against
     from splat.losses import LossSettings
-    from splat.losses_cpu import loss_against
     from splat.losses_cuda import CudaImageLoss
     from splat.photometric import photometric
     from splat.raster.cuda import CudaRaster

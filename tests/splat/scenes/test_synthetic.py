@@ -8,6 +8,7 @@ import torch
 from splat.gaussians import Gaussians
 from splat.projection import rotation_matrices
 from splat.render import render
+from splat.scenes.capture import forward_facing
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.synthetic import SyntheticScene, SyntheticSettings, synthetic_scene
 from splat.scenes.view import Frame, inside_image
@@ -42,7 +43,7 @@ def test_there_is_something_to_see_everywhere_and_it_differs_between_views(small
     assert (images[0] - images[-1]).abs().mean() > 0.02
     for frame in small.scene.frames:
         assert render(small.truth, frame.camera).alpha.mean() > 0.9
-    assert small.scene.forward_facing
+    assert forward_facing([frame.camera for frame in small.scene.frames])
 
 
 def test_gaussians_lie_flat_on_their_surfaces(small: SyntheticScene) -> None:
