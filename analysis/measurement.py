@@ -5,7 +5,8 @@
     traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
     eigenvalues         the two largest and the smallest, led by the blocks of single Gaussians (`splat.own_directions`)
     power iteration     both ends as the paper takes them; not in a quick probe, whose few products do not take it there
-    density             stochastic Lanczos quadrature, for sums and quantiles of |lambda|
+    density             stochastic Lanczos quadrature, for sums and quantiles of |lambda|; not in a quick probe, whose few
+                        products would leave them known to a factor of 1000
     finite probe        the second difference of the loss along the first eigenvector, over a range of steps; not in a quick
                         probe
     slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
@@ -77,11 +78,11 @@ class ProbeSettings:
     """How much of everything.
 
     checked_vectors, checked_views: of the self-checks; None: all views.  trace_samples: just so many; None: until `traces` is
-    met.  slice_radius: half the slice's side, in curvature units, sqrt(2 rise / lambda); slice_rise: that rise of the loss,
-    as a share of the loss; slice_tolerance: of what lies between its renders, as a share of its range; slice_holdout: renders
-    that judge it.  probe_steps: of the finite probe, parameter units, none: it is left out; noise_points: its renders that tell
-    their noise.  timings: of each product that tells what a skip saves, 0: it is not told.  seconds: for all estimators
-    together.  memory: GiB for the vectors of a basis.
+    met.  density_matvecs: 0: no density.  slice_radius: half the slice's side, in curvature units, sqrt(2 rise / lambda);
+    slice_rise: that rise of the loss, as a share of the loss; slice_tolerance: of what lies between its renders, as a share of
+    its range; slice_holdout: renders that judge it.  probe_steps: of the finite probe, parameter units, none: it is left out;
+    noise_points: its renders that tell their noise.  timings: of each product that tells what a skip saves, 0: it is not
+    told.  seconds: for all estimators together.  memory: GiB for the vectors of a basis.
     """
 
     checked_vectors: int = 4
@@ -122,7 +123,7 @@ class ProbeSettings:
             trace_samples=5,
             eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=60),
             power=None,
-            density_matvecs=12,
+            density_matvecs=0,
             slice_tolerance=0.1,
             slice_holdout=FEWEST_HELD_OUT,
             probe_steps=(),
@@ -197,15 +198,19 @@ def measure(
         with stage("power iteration") as report:
             each = replace(settings.power, max_seconds=budget.share("power iteration") / 2)
             power = power_ends(operator, streams["power iteration"], each, report)
-    with stage("density") as report:
-        seconds = budget.share("density")
-        active = ActiveSpace(hessian.project, hessian.rank)
-        each = timed.seconds / timed.matvecs
-        run = partial(
-            spectral_density, operator, streams["density"],
-            progress=report, active=active, ends=ends, trace=total_trace(traces),
-        )  # fmt: skip
-        density = _density(run, vectors_within(operator, settings.memory), settings, seconds, each, notes)
+    density = None
+    if settings.density_matvecs:
+        with stage("density") as report:
+            seconds = budget.share("density")
+            active = ActiveSpace(hessian.project, hessian.rank)
+            each = timed.seconds / timed.matvecs
+            run = partial(
+                spectral_density, operator, streams["density"],
+                progress=report, active=active, ends=ends, trace=total_trace(traces),
+            )  # fmt: skip
+            density = _density(run, vectors_within(operator, settings.memory), settings, seconds, each, notes)
+    else:
+        notes.append("the spectral density was left out, and the indices that need it")
     finite = None
     if settings.probe_steps:
         with stage("finite probe") as report:
@@ -237,11 +242,13 @@ class _Budget:
     """Divides the time that is left among the stages to come, in proportion to their shares."""
 
     def __init__(self, settings: ProbeSettings) -> None:
-        self.end, self.to_come = monotonic() + settings.seconds, dict(SHARES)
-        if settings.power is None:
-            del self.to_come["power iteration"]
-        if not settings.probe_steps:
-            del self.to_come["finite probe"]
+        asked = {
+            "power iteration": settings.power is not None,
+            "density": settings.density_matvecs > 0,
+            "finite probe": len(settings.probe_steps) > 0,
+        }
+        self.end = monotonic() + settings.seconds
+        self.to_come = {stage: share for stage, share in SHARES.items() if asked.get(stage, True)}
 
     def share(self, stage: str) -> float:
         part = self.to_come[stage] / sum(self.to_come.values())

@@ -297,6 +297,8 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
         said.out.split()
     )
     assert data["finite_probe"] is None and "the finite probe was left out" in data["notes"]
+    assert data["anisotropy"]["share"]["value"] is None and "density" not in data["timing"]
+    assert "the spectral density was left out, and the indices that need it" in data["notes"]
     skips = data["skipped"]
     assert skips["entries_behind_opaque_fronts"]["seconds_saved"] is None
     assert skips["gaussians_out_of_sight"]["count"] == data["counts"]["skipped_gaussians"]
