@@ -10,6 +10,8 @@
     finite probe        the second difference of the loss along the first eigenvector, over a range of steps; not in a quick
                         probe
     slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
+    depth               the positions' gradient and curvature along the rays and across them, and what finite steps there do to
+                        the loss; not in a quick probe
 
 Every kernel has worked once when the checks are done: what follows compiles nothing.  The estimators stop at their
 tolerance, at their budget of products, or when their share of the time is spent; each result says which.  Time that a stage
@@ -26,6 +28,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from analysis.depth_stage import DepthFindings, measure_depth
 from analysis.gradient_check import check_against_gradient
 from landscape import (
     CountingOperator,
@@ -55,6 +58,7 @@ from landscape.refinement import SliceSettings
 from landscape.results import Progress
 from landscape.trace import total_trace
 from splat.curvature import SceneHessian, SceneObjective
+from splat.depth import STEPS as DEPTH_STEPS
 from splat.device import by_triton
 from splat.losses import LossSettings
 from splat.own_directions import OwnDirections
@@ -70,7 +74,15 @@ FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
 FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds
 # shares of the time; measured on 8,000 Gaussians in 3 views of 504 x 378 pixels
-SHARES = {"traces": 4.0, "eigenvalues": 4.0, "power iteration": 2.0, "density": 3.0, "finite probe": 2.0, "slice": 4.0}
+SHARES = {
+    "traces": 4.0,
+    "eigenvalues": 4.0,
+    "power iteration": 2.0,
+    "density": 3.0,
+    "finite probe": 2.0,
+    "slice": 4.0,
+    "depth": 2.0,
+}
 
 
 @dataclass(frozen=True)
@@ -98,6 +110,8 @@ class ProbeSettings:
     slice_tolerance: float = 0.01
     slice_holdout: int = 30
     probe_steps: tuple[float, ...] = STEPS
+    depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=64))
+    depth_steps: tuple[float, ...] = DEPTH_STEPS
     noise_points: int = NOISE_POINTS
     timings: int = 3
     seconds: float = 45.0
@@ -127,6 +141,7 @@ class ProbeSettings:
             slice_tolerance=0.1,
             slice_holdout=FEWEST_HELD_OUT,
             probe_steps=(),
+            depth=None,
             timings=0,
             seconds=12.0,
         )
@@ -143,7 +158,7 @@ class PlaneSlice:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What was measured; density, finite and plane are None where a note says why, power where it was not asked for.
+    """What was measured; density, finite, depth and plane are None where a note says why, power where it was not asked for.
 
     matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
     of the directions that are not exactly flat.
@@ -158,6 +173,7 @@ class Findings:
     power: EigenEnds | None
     density: SpectralDensity | None
     finite: FiniteProbe | None
+    depth: DepthFindings | None
     plane: PlaneSlice | None
     matvecs: int
     spared: int
@@ -220,6 +236,15 @@ def measure(
     with stage("slice") as report:
         seconds, stream = budget.share("slice"), streams["slice"]
         plane = _plane(objective, gradient, value, ends, settings, seconds, render, stream, report, notes)
+    along_rays = None
+    if settings.depth is not None:
+        with stage("depth") as report:
+            seconds, stream = budget.share("depth"), streams["depth"]
+            along_rays = measure_depth(
+                objective, settings.depth, settings.depth_steps, seconds, render, stream, report, notes
+            )
+    else:
+        notes.append("positions along and across the rays were left out")
     return Findings(
         value=value,
         gradient_norm=float(gradient.double().norm()),
@@ -230,6 +255,7 @@ def measure(
         power=power,
         density=density,
         finite=finite,
+        depth=along_rays,
         plane=plane,
         matvecs=operator.matvecs,
         spared=hessian.spared,
@@ -246,6 +272,7 @@ class _Budget:
             "power iteration": settings.power is not None,
             "density": settings.density_matvecs > 0,
             "finite probe": len(settings.probe_steps) > 0,
+            "depth": settings.depth is not None,
         }
         self.end = monotonic() + settings.seconds
         self.to_come = {stage: share for stage, share in SHARES.items() if asked.get(stage, True)}

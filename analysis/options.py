@@ -117,7 +117,7 @@ class ProbeOptions:
     """Exit with 1 if a self-check fails; the record is written all the same."""
     quick: FlagCreatePairsOff[bool] = False
     """Numbers to 10% instead of 1% in a quarter of the time, without power iteration, spectral density (and the indices that
-    need it), finite probe and surface.png."""
+    need it), finite probe, the split of positions into depth and lateral and surface.png."""
     seconds: Unset[float] = None
     """Time for the estimators together; what a stage did not reach in its share is said.  inf: no limit.
     Default: 45, with --quick 12."""

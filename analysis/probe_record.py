@@ -34,6 +34,7 @@ def probe_data(findings: Findings, objective: SceneObjective, loss: LossSettings
         "anisotropy": _anisotropy(findings),
         "quantiles": _quantiles(findings.density),
         "finite_probe": None if findings.finite is None else {"direction": NAMES[0], **findings.finite.record()},
+        "depth": None if findings.depth is None else findings.depth.record(),
         "slice": None if findings.plane is None else _slice(findings.plane, findings.ends.largest),
         "counts": {**counts(objective.counts), **_work(findings, objective)},
         "checks": _checks(findings),

@@ -1,6 +1,6 @@
 """A record of a probe as one table for the terminal."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rich import box
@@ -45,6 +45,9 @@ def probe_table(data: Mapping[str, Any]) -> Table:
     for name, index in data["anisotropy"].items():
         table.add_row(name.replace("_", " "), *_index(index))
     table.add_section()
+    for row in _depth_rows(data.get("depth")):
+        table.add_row(*row)
+    table.add_section()
     for name, (used, stored) in COUNTS.items():
         table.add_row(name, f"{data['counts'][used]:,}", "", f"of {data['counts'][stored]:,}")
     table.add_section()
@@ -53,6 +56,19 @@ def probe_table(data: Mapping[str, Any]) -> Table:
         about += f" ({check['note']})" if check.get("note") else ""
         table.add_row(f"check: {name.replace('_', ' ')}", quantity(check["value"]), "", about)
     return table
+
+
+def _depth_rows(depth: Mapping[str, Any] | None) -> Iterator[tuple[str, str, str, str]]:
+    """Of positions: along the rays, over a direction across them."""
+    if depth is None:
+        return
+    median = f"median {quantity(depth['gradient_median'])}, {depth['pairs']:,} pairs of Gaussian and view"
+    yield "depth gradient / lateral", quantity(depth["gradient_ratio"]), "", median
+    yield "depth curvature / lateral", *_index(depth["curvature_ratio"])
+    for row in depth["rises"]:
+        rises = " over ".join(measured(row[kind], row[f"{kind}_error"]) for kind in ("depth", "lateral"))
+        name = f"depth / lateral rise, {row['pixels']:g} px"
+        yield name, measured(row["ratio"], row["ratio_error"]), "", rises
 
 
 def _index(index: Mapping[str, Any]) -> tuple[str, str, str]:

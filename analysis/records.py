@@ -45,6 +45,12 @@ finite_probe      null, or the second difference (L(+d v) + L(-d v) - 2 L) / d^2
     infinitesimal     v.H v;  center_loss, noise: L and the standard deviation of one evaluation's error
     best              index of the step with the least error of those that cross nothing; null without any
     evaluations       renders of all views
+depth             absent, null, or the positions along the rays against one direction across them (`splat.depth`):
+    gradient_ratio, gradient_median    of the root mean square gradients; the median over `pairs` of a Gaussian and a view
+    curvature         depth, lateral: traces, as above without tau
+    curvature_ratio   of the mean curvatures: value, low, high, note
+    rises             a row a length of finite steps: pixels; depth, lateral: rises of the loss, with _error and _crossed, the
+                      share of the renders with another order of the splats or set of visible ones; ratio, ratio_error
 families          absent, or rows of the anisotropy families (`analysis.family_stage`), each with: operator ("hessian" or
                   "gauss-newton"), block ("all" or an attribute), metric and unit, split (whether of the split scene),
                   gaussians, dim, rank (dim without the exact null space); lambda_max, lambda_min: value, residual, ...;

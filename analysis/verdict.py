@@ -42,6 +42,7 @@ def verdict(data: Mapping[str, Any]) -> list[Line]:
         *_of_anisotropy(data["anisotropy"]),
         *_of_needles(data["eigenvalues"]["max"].get("lives_on"), data["counts"]),
         *_of_finite_probe(data.get("finite_probe")),
+        *_of_depth(data.get("depth")),
         *_of_counts(data["counts"]),
         *_of_skips(data.get("skipped", {})),
         *of_slice(data.get("slice")),
@@ -181,6 +182,28 @@ def resolved(probe: Mapping[str, Any]) -> list[bool]:
     here = abs(probe["infinitesimal"])
     pairs = zip(probe["curvatures"], probe["round_off"], strict=True)
     return [_is_finite(value) and _is_finite(bound) and bound <= max(abs(value), here) / 2 for value, bound in pairs]
+
+
+def _of_depth(depth: Mapping[str, Any] | None) -> list[Line]:
+    """The paper's statement that the positions' gradient is typically 100 times as large along the rays as across them."""
+    if depth is None:
+        return []
+    lines = []
+    if _is_finite(depth["gradient_ratio"]):
+        text = f"In depth, along the rays, the gradient of the positions is {quantity(depth['gradient_ratio'])} times"
+        text += " what it is in a direction across them (root mean square; the paper says about 100)"
+        if _is_finite(depth["curvature_ratio"]["value"]):
+            ratio = depth["curvature_ratio"]
+            text += f", and their curvature {quantity(ratio['value'])} times{_bracket(ratio)}"
+        lines.append(Line(f"{text}."))
+    rises = [row for row in depth["rises"] if _is_finite(row["ratio"])]
+    if rises:
+        parts = [f"{measured(row['ratio'], row['ratio_error'])} at {row['pixels']:g} px" for row in rises]
+        crossed = max(row["depth_crossed"] for row in rises)
+        text = "Steps along the rays raise the loss by this many times what steps as long across them do: "
+        text += f"{', '.join(parts)}. They changed the order of the splats in up to {crossed:.0%} of the renders"
+        lines.append(Line(f"{text}, which derivatives do not see."))
+    return lines
 
 
 def _of_skips(skipped: Mapping[str, Mapping[str, Any]]) -> list[Line]:

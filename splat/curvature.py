@@ -155,14 +155,15 @@ class SceneObjective:
 
         The piece: which splats each tile draws, in which order.  Changes nothing, and may run in several threads at once.
         """
-        total, pieces = 0.0, []
         gaussians = self.active.with_flat(flat.to(self.active.flat.device))
         gaussians.require_finite()
-        for view, loss in zip(self.views, self._losses, strict=True):
-            raster = rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True)
-            total += loss.value(raster.planes)
-            pieces.append(raster.order)
-        return float(self.mean(torch.tensor(total, dtype=torch.float64))), self.joined(hash(tuple(pieces)))
+        losses, pieces = zip(*(self.evaluate_view(index, gaussians) for index in range(len(self.views))), strict=True)
+        return float(self.mean(torch.tensor(sum(losses), dtype=torch.float64))), self.joined(hash(pieces))
+
+    def evaluate_view(self, index: int, gaussians: Gaussians) -> tuple[float, Hashable]:
+        """The same of one view that this process holds, at finite Gaussians in place of the active ones."""
+        raster = rasterize_view(gaussians, self.views[index].camera, self.background, self.settings, finite=True)
+        return self._losses[index].value(raster.planes), raster.order
 
     def loss(self, flat: Float[Tensor, " p"]) -> float:
         """L alone."""

@@ -10,9 +10,12 @@ its own coefficient and the mean stays unbiased).  x and y are sums over views, 
 up to M times less variance than with common ones, at no cost (three views of fern: position, rotation and SH 2.6 to 3.6 times
 less, log-scales and opacity 1.2 to 1.9).  A sample costs one J u of as many vectors as there are blocks whose error is
 not yet small enough, and no backward pass.  Where the loss is a sum over pixels, l'' = D and the traces are exact.
+
+`sampled_traces` does the same for other parts of the parameters, such as positions along the rays (`depth.py`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from math import sqrt
 from time import monotonic
 
@@ -30,6 +33,10 @@ from splat.gaussians import ATTRIBUTES
 ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
 LEAST_SAMPLES = 4  # a mean, a slope, and a spread of two degrees of freedom
 COLUMNS = 5  # vectors in a pass over the pixels: one for each block
+
+Draw = Callable[[int, Sequence[torch.Generator], Sequence[str]], Float[Tensor, "p b s"]]
+"""(index of a view that this process holds, generators, names): for each name and each generator a random vector over the
+active parameters, of mean 0 and with the projector onto the named part as its covariance."""
 
 
 def exact_traces(
@@ -65,24 +72,38 @@ def exact_traces(
         }
     pixelwise = coupled.traces(quats, units)
     first, most = (samples, samples) if samples else (settings.min_probes, settings.max_probes)
-    blocks = [_Block(name, sizes[name], known[name], pixelwise[name], settings, first, most) for name in known]
-    deadline = monotonic() + settings.max_seconds
-    while still := [block for block in blocks if block.open]:
-        count, next_look = still[0].count, min(block.looks.next for block in still)
-        # few blocks leave room for several samples in the pass over the pixels
+    traces = [SampledTrace(name, sizes[name], known[name], pixelwise[name], settings, first, most) for name in known]
+    return sampled_traces(objective, generator, partial(_signs, objective, scale), traces, progress)
+
+
+def sampled_traces(
+    objective: SceneObjective,
+    generator: torch.Generator,
+    draw: Draw,
+    traces: Sequence["SampledTrace"],
+    progress: Progress | None = None,
+) -> dict[str, TraceEstimate]:
+    """Sample traces, side by side, until none is open."""
+    start = monotonic()
+    while still := [trace for trace in traces if trace.open]:
+        count, next_look = still[0].count, min(trace.looks.next for trace in still)
+        # few traces leave room for several samples in the pass over the pixels
         together = min(max(COLUMNS // len(still), 1), next_look - count)
-        sampled = _sample(objective, generator, [block.name for block in still], together, scale)
-        late = monotonic() > deadline
-        for block, x, y in zip(still, *sampled, strict=True):
-            block.add(x, y, late)
+        sampled = coupling_samples(objective, generator, draw, [trace.name for trace in still], together)
+        seconds = monotonic() - start
+        for trace, x, y in zip(still, *sampled, strict=True):
+            trace.add(x, y, late=seconds > trace.settings.max_seconds)
         if progress:
             state = f"traces: {count + together} samples of the coupling between pixels"
-            progress(count + together, most, state)
-    return {block.name: block.estimate() for block in blocks}
+            progress(count + together, still[0].most, state)
+    return {trace.name: trace.estimate() for trace in traces}
 
 
-class _Block:
-    """The samples of one block, from first to most, and whether it needs more."""
+class SampledTrace:
+    """The samples of one trace, from first to most, and whether it needs more.
+
+    known: T_b, pixelwise: C_b of the module's docstring.
+    """
 
     def __init__(
         self, name: str, dim: int, known: float, pixelwise: float, settings: TraceSettings, first: int, most: int
@@ -138,30 +159,33 @@ def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " 
     return sqrt(float(rest.square().sum()) / (count - 2) * (1 / count + off**2 / spread))
 
 
-def _sample(
-    objective: SceneObjective,
-    generator: torch.Generator,
-    names: list[str],
-    count: int,
-    scale: Float[Tensor, " p"] | None = None,
+def coupling_samples(
+    objective: SceneObjective, generator: torch.Generator, draw: Draw, names: Sequence[str], count: int
 ) -> tuple[Float64[Tensor, "b s"], Float64[Tensor, "b s"]]:
-    """x and y of the named blocks for so many draws of signs, which are the same whatever the names and the count are."""
+    """x and y of the named parts for so many draws, which are the same whatever the names and the count are."""
     seeds = torch.randint(2**62, (count,), generator=generator, device=generator.device).tolist()
     total = torch.zeros(2, len(names) * count, dtype=torch.float64)
-    for view, held in zip(objective.view_numbers, objective.linearized, strict=True):
+    for index, held in enumerate(objective.linearized):
+        view = objective.view_numbers[index]
         generators = [torch.Generator(generator.device).manual_seed(seed + view) for seed in seeds]
-        U = _signs(objective, generators, names).flatten(1)
-        total += torch.stack(held.loss_curvatures(U if scale is None else U * scale[:, None])).cpu()
+        total += torch.stack(held.loss_curvatures(draw(index, generators, names).flatten(1))).cpu()
     x, y = objective.mean(total)
     return x.view(len(names), count), y.view(len(names), count)
 
 
-def _signs(objective: SceneObjective, generators: list[torch.Generator], names: list[str]) -> Float[Tensor, "p b s"]:
+def _signs(
+    objective: SceneObjective,
+    scale: Float[Tensor, " p"] | None,
+    _index: int,
+    generators: Sequence[torch.Generator],
+    names: Sequence[str],
+) -> Float[Tensor, "p b s"]:
     """A draw of signs for each generator, in as many vectors as blocks."""
     flat = objective.active.flat
     U = flat.new_zeros(flat.numel(), len(names), len(generators))
     for j, generator in enumerate(generators):
         z = draw_probes(flat.numel(), 1, generator, flat.dtype, "rademacher")[:, 0]
+        z = z if scale is None else z * scale
         for i, name in enumerate(names):
             rows = objective.blocks[name]
             U[rows, i, j] = z[rows]

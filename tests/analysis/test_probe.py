@@ -9,22 +9,26 @@ import sys
 import time
 from contextlib import nullcontext
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from analysis.cli import main
 from analysis.measurement import SHARES, ProbeSettings
 from analysis.options import ProbeOptions
 from analysis.probe import run_probe, scene_objective
 from analysis.probe_record import literal_index
+from analysis.probe_table import probe_table
 from analysis.records import Record, read_record
 from landscape import DenseOperator, EigenSettings, PowerSettings, extreme_eigenpairs, power_ends
 from splat.adam import Adam
 from splat.checkpoint import load_checkpoint, save_checkpoint
 from splat.densify import ScreenGradients
+from splat.depth import STEPS, depth_split
 from splat.losses import photometric_loss
 from splat.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -255,6 +259,29 @@ def test_the_finite_probe_meets_the_curvature_where_nothing_is_crossed(record):
     assert abs(probe["curvatures"][best] - probe["infinitesimal"]) <= bound < 0.1 * probe["infinitesimal"]
 
 
+def test_positions_are_split_along_and_across_the_rays(record, dense):
+    found, objective = record.data["depth"], dense[0]
+    split = depth_split(objective, torch.Generator().manual_seed(1))
+    assert found["gradient_ratio"] == pytest.approx(split.gradient_ratio, rel=1e-6)
+    assert found["gradient_median"] == pytest.approx(split.median_ratio, rel=1e-6)
+    assert found["pairs"] == len(split.components) <= len(objective.active) * len(objective.views)
+    depth, lateral = found["curvature"]["depth"], found["curvature"]["lateral"]
+    whole = record.data["traces"]["means"]
+    error = math.hypot(*(trace["standard_error"] for trace in (depth, lateral, whole)))
+    assert abs(depth["value"] + lateral["value"] - whole["value"]) < 5 * error
+    assert found["curvature_ratio"]["value"] == pytest.approx(2 * depth["value"] / lateral["value"], rel=1e-12)
+    assert [row["pixels"] for row in found["rises"]] == list(STEPS)
+    for row in found["rises"]:
+        assert row["ratio"] == pytest.approx(row["depth"] / row["lateral"], rel=1e-12)
+        assert min(row[f"{kind}_error"] for kind in ("depth", "lateral", "ratio")) > 0
+        assert 0 <= row["depth_crossed"] <= 1
+    console = Console(width=140, record=True, file=StringIO())
+    console.print(probe_table(record.data))
+    table = console.export_text()
+    assert "depth gradient / lateral" in table and "depth curvature / lateral" in table
+    assert all(f"depth / lateral rise, {step:g} px" in table for step in STEPS)
+
+
 def test_quantiles_ascend_and_hold_those_of_the_dense_spectrum(record, dense):
     _, H, _, _ = dense
     found, null = record.data["quantiles"], len(H) - record.data["counts"]["rank"]
@@ -297,6 +324,7 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
         said.out.split()
     )
     assert data["finite_probe"] is None and "the finite probe was left out" in data["notes"]
+    assert data["depth"] is None and "positions along and across the rays were left out" in data["notes"]
     assert data["anisotropy"]["share"]["value"] is None and "density" not in data["timing"]
     assert "the spectral density was left out, and the indices that need it" in data["notes"]
     skips = data["skipped"]
@@ -329,6 +357,7 @@ def test_a_budget_that_ends_is_said_and_what_was_reached_is_recorded(run, tmp_pa
     assert any("the slice's interpolation stopped" in note for note in data["notes"])
     assert data["anisotropy"]["share"]["value"] is None
     assert any("density was left out" in note for note in data["notes"])
+    assert data["depth"]["rises"] == [] and any("steps along the rays were left out" in note for note in data["notes"])
     assert "density was left out" in " ".join(capsys.readouterr().out.split())
 
 

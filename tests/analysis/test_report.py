@@ -100,6 +100,46 @@ def test_every_number_of_the_tables_is_on_the_page_with_its_error(tmp_path):
         assert expected in text
 
 
+def depth_section(ratio: float | None = 0.0068) -> dict[str, Any]:
+    trace = {"value": 3.9e-4, "standard_error": 1e-5}
+    rise = {"depth": 1.4e-4, "depth_error": 1e-5, "depth_crossed": 0.75, "lateral": 5e-4, "lateral_error": 2e-6}
+    rows = [{"pixels": 0.1, "ratio": 0.28, "ratio_error": 0.02, "lateral_crossed": 0.5, **rise}]
+    return {
+        "gradient_ratio": ratio,
+        "gradient_median": ratio,
+        "pairs": 23054,
+        "curvature": {"depth": trace, "lateral": {"value": 20.4, "standard_error": 0.3}},
+        "curvature_ratio": {"value": 3.8e-5, "low": 3.7e-5, "high": 3.9e-5, "note": ""},
+        "rises": rows,
+    }
+
+
+def test_the_page_says_what_lies_in_depth_and_how_far_that_is_from_the_papers_factor(tmp_path):
+    data, arrays = synthetic()
+    assert "along the rays" not in Page(page(tmp_path / "without", data, arrays)).text
+    text = Page(page(tmp_path / "with", data | {"depth": depth_section()}, arrays)).text
+    for expected in (
+        "the gradient of the positions is 0.00680 times what it is in a direction across them",
+        "(root mean square; the paper says about 100)",
+        "curvature 3.80 × 10⁻⁵ times (between 3.70 × 10⁻⁵ and 3.90 × 10⁻⁵)",
+        "what steps as long across them do: 0.280 ± 0.020 at 0.1 px.",
+        "They changed the order of the splats in up to 75% of the renders",
+        "20.40 ± 0.30",
+        "75% and 50%",
+        "23,054 pairs",
+    ):
+        assert expected in text
+
+
+def test_of_depth_only_what_was_determined_is_said():
+    data, _ = synthetic()
+    undetermined = depth_section(None) | {"rises": []}
+    assert "along the rays" not in sentences(data | {"depth": undetermined})
+    open_ratio = depth_section() | {"curvature_ratio": {"value": None, "low": None, "high": None, "note": "why"}}
+    said = sentences(data | {"depth": open_ratio})
+    assert "(root mean square; the paper says about 100)." in said
+
+
 def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
     data, arrays = synthetic()
     data["slice"]["directions"][0]["name"] = '<a href="http://example.org">e₁</a>'

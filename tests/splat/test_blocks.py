@@ -1,5 +1,6 @@
 """Every Gaussian's own block of the Hessian, and the traces that build on it, against the dense Hessian in float64."""
 
+from functools import partial
 from math import sqrt
 
 import pytest
@@ -15,7 +16,7 @@ from splat.losses import LossSettings
 from splat.losses_cpu import ViewLoss
 from splat.render import render
 from splat.scenes.view import View
-from splat.traces import LEAST_SAMPLES, _Block, _sample, exact_traces
+from splat.traces import LEAST_SAMPLES, SampledTrace, _signs, coupling_samples, exact_traces
 from tests.splat.random_scenes import random_camera, random_gaussians, random_like
 
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")
@@ -150,6 +151,12 @@ def test_traces_with_ssim_are_within_their_errors_over_many_seeds(
         assert float(z.square().mean()) < 3, name
 
 
+def samples_of(
+    objective: SceneObjective, generator: torch.Generator, names: list[str], count: int
+) -> tuple[Tensor, Tensor]:
+    return coupling_samples(objective, generator, partial(_signs, objective, None), names, count)
+
+
 @pytest.mark.parametrize("noise", [0.02, 0.5], ids=["near a fit", "far from a fit"])
 def test_intervals_of_fixed_and_adaptive_budgets_cover_over_two_hundred_runs(noise: float) -> None:
     """95% intervals: 200 runs of 95% stay within 89.5 to 99% with a probability of 0.9986 (four blocks in a hundred fail)."""
@@ -158,13 +165,14 @@ def test_intervals_of_fixed_and_adaptive_budgets_cover_over_two_hundred_runs(noi
     truth = {name: float(H.diagonal()[rows].sum()) for name, rows in objective.blocks.items()}
     quats, generator = objective.active.quats, torch.Generator().manual_seed(0)
     known, pixelwise = (objective.block_diagonal(gauss_newton=part).traces(quats) for part in (False, True))
-    pool = torch.stack([torch.stack(_sample(objective, generator, names, 100)) for _ in range(40)], dim=2).flatten(2)
+    draws = [torch.stack(samples_of(objective, generator, names, 100)) for _ in range(40)]
+    pool = torch.stack(draws, dim=2).flatten(2)
     fixed, adaptive = TraceSettings.fixed(8), TraceSettings(rtol=0.05, max_probes=64)
     for settings, first, most in ((fixed, 8, 8), (adaptive, 8, 64), (adaptive, LEAST_SAMPLES, LEAST_SAMPLES)):
         for i, name in enumerate(names):
             covered, at = 0, 0
             for _ in range(200):
-                block = _Block(name, 0, known[name], pixelwise[name], settings, first, most)
+                block = SampledTrace(name, 0, known[name], pixelwise[name], settings, first, most)
                 while block.open:
                     block.add(*pool[:, i, [at % pool.shape[2]], None].squeeze(2), late=False)
                     at += 1
@@ -187,7 +195,7 @@ def test_every_view_draws_signs_of_its_own() -> None:
     alone = SceneObjective(objective.active, objective.views[:1], LossSettings())
     twice = SceneObjective(objective.active, objective.views[:1] * 2, LossSettings())
     names, draws = list(objective.blocks), 400
-    spread = [_sample(of, torch.Generator().manual_seed(0), names, draws)[0].var(dim=1) for of in (alone, twice)]
+    spread = [samples_of(of, torch.Generator().manual_seed(0), names, draws)[0].var(dim=1) for of in (alone, twice)]
     # of a ratio of two sample variances of near-normal numbers: sqrt(4 / draws) each way, four of them
     assert all(abs(float(ratio) - 0.5) < 0.5 * 4 * sqrt(4 / draws) for ratio in spread[1] / spread[0])
 

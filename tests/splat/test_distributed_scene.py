@@ -9,6 +9,7 @@ from landscape.distributed import Ranks
 from landscape.eigen import EigenSettings, extreme_eigenpairs
 from landscape.trace import TraceSettings
 from splat.curvature import SceneHessian, SceneObjective
+from splat.depth import depth_rises, depth_split
 from splat.distributed import DistributedHessian, DistributedObjective
 from splat.losses import LossSettings
 from splat.traces import exact_traces
@@ -30,12 +31,18 @@ def measured(objective: SceneObjective, hessians: list[SceneHessian]) -> Finding
     traces = exact_traces(objective, torch.Generator().manual_seed(1), TraceSettings.fixed(8))
     ends = extreme_eigenpairs(hessians[0], torch.Generator().manual_seed(2), EigenSettings(1, 1, rtol=1e-6))
     blocks = objective.block_diagonal()
+    split = depth_split(objective, torch.Generator().manual_seed(3), TraceSettings.fixed(8))
+    rises = depth_rises(objective, torch.Generator().manual_seed(4), (0.1, 10.0))
     return {
         "mask": objective.mask.double(),
         "loss": torch.tensor(objective.loss(objective.active.flat)),
         "gradient": objective.gradient,
         "geometry": blocks.geometry,
         "sh": blocks.sh,
+        "pairs": split.components,
+        "depth": torch.stack([split.depth.samples, split.lateral.samples]),
+        "rises": torch.stack([rises.values, rises.errors]),
+        "crossed": rises.crossed,
         "traces": torch.stack([trace.samples for trace in traces.values()]),
         "ends": torch.cat([ends.largest.values, ends.smallest.values]),
         **{f"product {i}": hessian.apply(V) for i, hessian in enumerate(hessians)},
