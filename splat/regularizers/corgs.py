@@ -48,7 +48,7 @@ from splat.train import Training
 
 @dataclass(frozen=True)
 class CoRGS(Method):
-    """distance: world units; noise: in units of the cameras' mean distance from their centroid.
+    """distance: world units; noise: in units of the cameras' mean distance from their centroid; the others but weight: steps.
 
     prune_every 0 leaves out the co-pruning, weight 0 the co-regularisation.
     """
