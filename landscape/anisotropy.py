@@ -45,7 +45,7 @@ def literal(ends: EigenEnds) -> Bracket:
     """lambda_max / lambda_min, signed: StableGS's Eq. (3).
 
     The value is always the quotient of what was found; where lambda_min may be 0, the bracket is that of its modulus instead,
-    with no upper bound.  The note says which, and whether the operator is definite.
+    with no upper bound.  The note says so, or else whether the operator is definite.
     """
     top, bottom = _intervals(ends)
     smallest = float(ends.smallest.values[0])
@@ -96,7 +96,7 @@ def effective_rank(ends: EigenEnds, density: SpectralDensity) -> Bracket:
 
 
 def mass_quantile(ends: EigenEnds, density: SpectralDensity, p: float = 0.05) -> Bracket:
-    """lambda_max / t, t the magnitude below which the share p of sum |lambda| lies (`absolute_quantile`)."""
+    """lambda_max / t, t the magnitude at or below which the share p of sum |lambda| lies (`absolute_quantile`)."""
     top, small = _intervals(ends)[0], absolute_quantile(density, p, JOINT)
     if not small.value:
         return Bracket(None, inf, inf, small.note)

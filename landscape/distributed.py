@@ -8,7 +8,7 @@
 
 Every rank runs the same estimator with the same seed.  An all-reduce hands the same bits to all, so all take the same steps;
 the numbers are those of one process but for the order of the sum.  What clocks decide may differ between ranks, so time
-budgets have to stay infinite.  Before a product the ranks compare their vectors, bit for bit: where they parted, all raise.
+budgets have to stay infinite.  Before a product the ranks compare a checksum of their vectors: where they parted, all raise.
 Where a process fails the others do not wait for it: what they exchange next raises ConnectionError.
 """
 
@@ -89,7 +89,7 @@ class Ranks:
             raise ValueError(f"expected the same {name} on every rank, got {value} on rank {self.rank} of {self.size}")
 
     def require_same_vectors(self, V: Float[Tensor, "n k"]) -> None:
-        """Raise ValueError on all ranks unless they have the same number of vectors, the same bit for bit."""
+        """Raise ValueError on all ranks unless they have as many vectors, with the same sum of all entries' bit patterns."""
         bits = {2: torch.int16, 4: torch.int32, 8: torch.int64}[V.element_size()]
         fingerprint = int(V.contiguous().view(bits).sum(dtype=torch.int64))  # exact, in whatever order it is added up
         if not self._agree(V.shape[1], fingerprint):

@@ -85,8 +85,8 @@ def finite_probe(
 ) -> FiniteProbe:
     """Probe along direction, for one matvec and 2 len(steps) + 1 + noise_points evaluations.
 
-    loss, center, operator: as for `evaluate_slice`.  steps: two or more, increasing, in multiples of direction; by default 1e-5
-    to 1, two a decade.  noise_points: values that the noise is estimated from, more than four.
+    loss, center: as for `evaluate_slice`; operator: H at center.  steps: two or more, increasing, in multiples of direction; by
+    default 1e-5 to 1, two a decade.  noise_points: values that the noise is estimated from, more than four.
 
     >>> from landscape.operator import DenseOperator
     >>> found = finite_probe(lambda x: (x**4).sum(), torch.ones(1, dtype=torch.float64), torch.ones(1),

@@ -23,7 +23,7 @@ SMALLEST = 1e-140  # a length whose square has all its digits, and those of its 
 
 @dataclass(frozen=True, eq=False)
 class LanczosFactorization:
-    """H Q = Q T + r e_m^T, m the steps made: fewer than asked for where Q spans an invariant subspace (r = 0) or is enough."""
+    """H Q = Q T + r e_m^T, m the steps made: fewer than asked for where Q spans an invariant subspace (r = 0) or was enough."""
 
     Q: Float[Tensor, "n m"]
     T: Float64[Tensor, "m m"]

@@ -22,7 +22,7 @@ from landscape.results import EigenEnds, Eigenpairs, Progress, StopReason
 class PowerSettings:
     """Power iteration stops at a residual |H v - lambda v| of max(rtol |lambda|, atol), or when its budget is spent.
 
-    max_matvecs, max_seconds: for one end; `power_ends` spends them twice.
+    max_matvecs, max_seconds: for one end; `power_ends` may spend them twice.
     """
 
     rtol: float = 1e-3

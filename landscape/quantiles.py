@@ -41,7 +41,7 @@ TINY = torch.finfo(torch.float64).tiny
 def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Bracket:
     """The eigenvalue that the share p (0 < p < 1) of all eigenvalues lies at or below: 0.5 is the median.
 
-    An end of the bracket that no node bounds is infinite.
+    confidence: that the bracket holds the truth; an end of it that no node bounds is infinite.
 
     >>> from landscape.density import spectral_density
     >>> H = DenseOperator(torch.diag(torch.linspace(0, 1, 1001, dtype=torch.float64)))
