@@ -179,7 +179,7 @@ class Training:
         )
 
     def move(self, device: torch.device) -> None:
-        """Go on on another device; the generator stays on the CPU, so that it draws the same numbers everywhere."""
+        """Continue on another device; the generator stays on the CPU, so that it draws the same numbers everywhere."""
         gradients = self.screen_gradients
         self.gaussians = self.gaussians.with_flat(self.gaussians.flat.to(device))
         self.adam.first, self.adam.second = (
