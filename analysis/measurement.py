@@ -87,14 +87,19 @@ SHARES = {
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """How much of everything.
+    """How much of everything; the defaults are for numbers to 1%.
 
-    checked_vectors, checked_views: of the self-checks; None: all views.  trace_samples: just so many; None: until `traces` is
-    met.  density_matvecs: 0: no density.  slice_radius: half the slice's side, in curvature units, sqrt(2 rise / lambda);
-    slice_rise: that rise of the loss, as a share of the loss; slice_tolerance: of what lies between its renders, as a share of
-    its range; slice_holdout: renders that judge it.  probe_steps: of the finite probe, parameter units, none: it is left out;
-    noise_points: its renders that tell their noise.  timings: of each product that tells what a skip saves, 0: it is not
-    told.  seconds: for all estimators together.  memory: GiB for the vectors of a basis.
+    checked_vectors, checked_views: of the self-checks; None: all views.
+    trace_samples: exactly so many for each trace; None: as many as `traces` asks for.
+    power: None: no power iteration.  density_matvecs: products of the spectral density; 0: it is left out.
+    slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
+        of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
+        slice_holdout: renders that judge this error.
+    probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
+        noise of a render.
+    depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
+    timings: how often each product is timed that tells what a skip saves; 0: that is not told.
+    seconds: for all estimators together.  memory: GiB for the vectors of a basis.
     """
 
     checked_vectors: int = 4
@@ -129,7 +134,7 @@ class ProbeSettings:
 
     @classmethod
     def quick(cls) -> "ProbeSettings":
-        """Numbers to 10% in a third of the time."""
+        """Numbers to 10%, in a quarter of the time."""
         return cls(
             checked_vectors=2,
             checked_views=1,

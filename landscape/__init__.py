@@ -1,6 +1,14 @@
 """Curvature of any objective from products with its Hessian: traces, eigenpairs, densities, anisotropy, slices.
 
-Everything here sees a `SymmetricOperator` and a `torch.Generator`, and returns a frozen result that carries its error.
+An estimator takes a `SymmetricOperator` H (products with k vectors at once, V of shape (n, k)) and a `torch.Generator`, and
+returns a frozen result that carries its error.  Bad arguments, and products that are not finite, raise ValueError.
+
+    operators     `ObjectiveHessian` of a torch function, `DenseOperator` of a matrix, and sums, restrictions, ... of these
+    checks        `check_operator`, `check_gradient`, `check_objective`: is it the Hessian?
+    estimators    `estimate_traces`, `estimate_diagonal`, `extreme_eigenpairs`, `spectral_density`
+    indices       `anisotropy` of ends and a density; `families`: of the whole operator and of each of its blocks
+    slices        `evaluate_slice` along `random_directions`, `gradient_direction`, ...; `finite_probe` at finite steps
+    processes     `Ranks`, `DistributedOperator`
 """
 
 from landscape.absolute_sum import absolute_sum

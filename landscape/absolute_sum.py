@@ -30,7 +30,10 @@ FAR = 1e8  # in units of the largest node; a node there adds 1 / FAR to the inte
 
 
 def absolute_sum(density: SpectralDensity, confidence: float = 0.95) -> Bracket:
-    """sum_i |lambda_i|: the mean of `absolute_integral` over start vectors, within its bounds widened by their spread."""
+    """sum_i |lambda_i|, the nuclear norm: the mean of `absolute_integral` over start vectors.
+
+    The bracket is made of the means of its lower and upper bounds, widened by Student's interval at this confidence.
+    """
     certain = float(density.known.abs().sum())
     shift, error = density.by_trace(torch.abs, confidence)
     error += density.of_known(torch.abs)

@@ -31,7 +31,7 @@ JOINT = 1 - (1 - CONFIDENCE) / 2  # each of two intervals, so that both hold wit
 
 
 def anisotropy(ends: EigenEnds, density: SpectralDensity | None = None) -> Anisotropy:
-    """The whole family, as far as what is given carries it."""
+    """The whole index family; without a density only `literal` and `saddle`.  ends: at least one pair at each end."""
     return Anisotropy(
         literal=literal(ends),
         saddle=saddle(ends),
@@ -42,7 +42,11 @@ def anisotropy(ends: EigenEnds, density: SpectralDensity | None = None) -> Aniso
 
 
 def literal(ends: EigenEnds) -> Bracket:
-    """lambda_max / lambda_min, Eq. (3), signed: always the quotient as found, with what is certain of it."""
+    """lambda_max / lambda_min, signed: StableGS's Eq. (3).
+
+    The value is always the quotient of what was found; where lambda_min may be 0, the bracket is that of its modulus instead,
+    with no upper bound.  The note says so, or else whether the operator is definite.
+    """
     top, bottom = _intervals(ends)
     smallest = float(ends.smallest.values[0])
     value = float(ends.largest.values[0]) / smallest if smallest else None
@@ -55,7 +59,7 @@ def literal(ends: EigenEnds) -> Bracket:
 
 
 def saddle(ends: EigenEnds) -> Bracket:
-    """lambda_max / |lambda_min| of an operator with curvatures of both signs."""
+    """lambda_max / |lambda_min| of an operator with curvatures of both signs; undefined (None) for any other."""
     top, bottom = _intervals(ends)
     if bottom[0] >= 0:
         return Bracket(None, inf, inf, "no negative curvature: the operator is positive semi-definite")
@@ -68,7 +72,7 @@ def saddle(ends: EigenEnds) -> Bracket:
 
 
 def share(ends: EigenEnds, density: SpectralDensity) -> Bracket:
-    """lambda_max / sum |lambda|, at most 1."""
+    """lambda_max / sum |lambda|, at most 1: the share of all curvature that lies in the steepest direction."""
     top, total = _intervals(ends)[0], absolute_sum(density, JOINT)
     if not total.value:
         return Bracket(None, inf, inf, "the operator is zero")
@@ -79,7 +83,7 @@ def share(ends: EigenEnds, density: SpectralDensity) -> Bracket:
 
 
 def effective_rank(ends: EigenEnds, density: SpectralDensity) -> Bracket:
-    """(sum |lambda|)^2 / sum lambda^2, between 1 and n."""
+    """(sum |lambda|)^2 / sum lambda^2, between 1 and n: over how many directions curvature is spread."""
     total, squares = absolute_sum(density, JOINT), density.integral(lambda x: x.square(), JOINT)
     if not total.value or not squares.value:
         return Bracket(None, inf, inf, "the operator is zero")
@@ -92,7 +96,7 @@ def effective_rank(ends: EigenEnds, density: SpectralDensity) -> Bracket:
 
 
 def mass_quantile(ends: EigenEnds, density: SpectralDensity, p: float = 0.05) -> Bracket:
-    """lambda_max / the |lambda| that the share p of sum |lambda| lies at or below."""
+    """lambda_max / t, t the magnitude at or below which the share p of sum |lambda| lies (`absolute_quantile`)."""
     top, small = _intervals(ends)[0], absolute_quantile(density, p, JOINT)
     if not small.value:
         return Bracket(None, inf, inf, small.note)

@@ -25,7 +25,11 @@ ROUND_OFFS = 1e4  # of a sum of up to 1e8 rounded terms, whose errors add up as 
 
 @dataclass(frozen=True)
 class OperatorCheck:
-    """Measured asymmetry and round-off of an operator, relative to |H z| of a random vector; nan where not finite."""
+    """Measured asymmetry and round-off of an operator, relative to |H z| of a random vector z.
+
+    symmetry, noise: see the top of this module; nan where a product was not finite.  tolerance: what either may be.
+    matvecs: products it took.
+    """
 
     symmetry: float
     noise: float
@@ -50,10 +54,11 @@ class OperatorCheck:
 
 @dataclass(frozen=True)
 class DerivativeCheck:
-    """Relative error of the operator against finite differences: the best over steps, and all of them.
+    """Relative error of the operator against finite differences.
 
-    skipped: steps on which the signature changed (a sort or a threshold was crossed), so that they prove nothing.
-    error is nan where all were skipped.
+    steps, errors: those that were tried, and their relative errors; error, step: the least of these errors and its step, both
+    nan where no step was tried.  skipped: how many steps were left out because the signature changed along them (a sort or a
+    threshold was crossed), so that they prove nothing.
     """
 
     error: float
@@ -75,9 +80,10 @@ class DerivativeCheck:
 def check_operator(
     operator: SymmetricOperator, generator: torch.Generator, vectors: int = 4, tolerance: float | None = None
 ) -> OperatorCheck:
-    """Symmetry, round-off and finiteness, from vectors + 1 matvecs.
+    """Symmetry, round-off and finiteness of products, from vectors + 1 matvecs.
 
-    tolerance: relative to |H z|; by default 1e4 units of round-off of the operator's dtype.
+    vectors: random ones that are compared pair by pair, at least 2.  tolerance: of asymmetry and round-off, relative to |H z|;
+    1e4 units of round-off (eps) of the operator's dtype where None.  A check that fails raises nothing: see `passed`.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.eye(5, dtype=torch.float64))
@@ -112,9 +118,11 @@ def check_gradient(
     signature: Callable[[Tensor], Hashable] | None = None,
     enough: float = 0.0,
 ) -> DerivativeCheck:
-    """H v against the central difference of gradient(theta) along v = direction, in units of which steps are given.
+    """H v against the central difference of the gradient along v = direction.
 
-    enough: the relative error at which no further step is tried.
+    gradient(theta) -> (n,), of the objective at any theta; center: where H is taken.  steps: multiples of direction, all above
+    0.  signature(theta): which smooth piece of the objective theta lies in; steps that leave the centre's are skipped.
+    enough: no further step is tried once a relative error is this small; 0 tries all, unless one is exact.
     """
     product = operator.apply(direction.to(operator.dtype)[:, None])[:, 0].double()
 
@@ -133,7 +141,7 @@ def check_objective(
     steps: Sequence[float] = (1e-1, 1e-2, 1e-3, 1e-4),
     signature: Callable[[Tensor], Hashable] | None = None,
 ) -> DerivativeCheck:
-    """v . H v against the second difference of loss(theta) along v = direction, in units of which steps are given."""
+    """v . H v against the second difference of loss(theta) along v = direction; the rest as for `check_gradient`."""
     v = direction.to(operator.dtype)
     curvature = float(torch.dot(v.double(), operator.apply(v[:, None])[:, 0].double()))
     middle = float(loss(center))

@@ -21,7 +21,7 @@ ROUND_OFFS = 10  # of the sum of squares, which is all that is left of the other
 
 @runtime_checkable
 class PartlyKnown(SymmetricOperator, Protocol):
-    """An operator with a part K whose diagonal it knows."""
+    """An operator H = K + R that knows the diagonal of its part K: estimators of traces and of the diagonal make use of it."""
 
     @property
     def known(self) -> SymmetricOperator:

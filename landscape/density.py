@@ -54,7 +54,7 @@ CONFIDENCE = 0.95  # of the interval that is to be short
 
 @dataclass(frozen=True, eq=False)
 class ActiveSpace:
-    """What a known null space of P H P leaves: the orthogonal projector `project(V) -> P V` and its rank."""
+    """What the known null space of an operator P H P leaves: the orthogonal projector `project(V) -> P V` and its rank."""
 
     project: Callable[[Tensor], Tensor]
     rank: int
@@ -76,13 +76,16 @@ def spectral_density(
     ends: EigenEnds | None = None,
     trace: tuple[float, float] | None = None,
 ) -> SpectralDensity:
-    """Gauss rules of random start vectors.
+    """Gauss rules of random start vectors, one Lanczos run each.
 
-    matvecs: products in all, at most.  starts: the number of start vectors, with runs of equal length; None: runs as long as
-    pays (`Lengths`), and as many of these as fit.  longest: the most steps of a run.  batch: vectors at a time (memory:
-    (batch + 1) * longest vectors); only where it is 2 or more do runs find eigenvalues.  active: leaves the eigenvalues of a
-    known null space out; `dim` of the result is then the rank.  ends: eigenpairs found before.  trace: of the operator, with
-    its standard error, where it is known better than from so few start vectors.
+    matvecs: products in all, at most.
+    starts: number of start vectors (2 or more), each with matvecs // starts steps; None: runs as long as pays (`Lengths`), and
+        as many of them as matvecs allow.  longest: the most steps of a run; None: no other limit than matvecs and the rank.
+    batch: runs at a time (memory: (batch + 1) vectors for each step of a run); eigenvalues are told apart as `known` only where
+        it is 2 or more.
+    active: leaves the eigenvalues of a known null space out; `dim` of the result is then the rank.
+    ends: eigenpairs found before by `extreme_eigenpairs`; those that are accurate enough are `known` from the beginning.
+    trace: of the operator, with its standard error, where it is known better than from so few start vectors.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([5.0, -1.0, *[2.0] * 98], dtype=torch.float64)))

@@ -1,8 +1,9 @@
 """The diagonal of H, and how much of it lies on groups of rows.
 
     method "signs"   random signs (Bekas, Kokiopoulou and Saad 2007)
-    method "auto"    the default: half of the probes are signs; where their products tell that it pays, by the rule of
-                     `choice`, they become a sketch and the other half its products (`sketched_diagonal`), else signs too
+    method "auto"    the default: the first half of the probes are signs.  Where their products tell that a sketch pays, by the
+                     rule of `choice`, they become its test vectors and the other matvecs go into the sketch's products
+                     (`sketched_diagonal`); else the other half are signs too
 
     a_i = z_i * (H z_i),   diag H ~ mean of a_i,   variance of an entry: the other entries of its row, squared, over k
 
@@ -13,8 +14,8 @@ with one probe, r what the sketch leaves.
 
 The sensitivity of a group of rows (a Gaussian, say) is the sum of |H_rr| over them.  The modulus of an estimate is too large on
 average: for a normal error s by at most s sqrt(2 / pi), where the entry is zero.  `GroupSums.bias` is that expected excess
-at the estimated entries.  The standard error is of the sum with the estimated signs, so that it knows how the errors of a
-group's rows go together.
+at the estimated entries, summed over the group.  The standard error is that of the sum of s_r H_rr, s_r the estimated signs
+taken for certain: so it includes how the errors of a group's rows are correlated.
 """
 
 from collections.abc import Mapping
@@ -42,7 +43,10 @@ FEWEST = 4  # test vectors of a sketch
 
 @dataclass(frozen=True, eq=False)
 class GroupSums:
-    """sum |H_rr| over the rows of each group, with its standard error and the share of it that noise alone makes."""
+    """sum |H_rr| over the rows of each group, with its standard error.
+
+    bias: by how much noise makes the sum too large on average (the top of this module); it is not subtracted from `values`.
+    """
 
     values: Float64[Tensor, " groups"]
     standard_errors: Float64[Tensor, " groups"]
@@ -51,7 +55,10 @@ class GroupSums:
 
 @dataclass(frozen=True, eq=False)
 class DiagonalEstimate:
-    """diag H.  samples: one column a test vector, with the mean `values`; no column where it is exact."""
+    """diag H.  samples: one column a test vector, whose mean is `values`; no columns where the diagonal is known exactly.
+
+    matvecs: products with H that it took.  method: "signs" or "sketch", whichever was used in the end.
+    """
 
     values: Float64[Tensor, " n"]
     standard_errors: Float64[Tensor, " n"]
@@ -61,7 +68,7 @@ class DiagonalEstimate:
     method: str = "signs"
 
     def block(self, name: str) -> "DiagonalEstimate":
-        """The rows of one block."""
+        """The part of the estimate in one block's rows; its matvecs are those of the whole."""
         rows = self.blocks[name]
         own = {name: slice(0, rows.stop - rows.start)}
         return replace(
@@ -73,7 +80,7 @@ class DiagonalEstimate:
         )
 
     def sensitivity(self, groups: Int64[Tensor, " n"], count: int) -> GroupSums:
-        """sum |H_rr| over the rows of each of `count` groups; groups: the group of every row."""
+        """sum |H_rr| over the rows of each of `count` groups; groups: the number, from 0, of the group of every row."""
         if groups.shape != self.values.shape or not ((groups >= 0) & (groups < count)).all():
             raise ValueError(
                 f"expected a group in 0..{count - 1} for each of {len(self.values)} rows, got shape {tuple(groups.shape)}"
@@ -96,7 +103,11 @@ def estimate_diagonal(
     progress: Progress | None = None,
     method: Method = "auto",
 ) -> DiagonalEstimate:
-    """diag H with a standard error for every entry, from `probes` matvecs at most.  Keeps n x probes numbers in float64.
+    """diag H with a standard error for every entry, from `probes` (3 or more) matvecs at most.
+
+    batch: vectors in one application of the operator.  Keeps n x probes numbers in float64.  Method "auto" is "signs" with
+    fewer than 8 probes, with no more rows than probes, and where a part of the diagonal is known; where all of it is known
+    (`control.PartlyKnown`), nothing is probed.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([1.0, -2.0])))

@@ -1,4 +1,4 @@
-"""Directions to slice along, as columns (n, d), in the units of the parameters.
+"""Directions to slice along, as columns (n, d), in the units of the parameters, in the dtype of what they are made from.
 
     random, filter-normalised   d_g <- d_g |theta_g| / |d_g| for every group g of parameters that one filter, or one attribute
                                 of one item, consists of: a step of 1 changes each by its own size (Li et al. 2018, Sec. 4)
@@ -22,7 +22,10 @@ SMALLEST_SINE = 1e-6  # of the angle between two directions that span a plane; r
 
 
 def groups_of(blocks: Mapping[str, slice], items: int, n: int) -> Int[Tensor, " n"]:
-    """The group of every parameter where each block holds `items` items one after the other: one group a block and item.
+    """The group of every parameter, for `random_directions`: each item of each block is a group of its own.
+
+    blocks: ranges of the n parameters, each of which holds `items` items of equal length one after the other (the positions of
+    all Gaussians, say, then all weights).  ValueError where a block cannot be divided so.
 
     >>> groups_of({"position": slice(0, 6), "weight": slice(6, 8)}, items=2, n=8)
     tensor([0, 0, 0, 1, 1, 1, 2, 3])
@@ -40,9 +43,9 @@ def groups_of(blocks: Mapping[str, slice], items: int, n: int) -> Int[Tensor, " 
 def random_directions(
     center: Float[Tensor, " n"], groups: Int[Tensor, " n"], generator: torch.Generator, count: int = 2
 ) -> Float[Tensor, "n {count}"]:
-    """Gaussian directions, filter-normalised: in each group as long as the group's parameters.
+    """`count` Gaussian directions, filter-normalised: in every group as long as the group's own parameters.
 
-    groups[i]: the number, from 0, of the group of parameter i.  A group of zeros does not move.
+    groups[i]: the number, from 0, of the group of parameter i.  A group whose parameters are all 0 does not move.
 
     >>> groups = torch.tensor([0, 0, 1])
     >>> d = random_directions(torch.tensor([3.0, 4.0, -0.5]), groups, torch.Generator().manual_seed(0), count=1)
@@ -87,7 +90,7 @@ def gradient_direction(gradient: Float[Tensor, " n"]) -> Float[Tensor, "n 1"]:
 
 
 def line_between(start: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[Tensor, "n 1"]:
-    """end - start: sliced from center = start, coordinate 1 is end.
+    """end - start, not normalised: in a slice with center = start, coordinate 0 is start and 1 is end.
 
     >>> line_between(torch.tensor([1.0, 2.0]), torch.tensor([1.0, 5.0])).T
     tensor([[0., 3.]])
@@ -105,6 +108,8 @@ def line_between(start: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[
 
 def orthonormal(directions: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
     """Unit directions at right angles: the first keeps its direction, each other its part orthogonal to those before.
+
+    ValueError where one is zero or not finite, or lies in the span of those before.
 
     >>> orthonormal(torch.tensor([[3.0, 1.0], [4.0, 1.0]]))
     tensor([[ 0.6000,  0.8000],

@@ -8,7 +8,7 @@
 
 Every rank runs the same estimator with the same seed.  An all-reduce hands the same bits to all, so all take the same steps;
 the numbers are those of one process but for the order of the sum.  What clocks decide may differ between ranks, so time
-budgets have to stay infinite.  Before a product the ranks compare their vectors, bit for bit: where they parted, all raise.
+budgets have to stay infinite.  Before a product the ranks compare a checksum of their vectors: where they parted, all raise.
 Where a process fails the others do not wait for it: what they exchange next raises ConnectionError.
 """
 
@@ -30,7 +30,11 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Ranks:
-    """The processes of a group, seen from the one of number `rank` out of `size`.  Every method but share is collective."""
+    """The processes of a group, seen from the one of number `rank` (from 0) out of `size`.
+
+    Every method but `share` is collective: all processes have to call it, in the same order.  group: all processes where None.
+    device: where tensors are exchanged; they come back to the device that they were on.
+    """
 
     rank: int
     size: int
@@ -39,7 +43,7 @@ class Ranks:
 
     @classmethod
     def joined(cls, group: dist.ProcessGroup | None = None) -> "Ranks":
-        """The group that this process has joined (all processes by default)."""
+        """The group that this process has joined (all processes where None).  ValueError where none is initialised."""
         if not (dist.is_available() and dist.is_initialized()):
             raise ValueError(
                 "expected an initialised process group, got none; start with torchrun and call "
@@ -52,6 +56,8 @@ class Ranks:
     def share(self, items: Sequence[Item]) -> Sequence[Item]:
         """This rank's items: a contiguous part, so that all parts one after the other are the items in order.
 
+        ValueError where there are fewer items than ranks.
+
         >>> Ranks(0, 2).share("abcde"), Ranks(1, 2).share("abcde")
         ('ab', 'cde')
         """
@@ -62,15 +68,15 @@ class Ranks:
         return items[self.rank * len(items) // self.size : (self.rank + 1) * len(items) // self.size]
 
     def sum(self, x: Shaped[Tensor, "..."]) -> Shaped[Tensor, "..."]:
-        """The sum of x over ranks."""
+        """The sum of x over ranks, the same bits on each."""
         return self._reduced(x, dist.ReduceOp.SUM)
 
     def any(self, mask: Bool[Tensor, "..."]) -> Bool[Tensor, "..."]:
-        """Where the mask of some rank is set."""
+        """Where the mask of at least one rank is set."""
         return self._reduced(mask.to(torch.uint8), dist.ReduceOp.MAX).bool()
 
     def gather(self, x: Shaped[Tensor, "..."]) -> list[Shaped[Tensor, "..."]]:
-        """x of every rank, in their order; all of one shape."""
+        """x of every rank, in their order; x has to have the same shape and dtype on all."""
         parts = [torch.empty_like(x, device=self.device) for _ in range(self.size)]
         with _exchange():
             dist.all_gather(parts, x.to(self.device).contiguous(), group=self.group)
@@ -83,7 +89,7 @@ class Ranks:
             raise ValueError(f"expected the same {name} on every rank, got {value} on rank {self.rank} of {self.size}")
 
     def require_same_vectors(self, V: Float[Tensor, "n k"]) -> None:
-        """Raise ValueError on all ranks unless they have the same number of vectors, the same bit for bit."""
+        """Raise ValueError on all ranks unless they have as many vectors, with the same sum of all entries' bit patterns."""
         bits = {2: torch.int16, 4: torch.int32, 8: torch.int64}[V.element_size()]
         fingerprint = int(V.contiguous().view(bits).sum(dtype=torch.int64))  # exact, in whatever order it is added up
         if not self._agree(V.shape[1], fingerprint):
@@ -137,9 +143,9 @@ def torchrun_ranks(device: torch.device) -> Iterator[Ranks | None]:
 
 
 class DistributedOperator:
-    """sum_r H_r over ranks; `local` is this rank's H_r.  Collective: every rank applies it to the same vectors.
+    """sum_r H_r over ranks; `local` is this rank's H_r.  Collective: every rank has to apply it to the same vectors.
 
-    Raises ValueError on all ranks where they disagree on rows, dtype or blocks.
+    Raises ValueError on all ranks where they disagree on rows, dtype or blocks, and on the vectors of a product.
     """
 
     def __init__(self, local: SymmetricOperator, ranks: Ranks) -> None:

@@ -30,10 +30,12 @@ def extreme_eigenpairs(
     start: Float[Tensor, "n *k"] | None = None,
     progress: Progress | None = None,
 ) -> EigenEnds:
-    """The largest and smallest eigenvalues with vectors and residuals.
+    """The largest and smallest eigenvalues with vectors and residuals; by default one of each, to 0.1%.
 
-    start: vectors to begin from (those of an earlier checkpoint, say): at the sum of their directions with a random vector of
-    settings.noise of its length.  Progress counts matvecs.
+    start: one or more vectors to begin from, such as those of an earlier checkpoint: the first vector of the recurrence is the
+    sum of their directions, scaled to length 1, plus a random vector of length settings.noise; None: it is random.  Progress
+    counts matvecs.  ValueError where more pairs are asked for than H has rows.  An end that is not found within the budget
+    raises nothing: see its `reason` and residuals.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.linspace(-1, 3, 50, dtype=torch.float64)))

@@ -25,7 +25,10 @@ WHOLE = "all"
 
 @dataclass(frozen=True)
 class FamilySettings:
-    """The budget of the whole and of each block: of both ends, and of the density (starts x steps products)."""
+    """The budget of the whole and of each block.
+
+    eigen: of the search for both ends.  The density has `starts` runs of `steps` products each, `batch` runs at a time.
+    """
 
     eigen: EigenSettings = field(default_factory=lambda: EigenSettings(rtol=1e-2, max_matvecs=60))
     starts: int = 3
@@ -35,7 +38,10 @@ class FamilySettings:
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """What is known of a part beforehand: where the search for both ends begins, and the trace with its standard error."""
+    """What is known of a part beforehand.
+
+    start: vectors in which the search for both ends begins (`extreme_eigenpairs`).  trace: its value and standard error.
+    """
 
     start: Float[Tensor, "n k"] | None = None
     trace: tuple[float, float] | None = None
@@ -43,7 +49,7 @@ class Lead:
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """The indices with what they are derived from.  rank: of the operator, rows of a known null space not counted."""
+    """The indices with what they are derived from.  rank: rows of the operator less the dimension of a known null space."""
 
     rank: int
     ends: EigenEnds
@@ -68,10 +74,10 @@ def families(
     progress: Progress | None = None,
     leads: Mapping[str, Lead] | None = None,
 ) -> dict[str, Family]:
-    """The family of each part: "all" and every block by default; a block without rows is left out.
+    """The family of each part by name: of "all", the whole operator, and every block by default; one without rows is left out.
 
-    active: what a known null space leaves of a part; leads: what is known of it beforehand.  Every part has random numbers of
-    its own, however many the others need.
+    active, leads: for each part by name, what its known null space leaves and what else is known of it beforehand; both may
+    lack parts.  Every part has random numbers of its own, whatever the others need.  ValueError for an unknown part.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([4.0, -1.0, 2.0, 1.0]).double()), {"a": slice(0, 2), "b": slice(2, 4)})

@@ -6,10 +6,10 @@ round-off   4 sqrt(6 noise^2 + 2 (d s)^2) / d^2: four standard errors of a secon
             s = eps |theta * H v| / sqrt(12): away from theta the slope has grown by d H v, and theta + d v is rounded
 truncation  |c(d) - v.H v| as far as neighbouring steps tell it: the term in d^2 that makes their c differ.  It says nothing
             across a kink, a jump or a crossed sort, where c(d) is no derivative at all but still what the probe sees
-noise       standard deviation of L's own error, from differences of order k = 4 of values at close, even steps along v, which
-            what is smooth does not pass: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and Wild 2011, Sec. 2);
-            at least the resolution of the numbers that the objective returns (float32 also where it hands them on as
-            Python's floats, which it does where none of them needs more digits)
+noise       standard deviation of L's own error, from differences of order k = 4 of values at close, even steps along v, in
+            which the smooth part of L cancels: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and Wild 2011,
+            Sec. 2); at least the resolution of the numbers that the objective returns (Python floats that are all
+            float32 numbers count as float32)
 """
 
 from collections.abc import Sequence
@@ -34,10 +34,10 @@ STEPS = tuple(10.0 ** (k / 2) for k in range(-10, 1))
 
 @dataclass(frozen=True, eq=False)
 class FiniteProbe:
-    """c(d) at increasing steps d, in multiples of the direction, with the bound of its round-off and its truncation.
+    """The curvature c(d) at increasing steps d, in multiples of the direction, with its round-off and its truncation.
 
-    infinitesimal: v.H v; crossed: where the signature at +d or -d is not the centre's (None: the objective has none);
-    noise: the standard deviation of one evaluation's error.
+    infinitesimal: v.H v, which c(d) tends to for small d; crossed: where the signature at +d or -d is not the centre's (None:
+    the objective has none); noise: the standard deviation of one evaluation's error; evaluations: of the objective.
     """
 
     steps: Float64[Tensor, " m"]
@@ -52,7 +52,7 @@ class FiniteProbe:
 
     @property
     def best(self) -> int | None:
-        """Of the steps that cross nothing, the one whose round-off and truncation together are least; None without any."""
+        """Index of the step, of those that cross nothing, whose round-off and truncation are least in sum; None without any."""
         error = (self.round_off + self.truncation).nan_to_num(torch.inf, posinf=torch.inf)
         if self.crossed is not None:
             error = error.masked_fill(self.crossed, torch.inf)
@@ -83,7 +83,10 @@ def finite_probe(
     progress: Progress | None = None,
     noise_points: int = NOISE_POINTS,
 ) -> FiniteProbe:
-    """Probe along direction, for one matvec and 2 len(steps) + 1 + noise_points evaluations; loss as for `evaluate_slice`.
+    """Probe along direction, for one matvec and 2 len(steps) + 1 + noise_points evaluations.
+
+    loss, center: as for `evaluate_slice`; operator: H at center.  steps: two or more, increasing, in multiples of direction; by
+    default 1e-5 to 1, two a decade.  noise_points: values that the noise is estimated from, more than four.
 
     >>> from landscape.operator import DenseOperator
     >>> found = finite_probe(lambda x: (x**4).sum(), torch.ones(1, dtype=torch.float64), torch.ones(1),

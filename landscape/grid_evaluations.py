@@ -24,7 +24,7 @@ from landscape.results import Progress
 
 Evaluation = float | Tensor | tuple[float | Tensor, Hashable]
 Loss = Callable[[Tensor], Evaluation]
-"""The objective at theta, or (the objective, its signature): the name of the smooth piece that theta lies in."""
+"""loss(theta) -> the objective, or (the objective, signature), where the signature tells which smooth piece theta lies in."""
 
 SAVE_EVERY = 5.0  # seconds
 SAME_LOSS = 100.0  # round-offs by which one objective at one point may differ between runs, summed in another order

@@ -33,10 +33,16 @@ GROUP = 32  # probes whose vectors are kept for the law of the mean
 
 @dataclass(frozen=True)
 class TraceSettings:
-    """How many probe vectors of which kind.  rtol = atol = 0: max_probes of them, unless max_seconds end it.
+    """How many probe vectors of which kind, and by which method.
 
-    method: see `landscape.trace`; but for "hutchinson" the numbers of probes are numbers of matvecs.  memory: GiB for the
-    vectors of XTrace, which stops where they are full.
+    distribution: entries of a probe are random signs ("rademacher") or standard normal ("gaussian").
+    reading, method: see `landscape.trace`.
+    rtol, atol: a block is done when half the width of its interval is max(rtol |trace|, atol) or less; both 0: every block
+        takes max_probes, unless max_seconds end it.  confidence: of the interval.
+    min_probes: before the error is first looked at.  max_probes: the most matvecs of a block, by any method (a probe of
+        Hutchinson's is one; a sketch takes more for each).
+    max_seconds: for all blocks together, after min_probes.  batch: vectors in one application of the operator.
+    memory: GiB for the vectors that a sketch keeps; XTrace stops where they are full.
     """
 
     distribution: Distribution = "rademacher"
@@ -80,7 +86,7 @@ class TraceSettings:
         reading: Reading = "block",
         method: Method = "hutchinson",
     ) -> "TraceSettings":
-        """Exactly this many probes."""
+        """Exactly this many probes, whatever the error (a method other than "hutchinson" counts matvecs)."""
         return cls(distribution, reading, rtol=0.0, min_probes=probes, max_probes=probes, method=method)
 
     @property

@@ -1,24 +1,26 @@
 """The subspace of a (block) Lanczos recurrence with thick restarts (Wu and Simon 2000), and what is reported of its pairs.
 
-Q is orthonormal and T = Q^T H Q known, kept whole, so that nothing is assumed of its shape after a restart.  When the memory
-budget of basis vectors is full, the Ritz vectors (`ritz`) next to both ends are kept and the recurrence goes on from them.
-r_i = H v_i - lambda_i v_i is known as its next vectors times B s_i, up to the noise of its products.
+Q is orthonormal and T = Q^T H Q is known as a full matrix, so that nothing is assumed of its shape after a restart.  When the
+memory budget of basis vectors is full, the Ritz vectors (`ritz`) next to both ends are kept and the recurrence goes on from
+them.  The residual r_i = H v_i - lambda_i v_i is known up to the noise of products: the vectors that come next, times B s_i
+with B what couples them to the newest rows of Q and s_i the coordinates of v_i in these.
 
 **What is seen of a product's noise.**  By symmetry a product H q_j has components q_i . H q_j that are known already.  Each
 is off by q_i . e_j - e_i . q_j, e the noise of a product: its rounding, or whatever else sets it off.  A recurrence begins at
-a random vector, so all m (m - 1) / 2 pairs of m steps see noise as random vectors do, 2 |e|^2 / n in the mean square.  MARGIN
-of this |e| is added to the |r| reported, or of the round-off that a product of this precision has at best, eps |lambda|_max.
-No product is spent on the noise where that sum is as small as was asked for, or where less than this round-off was asked for.
+a random vector, so all m (m - 1) / 2 pairs of m steps see noise as random vectors do, 2 |e|^2 / n in the mean square.  The
+|r| reported is widened by MARGIN times this |e|, or times the round-off that a product of this precision has at best,
+eps |lambda|_max, where that is more.  No product is spent on the noise where the sum is as small as was asked for, or where
+less than this round-off was asked for.
 
-**What is not seen.**  The components are sums in the vectors' precision, which in long float32 vectors is the larger
-noise.  Then one product with all the k pairs, signs at random,
+**What is not seen.**  The components are sums in the vectors' precision, whose own round-off may be the larger noise in long
+float32 vectors.  Where the sum above misses the goal, one product with all k pairs, signs at random,
 
     f = H x - sum_i +-(lambda_i v_i + r_i),  x = sum_i +-v_i
 
-shows what the subspace does not know, |f|^2 = k times the mean square of one pair's on average, and |r_i +- f| is the
-residual.  Where that is more than was asked for, as at the end of a budget, each pair has a product of its own.  And the noise
-is measured once before, with one vector more, when a residual that is still above its goal has come near what is
-seen of it: from there on steps might be made in vain.
+shows what the subspace does not know: |f|^2 is on average k times the mean square of one pair's noise, and |r_i +- f| is taken
+for the residual.  Where that is more than was asked for, as at the end of a budget, each pair has a product of its own.  The
+noise is also measured once before, with one vector more, when a residual that is still above its goal has come near the noise
+that is seen: from there on steps might be made in vain.
 """
 
 from math import inf, isfinite, isnan, log, nan, sqrt

@@ -23,7 +23,7 @@ SMALLEST = 1e-140  # a length whose square has all its digits, and those of its 
 
 @dataclass(frozen=True, eq=False)
 class LanczosFactorization:
-    """H Q = Q T + r e_m^T with m <= the steps asked for (fewer where Q spans an invariant subspace: then r = 0)."""
+    """H Q = Q T + r e_m^T, m the steps made: fewer than asked for where Q spans an invariant subspace (r = 0) or was enough."""
 
     Q: Float[Tensor, "n m"]
     T: Float64[Tensor, "m m"]
@@ -74,8 +74,9 @@ def lanczos(
 ) -> list[LanczosFactorization]:
     """One factorisation per column of starts, run in lock-step so that the operator sees blocks of k vectors.
 
-    Memory: k * steps vectors.  scale: |H|, where the starts were chosen so that they do not show it: what is its round-off ends
-    a recurrence.  enough: whether these (T, |r|) of all runs are; asked after every step.
+    Memory: k * steps vectors.  starts: not zero, of any length.  A recurrence ends early where its remainder is round-off.
+    scale: |H|, where starts do not show it (because they were projected off the largest eigenvectors, say): round-off is
+    then relative to it.  enough: is given (T, |r|) of every run after each step; once it returns True, all end.
 
     >>> from landscape.operator import DenseOperator
     >>> A = DenseOperator(torch.diag(torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)))

@@ -18,8 +18,11 @@ from landscape.operator import require_blocks, require_vectors
 class ObjectiveHessian:
     """The Hessian of loss(theta) at `point`, in the dtype of point.
 
-    A loss that torch does not trace back to the point is refused: it would look flat.  One that is constant or linear in
-    the point, piece by piece at least, has the Hessian 0.
+    loss: from the flat vector theta (n,) to a tensor of one finite number, by torch operations alone.  point: (n,); it is
+    copied.  blocks: named ranges of its rows; one of all, "all", where None.  value: the loss there.
+
+    A loss that torch does not trace back to the point raises ValueError: it would look flat.  One that is linear in the
+    point, or piecewise so (as is an l1 norm), has the Hessian 0.
 
     >>> def rosenbrock(x):
     ...     return (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2
@@ -50,7 +53,7 @@ class ObjectiveHessian:
 
     @property
     def gradient(self) -> Float[Tensor, " n"]:
-        """dL/dtheta at the point."""
+        """dL/dtheta at the point, (n,)."""
         return self._gradient.detach()
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:

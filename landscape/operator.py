@@ -7,7 +7,9 @@ An operator H has n rows (`dim`), named groups of rows (`blocks`: one per attrib
     RestrictedOperator  E^T H E     one block, E its rows of the identity
     ScaledOperator      D H D       a change of metric: curvature in the units theta / d
     ProjectedOperator   P H P       P an orthogonal projector, to leave a known null space out
-    CountingOperator    H           counts what is applied, and the seconds it took
+    CountingOperator    H           counts the vectors it is applied to, and the seconds that takes
+
+One that wraps another has its rows, blocks and dtype unless it says otherwise.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +23,11 @@ from torch import Tensor
 
 @runtime_checkable
 class SymmetricOperator(Protocol):
-    """H = H^T as a product with blocks of vectors."""
+    """H = H^T as a product with blocks of vectors: the interface that every estimator takes.
+
+    dim: n, the number of rows.  blocks: named ranges of rows, disjoint; an operator without a structure has one, "all".
+    dtype: of V and of H V; they are on the device of the generator that the estimator is given.
+    """
 
     @property
     def dim(self) -> int: ...
@@ -94,6 +100,9 @@ def require_blocks(blocks: Mapping[str, slice], n: int) -> dict[str, slice]:
 class DenseOperator:
     """A symmetric matrix as an operator.
 
+    blocks: one of all rows, "all", where None.  ValueError unless the matrix is square, finite and symmetric to round-off, and
+    the blocks are disjoint.
+
     >>> H = DenseOperator(torch.tensor([[2.0, 1.0], [1.0, 3.0]]))
     >>> H.apply(torch.tensor([[1.0], [-1.0]]))
     tensor([[ 1.],
@@ -120,7 +129,7 @@ class DenseOperator:
 
 
 class SumOperator:
-    """sum_i weights_i H_i of operators with the same rows; weights 1 by default."""
+    """sum_i weights_i H_i; weights are 1 where None.  ValueError unless all H_i have the same rows, blocks and dtype."""
 
     def __init__(self, terms: Sequence[SymmetricOperator], weights: Sequence[float] | None = None) -> None:
         if not terms:
@@ -147,7 +156,7 @@ class SumOperator:
 
 
 class RestrictedOperator:
-    """E^T H E: the diagonal block of H on one named block of rows.
+    """E^T H E: the diagonal block of H on one named block of rows, its only block.  A product costs one with all of H.
 
     >>> H = DenseOperator(torch.tensor([[2.0, 1.0], [1.0, 3.0]]), {"a": slice(0, 1), "b": slice(1, 2)})
     >>> RestrictedOperator(H, "b").apply(torch.ones(1, 1))
@@ -171,7 +180,7 @@ class RestrictedOperator:
 
 
 class ScaledOperator:
-    """D H D with D = diag(scale): the Hessian with respect to theta / scale."""
+    """D H D with D = diag(scale), n finite numbers: the Hessian with respect to theta / scale."""
 
     def __init__(self, inner: SymmetricOperator, scale: Float[Tensor, " n"]) -> None:
         if scale.shape != (inner.dim,) or not torch.isfinite(scale).all():
@@ -186,7 +195,10 @@ class ScaledOperator:
 
 
 class ProjectedOperator:
-    """P H P for an orthogonal projector `project(V) -> P V` (linear, symmetric, idempotent: the caller's promise)."""
+    """P H P for an orthogonal projector `project(V) -> P V`, V of shape (n, k).
+
+    That it is linear, symmetric and idempotent is the caller's promise, and is not checked.
+    """
 
     def __init__(self, inner: SymmetricOperator, project: Callable[[Tensor], Tensor]) -> None:
         self.inner, self.project = inner, project
@@ -198,7 +210,10 @@ class ProjectedOperator:
 
 
 class CountingOperator:
-    """H itself; counts the vectors (`matvecs`) and blocks (`calls`) applied so far and the `seconds` they took."""
+    """H itself, with counts of its use so far.
+
+    matvecs: vectors that it was applied to; calls: of `apply`; seconds: that these took, a GPU's work included.
+    """
 
     def __init__(self, inner: SymmetricOperator) -> None:
         self.inner = inner

@@ -20,7 +20,10 @@ from landscape.results import EigenEnds, Eigenpairs, Progress, StopReason
 
 @dataclass(frozen=True)
 class PowerSettings:
-    """Power iteration stops at a residual of max(rtol |lambda|, atol), or when the budget of one end is spent."""
+    """Power iteration stops at a residual |H v - lambda v| of max(rtol |lambda|, atol), or when its budget is spent.
+
+    max_matvecs, max_seconds: for one end; `power_ends` may spend them twice.
+    """
 
     rtol: float = 1e-3
     atol: float = 0.0
@@ -45,7 +48,8 @@ def power_iteration(
     """The eigenpair of H whose eigenvalue is farthest from shift, and the matvecs it took.
 
     v <- (H - shift) v / |(H - shift) v|, from a Gaussian start.  With shift = 0 this is the eigenvalue of largest
-    magnitude, of either sign; with that eigenvalue as the shift it is the other end of the spectrum.
+    magnitude, of either sign; with that eigenvalue as the shift it is the other end of the spectrum.  rtol is relative to the
+    eigenvalue of H, not of H - shift.
     """
     v = draw_probes(operator.dim, 1, generator, operator.dtype)[:, 0]
     deadline, epsilon = monotonic() + settings.max_seconds, torch.finfo(operator.dtype).eps

@@ -39,7 +39,9 @@ TINY = torch.finfo(torch.float64).tiny
 
 
 def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Bracket:
-    """The eigenvalue with the share p of all of them at or below it; an end that no node bounds is infinite.
+    """The eigenvalue that the share p (0 < p < 1) of all eigenvalues lies at or below: 0.5 is the median.
+
+    confidence: that the bracket holds the truth; an end of it that no node bounds is infinite.
 
     >>> from landscape.density import spectral_density
     >>> H = DenseOperator(torch.diag(torch.linspace(0, 1, 1001, dtype=torch.float64)))
@@ -74,7 +76,7 @@ def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Br
 
 
 def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: float = 0.95) -> Bracket:
-    """The magnitude t such that the share p of sum |lambda| comes from |lambda| <= t."""
+    """The magnitude t such that the share p (0 < p < 1) of sum |lambda| comes from eigenvalues with |lambda| <= t."""
     _require_share(p)
     totals = integrals_of_rules(density).T.tolist()
     tails = [_Tail(*rule, (low, high)) for rule, (low, _, high) in zip(density.rules(), totals, strict=True)]

@@ -26,12 +26,15 @@ SHARE_HELD_OUT = 1 / 8  # at most, of the points that are not known: small grids
 
 @dataclass(frozen=True)
 class SliceSettings:
-    """tolerance: of the interpolation, as a share of the range of the values; None: every point is evaluated.
+    """Which points of a slice are evaluated; the others are interpolated.
 
-    holdout: random points that judge the interpolation; SHARE_HELD_OUT of those not known at most.  (With 30, and none off by
-    more than the tolerance at the first look, at most 12% of the points not evaluated are, with 95% confidence; with 5, 52%.)
-    batch: points between two decisions.  workers: threads that evaluate.  max_evaluations, max_seconds: budgets, hold-out
-    points and the one at the centre included; without a tolerance they have no meaning.
+    tolerance: of the interpolation, as a share of the range of the values; None: every point is evaluated.
+    holdout: random points that judge the interpolation, at most an eighth of those not known.  (With 30, and none off by
+        more than the tolerance at the first look, at most 12% of the points not evaluated are, with 95% confidence; with 5,
+        52%.)
+    batch: points that are added between two decisions.  workers: threads that evaluate.
+    max_evaluations, max_seconds: budgets, hold-out points and the one at the centre included; ValueError without a tolerance,
+        as a slice of every point has none.
     """
 
     tolerance: float | None = 0.01

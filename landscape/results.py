@@ -28,7 +28,7 @@ Sign = Literal["positive", "negative", "zero", "undetermined"]
 Number = float | None
 
 Progress = Callable[[int, int, str], None]
-"""Called with the units of work done, the most there can be, and a few words on the state."""
+"""progress(done, most, state): units of work done, the most there can be, and a few words on the state of the estimate."""
 
 
 def finite_or_none(value: float) -> Number:
@@ -57,7 +57,13 @@ def t_interval(samples: Float64[Tensor, " s"], confidence: float) -> tuple[float
 
 @dataclass(frozen=True, eq=False)
 class TraceEstimate:
-    """The trace of one block of H."""
+    """The trace of one block of H.
+
+    block, dim: its name and number of rows.  low, high: the interval in which the trace lies with the probability `confidence`.
+    samples: one for each of `probes` random vectors, in order; value is their mean, standard_error its error.  Both are empty
+    or 0 where method is "exact".  matvecs: products with H that it took; blocks that were read from the same products each
+    count them all.  method: "hutchinson", "hutch++", "xtrace" or "exact" (`landscape.trace`).
+    """
 
     block: str
     dim: int
@@ -74,7 +80,7 @@ class TraceEstimate:
 
     @classmethod
     def exact(cls, block: str, dim: int, value: float, confidence: float, matvecs: int = 0) -> "TraceEstimate":
-        """A trace that nothing was left to chance in."""
+        """A trace without error: no part of it was sampled."""
         none = torch.zeros(0, dtype=torch.float64)
         return cls(block, dim, value, 0.0, value, value, confidence, 0, matvecs, "exact", none, "exact")
 
@@ -85,7 +91,7 @@ class TraceEstimate:
 
     @property
     def sign(self) -> Sign:
-        """The sign of the trace where the interval decides it."""
+        """The sign of the trace where the interval decides it ("zero": it is exactly 0), else "undetermined"."""
         if self.low == self.high == 0:
             return "zero"
         if self.low > 0:
@@ -112,10 +118,12 @@ class TraceEstimate:
 class Eigenpairs:
     """k eigenpairs of one end of the spectrum, the outermost first.
 
-    residuals: |H v - lambda v|, or a bound that noise is in: the recurrence's estimate and a margin, where these meet the goal
-        (`krylov`); else by a last application of the operator itself.
+    vectors: columns of unit length; of Lanczos with their largest entries positive.
+    residuals: |H v - lambda v|.  Where the recurrence's own estimate of it plus a margin for the matvec's noise meets the goal,
+        this sum (`krylov`); else measured by a last application of the operator.
     vector_errors: residual over the distance to the nearest other approximate eigenvalue, about the sine of the angle
         between v and the true eigenvector; infinite where that distance is not known.
+    reason: why the search for this end stopped.
     """
 
     values: Float64[Tensor, " k"]
@@ -128,7 +136,7 @@ class Eigenpairs:
         return self.values.numel()
 
     def interval(self, index: int = 0) -> tuple[float, float]:
-        """An eigenvalue of H lies in it."""
+        """[value - residual, value + residual] of the pair at this index: an eigenvalue of H lies in it."""
         value, residual = float(self.values[index]), float(self.residuals[index])
         return value - residual, value + residual
 
@@ -145,12 +153,14 @@ class Eigenpairs:
 class EigenEnds:
     """Both ends of the spectrum.
 
+    largest, smallest: by signed value; an end that was not asked for has no pairs.
+    method: "lanczos" or "power iteration".  matvecs: products that both ends took together.
     beyond: with the probability 0.99 over the random start, no eigenvalue lies farther than this outside
         [smallest[0], largest[0]] (a worst-case bound over all spectra, far from sharp; infinite where there is none).
-    noise: the error of one matvec of a unit vector, its round-off and any other: measured where a goal was near it; else as
-        the asymmetry of its components shows it (nan: not seen).
-    ritz: all approximate eigenvalues of the last basis, ascending, and estimates of their residuals, as two rows; None
-        where the method has no basis.
+    noise: the length of the error (round-off and any other) of one matvec of a unit vector: measured where a residual asked for
+        was near it; else estimated from how far products are from symmetric; nan where neither was possible.
+    ritz: all approximate eigenvalues of the last basis, ascending, and below them estimates of their residuals; None where
+        the method has no basis.
     """
 
     largest: Eigenpairs
@@ -174,9 +184,10 @@ class EigenEnds:
 
 @dataclass(frozen=True)
 class Bracket:
-    """A derived number, with ends that carry the errors of what it is derived from and a sentence for its limits.
+    """A number derived from other results, in [low, high], whose ends carry the errors of these results.
 
-    value is None where the number is undefined or unresolved; low and high may be infinite.
+    value is None where the number is undefined or cannot be told; low and high may be infinite.  note: what limits it, or what
+    the bracket rests on, in a few words.
     """
 
     value: Number
@@ -198,12 +209,14 @@ class Bracket:
 class SpectralDensity:
     """The spectrum as seen by stochastic Lanczos quadrature: for every start vector, nodes and weights of a Gauss rule.
 
-    known: simple eigenvalues that were found themselves.  The density of all the others, normalised to 1, is about the mean
-    over starts of sum_j weights_j delta(x - nodes_j); it is exact in expectation for polynomials of degree below 2 steps
-    (`density` for a bias too small to be seen).  dim: of how many eigenvalues in all, those of a known null space left out.
-    complete: start vectors whose rule is their measure itself; None: of those with weights of 0.  trace: of the operator,
-    with its standard error, where it is known better than from these start vectors.
-    missed: what the known eigenvalues' residuals r may add to sums of |lambda|^p, p from 1 to 2, as shares of their own terms.
+    known: simple eigenvalues that were found one by one, ascending.  The density of all the others, normalised to 1, is about
+    the mean over start vectors of sum_j weights_j delta(x - nodes_j), exact in expectation for polynomials of degree below
+    2 steps (but for a bias too small to be seen, see `density`).  Each row of weights adds up to 1; shorter rules are filled
+    up with weights of 0.  dim: how many eigenvalues there are in all, those of a known null space left out.
+    complete: for which start vectors the rule is the vector's measure itself (its recurrence ended in an invariant subspace);
+    None: for those that have weights of 0.  trace: of the operator, with its standard error, where it is known better than
+    from these start vectors.  missed: for each known eigenvalue, how much its residual may change sums of |lambda|^p,
+    1 <= p <= 2, as a share of its own term (`of_known`).
     """
 
     nodes: Float64[Tensor, "starts steps"]
@@ -234,7 +247,9 @@ class SpectralDensity:
         return torch.cat([self.nodes, everywhere], dim=1), torch.cat(weights, dim=1) / self.dim
 
     def integral(self, function: Callable[[Tensor], Tensor], confidence: float = 0.95) -> Bracket:
-        """sum_i f(lambda_i) with the interval of its spread over start vectors (the rule's own error is not in it).
+        """sum_i f(lambda_i) over all `dim` eigenvalues, with an interval from its spread over start vectors.
+
+        The error of the Gauss rules themselves is not in it.
 
         Student's interval, which takes samples for normal: of squares, which are skewed, it covers 86 to 95% at the nominal 95%
         with four start vectors (eight spectra, 200 seeds); `effective_rank`, which asks it for more, 93 to 100%.
@@ -277,7 +292,7 @@ class SpectralDensity:
 
 @dataclass(frozen=True)
 class Anisotropy:
-    """The index family: how unequal the curvatures are.  None: what it needs was not computed."""
+    """The index family of `landscape.anisotropy`: how unequal the curvatures are.  None: the density it needs was not given."""
 
     literal: Bracket
     saddle: Bracket
@@ -300,11 +315,14 @@ class Anisotropy:
 class Slice:
     """The objective on a grid center + sum_d x_d directions[:, d], d = 1 or 2, beside its quadratic model.
 
+    coordinates: increasing x_d of the grid, in multiples of the directions.
     loss has one axis per direction (rows follow coordinates[0], columns coordinates[1]): the objective itself at points that
-    are `evaluated`, interpolated elsewhere.  holdout: |prediction - objective| at random points, which tells how good that is.
-    model, slope and curvature are None where neither gradient nor operator was given.  crossed marks evaluated points whose
-    signature (order of sorting, visible set) differs from the centre's, so that the objective may jump on the way there;
-    at points that are not evaluated it is False and nothing is known.  evaluations: of the objective, the centre's too.
+    are `evaluated`, interpolated elsewhere.  holdout: |prediction - objective| at the random points of the last hold-out, which
+    tells how good the interpolation is; empty where none was drawn.
+    model: center_loss + slope . x + x^T curvature x / 2, with slope and curvature the derivatives of the objective in x; the
+    three are None where neither gradient nor operator was given.  crossed marks evaluated points whose signature (order of
+    sorting, visible set) differs from the centre's, so that the objective may jump on the way there; at points that are not
+    evaluated it is False and nothing is known.  evaluations: of the objective, the centre's too.
     looks: hold-outs that were drawn, one after the other, until one was good enough or a budget ended it.
     """
 
@@ -345,10 +363,10 @@ class Slice:
 
     @property
     def share_beyond(self) -> float:
-        """At most this share of the points drawn from is off by more than interpolation_error, with 95% confidence.
+        """With 95% confidence, at most this share of the interpolated points is off by more than interpolation_error.
 
-        If a share p were, m random points would all miss it with the probability (1 - p)^m at most.  That is 0.05 / 2^k at
-        the k-th look: one look of many that is lucky is likelier than one.
+        If a share p were, a hold-out of m random points would miss all of them with the probability (1 - p)^m at most.  p is
+        where that is 0.05 / 2^k at the k-th look: with many looks it is likelier that one of them is lucky.
         """
         if self.evaluated.all():
             return 0.0

@@ -1,7 +1,8 @@
-"""Which eigenpairs are looked for, and what a subspace has of them.
+"""Which eigenpairs are looked for, and what a subspace knows of them.
 
 With an orthonormal Q and T = Q^T H Q, T y = lambda y gives the Ritz pair (lambda, v = Q y) with the residual r = H v -
-lambda v: an eigenvalue lies within |r| of lambda.  How Q grows is left to `krylov`.
+lambda v: an eigenvalue lies within |r| of lambda.  A pair is wanted if it is one of those asked for at either end, and open
+as long as its |r| is above what was asked for.  How Q grows is left to `krylov`.
 """
 
 from dataclasses import dataclass
@@ -23,12 +24,17 @@ CHUNK = 1 << 16  # entries of vectors that are combined at a time
 class EigenSettings:
     """How many pairs at each end, to which residual, with how much memory and work.
 
-    basis: vectors kept at a time (the memory budget).  block: vectors per application of the operator; more than one
-    helps with multiple eigenvalues and where the operator is cheaper per vector in blocks.  noise: length of a random vector
-    beside a given start of unit length, so that an end that the start misses is still found.  The shorter, the fewer products
-    from a good start, and the likelier to take the neighbour of an end for it, where they are about rtol apart: with rtol = 1%
-    and two lowest eigenvalues 1.5% apart in 40% of the runs at 1, in 85% at 0.3, in 2% from a random start; on five scenes
-    with rtol = 10%, from their Gaussians' own steepest directions, in 4 of 30 runs at 0.3, in none at 1.
+    largest, smallest: pairs of the largest and of the smallest (signed) eigenvalues.
+    rtol, atol: a pair is good enough when its residual |H v - lambda v| is max(rtol |lambda|, atol) or less.
+    basis: vectors kept at a time, `block` more in work (the memory budget): at least largest + smallest + 3 block.
+    block: vectors per application of the operator; more than one helps with multiple eigenvalues and where the operator is
+        cheaper per vector in blocks (`fastest_block` measures that).
+    noise: length of a random vector added to a given start of unit length, so that an end that the start misses is still
+        found.  The shorter, the fewer products from a good start, and the likelier to take the neighbour of an end for it,
+        where they are about rtol apart: with rtol = 1% and two lowest eigenvalues 1.5% apart in 40% of the runs at 1, in 85%
+        at 0.3, in 2% from a random start; on five scenes with rtol = 10%, from their Gaussians' own steepest directions, in 4
+        of 30 runs at 0.3, in none at 1.
+    max_matvecs, max_seconds: budgets of both ends together; a step under way at the end of the time is finished.
     """
 
     largest: int = 1
@@ -64,7 +70,7 @@ class EigenSettings:
 
 @dataclass(frozen=True)
 class Goal:
-    """What a residual may be: rtol |lambda|, or floor where that is more."""
+    """The largest residual that is good enough: rtol |lambda|, or floor where that is more."""
 
     rtol: float
     floor: float
@@ -75,7 +81,7 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class Ritz:
-    """Ritz values (ascending), their coordinates in the basis, residuals, and which of them are wanted."""
+    """Ritz values (ascending), their vectors' coordinates in the basis (columns), |residuals|, and the wanted ones' indices."""
 
     values: Float64[Tensor, " m"]
     coordinates: Float64[Tensor, "m m"]
@@ -88,17 +94,17 @@ class Ritz:
         return self.largest + self.smallest
 
     def open(self, goal: Goal) -> list[int]:
-        """Which wanted residuals are above their goals."""
+        """Indices of the wanted pairs whose residuals are above the goal."""
         asked = goal.of(self.values)
         return [i for i in self.wanted if not self.residuals[i] <= asked[i]]
 
     def moved(self, before: Float64[Tensor, " k"] | None, goal: Goal) -> bool:
-        """Whether a wanted value is another than it was."""
+        """Whether a wanted value differs from its value before by more than the goal; True where there was none before."""
         values = self.values[self.wanted]
         return before is None or not ((values - before).abs() <= goal.of(values)).all()
 
     def near(self, noise: float, goal: Goal) -> bool:
-        """Whether an open residual is near this noise."""
+        """Whether an open pair's residual is so small that this noise of a product may be all that is left of it."""
         limit = min(NEAR * noise, NEAREST * float(self.values.abs().max()))
         return any(float(self.residuals[i]) < limit for i in self.open(goal))
 

@@ -24,7 +24,7 @@ from landscape.results import Progress, Slice, StopReason
 
 
 def symmetric_axis(radius: float, points: int = 41) -> Float64[Tensor, " points"]:
-    """Evenly spaced from -radius to radius, with 0 itself among them.
+    """Evenly spaced from -radius to radius, with 0 itself among them; points is odd, 3 or more.
 
     >>> symmetric_axis(1.0, 5)
     tensor([-1.0000, -0.5000,  0.0000,  0.5000,  1.0000], dtype=torch.float64)
@@ -38,7 +38,10 @@ def symmetric_axis(radius: float, points: int = 41) -> Float64[Tensor, " points"
 
 
 def curvature_reach(curvature: float, rise: float, multiple: float = 1.0) -> float:
-    """multiple * sqrt(2 rise / |curvature|): at 1, the distance at which the quadratic has changed by rise.
+    """multiple * sqrt(2 rise / |curvature|): with multiple = 1, the distance at which the quadratic term alone is rise.
+
+    For a unit direction: curvature in loss per squared parameter unit, rise in loss, the result in parameter units.
+    ValueError where the curvature is 0 or not finite, or rise or multiple is not above 0.
 
     >>> curvature_reach(curvature=-8.0, rise=1.0)
     0.5
@@ -66,10 +69,11 @@ def evaluate_slice(
     """loss on the grid coordinates[0] x coordinates[1] (d = 2) or along coordinates[0] (d = 1).
 
     loss(theta) is the objective, or (objective, signature) where it is piecewise smooth: points whose signature differs from
-    the centre's are marked.  It must be safe to call from settings.workers threads.  With gradient and operator (at center)
-    the quadratic model comes beside it, for d matvecs, or for none where E^T H E is given as the operator.  generator draws
-    the hold-out points (`refinement`); it is not needed where every point is evaluated.  store: a file that keeps the
-    evaluations, from which a killed run continues.
+    the centre's are marked.  It must be safe to call from settings.workers threads.  coordinates: increasing, in multiples of
+    the directions.  gradient, operator: both at center, both or neither: with them the quadratic model comes beside it, for d
+    matvecs, or for none where the operator is given as the matrix E^T H E.  generator draws the hold-out points
+    (`refinement`); it may be None only where settings.tolerance is.  store: a file that keeps the evaluations, from which a
+    killed run continues.  ValueError where the objective at the centre is not finite, or store holds another slice.
 
     >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
     >>> line = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :1], [axis], generator=generator)

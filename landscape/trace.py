@@ -1,13 +1,14 @@
-"""Traces of the blocks of H, each with an interval that the truth lies in as often as it says.
+"""Traces of the diagonal blocks H_bb of H, each with an interval that covers the truth as often as it says.
 
-    method "hutchinson"  mean of z^T H z over probes z (`hutchinson`); the interval's law is in `quadratic`
+    method "hutchinson"  mean of z^T H z over probes z (`hutchinson`); the interval is derived in `quadratic`
         reading "block"  z lives on one block at a time: a matvec per block and probe.  Variance 2 |H_bb|_F^2 for
                          Gaussian z, the same without the diagonal of H_bb for Rademacher z.
         reading "full"   z lives on all rows and every block reads its part of z * (H z): a matvec per probe for all
-                         blocks.  Unbiased, because the cross terms vanish in expectation; each adds |H_bc|_F^2 to the
-                         variance.
-    method "auto"        the default: Hutchinson, until its own probes tell that one of the following does better (`choice`);
-                         with the reading "full" and where a part of the diagonal is known it stays Hutchinson
+                         blocks.  Unbiased, because the cross terms vanish in expectation; each other block c adds
+                         |H_bc|_F^2 to the variance.
+    method "auto"        the default: Hutchinson, unless its first probes tell that XTrace, or every column of the identity,
+                         does better (`choice`); with the reading "full" and where a part of the diagonal is known it
+                         stays Hutchinson
     method "hutch++"     exact on the range of a sketch H S, Hutchinson on the rest (`sketched`)
     method "xtrace"      every test vector in turn on the rest that the sketch of the others leaves (`sketched`)
 
@@ -34,13 +35,14 @@ from landscape.results import Progress, TraceEstimate
 from landscape.sketched import hutch_plus_plus, xtrace
 
 PAPER = TraceSettings.fixed(10, "gaussian")
+"""StableGS's estimator, Eq. (6)."""
 ESTIMATORS = {"auto": chosen, "hutch++": hutch_plus_plus, "xtrace": xtrace}
 
 
 def total_trace(traces: Mapping[str, TraceEstimate]) -> tuple[float, float]:
-    """The trace of all blocks together, with a bound of its standard error: the blocks' may be of one mind.
+    """The sum of the traces, and a bound of its standard error: the sum of theirs, as their errors may be correlated.
 
-    Of few samples it is that of a normal law with the same interval.
+    Each error is taken from the interval: its half width over the normal quantile, so that few samples count as uncertain.
     """
     errors = [x.half_width / NormalDist().inv_cdf((1 + x.confidence) / 2) for x in traces.values()]
     return sum(x.value for x in traces.values()), sum(errors)
@@ -53,9 +55,10 @@ def estimate_traces(
     blocks: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, TraceEstimate]:
-    """The trace of each named block (all of the operator's by default) with its standard error and interval.
+    """The trace of each named block (all of the operator's where None) with its standard error and interval, by name.
 
-    Progress counts matvecs.  With the reading "full" all estimates share probes and matvecs, hence are correlated.
+    settings: by default to 5% with 95% confidence, from 8 to 100 probes a block.  Progress counts matvecs.  With the reading
+    "full" all estimates share probes and matvecs, hence are correlated.  ValueError where a block is not the operator's.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([1.0, 2.0, 3.0])))

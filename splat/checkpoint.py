@@ -50,9 +50,9 @@ class SceneReference:
     """Which scene a training belongs to, and how to load it as it was.
 
     absolute, relative: the scene's folder, and the same from the checkpoint's folder.  images: the folder of images in
-    it, where one was named; downscale: by which its images were reduced further.  train, test: names of the views;
+    it, where one was named; downscale: the factor by which its images were reduced further.  train, test: names of the views;
     sizes: (width, height) of the training views, px.  start: what the Gaussians started from (`splat/start.py`); depths:
-    the folder of depth maps, where one was named.  Older checkpoints have neither.
+    the folder of depth maps, where one was named.  Older files have neither; they are read as "scene" and None.
     """
 
     absolute: str
@@ -110,10 +110,11 @@ class Checkpoint:
     torch_version: str
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
-        """The scene of the checkpoint at path, or the one in the folder scene, with the views of the training.
+        """The scene that this checkpoint, read from path, belongs to; scene: its folder, where it has moved.
 
-        A COLMAP model's points, from which the Gaussians started, are not read again.
-        FileNotFoundError where there is none; ValueError where it lacks a view or has one of another size.
+        `scene.load(checkpoint.scene.train)` then gives the training views.  A COLMAP model's points, from which the Gaussians
+        started, are not read again.  FileNotFoundError where there is no such folder; ValueError where the scene lacks a view
+        or has one of another size.
         """
         reference = self.scene
         folder = reference.find(path) if scene is None else scene
@@ -204,7 +205,11 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint.  OSError where there is none or it may not be read; ValueError that says what is wrong with it."""
+    """Read a checkpoint, its tensors on the CPU.
+
+    OSError where there is none or it may not be read; ValueError, which says what is wrong with it, where it is damaged or of
+    another kind.
+    """
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
         raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found {found}")

@@ -47,7 +47,12 @@ def free_memory(device: torch.device) -> int:
 
 @dataclass(frozen=True)
 class ActiveCounts:
-    """What of a set of Gaussians is left in the operator, and what was removed as exactly flat."""
+    """What of a set of Gaussians is left in the operator, and what was removed as exactly flat.
+
+    active_gaussians: those that touch a pixel of some view.  parameters, active_parameters: stored numbers of all, and of the
+    active ones in the SH bands in use, less one for each quaternion, whose length does not count.  radial_quaternions: how
+    many such lengths were removed.
+    """
 
     gaussians: int
     active_gaussians: int
@@ -61,7 +66,7 @@ class ActiveCounts:
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """What a memory budget decides: kept of views stay linearised, the others are rebuilt for every product.
+    """What a memory budget decides: `kept` of the `views` stay linearised, the others are linearised anew for every product.
 
     vectors: how many vectors a product takes at a time.
     """
@@ -72,13 +77,14 @@ class MemoryPlan:
 
 
 class SceneObjective:
-    """The mean loss over views as a function of the active Gaussians' stored parameters.
+    """The mean loss L over views as a function of the active Gaussians' stored parameters.
 
-    gaussians: those of the checkpoint; sh_degree: the bands in use (all by default).  `active` are the Gaussians that touch
-    a pixel of some view, with unit quaternions; `mask` says which of the given ones they are.  memory: bytes that
-    linearised views and the workspace of their products may take (half of what is free by default); see `memory_plan`.
-    keep_unseen: all Gaussians are active, for steps so long that they may bring into sight what no view sees here.
-    Raises NothingInSight where no Gaussian is seen, ValueError where a parameter is not finite.
+    gaussians: those of the checkpoint; sh_degree: of the bands in use (theirs by default).  background: RGB in [0, 1], black by
+    default.  `active` are the Gaussians that touch a pixel of some view, with unit quaternions: `active.flat` (p,) is the point
+    at which L is studied; `mask` says which of the given ones they are, `counts` how many of what was removed.
+    memory: bytes that linearised views and the workspace of their products may take (half of what is free by default); see
+    `memory_plan`.  keep_unseen: all Gaussians are active, for steps so long that they may bring into sight what no view sees
+    here.  Raises NothingInSight where no Gaussian is seen, ValueError where there is no view or a parameter is not finite.
     """
 
     def __init__(
@@ -151,9 +157,10 @@ class SceneObjective:
         return self.active.blocks
 
     def evaluate(self, flat: Float[Tensor, " p"]) -> tuple[float, Hashable]:
-        """L at other parameters of the active Gaussians, a true render sorted anew, and the piece of L that they lie in.
+        """L at other parameters of the active Gaussians, and the smooth piece of L that they lie in.
 
-        The piece: which splats each tile draws, in which order.  Changes nothing, and may run in several threads at once.
+        L is rendered and sorted anew; the piece is a signature of which splats each tile draws, in which order.  Changes
+        nothing, and may run in several threads at once.
         """
         gaussians = self.active.with_flat(flat.to(self.active.flat.device))
         gaussians.require_finite()
@@ -166,11 +173,11 @@ class SceneObjective:
         return self._losses[index].value(raster.planes), raster.order
 
     def loss(self, flat: Float[Tensor, " p"]) -> float:
-        """L alone."""
+        """L alone, as of `evaluate`."""
         return self.evaluate(flat)[0]
 
     def signature(self, flat: Float[Tensor, " p"]) -> Hashable:
-        """The piece alone."""
+        """The smooth piece alone, as of `evaluate`."""
         return self.evaluate(flat)[1]
 
     def mean(self, total: Tensor) -> Tensor:
@@ -227,7 +234,10 @@ class SceneObjective:
         return self.mean(torch.stack([view.gradient for view in self.linearized]).sum(dim=0))
 
     def block_diagonal(self, *, gauss_newton: bool = False) -> OwnBlocks:
-        """Own blocks of the mean over views: of the Hessian or of its Gauss-Newton part (see `LinearizedView`)."""
+        """Every Gaussian's own block of the Hessian of L, or of its Gauss-Newton part.
+
+        Exact but for the coupling of pixels by SSIM: the loss's curvature l'' enters pixel by pixel.
+        """
         parts = (view.block_diagonal(gauss_newton=gauss_newton) for view in self.linearized)
         total = reduce(add, parts)
         return OwnBlocks(self.mean(total.geometry), self.mean(total.sh))
@@ -244,11 +254,11 @@ class SceneObjective:
 
 
 class SceneHessian:
-    """H of L, or its Gauss-Newton part, on the complement of its exact null space (`null_space.py`): P H P.
+    """H of L, or its Gauss-Newton part J^T l'' J, on the complement of its exact null space (`null_space.py`): P H P.
 
-    A `landscape` operator: `dim`, `blocks`, `dtype`, `apply(V)`, which gives its result where V is.  P leaves out, for the
-    Hessian, the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and the SH directions
-    that no view sees; for Gauss-Newton all that no view sees.  keep_null: P = 1 instead.
+    A `landscape` operator: `dim` = p, `blocks` (the attributes), `dtype`, `apply(V)`, which gives its result on V's device.  P
+    leaves out, for the Hessian, the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and
+    the SH directions that no view sees; for Gauss-Newton all that no view sees.  keep_null: P = 1 instead.
 
     passes, spared: products of a view with a vector that were made, and that were left out because the vector moves no
     Gaussian that the view draws (V on a few Gaussians, say).

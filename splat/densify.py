@@ -36,6 +36,9 @@ class DensifySettings:
 
     The interval is `every`, but at most every_share T.  3DGS trains for 30,000 steps, where the shares change nothing;
     with them short runs densify too, and have half of their steps to settle.
+
+    gradient_threshold: of the mean screen-space gradient, in normalised device coordinates.  clone_scale, prune_scale: in units
+    of the extent.  min_opacity: below it a Gaussian is removed; reset_opacity: what a reset lowers opacities to.
     """
 
     enabled: bool = True

@@ -16,7 +16,10 @@ from splat.raster.functions import last_derivative
 
 
 def loss_against(target: Float[Tensor, "3 h w"], settings: LossSettings, like: Tensor) -> Any:
-    """The loss of images where `like` is, in its precision: a `ViewLoss`, or a `CudaViewLoss` of the same interface."""
+    """The loss of images against a target, on the device and in the dtype of the tensor `like`.
+
+    A `ViewLoss`, or on a GPU a `CudaViewLoss` with the same interface; `view_loss` takes either.
+    """
     if by_triton(like):
         from splat.losses_cuda import CudaViewLoss
 
@@ -54,7 +57,7 @@ class _PhotometricGradient(torch.autograd.Function):
 
 
 def view_loss(image: Float[Tensor, "3 h w"], loss: Any) -> Float[Tensor, ""]:
-    """The loss of an image as a torch scalar, twice differentiable, by the kernels."""
+    """The loss of an image as a torch scalar, twice differentiable; loss: from `loss_against`."""
     return _Photometric.apply(image, loss)  # pyright: ignore[reportReturnType]
 
 

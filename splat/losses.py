@@ -6,8 +6,8 @@ Images are (3, h, w) in [0, 1].  Every loss is a mean over pixels and channels.
     charbonnier sqrt(r^2 + eps^2)              a smooth l1; its second derivative is eps^2 / (r^2 + eps^2)^(3/2)
     l2          r^2
     SSIM        11 x 11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, as in 3DGS
-    photometric (1 - lambda) pixel + lambda (1 - SSIM), lambda = 0.2: Eq. (2) as 3DGS weighs it;
-                literal: pixel + lambda (1 - SSIM), Eq. (2) as printed
+    photometric (1 - lambda) pixel + lambda (1 - SSIM), lambda = 0.2: StableGS's Eq. (2) as 3DGS weighs it;
+                literal: pixel + lambda (1 - SSIM), the same as printed
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,10 @@ PixelLoss = Literal["l1", "charbonnier", "l2"]
 
 @dataclass(frozen=True)
 class LossSettings:
-    """Which loss a view contributes.  eps: Charbonnier's, in units of intensity."""
+    """Which loss a view contributes: the pixel loss, and ssim_weight = lambda in [0, 1], of 1 - SSIM.
+
+    eps: Charbonnier's, in units of intensity.  literal: the pixel loss has the weight 1 instead of 1 - lambda.
+    """
 
     pixel: PixelLoss = "l1"
     ssim_weight: float = 0.2
@@ -77,7 +80,7 @@ def pixel_loss(image: Tensor, target: Tensor, kind: PixelLoss, eps: float) -> Te
 def photometric_loss(
     image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], settings: LossSettings = LossSettings()
 ) -> Float[Tensor, ""]:
-    """The loss of one view, Eq. (2)."""
+    """The loss of one view, a scalar that torch can differentiate."""
     loss = settings.pixel_weight * pixel_loss(image, target, settings.pixel, settings.eps)
     if settings.ssim_weight:
         loss = loss + settings.ssim_weight * (1 - ssim_map(image, target).mean())
@@ -85,10 +88,10 @@ def photometric_loss(
 
 
 def psnr(image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"]) -> float:
-    """Peak signal-to-noise ratio in dB, peak 1."""
+    """Peak signal-to-noise ratio in dB, peak 1, of the image clamped to [0, 1]; infinite for equal images."""
     return float(-10 * torch.log10((image.clamp(0, 1) - target).square().mean()))
 
 
 def ssim(image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"]) -> float:
-    """Mean structural similarity."""
+    """Mean structural similarity over pixels and channels, of the image clamped to [0, 1]."""
     return float(ssim_map(image.clamp(0, 1), target).mean())

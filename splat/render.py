@@ -19,8 +19,9 @@ Backend = Literal["kernels", "reference"]
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """image: linear RGB as trained on, background included; alpha: accumulated opacity; splats: the 2-D footprints.
+    """image: RGB in the encoding of the training images, background included, not clamped to [0, 1].
 
+    alpha: accumulated opacity; splats: the 2-D footprints.
     depth: the sum of weight times z, world units (divide by alpha for a mean); None where it was not asked for.
     `splats.means` is on the autograd graph: its gradient is the screen-space gradient of densification.
     """
@@ -43,8 +44,8 @@ def render(
 ) -> Rendering:
     """Colour, accumulated alpha and, if asked for, expected depth of one view; twice differentiable.
 
-    background: black where None.  opacity_gain: multiplies the opacities, may exceed 1, 0 hides a Gaussian; a constant.
-    backend: "kernels" those of where the Gaussians are, "reference" plain torch (slow, any number of derivatives).
+    background: RGB, black where None.  opacity_gain: constant factors of the opacities; may exceed 1, and 0 hides a Gaussian.
+    backend: "kernels": those for the device of the Gaussians; "reference": plain torch (slow, any number of derivatives).
     Raises ValueError where a parameter is not finite.
     """
     gaussians.require_finite()

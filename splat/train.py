@@ -47,7 +47,11 @@ from splat.settings import RenderSettings
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's rates of 3DGS.  position: per unit of the scene's extent, at the first step and at the last."""
+    """Adam's rates of 3DGS, about what a step changes a stored parameter by.
+
+    position, position_final: per unit of the scene's extent, at the first step and at the last.  sh_constant, sh_higher: of the
+    SH band of degree 0 and of those above.
+    """
 
     position: float = 1.6e-4
     position_final: float = 1.6e-6
@@ -72,8 +76,11 @@ class LearningRates:
 class TrainConfig:
     """Everything that a training's result depends on beside its start and its views.
 
+    sh_degree: the highest SH degree, 0 to 3; one is added every sh_degree_every steps, from 0.
     background: the colour that the views were composited over, RGB in [0, 1], drawn behind the Gaussians.
     random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
+    method: what is added to 3DGS, with its settings (`splat/regularizers/methods.py`).
+    ValueError where a setting is out of its range.
     """
 
     iterations: int = 2000
@@ -109,14 +116,14 @@ class TrainConfig:
         return torch.tensor(self.background, dtype=dtype)
 
     def objective(self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False) -> SceneObjective:
-        """The loss of a training over its views, at some Gaussians.  keep_unseen: see `SceneObjective`."""
+        """This loss, on this background, averaged over views: the objective whose Hessian is studied.  See `SceneObjective`."""
         background = self.background_colour(gaussians.flat.dtype)
         return SceneObjective(gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen)
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """One step done: its number, the loss before its update, the Gaussians after it, and the view's name."""
+    """One step done: its number, the view's loss before the update, how many Gaussians there are after it, the view's name."""
 
     step: int
     loss: float
@@ -126,8 +133,10 @@ class StepResult:
 
 @dataclass(eq=False)
 class Training:
-    """A training under way: all that its next step depends on.  order: the epoch's views still to come, last first.
+    """A training under way: all that its next step depends on.
 
+    extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.
+    order: indices of the epoch's views still to come, last first.
     watchers: called with every change of the set of Gaussians; no part of what is saved.
     """
 
@@ -144,7 +153,10 @@ class Training:
 
     @classmethod
     def start(cls, gaussians: Gaussians, extent: float, config: TrainConfig) -> "Training":
-        """A training before its first step.  The Gaussians are copied; extent: world units, see `splat/densify.py`."""
+        """A training before its first step.  The Gaussians are copied; extent: world units, as of `Scene.extent`.
+
+        ValueError where there are no Gaussians, one is not finite, or their SH degree is above the training's.
+        """
         if len(gaussians) == 0:
             raise ValueError("expected at least one Gaussian to start from, got none; use a random start")
         if gaussians.sh_degree > config.sh_degree:
@@ -167,7 +179,7 @@ class Training:
         )
 
     def move(self, device: torch.device) -> None:
-        """Go on at a device; the generator stays on the CPU, so that it draws the same numbers everywhere."""
+        """Continue on another device; the generator stays on the CPU, so that it draws the same numbers everywhere."""
         gradients = self.screen_gradients
         self.gaussians = self.gaussians.with_flat(self.gaussians.flat.to(device))
         self.adam.first, self.adam.second = (
@@ -182,7 +194,7 @@ class Training:
         return self.order.pop()
 
     def descend(self, gradient: Float[Tensor, " p"], step: int) -> None:
-        """Update every parameter with Adam, at the step's rates."""
+        """Update every parameter with Adam in place, at the rates of this step (counted from 1)."""
         self.adam.update(self.gaussians.flat, gradient, self.rates(step))
 
     def rates(self, step: int) -> Float[Tensor, " p"]:
@@ -191,7 +203,7 @@ class Training:
         return learning_rates(self.gaussians, self.config.rates, position)
 
     def control_density(self, step: int, camera: Camera, base: Photometric) -> None:
-        """Collect the screen-space gradient of a render; clone, split, prune and reset opacities when it is time."""
+        """Collect the screen-space gradient of a render; clone, split, prune and reset opacities in the steps that do so."""
         schedule, iterations = self.config.densify, self.config.iterations
         if schedule.collects(step, iterations):
             self.screen_gradients.add(base.screen_gradient, base.splats, camera)
@@ -203,7 +215,7 @@ class Training:
             self.adam.forget("opacity_logits")
 
     def follow(self, change: Densified) -> None:
-        """Take over other Gaussians: moments follow their Gaussian, new ones start from zero."""
+        """Replace the Gaussians: Adam's moments follow each one that is kept and are 0 for new ones."""
         if not len(change.gaussians):
             raise ValueError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
         self.gaussians = change.gaussians
@@ -251,7 +263,8 @@ def with_background(view: View, old: Float[Tensor, "3"], new: Float[Tensor, "3"]
 def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
     """Make the steps that are left of config.iterations, one each time the next item is asked for.
 
-    Between two items `training` is whole, so that it can be saved, evaluated or left there.
+    Between two items `training` is whole, so that it can be saved, evaluated or left there.  ValueError where there are no
+    views, they lack what the method needs, or a loss or gradient is not finite.
     """
     config, regularizer = training.config, training.regularizer
     if not views:

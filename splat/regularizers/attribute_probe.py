@@ -76,7 +76,11 @@ class Caps:
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """attributes: which are probed; dimension: what a trace is divided by, N_active d or d; kappa_full: the 100 of Eq. (10)."""
+    """attributes: which are probed; c, caps: of rho, for each; eps: of Eq. (5); kappa_full: the 100 of Eq. (10).
+
+    dimension: what a trace is divided by, "active": N_active d, "attribute": d.  gamma: how far means move along the viewing
+    ray, 1: along it alone, 0.5: along the gradient itself.
+    """
 
     attributes: tuple[Attribute, ...] = ("means", "log_scales", "quats", "opacity_logits", "sh")
     c: Constants = field(default_factory=Constants)
@@ -101,13 +105,13 @@ class ProbeSettings:
 
     @property
     def on(self) -> tuple[Attribute, ...]:
-        """The attributes that are probed: those named that have a weight.  Only their traces are needed."""
+        """The attributes that are probed: those named whose c is not 0.  Only their traces are needed."""
         return tuple(name for name in self.attributes if getattr(self.c, name) > 0)
 
 
 @dataclass(frozen=True)
 class Magnitude:
-    """How far an attribute is probed and why: its trace as given, tau, rho of Eq. (5), and the same under its cap."""
+    """How far an attribute is probed and why: its trace as given, tau, rho of Eq. (5) uncapped, and rho under its cap."""
 
     trace: float
     tau: float
@@ -129,7 +133,8 @@ def magnitudes(
 ) -> dict[str, Magnitude]:
     """The magnitude of each attribute that is on.
 
-    traces: of their Hessian blocks, of quats on the unit sphere; active: how many Gaussians they are over; extent: world units.
+    traces: of their Hessian blocks (of quats on the unit sphere), summed over `active` Gaussians; extent: of the scene, world
+    units, to which the cap of the means is relative.  ValueError where a trace is missing or not finite.
     """
     if active < 1 or not 0 < extent < inf:
         raise ValueError(f"expected at least 1 active Gaussian and a finite extent above 0, got {active} and {extent}")
@@ -155,7 +160,7 @@ class Probed:
     turns: Float[Tensor, "n 4"]
 
     def pull(self, gradient: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
-        """The gradient in the parameters, given that at the probed ones, in its place: (q x e).p = q.(p x conjugate e)."""
+        """The gradient in the parameters, given that at the probed ones (overwritten): (q x e).p = q.(p x conjugate e)."""
         pulled = self.gaussians.with_flat(gradient)
         pulled.quats.copy_(hamilton(pulled.quats, self.turns * self.turns.new_tensor([1, -1, -1, -1])))
         return gradient

@@ -50,7 +50,8 @@ from splat.train import Training
 class CoRGS(Method):
     """distance: world units; noise: in units of the cameras' mean distance from their centroid.
 
-    prune_every 0 leaves out the co-pruning, weight 0 the co-regularisation.
+    prune_every, prune_start, pseudo_start: steps; weight: of the co-regularisation.  prune_every 0 leaves out
+    the co-pruning, weight 0 the co-regularisation.
     """
 
     name: Literal["cor-gs"] = "cor-gs"

@@ -39,7 +39,10 @@ EPS = 0.01
 
 @dataclass(frozen=True)
 class DNGaussian(Method):
-    """tolerance: of normalised depth; patches: px; depths: what the depth maps hold."""
+    """tolerance: of normalised depth; smallest_patch, largest_patch: px; hard_start, soft_start: steps.
+
+    depths: what the depth maps hold, "disparity" (larger is nearer) or "depth" (larger is farther).
+    """
 
     name: Literal["dngaussian"] = "dngaussian"
     local_weight: float = 0.1

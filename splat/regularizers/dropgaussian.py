@@ -19,7 +19,7 @@ from splat.regularizers.regularizer import Method, Regularizer, Step
 
 @dataclass(frozen=True)
 class DropGaussian(Method):
-    """p_max: the share that is left out at the last step."""
+    """p_max: the share of the Gaussians that is left out at the last step, above 0 and below 1."""
 
     name: Literal["dropgaussian"] = "dropgaussian"
     p_max: float = 0.2

@@ -45,7 +45,10 @@ MIDAS = 200.0
 
 @dataclass(frozen=True)
 class FSGS(Method):
-    """neighbours: K; threshold, large: in units of the scene's extent; depths: what the depth maps hold."""
+    """neighbours: K; threshold, large: in units of the scene's extent; unpool_until, depth_until: steps.
+
+    depths: what the depth maps hold, "disparity" (larger is nearer) or "depth" (larger is farther).
+    """
 
     name: Literal["fsgs"] = "fsgs"
     neighbours: int = 3

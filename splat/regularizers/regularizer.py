@@ -34,9 +34,9 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of a training.  number: from 1; chosen: index of the sampled view.
+    """One step of a training.  number: from 1; chosen: index in `views` of the sampled view.
 
-    gaussians: before the update.  background, loss: this step's (they change where the background is random).
+    gaussians: before the update.  background, loss: this step's colour, and the loss against the sampled view's image on it.
     """
 
     number: int
@@ -58,9 +58,10 @@ class Step:
 
 
 class Regularizer:
-    """Plain 3DGS: nothing is added.  The base of the methods.
+    """Plain 3DGS: nothing is added.  The base of the methods' own regularizers, which hold what they need between steps.
 
-    history: rows of what is worth a look afterwards, each with its "step"; part of the state.
+    generator: of whatever the method draws.  history: rows of what is worth a look afterwards, each with its "step";
+    `landscape train` writes them to history.csv.  Both are part of the state.
     """
 
     def __init__(self, seed: int):
@@ -97,7 +98,7 @@ class Regularizer:
 
 @dataclass(frozen=True)
 class Method:
-    """Settings of a method, from which its regularizer is made.  name: of its own, as in `methods.METHODS`."""
+    """Settings of a method, from which `regularizer(seed)` makes a new regularizer.  name: its key in `methods.METHODS`."""
 
     name: str = ""
 

@@ -27,7 +27,7 @@ from splat.regularizers.regularizer import Method, Regularizer, Step
 
 @dataclass(frozen=True)
 class SAM(Method):
-    """rho: radius of the ball in its metric; 0.05 is Foret's default (their Sec. 3.1) and goes with "parameters"."""
+    """rho: radius of the ball in the metric's units; 0.05 is Foret's default (their Sec. 3.1) and goes with "parameters"."""
 
     name: Literal["sam"] = "sam"
     rho: float = 0.05

@@ -52,9 +52,13 @@ SAMPLES = 4
 
 @dataclass(frozen=True)
 class StableGS(Method):
-    """The paper's settings.  traces: exact but for a few samples, or Eq. (6)'s ten Gaussian samples a block.
+    """The paper's settings.
 
+    warm_up: steps before probing starts; every: steps between two diagnoses (magnitudes and edges).
+    asp_weight, vsp_weight: of the probed copy's loss, and of the agreement from probed viewpoints; 0 leaves it out.
+    traces: "exact" but for a few samples, or "paper": Eq. (6)'s ten Gaussian samples a block.
     viewpoints: "all" is the paper's K = M probes a step, "one" K = 1, that of the sampled view.
+    probe, viewpoint: of the attribute probes and of the viewpoint probes.
     """
 
     name: Literal["stablegs"] = "stablegs"

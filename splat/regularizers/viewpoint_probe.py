@@ -37,11 +37,11 @@ from splat.scenes.capture import CaptureGeometry
 class ViewpointSettings:
     """Modes and magnitudes of the probes.
 
-    edge_rotation, interpolation, parallax: each mode alone.
+    edge_rotation, interpolation, parallax: whether each mode is on (in a 360 capture, parallax replaces interpolation).
     capture: "forward" or "360" (the spherical shell in place of the parallax); "auto" tells by the cameras.
-    t_min, t_max: range of the interpolation; below 0 and above 1 it extrapolates.
-    theta_sigma: degrees.  parallax_sigma: in units of the cameras' mean distance from their centroid.
-    axis: what the edge rotation turns about.
+    t_min, t_max: range of the interpolation, 0 the view, 1 its neighbour; below 0 and above 1 it extrapolates.
+    theta_sigma: of the edge rotation, degrees.  parallax_sigma: in units of the cameras' mean distance from their centroid.
+    axis: what the edge rotation turns about: the edges' normal or their tangent.
     """
 
     edge_rotation: bool = True
