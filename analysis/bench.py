@@ -91,6 +91,11 @@ def run_bench(options: BenchOptions) -> int:
             f"expected a scene, a checkpoint or --sizes for the device cuda, got {options.subject}, which measures the CPU's "
             "kernels; leave out --device"
         )
+    folder = options.subject is not None and Path(options.subject).is_dir()
+    if (options.images is not None or options.downscale != 1) and not folder and options.checkpoint is None:
+        raise ValueError("expected --images and --downscale with a scene's folder, whose images they choose, got none")
+    if options.images is not None and not folder:
+        raise ValueError("expected --images with a scene's folder; a checkpoint's images are those of its training")
     if options.subject == "stress":
         return run_stress(options)
     if options.subject == "accuracy":

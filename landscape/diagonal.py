@@ -57,7 +57,7 @@ class GroupSums:
 class DiagonalEstimate:
     """diag H.  samples: one column a test vector, whose mean is `values`; no columns where the diagonal is known exactly.
 
-    matvecs: products with H that it took.  method: "signs" or "sketch", whichever was used in the end.
+    matvecs: products with H that it took.  method: "signs" or "sketch", whichever was used in the end, or "exact".
     """
 
     values: Float64[Tensor, " n"]
@@ -120,14 +120,16 @@ def estimate_diagonal(
         raise ValueError(f"expected the method 'auto' or 'signs', got {method!r}")
     if isinstance(operator, PartlyKnown) and operator.known is operator:
         exact = operator.known_diagonal().double()
-        return DiagonalEstimate(exact, torch.zeros_like(exact), exact.new_zeros(len(exact), 0), operator.blocks, 0)
+        return DiagonalEstimate(
+            exact, torch.zeros_like(exact), exact.new_zeros(len(exact), 0), operator.blocks, 0, "exact"
+        )
     half = probes // 2
     choosing = method == "auto" and half >= FEWEST and operator.dim > probes and not isinstance(operator, PartlyKnown)
     samples, controls = torch.zeros(2, operator.dim, 0, dtype=torch.float64, device=generator.device)
     kept: list[tuple[Tensor, Tensor]] = []
     while (done := samples.shape[1]) < probes:
-        Z = draw_probes(operator.dim, min(batch, probes - done), generator, operator.dtype, "rademacher")
-        Z = Z[:, : half - done] if choosing and done < half else Z
+        until = half if choosing and done < half else probes
+        Z = draw_probes(operator.dim, min(batch, until - done), generator, operator.dtype, "rademacher")
         Y = product(operator, Z)
         samples = torch.cat([samples, Z.double() * Y.double()], dim=1)
         if isinstance(operator, PartlyKnown):

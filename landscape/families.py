@@ -85,10 +85,10 @@ def families(
     >>> {name: round(family.indices.literal.value, 6) for name, family in found.items()}
     {'all': -4.0, 'a': -4.0, 'b': 2.0}
     """
-    names = [WHOLE, *(name for name in operator.blocks if name != WHOLE)] if parts is None else list(parts)
-    unknown = [name for name in names if name != WHOLE and name not in operator.blocks]
-    if unknown:
-        raise ValueError(f"expected parts out of {WHOLE}, {', '.join(operator.blocks)}, got {unknown[0]!r}")
+    known = [WHOLE, *(name for name in operator.blocks if name != WHOLE)]
+    names = known if parts is None else list(parts)
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"expected parts out of {', '.join(known)}, got {unknown[0]!r}")
     results: dict[str, Family] = {}
     for name in names:
         stream = split(generator)

@@ -94,7 +94,7 @@ def finite_probe(
     >>> found.infinitesimal, found.curvatures, found.truncation
     (12.0, tensor([12.0200, 14.0000], dtype=torch.float64), tensor([0.0200, 2.0000], dtype=torch.float64))
     """
-    _require_probe(center, direction, steps)
+    _require_probe(center, direction, steps, noise_points)
     origin, v = center.detach().double(), direction.detach().double()
     total = 2 * len(steps) + 1 + noise_points
     at = _Line(loss, origin, v, center.dtype, total, progress)
@@ -181,7 +181,9 @@ def _truncation(steps: Tensor, curvatures: Tensor) -> Tensor:
     return torch.cat([slopes, slopes[-1:]]) * squares
 
 
-def _require_probe(center: Tensor, direction: Tensor, steps: Sequence[float]) -> None:
+def _require_probe(center: Tensor, direction: Tensor, steps: Sequence[float], noise_points: int) -> None:
+    if noise_points <= ORDER:
+        raise ValueError(f"expected more than {ORDER} noise points, got {noise_points}")
     if center.ndim != 1 or center.shape != direction.shape:
         raise ValueError(
             f"expected a flat center and a direction of its length, got {tuple(center.shape)} and {tuple(direction.shape)}"

@@ -141,6 +141,8 @@ class SceneObjective:
         """The objective over the first `count` views alone; what is held still is shared."""
         part = copy(self)
         part.views, part._losses = self.views[:count], self._losses[:count]
+        part.counts = replace(self.counts, views=count)
+        part.memory_plan = replace(self.memory_plan, kept=min(self.memory_plan.kept, count), views=count)
         for name in ("gradient", "own_blocks", "pixelwise_blocks"):  # those of all views
             part.__dict__.pop(name, None)
         return part

@@ -239,6 +239,8 @@ def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
         (["--prototype", "elsewhere"], "bench kernels --prototype"),
         (["--sizes", "many"], "GAUSSIANS@WIDTHxHEIGHT"),
         (["nowhere"], "nowhere"),
+        (["--downscale", "2"], "--downscale with a scene's folder"),
+        (["kernels", "--images", "images_4"], "--images and --downscale with a scene's folder"),
         (["kernels", "--prototype", "nowhere"], "expected a prototype's"),
         (["kernels", "--device", "cuda"], "which measures the CPU's kernels; leave out --device"),
     ],

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from landscape.finite_probe import NOISE_POINTS, STEPS, evaluation_noise, finite_probe
+from landscape.finite_probe import NOISE_POINTS, ORDER, STEPS, evaluation_noise, finite_probe
 from landscape.operator import DenseOperator
 from tests.oracles import symmetric_matrix
 
@@ -109,6 +109,10 @@ def test_bad_probes_are_refused():
             probed(quartic, steps=steps)
     with pytest.raises(ValueError, match="finite objective at the centre"):
         probed(lambda theta: float("nan"))
+    seen = []
+    with pytest.raises(ValueError, match=f"more than {ORDER} noise points, got {ORDER}"):
+        finite_probe(lambda theta: seen.append(theta) or 0.0, CENTER, V, DenseOperator(A), noise_points=ORDER)
+    assert not seen
 
 
 @pytest.mark.parametrize("rounded", [float, np.float32, lambda value: value.item()], ids=["float", "numpy", "item"])

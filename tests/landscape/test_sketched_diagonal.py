@@ -93,8 +93,9 @@ def test_a_flat_spectrum_a_known_part_and_few_probes_stay_with_signs():
         assert torch.allclose(auto.values, signs.values, rtol=0, atol=1e-12)
 
 
-def test_the_same_seed_gives_the_same_numbers_in_batches_of_any_size():
-    one, same, other = (estimate_diagonal(DenseOperator(POWER), generator(), 32, batch).values for batch in (4, 4, 7))
+@pytest.mark.parametrize("matrix", [POWER, FLAT], ids=["a sketch", "signs"])
+def test_the_same_seed_gives_the_same_numbers_in_batches_of_any_size(matrix):
+    one, same, other = (estimate_diagonal(DenseOperator(matrix), generator(), 32, batch).values for batch in (4, 4, 7))
     assert torch.equal(one, same) and torch.allclose(one, other, rtol=0, atol=1e-12)
 
 

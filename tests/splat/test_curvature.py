@@ -173,6 +173,8 @@ def test_the_part_of_some_views_is_their_mean_at_the_same_gaussians():
     assert scene.gradient.any() and scene.own_blocks[0].sh.any()  # known before
     part, (first, _) = scene.of_views(1), scene.linearized
     assert part.active is scene.active and len(scene.views) == 2
+    assert (part.counts.views, part.memory_plan.views, part.memory_plan.kept) == (1, 1, 1)
+    assert (scene.counts.views, scene.memory_plan.views, scene.memory_plan.kept) == (2, 2, 2)
     assert part.loss(scene.active.flat) == pytest.approx(first.value, rel=1e-12)
     V = random_like((scene.active.flat.numel(), 2), 3)
     assert torch.equal(SceneHessian(part, keep_null=True).apply(V), first.hvp(V))
