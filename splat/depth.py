@@ -201,7 +201,7 @@ def _signs(
     flat, ray = objective.active.flat, rays[index]
     U = flat.new_zeros(flat.numel(), len(names), len(generators))
     for j, generator in enumerate(generators):
-        z = draw_probes(4 * len(ray), 1, generator, flat.dtype, "rademacher").view(-1, 4)
+        z = draw_probes(4 * len(ray), 1, generator, flat.dtype, "rademacher").view(-1, 4).to(ray)
         moves = {"depth": z[:, :1] * ray, "lateral": _across(z[:, 1:], ray)}
         for i, name in enumerate(names):
             U[objective.blocks["means"], i, j] = moves[name].reshape(-1)

@@ -10,7 +10,9 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from landscape.lanczos import lanczos
 from landscape.operator import DenseOperator
+from landscape.trace import TraceSettings
 from splat.curvature import SceneHessian, SceneObjective
+from splat.depth import depth_rises, depth_split
 from splat.localization import conditions, localize
 from splat.losses import LossSettings
 from splat.metrics import scene_units
@@ -103,6 +105,8 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         known.steepest(1, 1)
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
         split_control(objective.active, [views[0].camera])
+        depth_split(objective, torch.Generator().manual_seed(0), TraceSettings.fixed(8))
+        depth_rises(objective, torch.Generator().manual_seed(0), steps=(1.0,), draws=2)
     assert not +placed.mixed
 
 
