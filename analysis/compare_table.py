@@ -22,6 +22,7 @@ from splat.checkpoint import Checkpoint
 from splat.regularizers.regularizer import Method
 
 FAMILIES = "families"  # a section that only the page and the file show
+DEPTH = "depth over lateral"
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ MISSING = Entry(None, Cell(quantity(None)))
 
 def comparison(runs: Sequence[Run]) -> list[Row]:
     """All quantities, section by section."""
-    return [*_about(runs), *_scores(runs), *_curvature(runs), *_indices(runs), *_families(runs)]
+    return [*_about(runs), *_scores(runs), *_curvature(runs), *_indices(runs), *_depth(runs), *_families(runs)]
 
 
 def _about(runs: Sequence[Run]) -> Iterable[Row]:
@@ -96,6 +97,21 @@ def _indices(runs: Sequence[Run]) -> Iterable[Row]:
         factors = tuple(_effect(run.data, "hessian", "all", name) for run in runs)
         if any(entry is not MISSING for entry in factors):
             yield Row("anisotropy", "  split control", factors)
+
+
+def _depth(runs: Sequence[Run]) -> Iterable[Row]:
+    """Positions along the rays over those across them, where a run's probe has that."""
+    found = [run.data.get("depth") for run in runs]
+    if not any(found):
+        return
+    gradients = tuple(MISSING if depth is None else _plain(depth["gradient_ratio"]) for depth in found)
+    yield Row(DEPTH, "gradient of position", gradients)
+    curvatures = tuple(MISSING if depth is None else _index(depth["curvature_ratio"]) for depth in found)
+    yield Row(DEPTH, "curvature of position", curvatures)
+    lengths = dict.fromkeys(row["pixels"] for depth in found if depth for row in depth["rises"])
+    for pixels in lengths:
+        entries = tuple(_rise(depth, pixels) for depth in found)
+        yield Row(DEPTH, f"rise at {pixels:g} px", entries)
 
 
 def _families(runs: Sequence[Run]) -> Iterable[Row]:
@@ -154,6 +170,15 @@ def _index(entry: Mapping[str, Any] | None) -> Entry:
     return MISSING if entry is None else Entry(entry["value"], bracketed(entry), entry["low"], entry["high"])
 
 
+def _rise(depth: Mapping[str, Any] | None, pixels: float) -> Entry:
+    """The ratio of the rises at steps of this length, with two standard errors."""
+    for row in depth["rises"] if depth else ():
+        if row["pixels"] == pixels and row["ratio"] is not None and row["ratio_error"] is not None:
+            ratio, error = row["ratio"], row["ratio_error"]
+            return Entry(ratio, Cell(measured(ratio, error)), ratio - 2 * error, ratio + 2 * error)
+    return MISSING
+
+
 def _family(data: Mapping[str, Any], operator: str, block: str, index: str) -> Entry:
     for row in data.get("families", []):
         if (row["operator"], row["block"], row["split"]) == (operator, block, False):
@@ -201,6 +226,7 @@ def compare_table(rows: Sequence[Row], labels: Sequence[str]) -> Table:
             table.add_section()
             section = row.section
         name = f"trace of {row.name}" if row.section == "trace" else row.name
+        name = f"depth / lateral {row.name}" if row.section == DEPTH else name
         name += ", training views" if row.section == "training views" else ""
         cells = ("\n".join(filter(None, (entry.cell.value, entry.cell.bracket))) for entry in row.entries)
         table.add_row(name, *(escape(cell) for cell in cells))

@@ -77,6 +77,21 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
     return data, arrays
 
 
+def depth_section(ratio: float | None = 0.0068) -> dict[str, Any]:
+    """The section of a record that has positions split into depth and lateral."""
+    trace = {"value": 3.9e-4, "standard_error": 1e-5}
+    rise = {"depth": 1.4e-4, "depth_error": 1e-5, "depth_crossed": 0.75, "lateral": 5e-4, "lateral_error": 2e-6}
+    rows = [{"pixels": 0.1, "ratio": 0.28, "ratio_error": 0.02, "lateral_crossed": 0.5, **rise}]
+    return {
+        "gradient_ratio": ratio,
+        "gradient_median": ratio,
+        "pairs": 23054,
+        "curvature": {"depth": trace, "lateral": {"value": 20.4, "standard_error": 0.3}},
+        "curvature_ratio": {"value": 3.8e-5, "low": 3.7e-5, "high": 3.9e-5, "note": ""},
+        "rises": rows,
+    }
+
+
 def _trace(draws: np.ndarray, dim: int) -> dict[str, Any]:
     value, error = float(draws.mean()), float(draws.std(ddof=1) / np.sqrt(len(draws)))
     low, high = value - 2.13 * error, value + 2.13 * error

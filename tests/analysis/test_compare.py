@@ -17,7 +17,7 @@ from splat.losses import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from tests.figures.test_trajectory_figure import rows
-from tests.recorded import synthetic
+from tests.recorded import depth_section, synthetic
 
 ITERATIONS = 4
 FACTOR = {"value": 2.5, "low": 2.0, "high": 3.1, "note": ""}
@@ -86,6 +86,25 @@ def refused(capsys, words: list[str], *expected: str) -> None:
     assert captured.out == ""
     for part in expected:
         assert part in " ".join(captured.err.split())
+
+
+def test_depth_over_lateral_is_compared_where_a_probe_has_it(runs, tmp_path, no_pictures, capsys):
+    assert main(["compare", *runs, "--out", str(tmp_path / "without")]) == 0
+    assert "depth / lateral" not in capsys.readouterr().out
+    path = Path(runs[0]) / "probe/probe.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"depth": depth_section()}))
+    assert main(["compare", *runs, "--out", str(tmp_path / "with")]) == 0
+    lines = {line.strip().split("  ")[0]: line for line in capsys.readouterr().out.splitlines() if "depth" in line}
+    for name, value in (
+        ("gradient of position", "0.00680"),
+        ("curvature of position", "3.80"),
+        ("rise at 0.1 px", "0.280"),
+    ):
+        assert value in lines[f"depth / lateral {name}"] and lines[f"depth / lateral {name}"].rstrip().endswith("–")
+    table = pd.read_csv(tmp_path / "with/compare.csv").set_index(["section", "quantity", "run"])
+    rise = table.loc[("depth over lateral", "rise at 0.1 px", "plain/0")]
+    assert [float(rise[key]) for key in ("value", "low", "high")] == pytest.approx([0.28, 0.24, 0.32])
+    assert "Depth over lateral" in (tmp_path / "with/compare.html").read_text()
 
 
 def test_the_file_holds_the_numbers_of_the_records_and_metrics(trained, tmp_path, no_pictures):

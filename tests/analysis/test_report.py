@@ -9,7 +9,7 @@ import pytest
 from analysis.records import read_record, record_folder, write_record
 from analysis.report import interactive_surface, write_report
 from analysis.verdict import verdict
-from tests.recorded import synthetic
+from tests.recorded import depth_section, synthetic
 
 PIXEL = bytes.fromhex("89504e470d0a1a0a") + b"not looked into"
 
@@ -98,20 +98,6 @@ def test_every_number_of_the_tables_is_on_the_page_with_its_error(tmp_path):
         "rademacher",
     ):
         assert expected in text
-
-
-def depth_section(ratio: float | None = 0.0068) -> dict[str, Any]:
-    trace = {"value": 3.9e-4, "standard_error": 1e-5}
-    rise = {"depth": 1.4e-4, "depth_error": 1e-5, "depth_crossed": 0.75, "lateral": 5e-4, "lateral_error": 2e-6}
-    rows = [{"pixels": 0.1, "ratio": 0.28, "ratio_error": 0.02, "lateral_crossed": 0.5, **rise}]
-    return {
-        "gradient_ratio": ratio,
-        "gradient_median": ratio,
-        "pairs": 23054,
-        "curvature": {"depth": trace, "lateral": {"value": 20.4, "standard_error": 0.3}},
-        "curvature_ratio": {"value": 3.8e-5, "low": 3.7e-5, "high": 3.9e-5, "note": ""},
-        "rises": rows,
-    }
 
 
 def test_the_page_says_what_lies_in_depth_and_how_far_that_is_from_the_papers_factor(tmp_path):
