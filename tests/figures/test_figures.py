@@ -2,6 +2,7 @@ import math
 import subprocess
 import sys
 import warnings
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -150,6 +151,24 @@ def test_cross_sections_are_the_rows_and_columns_through_the_centre(tmp_path):
     second = np.asarray(sections[field.y.short_label].get_ydata(), dtype=float) * 10.0**field.exponent
     np.testing.assert_allclose(first, arrays["loss"][:, 8] - center, rtol=1e-12, atol=1e-17)
     np.testing.assert_allclose(second, arrays["loss"][10, :] - center, rtol=1e-12, atol=1e-17)
+
+
+@pytest.mark.parametrize("reach", [(0.3, 0.0072), (0.06, 0.04), (0.98, 0.038), (7.0, 0.145)], ids=str)
+def test_the_numbers_of_the_cross_sections_stay_apart(tmp_path, reach):
+    """Directions with a power of ten in common may leave one of them many digits."""
+    data, arrays = synthetic()
+    for name, about, far in zip("xy", data["slice"]["directions"], reach):
+        arrays["slice"][name] *= far / arrays["slice"][name].max()
+        about["unit"] = far / 3
+    figure = slice2d.draw(recorded(tmp_path / "probe", data, arrays))
+    renderer = laid_out(figure)
+    digit = POINT * figure.dpi * 4
+    for axes in figure.axes[-2:]:
+        for axis in (axes.xaxis, *(upper.xaxis for upper in axes.child_axes)):
+            boxes = [label.get_window_extent(renderer) for label in axis.get_majorticklabels() if label.get_text()]
+            inside = [box for box in boxes if axes.bbox.x0 <= (box.x0 + box.x1) / 2 <= axes.bbox.x1]
+            assert len(inside) >= 3
+            assert all(right.x0 - left.x1 > digit for left, right in pairwise(inside))
 
 
 def test_the_first_direction_runs_to_the_right(tmp_path):
