@@ -21,7 +21,7 @@ from figures.plane import Direction, Plane, curvature_text, plane, same_scale
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
 
 LEVELS = 12
-INTERVALS = 3  # between ticks along a cross-section: labels such as -0.008 stay apart in half a column
+ACROSS, INTERVALS = 5, 3  # between ticks of the plane and of a cross-section: labels such as -0.008 stay apart
 RENDERED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": BLACK, "markeredgewidth": 0}
 CROSSED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": SKY, "markeredgewidth": 0}
 
@@ -63,6 +63,7 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
     if field.crossed is not None:
         rows, columns = np.nonzero(field.crossed)
         axes.plot(x[rows], y[columns], **CROSSED)
+    axes.xaxis.set_major_locator(MaxNLocator(ACROSS))
     axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
     axes.set_xlabel(field.x.label)
     axes.set_ylabel(field.y.label)
