@@ -29,7 +29,7 @@ from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
 from landscape.families import WHOLE, Lead
 from landscape.operator import SymmetricOperator, finished
 from landscape.probes import split
-from landscape.results import Progress, finite_or_none
+from landscape.results import EigenEnds, Progress, finite_or_none
 from landscape.trace import total_trace
 from splat.active_spaces import active_spaces
 from splat.curvature import SceneHessian, SceneObjective
@@ -138,10 +138,18 @@ class FamilyFindings:
 
 
 def measure_families(
-    objective: SceneObjective, training: Training, options: FamilyOptions, generator: torch.Generator, stage: Stage
+    objective: SceneObjective,
+    training: Training,
+    options: FamilyOptions,
+    generator: torch.Generator,
+    stage: Stage,
+    ends: EigenEnds | None = None,
 ) -> FamilyFindings:
-    """Every family of the scene and, if asked for, of the split scene.  training: that of the checkpoint; stage: see
-    `analysis.stages`."""
+    """Every family of the scene and, if asked for, of the split scene.
+
+    training: that of the checkpoint; stage: see `analysis.stages`; ends: of the objective's Hessian in the stored parameters,
+    where they have been looked for.
+    """
     scenes: dict[SceneName, SceneObjective] = {"trained": objective}
     control, notes = None, []
     if options.split_control:
@@ -162,7 +170,8 @@ def measure_families(
         with stage(f"families: {operator}{', split' if scene == 'split' else ''}") as report:
             hessian = SceneHessian(scenes[scene], gauss_newton=OPERATORS[operator])
             D = scale(scenes[scene])
-            measured = _of_operator(hessian, D, options, stream, partial(clock.share, scene), report, notes)
+            known = ends if scene == "trained" and operator == "hessian" and D is None else None
+            measured = _of_operator(hessian, D, known, options, stream, partial(clock.share, scene), report, notes)
             count = len(scenes[scene].active)
             rows += [FamilyRow(scene, operator, block, count, dim, found) for block, dim, found in measured]
     return FamilyFindings(options.metric, unit, tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)))
@@ -210,13 +219,14 @@ def _metric(
 def _of_operator(
     hessian: SceneHessian,
     scale: Tensor | None,
+    ends: EigenEnds | None,
     options: FamilyOptions,
     generator: torch.Generator,
     seconds: Callable[[], float],
     report: Progress,
     notes: list[str],
 ) -> list[tuple[str, int, Family]]:
-    """(block, dim, family) of the whole and of every attribute of one operator."""
+    """(block, dim, family) of the whole and of every attribute of one operator.  ends: of the whole, where known."""
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
     spaces, found = active_spaces(hessian, scale), []
     traces = _traces(hessian, scale, split(generator))
@@ -233,7 +243,7 @@ def _of_operator(
             report(done, len(names), state)
 
         dim = hessian.dim if name == WHOLE else hessian.blocks[name].stop - hessian.blocks[name].start
-        leads = {name: replace(_lead(hessian, name, scale), trace=traces.get(name))}
+        leads = {name: replace(_lead(hessian, name, scale, ends), trace=traces.get(name))}
         found.append((name, dim, families(operator, stream, settings, [name], spaces, say, leads)[name]))
     report(len(names), len(names), "done")
     return found
@@ -247,14 +257,16 @@ def _traces(hessian: SceneHessian, scale: Tensor | None, generator: torch.Genera
     return {WHOLE: total_trace(found), **{name: total_trace({name: trace}) for name, trace in found.items()}}
 
 
-def _lead(hessian: SceneHessian, name: str, scale: Tensor | None) -> Lead:
-    """Where the Gaussians' own blocks know the ends of the whole, or of an attribute, to lie.
+def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnds | None) -> Lead:
+    """Where an earlier search knows the ends of the whole to lie, or the Gaussians' own blocks those of it or an attribute.
 
     Both of the Hessian's whole and of rotations; of positions the largest, as several Gaussians make their least curvatures
     together, and of Gauss-Newton, which has a null space for its smallest.
     """
     if name not in (WHOLE, "means", "quats"):
         return Lead()
+    if name == WHOLE and ends is not None:
+        return Lead(torch.cat([ends.largest.vectors[:, :1], ends.smallest.vectors[:, :1]], dim=1))
     objective = hessian.objective
     own, pixelwise = objective.own_blocks
     if hessian.gauss_newton:

@@ -89,7 +89,9 @@ def _run(
         if family_options is not None:
             from analysis.family_stage import measure_families
 
-            found = measure_families(objective, checkpoint.training, family_options, split(generator), stages.stage)
+            found = measure_families(
+                objective, checkpoint.training, family_options, split(generator), stages.stage, findings.ends
+            )
             data |= found.record()
             data["notes"] += found.notes
             data["provenance"]["families"] = asdict(family_options)

@@ -21,6 +21,7 @@ from figures.plane import Direction, Plane, curvature_text, plane, same_scale
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
 
 LEVELS = 12
+ACROSS, INTERVALS = 5, 3  # between ticks of the plane and of a cross-section: labels such as -0.008 stay apart
 RENDERED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": BLACK, "markeredgewidth": 0}
 CROSSED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": SKY, "markeredgewidth": 0}
 
@@ -62,6 +63,7 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
     if field.crossed is not None:
         rows, columns = np.nonzero(field.crossed)
         axes.plot(x[rows], y[columns], **CROSSED)
+    axes.xaxis.set_major_locator(MaxNLocator(ACROSS))
     axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
     axes.set_xlabel(field.x.label)
     axes.set_ylabel(field.y.label)
@@ -90,13 +92,13 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
         axes.plot(direction.scaled, field.model.take(other.centre, axis=1 - axis), "--", color=VERMILION, linewidth=0.9)
     axes.axvline(0, color="0.7", linewidth=0.5, zorder=0)
     axes.set_xlabel(direction.short_label)
-    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_locator(MaxNLocator(INTERVALS))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.grid(True)
     step = direction.unit / 10.0**direction.exponent
     if np.isfinite(step) and step > 0:
         upper = axes.secondary_xaxis("top", functions=(lambda x: np.divide(x, step), lambda u: np.multiply(u, step)))
-        upper.xaxis.set_major_locator(MaxNLocator(4))
+        upper.xaxis.set_major_locator(MaxNLocator(INTERVALS))
         upper.set_xlabel(f"{curvature_text(direction)}\nsteps in curvature units", linespacing=1.4)
 
 

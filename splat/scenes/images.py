@@ -24,7 +24,7 @@ import numpy as np
 import pycolmap
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -116,6 +116,15 @@ def image_header(path: Path) -> tuple[tuple[int, int], bool]:
     if mode.startswith(("I", "F")):
         raise ValueError(f"expected an image of 8 bits a channel, got mode {mode} in {path}; convert it")
     return size, has_alpha
+
+
+def image_pixels(path: Path) -> UInt8[np.ndarray, "h w c"]:
+    """Red, green, blue, and alpha where the image has it, from 0 to 255."""
+    try:
+        with Image.open(path, formats=FORMATS) as file:
+            return np.array(file.convert("RGBA" if _has_alpha(file) else "RGB"))
+    except UNREADABLE as error:
+        raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
 
 
 def _has_alpha(file: Image.Image) -> bool:
@@ -218,14 +227,9 @@ def _displacement(lens: pycolmap.Camera) -> float:
 
 def _read(path: Path, warp: Warp, background: Float[Tensor, "3"]) -> Picture:
     """Composite over the background, undistort, downscale: in this order, no transparent colour bleeds in."""
-    try:
-        with Image.open(path, formats=FORMATS) as file:
-            has_alpha = _has_alpha(file)
-            pixels = np.array(file.convert("RGBA" if has_alpha else "RGB"))
-    except UNREADABLE as error:
-        raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
-    layers = torch.from_numpy(pixels).permute(2, 0, 1).to(torch.float32) / 255
-    if has_alpha:
+    pixels = torch.from_numpy(image_pixels(path))
+    layers = pixels.permute(2, 0, 1).to(torch.float32) / 255
+    if has_alpha := len(layers) == 4:
         rgb, alpha = layers[:3], layers[3:]
         layers = torch.cat([rgb * alpha + background[:, None, None] * (1 - alpha), alpha])
     layers = warp(layers).clamp(0, 1)

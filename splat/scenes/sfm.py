@@ -21,7 +21,7 @@ from typing import Literal
 import pycolmap
 from PIL import ExifTags, Image
 
-from splat.scenes.images import IMAGE_SUFFIXES, image_files, image_header
+from splat.scenes.images import IMAGE_SUFFIXES, image_files, image_header, image_pixels
 from splat.scenes.layers import FORMATS
 from splat.scenes.scene import load_scene
 from splat.scenes.triangulation import SEED, matching, quiet, verification
@@ -36,8 +36,8 @@ CAMERA = "SIMPLE_RADIAL"
 class Mapped:
     """What became of the photographs.
 
-    left_out: names of those that the model could not place; models: how many photographs every model found has, the
-    kept one first; error: mean reprojection error, px.
+    left_out: names of those that the model could not place; models: how many photographs every model has, the kept one
+    first, then those with photographs that it has not; error: mean reprojection error, px.
     """
 
     placed: int
@@ -68,11 +68,11 @@ def scene_from_photos(photos: Path, out: Path, on_progress: Progress = lambda *_
         os.replace(scene, out)
     finally:
         shutil.rmtree(building, ignore_errors=True)
-    placed = {models[0].images[i].name for i in models[0].reg_image_ids()}
+    placed, *others = ({model.images[i].name for i in model.reg_image_ids()} for model in models)
     return Mapped(
         placed=len(placed),
         left_out=tuple(path.name for path in files if path.name not in placed),
-        models=tuple(model.num_reg_images() for model in models),
+        models=(len(placed), *(len(other) for other in others if other - placed)),
         points=models[0].num_points3D(),
         error=models[0].compute_mean_reprojection_error(),
     )
@@ -82,7 +82,8 @@ def _photographs(folder: Path) -> list[Path]:
     """The image files, all of which can be read."""
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"expected a folder of photographs, {folder} {'is not a folder' if folder.exists() else 'does not exist'}"
+            f"expected a folder of photographs, {folder} {'is not a folder' if folder.exists() else 'does not exist'}; "
+            "name the one that holds them"
         )
     files = image_files(folder)
     if len(files) < FEWEST:
@@ -92,6 +93,7 @@ def _photographs(folder: Path) -> list[Path]:
         )
     for path in files:
         image_header(path)
+        image_pixels(path)  # COLMAP takes what it can of a file that was cut off, and leaves the rest grey
     return files
 
 

@@ -20,7 +20,8 @@ from analysis.family_table import Cell, family_lines, family_table
 from analysis.probe import scene_objective
 from analysis.records import Record, read_record
 from analysis.report import render_report
-from landscape import Bracket, DenseOperator, EigenSettings, FamilySettings, families
+from landscape import Bracket, DenseOperator, EigenSettings, FamilySettings, extreme_eigenpairs, families
+from landscape.results import EigenEnds
 from splat.adam import Adam
 from splat.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from splat.curvature import SceneHessian, SceneObjective
@@ -65,10 +66,12 @@ def silent(name: str) -> nullcontext:
     return nullcontext(lambda done, most, state: None)
 
 
-def found(objective: SceneObjective, checkpoint: Checkpoint, **options) -> FamilyFindings:
+def found(
+    objective: SceneObjective, checkpoint: Checkpoint, ends: EigenEnds | None = None, **options
+) -> FamilyFindings:
     generator = torch.Generator().manual_seed(0)
     options = {"family": BUDGET, **options}
-    return measure_families(objective, checkpoint.training, FamilyOptions(**options), generator, silent)
+    return measure_families(objective, checkpoint.training, FamilyOptions(**options), generator, silent, ends)
 
 
 @pytest.fixture(scope="module")
@@ -295,6 +298,26 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
         diagonal, rows = diagonals[gauss_newton], slice(None) if block == "all" else objective.blocks[block]
         value, error = lead.trace
         assert abs(value - float(diagonal[rows].sum())) < 4 * error + 1e-9 * float(diagonal[rows].abs().sum())
+
+
+@pytest.mark.parametrize("metric", ["parameters", "scene"])
+def test_the_ends_that_were_looked_for_lead_to_those_of_the_whole(objective, checkpoint, metric, monkeypatch):
+    leads = []
+
+    def watched(*given):
+        leads.append(given[6])
+        return families(*given)
+
+    monkeypatch.setattr("analysis.family_stage.families", watched)
+    ends = extreme_eigenpairs(SceneHessian(objective), torch.Generator().manual_seed(1), EigenSettings(2, 1))
+    found(objective, checkpoint, metric=metric, split_control=True, ends=ends)
+    known = torch.stack([ends.largest.vectors[:, 0], ends.smallest.vectors[:, 0]], dim=1)
+    begins = [block for lead in leads for block, given in lead.items() if same(given.start, known)]
+    assert begins == (["all"] if metric == "parameters" else [])  # those of the trained scene's Hessian alone
+
+
+def same(a: torch.Tensor | None, b: torch.Tensor) -> bool:
+    return a is not None and a.shape == b.shape and torch.equal(a, b)
 
 
 def test_a_product_is_timed_where_the_scene_is():

@@ -2,9 +2,11 @@ import math
 import subprocess
 import sys
 import warnings
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.axes._secondary_axes import SecondaryAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from PIL import Image
@@ -41,11 +43,12 @@ def nothing_drawn(*_):
     raise RuntimeError("no OpenGL here")
 
 
-def laid_out(figure):
-    """The figure drawn once, at a resolution that suffices for its layout, and the renderer that measures it."""
-    figure.set_dpi(100)
+def laid_out(figure, dpi=100):
+    """The figure drawn once, as `save` does, at a resolution that suffices for its layout; the renderer that measures it."""
+    figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
-    canvas.draw()
+    with style():  # how many ticks there are is decided when they are drawn
+        canvas.draw()
     return canvas.get_renderer()
 
 
@@ -150,6 +153,26 @@ def test_cross_sections_are_the_rows_and_columns_through_the_centre(tmp_path):
     second = np.asarray(sections[field.y.short_label].get_ydata(), dtype=float) * 10.0**field.exponent
     np.testing.assert_allclose(first, arrays["loss"][:, 8] - center, rtol=1e-12, atol=1e-17)
     np.testing.assert_allclose(second, arrays["loss"][10, :] - center, rtol=1e-12, atol=1e-17)
+
+
+@pytest.mark.parametrize("reach", [(0.3, 0.0072), (0.06, 0.04), (0.001, 0.4), (7.0, 0.145)], ids=str)
+def test_the_numbers_along_the_steps_stay_apart(tmp_path, reach):
+    """Directions with a power of ten in common may leave one of them many digits."""
+    data, arrays = synthetic()
+    for name, about, far in zip("xy", data["slice"]["directions"], reach):
+        arrays["slice"][name] *= far / arrays["slice"][name].max()
+        about["unit"] = far / 3
+    figure = slice2d.draw(recorded(tmp_path / "probe", data, arrays))
+    renderer = laid_out(figure, dpi=300)
+    for axes in (axes for axes in figure.axes if "step along" in axes.get_xlabel()):
+        uppers = [upper for upper in axes.child_axes if isinstance(upper, SecondaryAxis)]
+        for axis in (axes.xaxis, *(upper.xaxis for upper in uppers)):
+            with style():  # the ticks are made anew
+                labels = [label for label in axis.get_majorticklabels() if label.get_text()]
+            boxes = [label.get_window_extent(renderer) for label in labels]
+            inside = [box for box in boxes if axes.bbox.x0 - 1 <= (box.x0 + box.x1) / 2 <= axes.bbox.x1 + 1]
+            assert len(inside) >= 3
+            assert all(right.x0 - left.x1 > 4 * POINT * figure.dpi for left, right in pairwise(inside))
 
 
 def test_the_first_direction_runs_to_the_right(tmp_path):

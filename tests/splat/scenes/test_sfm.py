@@ -1,15 +1,17 @@
 """Scenes from photographs, of a place whose cameras are known."""
 
+import copy
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import textured
 from PIL import ExifTags, Image
 from textured import DISTANCE, FOCAL
 
 from splat.scenes.scene import load_scene
-from splat.scenes.sfm import Mapped, _by_camera, scene_from_photos
+from splat.scenes.sfm import Mapped, _by_camera, _models, scene_from_photos
 
 
 def write_photos(folder: Path, names: list[str], mirrored: bool = False) -> None:
@@ -78,6 +80,19 @@ def test_of_several_models_the_largest_is_kept(tmp_path: Path) -> None:
     assert load_scene(tmp_path / "scene").names == tuple(f"{i}.png" for i in range(4, 9))
 
 
+def test_a_model_within_the_kept_one_is_none_that_it_fell_apart_into(tmp_path: Path, monkeypatch) -> None:
+    write_photos(tmp_path / "photos", [f"{i}.png" for i in range(5)])
+
+    def with_a_part(*given) -> list[pycolmap.Reconstruction]:
+        (whole,) = _models(*given)
+        part = copy.deepcopy(whole)
+        part.deregister_frame(part.reg_frame_ids()[0])
+        return [whole, part]
+
+    monkeypatch.setattr("splat.scenes.sfm._models", with_a_part)
+    assert scene_from_photos(tmp_path / "photos", tmp_path / "scene").models == (5,)
+
+
 def test_photographs_that_make_no_model_leave_nothing_behind(tmp_path: Path) -> None:
     write_blank(tmp_path / "photos", ["a.png", "b.png", "c.png"])
     with pytest.raises(ValueError, match=r"of 3 photographs with 0 features each, 0 of 3 pairs match; take sharp"):
@@ -107,7 +122,13 @@ def test_folders_that_cannot_be_photographs_are_refused(tmp_path: Path) -> None:
     (tmp_path / "few" / "c.png").write_text("")
     with pytest.raises(ValueError, match=r"cannot read .*c\.png"):
         scene_from_photos(tmp_path / "few", tmp_path / "scene")
-    write_blank(tmp_path / "few", ["c.png"])
+    for name in ("c.png", "c.jpg"):
+        write_photos(tmp_path / "few", [name])
+        whole = (tmp_path / "few" / name).read_bytes()
+        (tmp_path / "few" / name).write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(ValueError, match=rf"cannot read .*c\{name[1:]}: image file is truncated.*; replace"):
+            scene_from_photos(tmp_path / "few", tmp_path / "scene")
+        write_blank(tmp_path / "few", [name])
     (tmp_path / "scene").mkdir()
     with pytest.raises(FileExistsError, match="remove it or choose another --out"):
         scene_from_photos(tmp_path / "few", tmp_path / "scene")
