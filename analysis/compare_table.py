@@ -105,9 +105,9 @@ def _depth(runs: Sequence[Run]) -> Iterable[Row]:
     if not any(found):
         return
     gradients = tuple(MISSING if depth is None else _plain(depth["gradient_ratio"]) for depth in found)
-    yield Row(DEPTH, "gradient of position", gradients)
+    yield Row(DEPTH, "gradient", gradients)
     curvatures = tuple(MISSING if depth is None else _index(depth["curvature_ratio"]) for depth in found)
-    yield Row(DEPTH, "curvature of position", curvatures)
+    yield Row(DEPTH, "curvature", curvatures)
     lengths = dict.fromkeys(row["pixels"] for depth in found if depth for row in depth["rises"])
     for pixels in lengths:
         entries = tuple(_rise(depth, pixels) for depth in found)
