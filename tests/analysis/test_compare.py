@@ -96,8 +96,8 @@ def test_depth_over_lateral_is_compared_where_a_probe_has_it(runs, tmp_path, no_
     assert main(["compare", *runs, "--out", str(tmp_path / "with")]) == 0
     lines = {line.strip().split("  ")[0]: line for line in capsys.readouterr().out.splitlines() if "depth" in line}
     for name, value in (
-        ("gradient of position", "0.00680"),
-        ("curvature of position", "3.80"),
+        ("gradient", "0.00680"),
+        ("curvature", "3.80"),
         ("rise at 0.1 px", "0.280"),
     ):
         assert value in lines[f"depth / lateral {name}"] and lines[f"depth / lateral {name}"].rstrip().endswith("–")
