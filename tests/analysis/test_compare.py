@@ -88,7 +88,8 @@ def refused(capsys, words: list[str], *expected: str) -> None:
         assert part in " ".join(captured.err.split())
 
 
-def test_depth_over_lateral_is_compared_where_a_probe_has_it(runs, tmp_path, no_pictures, capsys):
+def test_depth_over_lateral_is_compared_where_a_probe_has_it(runs, tmp_path, no_pictures, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "140")
     assert main(["compare", *runs, "--out", str(tmp_path / "without")]) == 0
     assert "depth / lateral" not in capsys.readouterr().out
     path = Path(runs[0]) / "probe/probe.json"
