@@ -178,7 +178,7 @@ def _lanczos(
 def _from_own_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
     """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
     assert case.objective is not None
-    start = OwnDirections(case.objective, case.objective.block_diagonal()).steepest(1, 1)
+    start = OwnDirections(case.objective, case.objective.block_diagonal()).leads()
     operator.charge(PASS)
     return end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
 

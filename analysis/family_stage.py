@@ -274,7 +274,7 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnd
     known = OwnDirections(objective, own, pixelwise, None if name == WHOLE else name, scale)
     if hessian.gauss_newton or name == "means":
         return Lead(known.steepest(1, 0))
-    return Lead(known.steepest(1, 1))
+    return Lead(known.leads())
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: SceneObjective) -> float:

@@ -211,7 +211,7 @@ def measure(
     with stage("eigenvalues") as report:
         eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
         eigen = replace(eigen, basis=_basis(operator, eigen, settings.memory, notes))
-        start = OwnDirections(objective, *own).steepest(eigen.largest, eigen.smallest)
+        start = OwnDirections(objective, *own).leads()
         timed = CountingOperator(operator)
         ends = extreme_eigenpairs(timed, streams["eigenvalues"], eigen, start, report)
     power = None

@@ -32,8 +32,8 @@ class EigenSettings:
     noise: length of a random vector added to a given start of unit length, so that an end that the start misses is still
         found.  The shorter, the fewer products from a good start, and the likelier to take the neighbour of an end for it,
         where they are about rtol apart: with rtol = 1% and two lowest eigenvalues 1.5% apart in 40% of the runs at 1, in 85%
-        at 0.3, in 2% from a random start; on five scenes with rtol = 10%, from their Gaussians' own steepest directions, in 4
-        of 30 runs at 0.3, in none at 1.
+        at 0.3, in 2% from a random start.  With a start of several directions (`splat.own_directions.LEADS`) it
+        makes no difference.
     max_matvecs, max_seconds: budgets of both ends together; a step under way at the end of the time is finished.
     """
 

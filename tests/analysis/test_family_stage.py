@@ -291,7 +291,8 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
             assert lead.start is None
         else:
             known = OwnDirections(objective, pixelwise if gauss_newton else own, pixelwise, attribute, scale)
-            assert torch.equal(lead.start, known.steepest(1, 0 if gauss_newton or block == "means" else 1))
+            upwards = gauss_newton or block == "means"
+            assert torch.equal(lead.start, known.steepest(1, 0) if upwards else known.leads())
     eye = torch.eye(objective.active.flat.numel(), dtype=torch.float64)
     diagonals = {newton: seen[newton, "all"][0].apply(eye).diagonal() for newton in (False, True)}
     for (gauss_newton, block), (_, lead) in seen.items():

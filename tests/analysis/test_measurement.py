@@ -8,12 +8,14 @@ import pytest
 import torch
 
 from analysis import measurement
+from analysis.accuracy_cases import splat_cases
 from analysis.measurement import ProbeSettings, _density, _within, measure
-from landscape import CountingOperator
+from landscape import CountingOperator, EigenSettings, extreme_eigenpairs
 from landscape.density import spectral_density
 from landscape.operator import DenseOperator
 from splat.curvature import SceneHessian, SceneObjective
 from splat.losses import LossSettings
+from splat.own_directions import OwnDirections
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import random_gaussians
 
@@ -96,3 +98,20 @@ def test_the_slices_model_has_the_hessians_curvature_between_its_directions():
     between = E.T @ SceneHessian(objective).apply(E)
     off = (found.plane.slice.curvature - between).abs().max() / between.abs().max()
     assert off < 1e4 * torch.finfo(torch.float64).eps  # what a probe's checks ask of a product
+
+
+def test_a_search_for_the_ends_begins_with_several_directions_as_one_alone_takes_a_neighbour_for_the_end():
+    """The two largest values of this scene are 13% apart."""
+    case = splat_cases(0, 2)["far from a fit #2"]()
+    assert case.objective is not None
+    seeds, loose, fine = range(3), EigenSettings(rtol=0.1), EigenSettings(rtol=1e-6)
+    true = extreme_eigenpairs(case.operator, torch.Generator().manual_seed(9), fine)
+    own = OwnDirections(case.objective, case.objective.block_diagonal())
+    for start, certain in ((own.steepest(1, 1), False), (own.leads(), True)):
+        found = [extreme_eigenpairs(case.operator, torch.Generator().manual_seed(s), loose, start) for s in seeds]
+        errors = [
+            abs(float(getattr(run, end).values[0] / getattr(true, end).values[0]) - 1)
+            for run in found
+            for end in ("largest", "smallest")
+        ]
+        assert (max(errors) < 0.1) == certain

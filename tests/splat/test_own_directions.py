@@ -122,7 +122,7 @@ def test_a_recurrence_from_the_steepest_finds_the_same_ends(ssim_weight):
     loss = LossSettings(ssim_weight=ssim_weight)
     objective = SceneObjective(random_gaussians(40, 1, logit=1.0), two_views(), loss, BACKGROUND)
     H, settings = SceneHessian(objective), EigenSettings(2, 1, rtol=1e-3)
-    start = OwnDirections(objective, *objective.own_blocks).steepest(2, 1)
+    start = OwnDirections(objective, *objective.own_blocks).leads()
     led = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings, start)
     truth = torch.linalg.eigvalsh(H.apply(torch.eye(H.dim, dtype=H.dtype)).double())
     for pairs, true in ((led.largest, truth[-2:].flip(0)), (led.smallest, truth[:1])):
