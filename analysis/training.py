@@ -45,6 +45,7 @@ from splat.evaluate import Evaluation, ViewScore, evaluate, have_masks
 from splat.losses import LossSettings
 from splat.perceptual import MissingPerceptual, load_lpips
 from splat.regularizers.methods import METHODS
+from splat.regularizers.regularizer import Method
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
@@ -102,13 +103,8 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         f"{scene.name}: {len(views)} views to train on, {len(held_out)} held out, {camera.width} x {camera.height} px, "
         f"{len(training.gaussians)} Gaussians"
     )
-    method = config.method
-    if (warm_up := getattr(method, "warm_up", 0)) >= config.iterations:
-        console.print(
-            f"{method.name} begins after step {warm_up}, which this run does not reach: it is plain 3DGS so far; "
-            f"take more --iterations, or --set warm_up={config.iterations // 2}",
-            **WARNING,
-        )
+    if later := _beginnings_after(config.iterations, config.method):
+        console.print(later, **WARNING)
     trajectory = None if along is None else Trajectory(out, training, views, along)
     if trajectory and (hopeless := trajectory.hopeless):
         console.print(hopeless, **WARNING)
@@ -120,6 +116,18 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     if trajectory and (skipped := trajectory.skipped):
         console.print(skipped, **WARNING)
     return 0
+
+
+def _beginnings_after(iterations: int, method: Method) -> str:
+    """Which parts of a method a run of so many steps does not reach, in words; none: empty."""
+    starts = {name: value for name, value in asdict(method).items() if name == "warm_up" or name.endswith("_start")}
+    late = [f"{name} = {value}" for name, value in starts.items() if value >= iterations]
+    if not late:
+        return ""
+    return (
+        f"{method.name}: what begins after step {' and '.join(late)} is not reached in {iterations} steps; take more "
+        f"--iterations, or --set {late[0].split()[0]}={iterations // 2}"
+    )
 
 
 def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig, SceneReference]:

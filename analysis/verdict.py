@@ -240,11 +240,12 @@ def of_slice(plane: Mapping[str, Any] | None) -> list[Line]:
     lines, points, rendered = [], plane.get("points", 0), plane.get("evaluated_points", plane.get("points", 0))
     error = plane.get("interpolation_error")
     if rendered < points:
+        count = plane["holdout_points"]
         size = f"of at most {100 * error:.2g}% of the range of the loss" if error is not None else "without bound"
         lines.append(
             Line(
                 f"Of the slice's {points:,} points {rendered:,} are renders; the others are interpolated, with an error at "
-                f"{plane['holdout_points']} random points {size}."
+                f"{count} random point{'' if count == 1 else 's'} {size}."
             )
         )
     if plane.get("crossed_points"):

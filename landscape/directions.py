@@ -101,8 +101,10 @@ def line_between(start: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[
             "densification changes their number: compare checkpoints after it has ended"
         )
     difference = end.double() - start.double()
-    if not (torch.isfinite(difference).all() and difference.any()):
-        raise ValueError("expected two checkpoints that differ and are finite, got equal ones or others")
+    if not torch.isfinite(difference).all():
+        raise ValueError("expected two checkpoints with finite parameters, got one that has others")
+    if not difference.any():
+        raise ValueError("expected two checkpoints that differ, got equal ones; name another second one")
     return difference.to(start.dtype)[:, None]
 
 

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from analysis.cli import main
 from analysis.options import TrainOptions
-from analysis.training import planned
+from analysis.training import _beginnings_after, planned
 from splat.checkpoint import load_checkpoint
+from splat.regularizers.corgs import CoRGS
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -139,9 +140,15 @@ def test_a_method_that_lacks_its_depth_maps_is_refused_before_there_is_a_folder(
 
 def test_a_method_that_begins_after_the_last_step_is_pointed_out(original, tmp_path, capsys):
     assert train(original, tmp_path / "late", "--method", "stablegs") == 0
-    assert "stablegs begins after step 1000, which this run does not reach" in capsys.readouterr().err
+    assert "stablegs: what begins after step warm_up = 1000 is not reached in" in capsys.readouterr().err
     assert train(original, tmp_path / "early", "--method", "stablegs", "--set", "warm_up=0") == 0
     assert "begins after" not in capsys.readouterr().err
+    assert _beginnings_after(3000, CoRGS()) == ""
+    said = _beginnings_after(500, CoRGS())
+    assert (
+        "cor-gs: what begins after step prune_start = 500 and pseudo_start = 2000 is not reached in 500 steps" in said
+    )
+    assert said.endswith("or --set prune_start=250")
 
 
 def test_the_start_can_be_chosen(original, tmp_path, capsys, monkeypatch):
