@@ -30,9 +30,10 @@ stopping rule are given the right budget, as an oracle would.
     both ends    one Lanczos run to 1e-3 with a basis of 64: looser saves two to four products, other bases and blocks
                  nothing.  It needs the steps that no Krylov method does without, 0.93 to 0.99 of those of a peer that is told
                  how many (0.11 on the power law), as it reads the noise of products from their asymmetry.  On scenes the
-                 Gaussians' own blocks lead, and their pass is paid: over 24 small scenes (`--scenes 8`, 12 seeds) 0.59 of
-                 SciPy's products, which stops by itself, and 0.80 (0.80 to 0.83) of those of the best peer when it is told how
-                 many steps do, 0.64 to 1.01 one by one; fern at a quarter of its size 0.74
+                 Gaussians' own blocks lead, and their pass is paid: over 24 small scenes (`--scenes 8`, 12 seeds) 0.64 of
+                 SciPy's products, which stops by itself, and 0.84 (0.84 to 0.88) of those of the best peer when it is told how
+                 many steps do, 0.71 to 1.06 one by one; fern after 2,000 steps, from one direction of either end: 0.52
+                 (0.49 to 0.54) of SciPy's, the best there, and 0.39 of its seconds
     diagonal     method "auto": 0.76 of XDiag's products on the power law, 0.88 and exact at rank 5 (21), random signs elsewhere
     quadrature   192 products, divided as they go: start vectors are many on flat, clustered and indefinite spectra, four of up
                  to 48 steps elsewhere.  At equal error 0.5 of the best peer's products or less in sum |lambda| and effective
@@ -43,10 +44,11 @@ stopping rule are given the right budget, as an oracle would.
                  make no difference at these sizes; they are kept as they cost nothing, and float32's grow with the rows
 
 **Which they do not.**  Mass quantiles of scenes lie where the rules of so few steps have a node or two: their middles are off
-by 15 to 150%, and only their brackets tell.  On seven of the 24 scenes the ends take more than 0.85 of the products of a peer
+by 15 to 150%, and only their brackets tell.  On eight of the 24 scenes the ends take more than 0.85 of the products of a peer
 that is told how many: 10 to 15 steps do there from random vectors, too, and a good start saves no more than its pass costs.
 (With a peer's steps in doublings, 10, 20, 40, the same runs seemed to take 0.65: its error falls to round-off between two.)
-In seconds six of them take 1.14 (0.86 to 1.35): with so small a scene a product takes a millisecond, the rest as long.
+A search that begins with one direction of either end takes 7% less, and misses ends (`splat.own_directions`).
+In seconds the 24 take 1.13 of the told peer: with so small a scene a product takes a millisecond, the rest as long.
 """
 
 from collections.abc import Iterator, Sequence
