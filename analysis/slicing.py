@@ -85,6 +85,11 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         except ValueError:  # it would not end better the next time
             shutil.rmtree(unfinished, ignore_errors=True)
             raise
+        except KeyboardInterrupt:
+            if unfinished.is_dir():
+                again = shlex.join(command)
+                console.print(f"what was rendered is kept; to continue: {again}", soft_wrap=True, highlight=False)
+            raise
         data = slice_data(found, objective, checkpoint.training.config.loss)
         data["notes"] = slice_notes(found.slice)
         data["provenance"] = _provenance(options, command, settings, checkpoint, scene)

@@ -67,7 +67,7 @@ def draw_traces(records: Records) -> Figure:
         axes.grid(True, axis="x")
         axes.set_xlabel("|trace| (loss per squared parameter unit)")
         axes.set_title("Trace by attribute", loc="left")
-        _legend(figure, records)
+        _legend(figure, records, marker="o")
     return figure
 
 
@@ -208,8 +208,9 @@ def _looks(records: Records) -> list[dict[str, str]]:
     ]
 
 
-def _legend(figure: Figure, records: Records, *more: Line2D) -> None:
-    handles = [Line2D([], [], label=literal(label), **look) for label, look in zip(records, _looks(records))]  # pyright: ignore[reportArgumentType]
+def _legend(figure: Figure, records: Records, *more: Line2D, marker: str = "") -> None:
+    looks = zip(records, _looks(records))
+    handles = [Line2D([], [], label=literal(label), marker=marker, **look) for label, look in looks]  # pyright: ignore[reportArgumentType]
     handles += more
     figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)))
 

@@ -1,6 +1,7 @@
 """Slicing a checkpoint: losses that are renders, directions that are what they are called, interruptions, refusals."""
 
 import math
+import shlex
 import shutil
 import signal
 import subprocess
@@ -306,6 +307,23 @@ def test_an_interrupted_slice_keeps_the_old_record(run, eigen, tmp_path, monkeyp
     monkeypatch.setattr("analysis.recording.draw", interrupt)
     assert main(["slice", str(run / "double.pt"), "--out", str(out), "--points", "5", "--all-points"]) == 130
     assert (out / "slice.json").read_bytes() == before
+
+
+def test_an_interrupted_slice_says_how_it_is_continued(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("landscape.grid_evaluations.SAVE_EVERY", 0.0)
+    evaluate, calls = SceneObjective.evaluate, []
+
+    def interrupted(self, flat):
+        calls.append(flat)
+        if len(calls) > 30:
+            raise KeyboardInterrupt
+        return evaluate(self, flat)
+
+    monkeypatch.setattr(SceneObjective, "evaluate", interrupted)
+    words = ["slice", str(run / "double.pt"), "--out", str(tmp_path / "slice"), "--all-points", "--workers", "1"]
+    assert main([*words, "--points", "11"]) == 130
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"what was rendered is kept; to continue: landscape {shlex.join([*words, '--points', '11'])}" in said
 
 
 def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
