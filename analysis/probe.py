@@ -120,7 +120,7 @@ def scene_objective(
     if ranks is None:
         return config.objective(gaussians, scene.load(names), keep_unseen=keep_unseen)
     background = config.background_colour(gaussians.flat.dtype)
-    views = scene.load(ranks.share(names))
+    views = scene.load(ranks.share(names, "training view"))
     return DistributedObjective(gaussians, views, ranks, config.loss, background, config.render)
 
 

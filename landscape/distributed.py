@@ -53,17 +53,17 @@ class Ranks:
         device = torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
         return cls(dist.get_rank(group), dist.get_world_size(group), group, device)
 
-    def share(self, items: Sequence[Item]) -> Sequence[Item]:
+    def share(self, items: Sequence[Item], name: str = "item") -> Sequence[Item]:
         """This rank's items: a contiguous part, so that all parts one after the other are the items in order.
 
-        ValueError where there are fewer items than ranks.
+        ValueError where there are fewer items than ranks, which calls them by their name.
 
         >>> Ranks(0, 2).share("abcde"), Ranks(1, 2).share("abcde")
         ('ab', 'cde')
         """
         if len(items) < self.size:
             raise ValueError(
-                f"expected at least one item for each of {self.size} ranks, got {len(items)}; start fewer processes"
+                f"expected at least one {name} for each of {self.size} ranks, got {len(items)}; start fewer processes"
             )
         return items[self.rank * len(items) // self.size : (self.rank + 1) * len(items) // self.size]
 
