@@ -77,8 +77,8 @@ SHORTEST = 1e-9  # seconds
 SHARES = {
     "traces": 4.0,
     "eigenvalues": 4.0,
-    "power iteration": 2.0,
-    "density": 3.0,
+    "power iteration": 2.5,
+    "density": 4.0,
     "finite probe": 2.0,
     "slice": 4.0,
     "depth": 2.0,
