@@ -30,9 +30,9 @@ stopping rule are given the right budget, as an oracle would.
     both ends    one Lanczos run to 1e-3 with a basis of 64: looser saves two to four products, other bases and blocks
                  nothing.  It needs the steps that no Krylov method does without, 0.93 to 0.99 of those of a peer that is told
                  how many (0.11 on the power law), as it reads the noise of products from their asymmetry.  On scenes the
-                 Gaussians' own blocks lead, and their pass is paid: over 24 small scenes (`--scenes 8`, 12 seeds) 0.64 of
+                 Gaussians' own blocks lead, and their pass is paid: over 24 small scenes (`--scenes 8`, 15 seeds) 0.64 of
                  SciPy's products, which stops by itself, and 0.84 (0.84 to 0.88) of those of the best peer when it is told how
-                 many steps do, 0.71 to 1.06 one by one; fern after 2,000 steps, from one direction of either end: 0.52
+                 many steps do, 0.71 to 1.06 one by one; fern after 2,000 steps, from one direction of either end, 2 seeds: 0.52
                  (0.49 to 0.54) of SciPy's, the best there, and 0.39 of its seconds
     diagonal     method "auto": 0.76 of XDiag's products on the power law, 0.88 and exact at rank 5 (21), random signs elsewhere
     quadrature   192 products, divided as they go: start vectors are many on flat, clustered and indefinite spectra, four of up
