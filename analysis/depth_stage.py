@@ -1,7 +1,6 @@
 """The stage `depth` of a probe: positions along the rays against positions across them (`splat.depth`)."""
 
 from dataclasses import dataclass, replace
-from math import isfinite
 from time import monotonic
 from typing import Any
 
@@ -46,23 +45,18 @@ def measure_depth(
     """Within so many seconds, with so many for a render of all views.  steps: px, of the rises."""
     end = monotonic() + seconds
     split = depth_split(objective, generator, replace(traces, max_seconds=seconds / 2), report)
-    if (4 * DRAWS * len(steps) + 1) * render > end - monotonic():
+    if (2 * len(KINDS) * DRAWS * len(steps) + 1) * render > end - monotonic():
         notes.append("finite steps along the rays were left out: their renders would have taken more than their time")
         return DepthFindings(split, None)
     return DepthFindings(split, depth_rises(objective, generator, steps, progress=report))
 
 
 def _rows(rises: DepthRises) -> list[dict[str, Any]]:
-    ratios, errors = rises.ratios
     rows = []
-    for i, pixels in enumerate(rises.steps):
-        row = {"pixels": pixels, "ratio": _number(ratios[i]), "ratio_error": _number(errors[i])}
+    for i, (pixels, ratio, error) in enumerate(zip(rises.steps, *(x.tolist() for x in rises.ratios), strict=True)):
+        row = {"pixels": pixels, "ratio": finite_or_none(ratio), "ratio_error": finite_or_none(error)}
         for kind, name in enumerate(KINDS):
-            row |= {name: _number(rises.values[i, kind]), f"{name}_error": _number(rises.errors[i, kind])}
-            row |= {f"{name}_crossed": _number(rises.crossed[i, kind])}
+            for suffix, table in (("", rises.values), ("_error", rises.errors), ("_crossed", rises.crossed)):
+                row[f"{name}{suffix}"] = finite_or_none(float(table[i, kind]))
         rows.append(row)
     return rows
-
-
-def _number(value: torch.Tensor) -> float | None:
-    return float(value) if isfinite(value) else None

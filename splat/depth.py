@@ -101,37 +101,22 @@ def depth_split(
 ) -> DepthSplit:
     """Gradient and curvature of the active Gaussians' positions.  settings: as for `exact_traces`, for either trace."""
     rays = [rays_of(objective, index) for index in range(len(objective.views))]
-    components, own = (
-        [],
-        torch.zeros(2, len(KINDS), dtype=torch.float64),
-    )  # rows: of the loss, of what it is pixel by pixel
+    parts = (False, True) if objective.couples_pixels else (False,)  # the blocks whole, and pixel by pixel
+    components, own = [], torch.zeros(len(KINDS), len(parts), dtype=torch.float64)
     for ray, view in zip(rays, objective.linearized, strict=True):
         components.append(along_and_across(view.gradient[objective.blocks["means"]].view(-1, 3), ray))
-        for row, gauss_newton in zip(own, (False, True), strict=True):
-            row += _split_traces(view.block_diagonal(gauss_newton=gauss_newton).geometry[:, :3, :3], ray).cpu()
+        for part, gauss_newton in enumerate(parts):
+            own[:, part] += _split_traces(view.block_diagonal(gauss_newton=gauss_newton).geometry[:, :3, :3], ray).cpu()
     pairs = objective.stacked(torch.stack(components, dim=1)).flatten(0, 1)
-    found = _curvatures(objective, generator, rays, objective.mean(own), settings, progress)
+    dims = (len(objective.active), LATERAL_DIRECTIONS * len(objective.active))
+    traces = [
+        SampledTrace(
+            kind, dim, known, pixelwise[0] if pixelwise else None, settings, settings.min_probes, settings.max_probes
+        )
+        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean(own).tolist(), strict=True)
+    ]
+    found = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
     return DepthSplit(pairs[pairs.any(dim=1)], **found)
-
-
-def _curvatures(
-    objective: SceneObjective,
-    generator: torch.Generator,
-    rays: Sequence[Float[Tensor, "n 3"]],
-    own: Float64[Tensor, "2 2"],
-    settings: TraceSettings,
-    progress: Progress | None,
-) -> dict[str, TraceEstimate]:
-    """Of both KINDS; own: rows as in `depth_split`."""
-    count, (whole, pixelwise) = len(objective.active), own.tolist()
-    sizes = dict(zip(KINDS, (count, LATERAL_DIRECTIONS * count), strict=True))
-    if not objective.couples_pixels:
-        known = zip(sizes.items(), whole, strict=True)
-        return {name: TraceEstimate.exact(name, dim, value, settings.confidence) for (name, dim), value in known}
-    limits = settings, settings.min_probes, settings.max_probes
-    parts = zip(sizes.items(), whole, pixelwise, strict=True)
-    traces = [SampledTrace(name, dim, value, part, *limits) for (name, dim), value, part in parts]
-    return sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
 
 
 def depth_rises(

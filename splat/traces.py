@@ -67,13 +67,11 @@ def exact_traces(
     known = {name: value for name, value in whole.traces(quats, units).items() if name in names}
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
-    if coupled is None:
-        return {
-            name: TraceEstimate.exact(name, sizes[name], value, settings.confidence) for name, value in known.items()
-        }
-    pixelwise = coupled.traces(quats, units)
+    pixelwise = {} if coupled is None else coupled.traces(quats, units)
     first, most = (samples, samples) if samples else (settings.min_probes, settings.max_probes)
-    traces = [SampledTrace(name, sizes[name], known[name], pixelwise[name], settings, first, most) for name in known]
+    traces = [
+        SampledTrace(name, sizes[name], known[name], pixelwise.get(name), settings, first, most) for name in known
+    ]
     return sampled_traces(objective, generator, partial(_signs, objective, scale), traces, progress)
 
 
@@ -103,18 +101,18 @@ def sampled_traces(
 class SampledTrace:
     """The samples of one trace, from first to most, and whether it needs more.
 
-    known: T_b, pixelwise: C_b of the module's docstring.
+    known: T_b, pixelwise: C_b of the module's docstring; None: the loss does not couple pixels, and T_b is the trace.
     """
 
     def __init__(
-        self, name: str, dim: int, known: float, pixelwise: float, settings: TraceSettings, first: int, most: int
+        self, name: str, dim: int, known: float, pixelwise: float | None, settings: TraceSettings, first: int, most: int
     ):
         self.name, self.dim, self.settings, self.first, self.most = name, dim, settings, first, most
-        self.exact, self.mean = known - pixelwise, pixelwise
+        self.known, self.pixelwise = known, pixelwise
         self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
         # a run may end at `first` samples: where the tolerance holds there and held CONFIRMATION earlier
         look = most if first == most else max(first - CONFIRMATION, LEAST_SAMPLES)
-        self.looks, self.open, self.late = Looks(look, most), True, False
+        self.looks, self.open, self.late = Looks(look, most), pixelwise is not None, False
 
     @property
     def count(self) -> int:
@@ -130,9 +128,11 @@ class SampledTrace:
 
     def estimate(self) -> TraceEstimate:
         settings = self.settings
-        samples = self.exact + controlled(self.full, self.diagonal, self.mean)
+        if self.pixelwise is None:
+            return TraceEstimate.exact(self.name, self.dim, self.known, settings.confidence)
+        samples = self.known - self.pixelwise + controlled(self.full, self.diagonal, self.pixelwise)
         value = float(samples.mean())
-        error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.mean))
+        error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.pixelwise))
         # the slope of the control variate is one more number that the samples had to give
         quantile = t_quantile(self.count - 2, settings.confidence)
         half = quantile * error * (WIDENING if settings.adaptive and self.first < self.most else 1.0)
