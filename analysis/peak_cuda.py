@@ -1,6 +1,6 @@
 """The arithmetic peak of a GPU: `peak.py` in Triton.  A thread has eight chains of fused multiply-adds, in registers."""
 
-# pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
 # (in a kernel names mean tensors)
 
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 import triton.language as tl
 
-from splat.raster.triton_formulas import fma, jit, launch, static_range
+from splat.raster.triton_formulas import fma, jit, launch
 
 BLOCK, WARPS = 1024, 4  # numbers a program: eight a thread
 UNROLLED = 32  # steps between two looks at the loop's counter
@@ -22,7 +22,7 @@ def multiply_add(values, a, b, steps, BLOCK: tl.constexpr, UNROLLED: tl.constexp
     at = values + tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     x = tl.load(at)
     for _turn in range(0, steps // UNROLLED):
-        for _step in static_range(UNROLLED):  # a name of its own: older versions of Triton take it for the outer one
+        for _step in tl.static_range(UNROLLED):  # a name of its own: older versions of Triton take it for the outer one
             x = fma(x, a, b)
     tl.store(at, x)
 

@@ -9,9 +9,9 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.raster.triton_formulas import INTERPRETED, launch, sized
+from splat.raster.triton_formulas import launch, sized
 
-BLOCK = 1 << 14 if INTERPRETED else 1024
+BLOCK = 1024
 
 
 @sized("n")

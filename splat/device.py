@@ -61,9 +61,9 @@ def _lack() -> str | None:
     return None
 
 
-INTERPRETED = False  # tests of the Triton kernels without a GPU set this: then they take tensors on the CPU, too
+EMULATED = False  # tests of the Triton kernels without a GPU set this: then they take tensors on the CPU, too
 
 
 def by_triton(tensor: Tensor) -> bool:
     """Whether what is computed from this tensor is computed by the Triton kernels."""
-    return INTERPRETED or tensor.device.type != "cpu"
+    return EMULATED or tensor.device.type != "cpu"

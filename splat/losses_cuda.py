@@ -13,10 +13,10 @@ from triton import cdiv
 from splat import losses_cuda_kernels as kernels
 from splat.losses import LossSettings, window
 from splat.losses_formulas import CHARBONNIER, L1, L2, SECONDS
-from splat.raster.triton_formulas import INTERPRETED, launch
+from splat.raster.triton_formulas import launch
 
 KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
-BLOCK = 1024 if INTERPRETED else 256
+BLOCK = 256
 FORMULAS = kernels.FORMULAS
 
 

@@ -16,15 +16,12 @@ from splat.gaussians import Gaussians
 from splat.projection_cpu import LARGEST_SPLAT, require_sizes
 from splat.projection_formulas import Lens
 from splat.projection_linear import GEOMETRY, SYMMETRIC, Held
-from splat.raster.triton_formulas import INTERPRETED, launch
+from splat.raster.triton_formulas import launch
 
+BLOCK = 128  # Gaussians that a program takes; for a product, times vectors
+FEW = 8  # ... that one takes which holds all their derivatives
 WIDEST = 8  # vectors that a program takes at a time
 CHUNK = 1 << 16  # Gaussians whose blocks are chained at a time
-
-
-def _block(compiled: int) -> int:
-    """Gaussians that a program takes; for the interpreter, few programs are better."""
-    return 512 if INTERPRETED else compiled
 
 
 def _run(kernel: Any, programs: tuple[int, ...], *arguments) -> None:
@@ -38,12 +35,12 @@ def _lens_numbers(lens: Lens, device: torch.device) -> Float64[Tensor, " 20"]:
 
 def project(gaussians: Gaussians, lens: Lens) -> tuple[Float64[Tensor, "n 9"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
     """Splats in double precision, depths in that of the parameters, and which are drawn; ValueError as `require_sizes`."""
-    flat, n, block = gaussians.flat.detach(), len(gaussians), _block(128)
+    flat, n = gaussians.flat.detach(), len(gaussians)
     splats, depths = flat.new_empty(n, 9, dtype=torch.float64), flat.new_empty(n)
     drawn = flat.new_empty(n, dtype=torch.bool)
     _run(
-        kernels.project_splats, (cdiv(n, block),),
-        flat, _lens_numbers(lens, flat.device), splats, depths, drawn, n, gaussians.sh.shape[1], block,
+        kernels.project_splats, (cdiv(n, BLOCK),),
+        flat, _lens_numbers(lens, flat.device), splats, depths, drawn, n, gaussians.sh.shape[1], BLOCK,
     )  # fmt: skip
     largest = float(gaussians.log_scales.detach().max()) if n else 0.0
     if largest + max(log(max(lens.fx, lens.fy) / lens.near), 0.0) > log(LARGEST_SPLAT):
@@ -59,11 +56,11 @@ def project_adjoint(
     bar: Float64[Tensor, "n 9"],
 ) -> Float[Tensor, " p"]:
     """The gradient in the flat vector, given the adjoint of the splats."""
-    flat, n, block = gaussians.flat.detach(), len(gaussians), _block(128)
+    flat, n = gaussians.flat.detach(), len(gaussians)
     gradient = torch.empty_like(flat)
     _run(
-        kernels.project_adjoint, (cdiv(n, block),),
-        flat, _lens_numbers(lens, flat.device), splats, drawn, bar.contiguous(), gradient, n, gaussians.sh.shape[1], block
+        kernels.project_adjoint, (cdiv(n, BLOCK),),
+        flat, _lens_numbers(lens, flat.device), splats, drawn, bar.contiguous(), gradient, n, gaussians.sh.shape[1], BLOCK
     )  # fmt: skip
     return gradient
 
@@ -82,16 +79,16 @@ class CudaProjection:
         bar: Float64[Tensor, "n 9"],
         index: Int[Tensor, " m"],
     ):
-        flat, m, block = gaussians.flat.detach(), index.numel(), _block(8)
+        flat, m = gaussians.flat.detach(), index.numel()
         self.n, self.bands, self.parameters = len(gaussians), gaussians.sh.shape[1], flat.numel()
         self._splats, self._bar, self._index = splats, bar.contiguous(), index
         shapes = ((5, GEOMETRY), (SYMMETRIC,), (16,), (16, 3), (3,), (3,), (3, 3))
         self._held = tuple(flat.new_empty(*shape, m) for shape in shapes)
         inputs = (flat, _lens_numbers(lens, flat.device), splats, self._bar, index)
         jacobian, curvature, *colours = self._held
-        programs = (cdiv(m, block),)
-        _run(kernels.linearize_geometry, programs, *inputs, jacobian, curvature, self.n, m, block)
-        _run(kernels.linearize_colour, programs, *inputs, curvature, *colours, self.n, m, self.bands, block)
+        programs = (cdiv(m, FEW),)
+        _run(kernels.linearize_geometry, programs, *inputs, jacobian, curvature, self.n, m, FEW)
+        _run(kernels.linearize_colour, programs, *inputs, curvature, *colours, self.n, m, self.bands, FEW)
 
     @property
     def held(self) -> Held:
@@ -106,8 +103,8 @@ class CudaProjection:
     def _grid(self, vectors: int) -> tuple[tuple[int, int], int, int]:
         """The programs of a product, and how many Gaussians and vectors each takes."""
         wide = min(next_power_of_2(vectors), WIDEST)
-        block = _block(128 // wide)
-        return (cdiv(self._index.numel(), block), cdiv(vectors, wide)), block, wide
+        rows = BLOCK // wide
+        return (cdiv(self._index.numel(), rows), cdiv(vectors, wide)), rows, wide
 
     def concerns(self, block: Float[Tensor, "p k"]) -> bool:
         """True: to look whether a vector moves any of the Gaussians that matter would be to wait for the device."""
@@ -159,12 +156,12 @@ class CudaProjection:
 
     def _jacobian(self, some: slice) -> Float64[Tensor, "c 9 11"]:
         """Of the splats at some places, in plain coordinates, in geometry and opacity logit."""
-        count, block = some.stop - some.start, _block(128)
+        count = some.stop - some.start
         jacobian, _, _, _, _, visible, colour_slope = self._held
         J = self._splats.new_zeros(count, 9, GEOMETRY + 1)
         _run(
             kernels.plain_jacobian,
-            (cdiv(count, block),),
+            (cdiv(count, BLOCK),),
             self._splats,
             self._index,
             jacobian,
@@ -172,7 +169,7 @@ class CudaProjection:
             some.start,
             count,
             self._index.numel(),
-            block,
+            BLOCK,
         )
         J[:, 5, GEOMETRY] = self._slope_of_opacity(some)
         J[:, 6:, :3] = (visible[:, None, some].double() * colour_slope[..., some].double()).movedim(-1, 0)

@@ -1,7 +1,7 @@
 """The CPU kernels' formulas inside Triton kernels: one source of formulas, compiled twice.
 
 A `@formula` of plain numbers is a Python function that Numba compiles for the CPU.  Here the same function runs, as Python,
-while a Triton kernel is compiled or interpreted: on `Number`s, which stand for tensors of that kernel and write down every
+while a Triton kernel is compiled: on `Number`s, which stand for tensors of that kernel and write down every
 operation that is made with them.  Tuples, loops and branches over constants are Python's own and leave no trace; a choice that
 depends on a tensor is written `select(condition, x, y)`.  (`raster/triton_formulas.py` gives a formula's source to Triton's own
 front end instead, which knows no dual numbers.)
@@ -28,11 +28,8 @@ from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
 
-import triton
 import triton.language as tl
 from numba.core.dispatcher import Dispatcher
-
-from splat.raster.triton_formulas import INTERPRETED
 
 
 class Number:
@@ -191,8 +188,7 @@ def traced(function: Callable) -> Callable:
 
     @wraps(python)
     def call(*arguments: Any, _semantic: Any = None) -> Any:
-        semantic = triton.runtime.interpreter.interpreter_semantic if _semantic is None else _semantic
-        return _tensors(python(*(_numbers(argument, semantic) for argument in arguments)))
+        return _tensors(python(*(_numbers(argument, _semantic) for argument in arguments)))
 
     call.__triton_builtin__ = True
     # Triton gives _semantic to those that have it in their signature, which older versions look up as Python does
@@ -210,6 +206,5 @@ def _numbers(argument: Any, semantic: Any) -> Any:
 
 def _tensors(result: Any) -> Any:
     if isinstance(result, tuple | list):
-        values = tuple(_tensors(each) for each in result)
-        return values if INTERPRETED else tl.tuple(values)
+        return tl.tuple(tuple(_tensors(each) for each in result))
     return result.value if isinstance(result, Number) else result

@@ -1,13 +1,17 @@
 """Fixtures that several folders share."""
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
-if not torch.cuda.is_available():  # before the first import of triton, which reads it
-    os.environ.setdefault("TRITON_INTERPRET", "1")
+from tests.ptx import driver
+
+if not torch.cuda.is_available() and find_spec("triton"):
+    driver.install()
 
 # the processes of a run share the cores
 torch.set_num_threads(max(1, torch.get_num_threads() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
@@ -35,7 +39,11 @@ def lego() -> Path:
 
 
 @pytest.fixture
-def device() -> torch.device:
-    """Where the kernels for GPUs run: a GPU, or else the CPU with Triton's interpreter."""
+def device(monkeypatch: pytest.MonkeyPatch) -> torch.device:
+    """Where the kernels for GPUs run: a GPU, or else the CPU with `tests.ptx`, in memory that holds NaN until it is written."""
     pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip install -e '.[gpu]'")
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if torch.cuda.is_available():
+        return torch.device("cuda")
+    for owner, name in ((torch, "empty"), (torch, "empty_like"), (Tensor, "new_empty")):
+        monkeypatch.setattr(owner, name, driver.unwritten(getattr(owner, name)))
+    return torch.device("cpu")

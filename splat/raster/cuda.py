@@ -9,7 +9,7 @@ last bit from run to run; or "atomic": entries are added to their splats as they
 
 Two sizes are read back by the constructor, the numbers of strips and of entries (`cuda_binning`), for which arrays are made;
 no later call waits for the device: there is room for the sums of all entries, also of those that no pixel reaches.
-Everything runs on the current stream of the splats' device; without a GPU, on the CPU by Triton's interpreter.
+Everything runs on the current stream of the splats' device.
 """
 
 from math import inf, log2

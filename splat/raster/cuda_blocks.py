@@ -1,5 +1,8 @@
 """Every splat's own block of the Hessian on the GPU: `blocks.py`, whose glossary and formulas hold here."""
 
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
+# (Triton tells type checkers little of its language)
+
 import torch
 import triton.language as tl
 from jaxtyping import Float
@@ -17,7 +20,7 @@ from splat.raster.cuda_compositing import (
     pixels_of,
 )
 from splat.raster.cuda_packing import ALPHA_MAX, CAP, RED
-from splat.raster.triton_formulas import device, jit, reciprocal, static_range, sum_over, twins
+from splat.raster.triton_formulas import device, jit, reciprocal, twins
 from splat.raster.whitening import LEAST_RATIO, LOG2_E, ROUND, plain_adjoint
 
 step_block, cross_terms = twins(blocks.step_block, blocks.cross_terms)
@@ -29,10 +32,10 @@ CROSS, COLOUR, DEGREE2 = tl.constexpr(blocks.CROSS), tl.constexpr(blocks.COLOUR)
 @device
 def powers_of_columns(total, j, place, rows, u, degree: tl.constexpr):
     """The moments to a degree, to their places of `total`, from the sums over rows of a weight times v^k."""
-    for b in static_range(degree + 1):
+    for b in tl.static_range(degree + 1):
         column = rows[b]
-        for a in static_range(degree + 1 - b):
-            total = tl.where(j == place + b * (degree + 1) - b * (b - 1) // 2 + a, sum_over(column, 1)[:, None], total)
+        for a in tl.static_range(degree + 1 - b):
+            total = tl.where(j == place + b * (degree + 1) - b * (b - 1) // 2 + a, tl.sum(column, 1)[:, None], total)
             column = column * u
     return total
 
@@ -85,20 +88,20 @@ def block_moments(
 @device
 def block_sums(u, v, w, free, D, weight, g, h):
     """The 36 sums over a tile, (1, 64) with zeros after them."""
-    j, u, vv = tl.arange(0, 64)[None, :], sum_over(u, 1), v * v
+    j, u, vv = tl.arange(0, 64)[None, :], tl.sum(u, 1), v * v
     rows = (
-        sum_over(weight, 1),
-        sum_over(weight * v, 1),
-        sum_over(weight * vv, 1),
-        sum_over(weight * vv * v, 1),
-        sum_over(weight * vv * vv, 1),
+        tl.sum(weight, 1),
+        tl.sum(weight * v, 1),
+        tl.sum(weight * vv, 1),
+        tl.sum(weight * vv * v, 1),
+        tl.sum(weight * vv * vv, 1),
     )
     total = powers_of_columns(tl.zeros((1, 64), u.dtype), j, 0, rows, u, 4)
-    for c in static_range(3):
+    for c in tl.static_range(3):
         cross, square = cross_terms(w, free, D[c], g[c], h[c])
-        rows = (sum_over(cross, 1), sum_over(cross * v, 1), sum_over(cross * vv, 1))
+        rows = (tl.sum(cross, 1), tl.sum(cross * v, 1), tl.sum(cross * vv, 1))
         total = powers_of_columns(total, j, CROSS + DEGREE2 * c, rows, u, 2)
-        total = tl.where(j == COLOUR + c, sum_over(sum_over(square, 1), 1)[:, None], total)
+        total = tl.where(j == COLOUR + c, tl.sum(tl.sum(square, 1), 1)[:, None], total)
     return total
 
 

@@ -33,6 +33,9 @@ Deterministic mode reads the 36 bytes (a tangent) of an entry once more.  Around
 72 + 48 a tangent to pack, 72 for the totals and 3 x 72 to turn them into a gradient, 5 x 72 into the gradient's tangent.
 """
 
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
+# (Triton tells type checkers little of its language)
+
 import triton.language as tl
 
 from splat.raster import formulas
@@ -53,7 +56,7 @@ from splat.raster.cuda_packing import (
     X,
     Y,
 )
-from splat.raster.triton_formulas import device, fma, jit, max_over, sum_over, twins
+from splat.raster.triton_formulas import device, fma, jit, twins
 
 NEVER = tl.constexpr(2**31 - 1)  # the stop index of a pixel that does not stop
 CHUNK = tl.constexpr(16)  # entries between two looks whether all pixels of a tile have stopped
@@ -124,14 +127,14 @@ def store_planes(planes, p, size, image, alpha, inside):
 def any_lit(g):
     """Whether a cotangent's four planes are not all exactly 0 in a tile; NaN is not 0."""
     lit = (g[0] != 0) | (g[1] != 0) | (g[2] != 0) | (g[3] != 0)
-    return max_over(max_over(max_over(lit.to(tl.int32), 2), 1), 0) > 0
+    return tl.max(tl.max(tl.max(lit.to(tl.int32), 2), 1), 0) > 0
 
 
 @device
 def side_by_side(one, other, lane, axis: tl.constexpr):
     """The sums of two arrays over an axis of length 2, one at either place of it."""
     first = (lane >> (5 - axis)) % 2 == 0
-    return tl.where(first, sum_over(one, axis, True), sum_over(other, axis, True))
+    return tl.where(first, tl.sum(one, axis, True), tl.sum(other, axis, True))
 
 
 @device
@@ -143,12 +146,12 @@ def nine_sums(v, u, s, w, h, K: tl.constexpr, HEIGHT: tl.constexpr):
     """
     rows = row_terms(v, s, w, h)
     columns = (
-        sum_over(tl.reshape(rows[0], (K, HEIGHT // 2, 2, 16)), 1),
-        sum_over(tl.reshape(rows[1], (K, HEIGHT // 2, 2, 16)), 1),
-        sum_over(tl.reshape(rows[2], (K, HEIGHT // 2, 2, 16)), 1),
-        sum_over(tl.reshape(rows[3], (K, HEIGHT // 2, 2, 16)), 1),
-        sum_over(tl.reshape(rows[4], (K, HEIGHT // 2, 2, 16)), 1),
-        sum_over(tl.reshape(rows[5], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[0], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[1], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[2], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[3], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[4], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[5], (K, HEIGHT // 2, 2, 16)), 1),
     )
     nine = column_terms(columns, u)
     lane = tl.reshape(tl.arange(0, 32), (1, 2, 2, 2, 2, 2))
@@ -156,9 +159,9 @@ def nine_sums(v, u, s, w, h, K: tl.constexpr, HEIGHT: tl.constexpr):
     b = side_by_side(threads(nine[2], K), threads(nine[3], K), lane, 1)
     c = side_by_side(threads(nine[4], K), threads(nine[5], K), lane, 1)
     d = side_by_side(threads(nine[6], K), threads(nine[7], K), lane, 1)
-    ninth = sum_over(sum_over(sum_over(threads(nine[8], K), 1, True), 2, True), 3, True)
+    ninth = tl.sum(tl.sum(tl.sum(threads(nine[8], K), 1, True), 2, True), 3, True)
     eight = side_by_side(side_by_side(a, b, lane, 2), side_by_side(c, d, lane, 2), lane, 3)
-    return tl.reshape(sum_over(side_by_side(eight, ninth, lane, 4), 5), (K, 16))
+    return tl.reshape(tl.sum(side_by_side(eight, ninth, lane, 4), 5), (K, 16))
 
 
 @device
@@ -229,14 +232,14 @@ def forward(
             w, T = tl.where(ends, 0.0, w), tl.where(ends, -T, after)
             stopped = tl.where(ends, k, stopped)
             red, green, blue = plus((red, green, blue), w, load3(splat, RED))
-        running = max_over(max_over(max_over(T, 2), 1), 0)
+        running = tl.max(tl.max(tl.max(T, 2), 1), 0)
         done = tl.where(running > 0, done + CHUNK, count)
     T = tl.abs(T)
     image = plus((red, green, blue), T, load_background(frame, real))
     store_planes(planes, p, width * height, image, 1.0 - T, inside)
     tl.store(transmittance + p, T, inside)
     tl.store(stop + p, stopped, inside)
-    furthest = max_over(max_over(max_over(stopped, 2), 1), 0)
+    furthest = tl.max(tl.max(tl.max(stopped, 2), 1), 0)
     tl.store(reached + tile, tl.minimum(count, furthest))
 
 
@@ -299,7 +302,7 @@ def any_moved(moved, splat_of, first, count, K: tl.constexpr):
         e = done + lane
         splat = tl.load(splat_of + first + e, e < count, other=0).to(tl.int64)
         some = tl.load(moved + splat * K + k, e < count, other=0)
-        found = max_over(max_over(some.to(tl.int32), 1), 0)
+        found = tl.max(tl.max(some.to(tl.int32), 1), 0)
         done = tl.where(found > 0, count, done + 32)
     return found > 0
 

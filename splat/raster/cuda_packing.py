@@ -8,11 +8,14 @@ whole number, exact in single precision, so the kernels need no double precision
     CAP     alpha above which derivatives in ln alpha are 0: infinite where the splat cannot reach it
 """
 
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
+# (Triton tells type checkers little of its language)
+
 import triton.language as tl
 
 from splat.raster import packing, whitening
 from splat.raster.cuda_binning import load_splat
-from splat.raster.triton_formulas import device, max_over, sized, static_range, twin, twins
+from splat.raster.triton_formulas import device, sized, twin, twins
 
 PARAMS = 16
 X, Y, U, V, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT, CAP = (tl.constexpr(i) for i in range(14))
@@ -49,13 +52,13 @@ def load_six(array, at, inside):
 
 @device
 def store_six(array, at, numbers, inside):
-    for j in static_range(6):
+    for j in tl.static_range(6):
         tl.store(array + at + j, numbers[j], inside)
 
 
 @device
 def copy_colour(target, to, source, at, inside):
-    for j in static_range(6, 9):
+    for j in tl.static_range(6, 9):
         tl.store(target + to + j, tl.load(source + at + j, inside, other=0.0), inside)
 
 
@@ -104,9 +107,9 @@ def pack_tangents(splats, directions, tangents, moved, n, K, begin, size, BLOCK:
     store_six(tangents, to, exponent_tangent(whiten(splat), splat[5], direction), inside)
     copy_colour(tangents, to, directions, at, inside)
     some = direction[0] != 0
-    for j in static_range(1, 6):
+    for j in tl.static_range(1, 6):
         some = some | (direction[j] != 0)
-    for j in static_range(6, 9):
+    for j in tl.static_range(6, 9):
         some = some | (tl.load(directions + at + j, inside, other=0.0) != 0)
     tl.store(moved + i.to(tl.int64) * size + k, some.to(tl.int8), inside)
 
@@ -122,7 +125,7 @@ def sum_slots(first, last, sums, totals, n, K, WIDTH: tl.constexpr, PADDED: tl.c
     start, stop = tl.load(first + i, i < n, other=0), tl.load(last + i, i < n, other=0)
     k = tl.program_id(1)
     total = tl.zeros((BLOCK, PADDED), tl.float64)
-    longest = max_over(stop - start, 0)
+    longest = tl.max(stop - start, 0)
     for s in range(0, longest):
         slot = (start + s)[:, None]
         total += tl.load(sums + (slot * K + k) * WIDTH + j, (slot < stop[:, None]) & (j < WIDTH), other=0.0).to(

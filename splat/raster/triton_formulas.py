@@ -7,8 +7,7 @@ this module.  Formulas therefore take and give numbers and tuples of numbers, in
 
     quadratic, dot = twins(formulas.quadratic, formulas.dot)
 
-`jit` and `sized` mark kernels and `device` what they call: `triton.jit` too, or with Triton's interpreter (TRITON_INTERPRET=1)
-the plain function, since the interpreter patches its language anew at every call of a jitted one.
+`jit` and `sized` mark kernels and `device` what they call.
 """
 
 from collections.abc import Callable
@@ -19,15 +18,10 @@ from typing import Any
 import torch
 import triton
 import triton.language as tl
-from triton import knobs
-from triton.language.standard import _elementwise_max, _sum_combine
-
-INTERPRETED = knobs.runtime.interpret
-static_range: Any = range if INTERPRETED else tl.static_range  # a loop that is unrolled
 
 
 def jit(function: Callable) -> Any:
-    """A kernel, run by `launch`: `triton.jit`.  No parameter may be called params: Triton's code round it uses the name."""
+    """A kernel, run by `launch`.  No parameter may be called params: Triton's code round it uses the name."""
     return triton.jit(function)
 
 
@@ -48,7 +42,7 @@ def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants:
 
 def device(function: Callable) -> Any:
     """A function that kernels call."""
-    return function if INTERPRETED else jit(function)
+    return triton.jit(function)
 
 
 def twin(formula: Callable) -> Any:
@@ -77,25 +71,12 @@ def _meaning(name: str, names: dict[str, Any]) -> Any:
         return MEANING[name]
     value = names[name]
     if isinstance(value, bool | int | float):
-        return value if INTERPRETED else tl.constexpr(value)
+        return tl.constexpr(value)
     if not isinstance(getattr(value, "py_func", value), FunctionType):
         raise TypeError(
             f"expected a formula's names to be formulas, numbers or in MEANING, got {name}; give it a meaning"
         )
     return twin(value)
-
-
-# --- reductions: `tl.sum` and `tl.max` are jitted functions themselves, which the interpreter would take its time over ------
-
-
-@device
-def sum_over(x, axis: tl.constexpr, keep_dims: tl.constexpr = False):  # pyright: ignore[reportArgumentType]
-    return tl.reduce(x, axis, _sum_combine, keep_dims)  # pyright: ignore[reportArgumentType]
-
-
-@device
-def max_over(x, axis: tl.constexpr):
-    return tl.reduce(x, axis, _elementwise_max)
 
 
 # --- what the names of the formulas mean ------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The bench of scenes on the kernels for GPUs, at toy size: without one by Triton's interpreter, with a clock that is given."""
+"""The bench of scenes on the kernels for GPUs, at toy size: without one by `tests.ptx`, with a clock that is given."""
 
 import sys
 from collections.abc import Callable
@@ -44,7 +44,7 @@ class StillClock(HostMeter):
 @pytest.fixture
 def gpu(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     """The device, with its kernels for all tensors on it."""
-    monkeypatch.setattr("splat.device.INTERPRETED", device.type == "cpu")
+    monkeypatch.setattr("splat.device.EMULATED", device.type == "cpu")
     return device
 
 
@@ -71,7 +71,7 @@ def test_a_bench_on_the_gpus_kernels_measures_every_stage_and_says_that_gsplat_i
     )
 
     found = [own.gradient(), own.gradient_by_autograd(), own.gradient_by_autograd("atomic"), own.linearized.gradient]
-    monkeypatch.setattr("splat.device.INTERPRETED", False)
+    monkeypatch.setattr("splat.device.EMULATED", False)
     expected = ViewBench(toy())
     for gradient in found:
         assert relative_error(gradient.cpu(), expected.gradient()) < 1e-5

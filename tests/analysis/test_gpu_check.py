@@ -1,4 +1,4 @@
-"""The checks for a machine with a GPU, at toy size: without one, by Triton's interpreter."""
+"""The checks for a machine with a GPU, at toy size: without one, by `tests.ptx`."""
 
 import json
 import re
@@ -37,25 +37,25 @@ from tests.splat.tiny import tiny_gaussians, tiny_views
 
 
 def toy(dtype: torch.dtype = torch.float32) -> Workload:
-    """For an interpreter: one tile, and a loss without SSIM, whose kernels are slow there."""
+    """For a machine without a GPU: one tile, and a loss without SSIM."""
     gaussians = random_gaussians(4, 0, logit=1.0, spread=0.4).to(dtype)
     return Workload("toy", gaussians, tuple(two_views(16, 12)[:1]), torch.zeros(3), LossSettings("charbonnier", 0.0))
 
 
-def last_interpreted(device, monkeypatch, runs: int) -> None:
-    """Without a GPU the last of so many runs is the interpreter's."""
+def last_emulated(device, monkeypatch, runs: int) -> None:
+    """Without a GPU the last of so many runs is that of the GPU's kernels."""
     if device.type == "cpu":
-        interpreted = iter([False] * (runs - 1) + [True])
+        emulated = iter([False] * (runs - 1) + [True])
 
         def stay(workload: Workload, at: torch.device) -> Workload:
-            monkeypatch.setattr("splat.device.INTERPRETED", next(interpreted))
+            monkeypatch.setattr("splat.device.EMULATED", next(emulated))
             return workload
 
         monkeypatch.setattr(Workload, "to", stay)
 
 
 def test_a_device_agrees_with_the_cpu(device, monkeypatch):
-    last_interpreted(device, monkeypatch, 2)
+    last_emulated(device, monkeypatch, 2)
     checks = agreement(toy(torch.float64), device)  # in single precision so few Gaussians' traces cancel
     assert [check.name for check in checks][:3] == ["loss", "gradient", "H v"] and len(checks) == 8
     assert all(check.holds for check in checks), checks
@@ -63,7 +63,7 @@ def test_a_device_agrees_with_the_cpu(device, monkeypatch):
 
 
 def test_what_the_last_bits_change_on_the_cpu_is_no_disagreement(device, monkeypatch):
-    last_interpreted(device, monkeypatch, 3)
+    last_emulated(device, monkeypatch, 3)
     moved = []
 
     def twice_as_dense(workload: Workload, seed: int) -> Workload:

@@ -1,4 +1,4 @@
-"""A view, an objective and a training on the GPU (without one: Triton's interpreter), against CPU and specification."""
+"""A view, an objective and a training on the GPU (without one, by `tests.ptx`), against CPU and specification."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ LOSS = LossSettings("charbonnier")
 @pytest.fixture
 def gpu(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     """The device, with its kernels for all tensors on it."""
-    monkeypatch.setattr("splat.device.INTERPRETED", device.type == "cpu")
+    monkeypatch.setattr("splat.device.EMULATED", device.type == "cpu")
     return device
 
 
@@ -85,7 +85,7 @@ def test_all_that_a_view_on_the_gpu_gives_is_what_one_on_the_cpu_gives(device, m
         return [each.cpu() for each in (*found, coarse.geometry, coarse.sh, *held.loss_curvatures(u))]
 
     expected = everything(gaussians)
-    monkeypatch.setattr("splat.device.INTERPRETED", device.type == "cpu")
+    monkeypatch.setattr("splat.device.EMULATED", device.type == "cpu")
     for got, one in zip(everything(on(gaussians, device)), expected, strict=True):
         assert relative_error(got, one) < 1e-12
 
@@ -102,7 +102,7 @@ def test_the_hessian_of_a_scene_on_the_gpu_is_that_on_the_cpu(device, monkeypatc
         return [value, objective.gradient.cpu(), *(each.cpu() for each in found)]
 
     expected = products(gaussians)
-    monkeypatch.setattr("splat.device.INTERPRETED", device.type == "cpu")
+    monkeypatch.setattr("splat.device.EMULATED", device.type == "cpu")
     for got, one in zip(products(on(gaussians, device)), expected, strict=True):
         assert relative_error(got, one) < 1e-10  # the projectors are found by singular value decompositions
 
@@ -132,7 +132,7 @@ def test_a_training_on_the_gpu_takes_the_steps_of_one_on_the_cpu(device, monkeyp
         return training
 
     expected = trained(torch.device("cpu"))
-    monkeypatch.setattr("splat.device.INTERPRETED", device.type == "cpu")
+    monkeypatch.setattr("splat.device.EMULATED", device.type == "cpu")
     found = trained(device)
     assert len(found.gaussians) == len(expected.gaussians) and found.adam.updates == expected.adam.updates == 3
     # Adam divides by the gradient's own size, so that what is next to 0 keeps few digits

@@ -1,4 +1,4 @@
-"""The losses on the GPU (without one, by Triton's interpreter), against the specification: the cases of the CPU's tests."""
+"""The losses on the GPU (without one, by `tests.ptx`), against the specification: the cases of the CPU's tests."""
 
 import pytest
 import torch
@@ -78,7 +78,7 @@ def test_near_a_fit_of_a_smooth_picture_ssim_keeps_its_digits_on_the_gpu(device)
 
 
 def test_autograd_reaches_the_kernels_on_the_gpu_twice(device, monkeypatch):
-    monkeypatch.setattr("splat.device.INTERPRETED", True)
+    monkeypatch.setattr("splat.device.EMULATED", True)
     image, target = (picture.to(device) for picture in image_and_target((9, 6)))
     x, v = image.clone().requires_grad_(), random_like(image.shape, 3).to(device)
     found = view_loss(x, loss_against(target, SETTINGS[1], x))

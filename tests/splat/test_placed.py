@@ -57,7 +57,7 @@ def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_six_times(mon
     config = replace(tiny_config(), random_background=False)  # which would compare with another picture every step
     training = Training.start(tiny_gaussians(6), EXTENT, config)
     placed = Placed(monkeypatch)
-    monkeypatch.setattr("splat.device.INTERPRETED", True)
+    monkeypatch.setattr("splat.device.EMULATED", True)
     with placed:
         put_on_gpu(training, placed)
         steps = train(training, views)
@@ -88,7 +88,7 @@ def test_what_the_host_finds_out_about_neighbours_is_brought_back(monkeypatch, m
 def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait_for_it(monkeypatch):
     gaussians = random_gaussians(4, 0, logit=1.0, spread=0.4)
     placed = Placed(monkeypatch)
-    monkeypatch.setattr("splat.device.INTERPRETED", True)
+    monkeypatch.setattr("splat.device.EMULATED", True)
     with placed:
         flat = placed.on_gpu(gaussians.flat)
         views = two_views(16, 12)[:1]

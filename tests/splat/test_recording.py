@@ -115,7 +115,7 @@ def test_captures_share_the_memory_and_the_stream_of_the_first_and_leave_the_str
 
 
 def objective(device: torch.device, views: int, memory: int = 2**30) -> SceneObjective:
-    """For an interpreter: one tile a view, and a loss without SSIM."""
+    """For a machine without a GPU: one tile a view, and a loss without SSIM."""
     gaussians = random_gaussians(4, 0, logit=1.0, spread=0.4)
     gaussians = gaussians.with_flat(gaussians.flat.to(device))
     return SceneObjective(
@@ -128,7 +128,7 @@ def test_recorded_products_of_a_scene_are_those_that_are_not_recorded_to_the_las
     device, monkeypatch, gauss_newton
 ):
     monkeypatch.setattr(recording, "CALLS", 1)
-    monkeypatch.setattr("splat.device.INTERPRETED", device.type == "cpu")
+    monkeypatch.setattr("splat.device.EMULATED", device.type == "cpu")
     hessian = SceneHessian(objective(device, 1), gauss_newton=gauss_newton)
     tape = None
     if device.type == "cpu":

@@ -1,4 +1,4 @@
-"""Every launch of the GPU's path passes Triton's own entry, without a GPU: the interpreter of the other tests goes round it.
+"""No launch of the GPU's path has a kernel compiled anew for another number of Gaussians or vectors.
 
 A driver that is none and a compiler that compiles nothing stand in: what Triton makes of the arguments is what is looked at.
 """
@@ -100,7 +100,7 @@ def kernels() -> list[str]:
 if __name__ == "__main__":
     import splat.device
 
-    splat.device.INTERPRETED = True  # tensors on the CPU for the GPU's path
+    splat.device.EMULATED = True  # tensors on the CPU for the GPU's path
     torch.empty, torch.empty_like = zeros(torch.empty), zeros(torch.empty_like)
     Tensor.new_empty = zeros(Tensor.new_empty)
     compiled = stand_in()

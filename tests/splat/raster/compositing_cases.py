@@ -53,7 +53,7 @@ CASES = {
 }
 
 
-# few enough entries for an interpreter: in one tile of 16 x 16 pixels all that the cases above have
+# few enough entries for a machine without a GPU: in one tile of 16 x 16 pixels all that the cases above have
 TINY = {
     "tiny walled": Case(14, size=(4, 3), logit=9.0, spread=0.02, focal=200.0),
     "tiny capped": Case(

@@ -1,5 +1,6 @@
-"""The compositing kernels for GPUs against the float64 specification; on a machine without one, by Triton's interpreter."""
+"""The compositing kernels for GPUs against the float64 specification; on a machine without one, by `tests.ptx`."""
 
+import os
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -16,14 +17,14 @@ from splat.settings import RenderSettings, Sums
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, NUMPY, relative_error
 from tests.splat.raster.compositing_cases import BACKGROUND, BLOCKS, CASES, TINY, truth
 
-FAST = torch.cuda.is_available()
-each_case = pytest.mark.parametrize("name", [*CASES, *TINY] if FAST else TINY)
+ALL = torch.cuda.is_available() or "LANDSCAPE_ALL_CASES" in os.environ  # ten minutes without a GPU
+each_case = pytest.mark.parametrize("name", [*CASES, *TINY] if ALL else TINY)
 each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
 
 
 def vectors(name: str) -> int:
     """How many tangents a case is tested with: a full launch, and one more."""
-    return TOGETHER + 1 if FAST or name == "tiny equal depths" else TOGETHER
+    return TOGETHER + 1 if ALL or name == "tiny equal depths" else TOGETHER
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def test_the_cases_stop_pixels_leave_entries_unreached_and_reach_the_cap(device)
         assert truth(name).planes[3].max() > 0.2 and truth(name).decided.double().mean() > 0.9
 
 
-@pytest.mark.parametrize("name", [*CASES, *TINY] if FAST else ["tiny equal depths"])
+@pytest.mark.parametrize("name", [*CASES, *TINY] if ALL else ["tiny equal depths"])
 def test_atomic_sums_differ_from_slots_by_round_off(name, device):
     one, other = results(name, torch.float64, device), results(name, torch.float64, device, sums="atomic")
     assert torch.equal(one.raster.planes, other.raster.planes) and torch.equal(one.jvp, other.jvp)
@@ -108,7 +109,7 @@ def test_atomic_sums_differ_from_slots_by_round_off(name, device):
     assert relative_error(one.curvature, other.curvature) < 1e-13
 
 
-@pytest.mark.parametrize("name", CASES if FAST else ["tiny equal depths"])
+@pytest.mark.parametrize("name", CASES if ALL else ["tiny equal depths"])
 def test_results_are_the_same_to_the_last_bit_when_repeated(name, device):
     one, other = results(name, torch.float32, device), results.__wrapped__(name, torch.float32, device)
     assert torch.equal(one.gradient, other.gradient) and torch.equal(one.curvature, other.curvature)
@@ -204,8 +205,8 @@ def test_as_a_torch_function_it_has_the_derivatives_of_the_cpu(device, monkeypat
     splats = expected.splats.to(device)
     drawn = (expected.depths.to(device), expected.drawn.to(device))
     found = []
-    for where, interpreted in ((torch.device("cpu"), False), (device, device.type == "cpu")):
-        monkeypatch.setattr("splat.device.INTERPRETED", interpreted)
+    for where, emulated in ((torch.device("cpu"), False), (device, device.type == "cpu")):
+        monkeypatch.setattr("splat.device.EMULATED", emulated)
         parts = [part.to(where).requires_grad_() for part in splats.split((2, 3, 1, 3), dim=1)]
         shown = Splats(parts[0], parts[1], parts[2][:, 0], parts[3], *(tensor.to(where) for tensor in drawn))
         image, alpha = functions.rasterize_by_kernel(

@@ -1,4 +1,4 @@
-"""Every kernel of the rasterizer compiles for GPUs, without a GPU: what the interpreter accepts, the compiler may not."""
+"""Every kernel of the rasterizer compiles for GPUs, and keeps its numbers in registers."""
 
 from importlib.metadata import version
 
