@@ -17,8 +17,9 @@ import pytest
 import torch
 from rich.console import Console
 
+from analysis.budget import SHARES
 from analysis.cli import main
-from analysis.measurement import SHARES, ProbeSettings
+from analysis.measurement import ProbeSettings
 from analysis.options import ProbeOptions
 from analysis.probe import run_probe, scene_objective
 from analysis.probe_record import literal_index
