@@ -216,14 +216,17 @@ def load_checkpoint(path: Path) -> Checkpoint:
     damaged = ValueError(
         f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
     )
-    path.open("rb").close()  # what the system does not open, it says itself
-    try:
-        with zipfile.ZipFile(path) as archive:
-            whole = archive.testzip() is None
-        with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
-            content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception:  # what torch stumbles over in a file of another kind is of many kinds too
-        raise damaged from None
+    with path.open("rb") as file:  # one file throughout: a training may replace it meanwhile
+        try:
+            with zipfile.ZipFile(file) as archive:
+                whole = archive.testzip() is None
+            file.seek(0)
+            with warnings.catch_warnings(
+                action="ignore"
+            ):  # torch warns of pickles of another kind before it refuses them
+                content = torch.load(file, map_location="cpu", weights_only=True)
+        except Exception:  # what torch stumbles over in a file of another kind is of many kinds too
+            raise damaged from None
     if not whole:
         raise damaged
     try:
