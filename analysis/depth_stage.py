@@ -4,10 +4,9 @@ from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Any
 
-import torch
-
+from analysis.budget import Share
 from landscape import TraceSettings
-from landscape.results import Progress, finite_or_none
+from landscape.results import finite_or_none
 from splat.curvature import SceneObjective
 from splat.depth import DRAWS, KINDS, DepthRises, DepthSplit, depth_rises, depth_split
 
@@ -36,19 +35,18 @@ def measure_depth(
     objective: SceneObjective,
     traces: TraceSettings,
     steps: tuple[float, ...],
-    seconds: float,
     render: float,
-    generator: torch.Generator,
-    report: Progress,
-    notes: list[str],
+    share: Share,
 ) -> DepthFindings:
-    """Within so many seconds, with so many for a render of all views.  steps: px, of the rises."""
-    end = monotonic() + seconds
-    split = depth_split(objective, generator, replace(traces, max_seconds=seconds / 2), report)
+    """render: seconds, of all views.  steps: px, of the rises."""
+    end = monotonic() + share.seconds
+    split = depth_split(objective, share.generator, replace(traces, max_seconds=share.seconds / 2), share.report)
     if (2 * len(KINDS) * DRAWS * len(steps) + 1) * render > end - monotonic():
-        notes.append("finite steps along the rays were left out: their renders would have taken more than their time")
+        share.notes.append(
+            "finite steps along the rays were left out: their renders would have taken more than their time"
+        )
         return DepthFindings(split, None)
-    return DepthFindings(split, depth_rises(objective, generator, steps, progress=report))
+    return DepthFindings(split, depth_rises(objective, share.generator, steps, progress=share.report))
 
 
 def _rows(rises: DepthRises) -> list[dict[str, Any]]:

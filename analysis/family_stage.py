@@ -24,7 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from analysis.measurement import Stage, basis_within, vectors_within
+from analysis.budget import Stage
+from analysis.measurement import basis_within, vectors_within
 from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
 from landscape.families import WHOLE, Lead
 from landscape.operator import SymmetricOperator, finished

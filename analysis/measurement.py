@@ -19,7 +19,6 @@ leaves goes to the later ones.  The numbers depend on the seed alone unless time
 """
 
 from collections.abc import Callable, Hashable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import monotonic
@@ -28,6 +27,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from analysis.budget import Budget, Share, Stage
 from analysis.depth_stage import DepthFindings, measure_depth
 from analysis.gradient_check import check_against_gradient
 from landscape import (
@@ -73,16 +73,6 @@ MOST_AT_ONCE = 4  # start vectors
 FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
 FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds
-# shares of the time; measured on 8,000 Gaussians in 3 views of 504 x 378 pixels
-SHARES = {
-    "traces": 4.0,
-    "eigenvalues": 4.0,
-    "power iteration": 2.5,
-    "density": 4.0,
-    "finite probe": 2.0,
-    "slice": 4.0,
-    "depth": 2.0,
-}
 
 
 @dataclass(frozen=True)
@@ -186,14 +176,10 @@ class Findings:
     notes: tuple[str, ...]
 
 
-Stage = Callable[[str], AbstractContextManager[Progress]]
-
-
 def measure(
     objective: SceneObjective, loss: LossSettings, settings: ProbeSettings, generator: torch.Generator, stage: Stage
 ) -> Findings:
     """Run every stage.  loss: the objective's; stage(name): see `analysis.stages`."""
-    notes: list[str] = []
     with stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
@@ -203,53 +189,32 @@ def measure(
     with stage("checks") as report:
         operator_check = check_operator(operator, split(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(hessian, loss, split(generator), report, settings.checked_views)
-    budget = _Budget(settings)
-    streams = {name: split(generator) for name in SHARES}
-    with stage("traces") as report:
-        allowed = replace(settings.traces, max_seconds=budget.share("traces"))
-        traces = exact_traces(objective, streams["traces"], allowed, report, samples=settings.trace_samples)
-    with stage("eigenvalues") as report:
-        eigen = replace(settings.eigen, max_seconds=budget.share("eigenvalues"))
-        eigen = replace(eigen, basis=_basis(operator, eigen, settings.memory, notes))
-        start = OwnDirections(objective, *own).leads()
+    budget = Budget(settings.seconds, _unasked(settings), generator, stage)
+    with budget.stage("traces") as share:
+        allowed = replace(settings.traces, max_seconds=share.seconds)
+        traces = exact_traces(objective, share.generator, allowed, share.report, samples=settings.trace_samples)
+    with budget.stage("eigenvalues") as share:
+        eigen, start = _search(operator, settings, share), OwnDirections(objective, *own).leads()
         timed = CountingOperator(operator)
-        ends = extreme_eigenpairs(timed, streams["eigenvalues"], eigen, start, report)
-    power = None
+        ends = extreme_eigenpairs(timed, share.generator, eigen, start, share.report)
+    power = density = finite = depth = None
     if settings.power is not None:
-        with stage("power iteration") as report:
-            each = replace(settings.power, max_seconds=budget.share("power iteration") / 2)
-            power = power_ends(operator, streams["power iteration"], each, report)
-    density = None
+        with budget.stage("power iteration") as share:
+            each = replace(settings.power, max_seconds=share.seconds / 2)
+            power = power_ends(operator, share.generator, each, share.report)
     if settings.density_matvecs:
-        with stage("density") as report:
-            seconds = budget.share("density")
-            active = ActiveSpace(hessian.project, hessian.rank)
-            each = timed.seconds / timed.matvecs
-            run = partial(
-                spectral_density, operator, streams["density"],
-                progress=report, active=active, ends=ends, trace=total_trace(traces),
-            )  # fmt: skip
-            density = _density(run, vectors_within(operator, settings.memory), settings, seconds, each, notes)
-    else:
-        notes.append("the spectral density was left out, and the indices that need it")
-    finite = None
+        with budget.stage("density") as share:
+            active, room = ActiveSpace(hessian.project, hessian.rank), vectors_within(operator, settings.memory)
+            run = partial(spectral_density, operator, active=active, ends=ends, trace=total_trace(traces))
+            density = _density(run, room, settings, timed.seconds / timed.matvecs, share)
     if settings.probe_steps:
-        with stage("finite probe") as report:
-            finite = _finite(objective, operator, ends, settings, budget.share("finite probe"), render, report, notes)
-    else:
-        notes.append("the finite probe was left out")
-    with stage("slice") as report:
-        seconds, stream = budget.share("slice"), streams["slice"]
-        plane = _plane(objective, gradient, value, ends, settings, seconds, render, stream, report, notes)
-    along_rays = None
+        with budget.stage("finite probe") as share:
+            finite = _finite(objective, operator, ends, settings, render, share)
+    with budget.stage("slice") as share:
+        plane = _plane(objective, gradient, value, ends, settings, render, share)
     if settings.depth is not None:
-        with stage("depth") as report:
-            seconds, stream = budget.share("depth"), streams["depth"]
-            along_rays = measure_depth(
-                objective, settings.depth, settings.depth_steps, seconds, render, stream, report, notes
-            )
-    else:
-        notes.append("positions along and across the rays were left out")
+        with budget.stage("depth") as share:
+            depth = measure_depth(objective, settings.depth, settings.depth_steps, render, share)
     return Findings(
         value=value,
         gradient_norm=float(gradient.double().norm()),
@@ -260,32 +225,23 @@ def measure(
         power=power,
         density=density,
         finite=finite,
-        depth=along_rays,
+        depth=depth,
         plane=plane,
         matvecs=operator.matvecs,
         spared=hessian.spared,
         rank=hessian.rank,
-        notes=tuple(notes),
+        notes=tuple(budget.notes),
     )
 
 
-class _Budget:
-    """Divides the time that is left among the stages to come, in proportion to their shares."""
-
-    def __init__(self, settings: ProbeSettings) -> None:
-        asked = {
-            "power iteration": settings.power is not None,
-            "density": settings.density_matvecs > 0,
-            "finite probe": len(settings.probe_steps) > 0,
-            "depth": settings.depth is not None,
-        }
-        self.end = monotonic() + settings.seconds
-        self.to_come = {stage: share for stage, share in SHARES.items() if asked.get(stage, True)}
-
-    def share(self, stage: str) -> float:
-        part = self.to_come[stage] / sum(self.to_come.values())
-        del self.to_come[stage]
-        return max(self.end - monotonic(), 0.0) * part
+def _unasked(settings: ProbeSettings) -> list[str]:
+    optional = {
+        "power iteration": settings.power,
+        "density": settings.density_matvecs,
+        "finite probe": settings.probe_steps,
+        "depth": settings.depth,
+    }
+    return [name for name, wanted in optional.items() if not wanted]
 
 
 def _linearised_gradient(objective: SceneObjective, report: Progress) -> Tensor:
@@ -305,38 +261,35 @@ def basis_within(eigen: EigenSettings, room: int) -> int:
     return min(eigen.basis, max(eigen.wanted + 3 * eigen.block, room))
 
 
-def _basis(operator: CountingOperator, eigen: EigenSettings, memory: float, notes: list[str]) -> int:
-    basis = basis_within(eigen, vectors_within(operator, memory))
+def _search(operator: CountingOperator, settings: ProbeSettings, share: Share) -> EigenSettings:
+    """For the ends: in the time of the stage, with a basis that memory has room for."""
+    eigen = settings.eigen
+    basis = basis_within(eigen, vectors_within(operator, settings.memory))
     if basis < eigen.basis:
-        notes.append(
-            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB"
+        share.notes.append(
+            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {settings.memory:g} GiB"
         )
-    return basis
+    return replace(eigen, max_seconds=share.seconds, basis=basis)
 
 
 def _density(
-    run: Callable[..., SpectralDensity],
-    room: int,
-    settings: ProbeSettings,
-    seconds: float,
-    each: float,
-    notes: list[str],
+    run: Callable[..., SpectralDensity], room: int, settings: ProbeSettings, each: float, share: Share
 ) -> SpectralDensity | None:
     """As many products as time allows at so many seconds each, in runs that memory has room for (of that many vectors); None
     where they are too few."""
-    matvecs = int(min(settings.density_matvecs, seconds / each))
+    matvecs = int(min(settings.density_matvecs, share.seconds / each))
     starts = FEWEST_STARTS if matvecs < MANY_MATVECS else None
     batch, longest = (
         (MOST_AT_ONCE, room // (MOST_AT_ONCE + 1)) if room > FEWEST_STEPS * MOST_AT_ONCE else (1, room // 2)
     )
     if min(matvecs // FEWEST_STARTS, longest) < FEWEST_STEPS:
-        notes.append(
+        share.notes.append(
             f"the spectral density was left out: time and memory allowed {matvecs} products in runs of {longest}"
         )
         return None
     if matvecs < settings.density_matvecs:
-        notes.append(f"the spectral density took {matvecs} products instead of {settings.density_matvecs}")
-    return run(matvecs=matvecs, starts=starts, longest=longest, batch=batch)
+        share.notes.append(f"the spectral density took {matvecs} products instead of {settings.density_matvecs}")
+    return run(share.generator, progress=share.report, matvecs=matvecs, starts=starts, longest=longest, batch=batch)
 
 
 def _rendered(objective: SceneObjective) -> tuple[float, float]:
@@ -351,18 +304,18 @@ def _finite(
     operator: CountingOperator,
     ends: EigenEnds,
     settings: ProbeSettings,
-    seconds: float,
     render: float,
-    report: Progress,
-    notes: list[str],
+    share: Share,
 ) -> FiniteProbe | None:
     """Along the first eigenvector; None where its renders, of so many seconds each, would take longer than they may."""
-    if (2 * len(settings.probe_steps) + settings.noise_points + 1) * render > max(seconds, SHORTEST):
-        notes.append("the finite probe was left out: its renders would have taken more than its share of the time")
+    if (2 * len(settings.probe_steps) + settings.noise_points + 1) * render > max(share.seconds, SHORTEST):
+        share.notes.append(
+            "the finite probe was left out: its renders would have taken more than its share of the time"
+        )
         return None
     center, vector = objective.active.flat, ends.largest.vectors[:, 0]
     return finite_probe(
-        objective.evaluate, center, vector, operator, settings.probe_steps, report, settings.noise_points
+        objective.evaluate, center, vector, operator, settings.probe_steps, share.report, settings.noise_points
     )
 
 
@@ -372,27 +325,26 @@ def _plane(
     value: float,
     ends: EigenEnds,
     settings: ProbeSettings,
-    seconds: float,
     render: float,
-    generator: torch.Generator,
-    report: Progress,
-    notes: list[str],
+    share: Share,
 ) -> PlaneSlice | None:
     center, loss_scale = objective.active.flat, settings.slice_rise * value
     curvatures: Float64[Tensor, 2] = ends.largest.values[:2]
     if loss_scale <= 0 or not curvatures.all():
-        notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")
+        share.notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")
         return None
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
     workers = 1 if objective.collective or by_triton(center) else thread_count()
-    allowed = _within(settings, seconds, render, workers)
+    allowed = _within(settings, share.seconds, render, workers)
     evaluate = evaluation(objective, allowed.workers)
     # Ritz vectors: H between any two of them is their values' diagonal matrix
     known = curvatures.diag()
-    plane = evaluate_slice(evaluate, center, vectors, axes, gradient, known, allowed, generator, progress=report)
-    notes += slice_notes(plane)
+    plane = evaluate_slice(
+        evaluate, center, vectors, axes, gradient, known, allowed, share.generator, progress=share.report
+    )
+    share.notes.extend(slice_notes(plane))
     return PlaneSlice(plane, loss_scale, (first, second))
 
 

@@ -184,7 +184,7 @@ class SliceOptions:
     all_points: FlagCreatePairsOff[bool] = False
     """Render every point, whatever the tolerance."""
     max_renders: Unset[int] = None
-    """Points that are rendered at most (each in all training views).  Default: no limit."""
+    """Points that are rendered at most (each in all training views), with those before an interruption.  Default: no limit."""
     workers: Unset[int] = None
     """Points rendered at a time, each on one thread.  Default: one for each processor; one on a GPU."""
     device: DeviceName = "auto"

@@ -20,7 +20,7 @@ _METRICS = {
     "test": _OF_VIEWS,
     "seconds": {"wall": MAYBE, "cpu": MAYBE, "threads": MAYBE},
 }
-_SECONDS = {"step": int, "wall": NUMBER, "cpu": NUMBER, "threads": int}
+_SECONDS = {"step": int, "wall": NUMBER, "cpu": NUMBER, "threads": int | None}
 _SCORE_AGAIN = "remove it and repeat the training's command with --resume, which scores again"
 _FORGET = "remove it: nothing but the time until its last checkpoint is lost"
 
@@ -33,7 +33,7 @@ def read_scores(run: Path) -> dict[str, Any]:
 def read_seconds(run: Path) -> dict[str, Any]:
     """`seconds.json` of a run, see `analysis/spent.py`."""
     found = _read(run / SECONDS, _SECONDS, "the seconds of a training", _FORGET)
-    return {key: found[key] for key in _SECONDS}
+    return {key: found.get(key) for key in _SECONDS}
 
 
 def _read(path: Path, layout: Mapping[str, Any], what: str, remedy: str) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """How long a training took: the time in its steps alone, over resumes, without loading, saving and scoring.
 
 RUN/seconds.json    {"step", "wall", "cpu", "threads"}, written after every checkpoint: seconds by the clock and of all
-                    processors together up to that step, and the threads that a kernel may use.  A kernel that has to be
-                    compiled first counts in
+                    processors together up to that step, and the threads that a kernel might use; null where a resume
+                    changed them.  A kernel that has to be compiled first counts in
 """
 
 import json
@@ -25,7 +25,7 @@ class Spent:
     step: int = 0
     wall: float = 0.0
     cpu: float = 0.0
-    threads: int = 1
+    threads: int | None = 1
 
     @classmethod
     def read(cls, run: Path) -> "Spent":
@@ -38,7 +38,8 @@ class Spent:
     def timed(self, steps: Iterable[StepResult]) -> Iterator[StepResult]:
         """The same steps; the time that each takes is added up as it is made."""
         iterator = iter(steps)
-        self.threads = torch.get_num_threads()
+        threads = torch.get_num_threads()
+        self.threads = threads if self.threads == threads or self.step == 0 else None
         while True:
             wall, cpu = perf_counter(), process_time()
             done = next(iterator, None)

@@ -34,7 +34,7 @@ from analysis.records import FILE, read_record
 from analysis.run_files import CHECKPOINT, METRICS
 from analysis.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.sweep_progress import Stage, SweepProgress
-from analysis.sweep_results import PROBE, summarize, tables, unfinished, write_results
+from analysis.sweep_results import PROBE, of_other_threads, summarize, tables, unfinished, write_results
 from analysis.training import planned, resumed
 
 CELL_FAILED = 1
@@ -209,7 +209,7 @@ def _conclude(cells: _Cells, stopped: bool) -> int:
     rows = write_results(sweep, cells.statuses)
     for table in tables(summarize(rows)):
         console.print(table)
-    for line in unfinished(rows):
+    for line in [*unfinished(rows), *of_other_threads(rows)]:
         console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
     for line in cells.failed.values():
         console.print(line, style="red", soft_wrap=True, highlight=False, markup=False)

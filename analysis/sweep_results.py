@@ -1,8 +1,9 @@
 """What the cells of a sweep came to: a row a cell, and mean and standard deviation over the seeds.
 
 OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or "to do"); of what has been trained: psnr (dB),
-                  ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads;
-                  wall_ratio, cpu_ratio: over the seconds of the first method, of the same scene and seed; where it was probed,
+                  ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads (that
+                  its steps might use; none where a resume changed them); wall_ratio, cpu_ratio: over the seconds of the
+                  first method, of the same scene and seed, the wall's only at the same number of threads; where it was probed,
                   trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error (standard error or residual), of the latter
                   also the _reason why the search ended ("... budget": the end may lie farther out), and the anisotropy
                   indices with _low and _high, without value where one of these is unbounded; with the split control,
@@ -55,10 +56,10 @@ def results(cells: Sequence[Cell], statuses: Mapping[str, str]) -> pd.DataFrame:
 
 
 def with_ratios(rows: pd.DataFrame) -> pd.DataFrame:
-    """Seconds over those of the first method, of the same scene and seed.
+    """Seconds over those of the first method, of the same scene and seed; those by the clock only at as many threads.
 
     >>> both = {"scene": "fern", "method": ["3dgs", "sam"], "seed": 0, "wall_seconds": [10.0, 21.0], "cpu_seconds": [9.0, 18.0]}
-    >>> with_ratios(pd.DataFrame(both))[["wall_ratio", "cpu_ratio"]].values.tolist()
+    >>> with_ratios(pd.DataFrame(both | {"threads": 2}))[["wall_ratio", "cpu_ratio"]].values.tolist()
     [[1.0, 1.0], [2.1, 2.0]]
     """
     if "wall_seconds" not in rows:
@@ -68,6 +69,8 @@ def with_ratios(rows: pd.DataFrame) -> pd.DataFrame:
     for clock in ("wall", "cpu"):
         reference = first[f"{clock}_seconds"].reindex(keys).to_numpy()
         rows[f"{clock}_ratio"] = rows[f"{clock}_seconds"] / reference
+    same = rows["threads"] == first["threads"].reindex(keys).to_numpy()
+    rows["wall_ratio"] = rows["wall_ratio"].where(same)
     return rows
 
 
@@ -98,7 +101,7 @@ def _metrics(run: Path) -> dict[str, float]:
         **scores,
         "gaussians": metrics["gaussians"],
         **{f"{clock}_seconds": seconds.get(clock, math.nan) for clock in ("wall", "cpu")},
-        "threads": seconds.get("threads", math.nan),
+        "threads": seconds.get("threads") or math.nan,
     }
 
 
@@ -140,6 +143,16 @@ def unfinished(rows: pd.DataFrame) -> list[str]:
         for line in of_budgets({end: {"reason": row[name]} for name, end in REASONS.items()}):
             cells.setdefault(line.text, []).append(f"{row['scene']}/{row['method']}/{row['seed']}")
     return [f"{', '.join(names)}: {text}" for text, names in cells.items()]
+
+
+def of_other_threads(rows: pd.DataFrame) -> list[str]:
+    """Which cells' times by the clock are not compared, in a line if there are any."""
+    found = rows.reindex(columns=["scene", "method", "seed", "wall_ratio", "cpu_ratio"]).dropna(subset="cpu_ratio")
+    cells = found.to_dict("records")
+    names = [f"{c['scene']}/{c['method']}/{c['seed']}" for c in cells if math.isnan(c["wall_ratio"])]
+    if not names:
+        return []
+    return [f"{', '.join(names)}: not trained with as many threads as the first method; their time × is left out"]
 
 
 def tables(summary: pd.DataFrame) -> list[Table]:

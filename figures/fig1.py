@@ -6,13 +6,14 @@ view that both have rendered.  Both share their axes (`figures.manifold`).
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
 
-from figures.fig7 import command_line, names_of
+from figures.fig7 import command_line, names_of, read_all
 from figures.manifold import Scale, contours, landscape_of, require_same_function, section, surface
 from figures.style import BLACK, RUNS, literal, new_figure, style
 
@@ -21,10 +22,16 @@ WIDTH = 4.8  # inches
 
 
 def draw(runs: Sequence[Path]) -> Figure:
-    """Of two runs.  FileNotFoundError or ValueError name the record that is missing and the command that makes it."""
-    names, landscapes = names_of(runs), [landscape_of(run) for run in runs]
+    """Of two runs.  ValueError names every record that is missing, each with the command that makes it."""
+    names = names_of(runs)
+    found = read_all(*(partial(landscape_of, run) for run in runs), *(partial(_views, run) for run in runs))
+    landscapes = found[:2]
     require_same_function(runs)
-    view = common_view(runs)
+    if not (common := found[2] & found[3]):
+        raise ValueError(
+            f"expected a view that both {runs[0]} and {runs[1]} have rendered, found none; train on one scene"
+        )
+    view = min(common)
     scale = Scale.of(*landscapes)
     with style():
         figure = new_figure(7.4)
@@ -53,20 +60,14 @@ def draw(runs: Sequence[Path]) -> Figure:
     return figure
 
 
-def common_view(runs: Sequence[Path]) -> str:
-    """The file name of the first held-out view that every run has rendered."""
-    found = [{path.name for path in (run / RENDERS).glob("*.png")} for run in runs]
-    for run, views in zip(runs, found, strict=True):
-        if not views:
-            raise FileNotFoundError(
-                f"expected renders of held-out views in {run / RENDERS}, found none; run landscape train to its end, with "
-                "fewer --views than the scene has"
-            )
-    if not (common := set.intersection(*found)):
-        raise ValueError(
-            f"expected a view that both {runs[0]} and {runs[1]} have rendered, found none; train on one scene"
+def _views(run: Path) -> set[str]:
+    """The file names of the held-out views that a run has rendered."""
+    if not (views := {path.name for path in (run / RENDERS).glob("*.png")}):
+        raise FileNotFoundError(
+            f"expected renders of held-out views in {run / RENDERS}, found none; run landscape train to its end, with "
+            "fewer --views than the scene has"
         )
-    return min(common)
+    return views
 
 
 def main() -> None:

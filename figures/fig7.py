@@ -9,7 +9,8 @@ sections' losses, which hold the start's too: a slope is not cut off where it fa
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,15 @@ BAR: dict[str, Any] = {"shrink": 0.6, "aspect": 14}  # without a name: the title
 
 
 def draw(runs: Sequence[Path]) -> Figure:
-    """Of two runs.  FileNotFoundError or ValueError name the record that is missing and the command that makes it."""
+    """Of two runs.  ValueError names every record that is missing, each with the command that makes it."""
     names = names_of(runs)
-    measured = _measured(runs, names)
+    *found, start = read_all(
+        *(partial(_measured, run, name) for run, name in zip(runs, names, strict=True)),
+        *(partial(landscape_of, run) for run in runs),
+        partial(start_of, runs[0]),
+    )
+    measured, ends = pd.concat(found[:2], ignore_index=True), found[2:]
     require_same_function(runs)
-    ends, start = [landscape_of(run) for run in runs], start_of(runs[0])
     scale, wide = Scale.of(*ends), Scale.of(start)
     across = scale.holding(start)
     with style():
@@ -73,23 +78,30 @@ def names_of(runs: Sequence[Path]) -> list[str]:
     return [first.name, second.name]
 
 
-def _measured(runs: Sequence[Path], names: Sequence[str]) -> pd.DataFrame:
-    tables = []
-    for run, name in zip(runs, names, strict=True):
-        if not (run / RECORDS).is_file():
-            raise FileNotFoundError(f"expected {RECORDS} in the run {run}, found none; train anew with --probe-every")
-        table = pd.read_csv(run / RECORDS)
-        if not {"step", "state", "literal", "literal_low", "literal_high"} <= set(table.columns):
-            raise ValueError(
-                f"expected the records of landscape train --probe-every in {run / RECORDS}, got another table"
-            )
-        table = pd.DataFrame(table[table["state"] != "skipped"]).assign(run=name)
-        if table.empty:
-            raise ValueError(
-                f"expected records in {run / RECORDS}, all were skipped; train with a larger --probe-share"
-            )
-        tables.append(table)
-    return pd.concat(tables, ignore_index=True)
+def read_all(*reads: Callable[[], Any]) -> list[Any]:
+    """What each of them gives.  ValueError with what all of them say is missing or wrong, so that one look is enough."""
+    found, missing = [], []
+    for read in reads:
+        try:
+            found.append(read())
+        except (FileNotFoundError, ValueError) as error:
+            missing.append(str(error))
+    if missing:
+        raise ValueError("; and ".join(missing))
+    return found
+
+
+def _measured(run: Path, name: str) -> pd.DataFrame:
+    """The run's records of its training, under its name."""
+    if not (run / RECORDS).is_file():
+        raise FileNotFoundError(f"expected {RECORDS} in the run {run}, found none; train anew with --probe-every")
+    table = pd.read_csv(run / RECORDS)
+    if not {"step", "state", "literal", "literal_low", "literal_high"} <= set(table.columns):
+        raise ValueError(f"expected the records of landscape train --probe-every in {run / RECORDS}, got another table")
+    table = pd.DataFrame(table[table["state"] != "skipped"]).assign(run=name)
+    if table.empty:
+        raise ValueError(f"expected records in {run / RECORDS}, all were skipped; train with a larger --probe-share")
+    return table
 
 
 def main() -> None:

@@ -105,9 +105,10 @@ def estimate_diagonal(
 ) -> DiagonalEstimate:
     """diag H with a standard error for every entry, from `probes` (3 or more) matvecs at most.
 
-    batch: vectors in one application of the operator.  Keeps n x probes numbers in float64.  Method "auto" is "signs" with
-    fewer than 8 probes, with no more rows than probes, and where a part of the diagonal is known; where all of it is known
-    (`control.PartlyKnown`), nothing is probed.
+    batch: vectors in one application of the operator.  Keeps n x probes numbers in float64, and squares them: entries within
+    1e-150 to 1e150, as all of float32 are, have their errors; scale H before where others matter.  Method "auto" is "signs"
+    with fewer than 8 probes, with no more rows than probes, and where a part of the diagonal is known; where all of it is
+    known (`control.PartlyKnown`), nothing is probed.
 
     >>> from landscape.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([1.0, -2.0])))

@@ -41,7 +41,8 @@ class GridEvaluations:
     """The objective at center + directions @ points[i]: what is known so far, and `require` for more.
 
     value, known, crossed [points]: the loss (nan where not known), which are known, and which of those have another
-    signature than the centre; has_signature: whether the objective gives any.  loss must be safe to call from several
+    signature than the centre; has_signature: whether the objective gives any; made: how many of the points were evaluated here,
+    not read.  loss must be safe to call from several
     threads if workers > 1.  Points are formed in float64, where center is, and rounded once to its dtype.
     """
 
@@ -64,6 +65,7 @@ class GridEvaluations:
         self.has_signature = self._here is not None
         count = len(points)
         self.value, self.known, self.crossed = np.full(count, np.nan), np.zeros(count, bool), np.zeros(count, bool)
+        self.made = 0
         self._digest = slice_digest(self._center, self._spans, points)
         self._stored = self._read() if store is not None and store.exists() else {}
 
@@ -78,6 +80,7 @@ class GridEvaluations:
         try:
             for point, (value, signature) in zip(missing, self._evaluate(missing), strict=True):
                 self._stored[point] = value, signature != self._here
+                self.made += 1
                 self._set(point, *self._stored[point])
                 if self._store is not None and monotonic() - saved > SAVE_EVERY:
                     self._write(self._store)

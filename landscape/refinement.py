@@ -34,7 +34,8 @@ class SliceSettings:
         52%.)
     batch: points that are added between two decisions.  workers: threads that evaluate.
     max_evaluations, max_seconds: budgets, hold-out points and the one at the centre included; ValueError without a tolerance,
-        as a slice of every point has none.
+        as a slice of every point has none.  A slice that continues from a store has its evaluations in total, but its time
+        anew: a call takes at most so long.
     """
 
     tolerance: float | None = 0.01
@@ -151,6 +152,6 @@ class _Budget:
         """The budget that ends refinement, which goes on only where there is room and time for a whole batch."""
         if self.room == 0:
             return "evaluation budget"
-        elapsed, done = monotonic() - self._start, int(self._evaluations.known.sum())
+        elapsed, made = monotonic() - self._start, self._evaluations.made  # what was stored took no time
         next_ones = self._settings.batch + self._settings.holdout
-        return "time budget" if elapsed * (1 + next_ones / done) > self._settings.max_seconds else None
+        return "time budget" if made and elapsed * (1 + next_ones / made) > self._settings.max_seconds else None

@@ -20,14 +20,12 @@ Keys (p parameters, n Gaussians):
 import io
 import os
 import sys
-import textwrap
 import warnings
 import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import torch
 from torch import Tensor
@@ -35,6 +33,7 @@ from torch import Tensor
 from splat.adam import Adam
 from splat.densify import ScreenGradients
 from splat.gaussians import Gaussians
+from splat.plain_types import fits, short
 from splat.regularizers.methods import METHODS
 from splat.regularizers.regularizer import Method, Regularizer, ThreeDGS
 from splat.scenes.scene import Scene, load_scene
@@ -216,14 +215,17 @@ def load_checkpoint(path: Path) -> Checkpoint:
     damaged = ValueError(
         f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
     )
-    path.open("rb").close()  # what the system does not open, it says itself
-    try:
-        with zipfile.ZipFile(path) as archive:
-            whole = archive.testzip() is None
-        with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
-            content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception:  # what torch stumbles over in a file of another kind is of many kinds too
-        raise damaged from None
+    with path.open("rb") as file:  # one file throughout: a training may replace it meanwhile
+        try:
+            with zipfile.ZipFile(file) as archive:
+                whole = archive.testzip() is None
+            file.seek(0)
+            with warnings.catch_warnings(
+                action="ignore"
+            ):  # torch warns of pickles of another kind before it refuses them
+                content = torch.load(file, map_location="cpu", weights_only=True)
+        except Exception:  # what torch stumbles over in a file of another kind is of many kinds too
+            raise damaged from None
     if not whole:
         raise damaged
     try:
@@ -287,7 +289,7 @@ def restored_training(content: dict[str, Any]) -> Training:
     if not 0 < training.extent < float("inf"):
         raise ValueError(f"its extent is {training.extent}")
     if not 0 <= training.adam.updates <= training.step:
-        raise ValueError(f"its optimiser has made {_short(training.adam.updates)} updates in {training.step} steps")
+        raise ValueError(f"its optimiser has made {short(training.adam.updates)} updates in {training.step} steps")
     return training
 
 
@@ -323,7 +325,9 @@ def _restore(regularizer: Regularizer, state: dict) -> None:
             {key: restored_training(value) if _is_training(value) else value for key, value in state.items()}
         )
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"'regularizer' is not the state of its method ({error})") from None
+        raise ValueError(
+            f"'regularizer' is not the state of its method ({error}); take another copy of the file, or train anew"
+        ) from None
 
 
 def _generator(state: Tensor) -> torch.Generator:
@@ -345,8 +349,8 @@ def _dataclass(kind: type[T], content: dict, where: str) -> T:
         value = content[key]
         if inner := _nested(hint, value, f"{where}.{key}"):
             value = _dataclass(inner, _get(content, key, dict), f"{where}.{key}")
-        elif not _fits(value, hint):
-            raise ValueError(f"'{where}.{key}' is {_short(value)}, expected {getattr(hint, '__name__', hint)}")
+        elif not fits(value, hint):
+            raise ValueError(f"'{where}.{key}' is {short(value)}, expected {getattr(hint, '__name__', hint)}")
         values[key] = value
     return kind(**values)
 
@@ -358,27 +362,4 @@ def _nested(hint: Any, value: Any, where: str) -> type | None:
     name = value.get("name") if isinstance(value, dict) else value
     if isinstance(name, str) and name in METHODS:
         return METHODS[name]
-    raise ValueError(f"'{where}' has the unknown name {_short(name)}")
-
-
-def _short(value: Any) -> str:
-    """What a value is, in a line."""
-    return f"a {type(value).__name__}" if isinstance(value, Tensor) else textwrap.shorten(repr(value), 80)
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a plain value is of a type: int (of 64 bits), float (or an int), bool, str, list, tuple, Literal, X | None."""
-    if get_origin(hint) in (Union, UnionType):
-        return any(_fits(value, option) for option in get_args(hint))
-    if get_origin(hint) is Literal:
-        return value in get_args(hint)
-    if get_origin(hint) is list:
-        return type(value) is list and all(_fits(item, get_args(hint)[0]) for item in value)
-    if get_origin(hint) is tuple:
-        options = get_args(hint)
-        if options[1:] == (Ellipsis,):
-            return type(value) is tuple and all(_fits(item, options[0]) for item in value)
-        return type(value) is tuple and len(value) == len(options) and all(map(_fits, value, options))
-    if type(value) is int:  # of any size, of which neither a tensor nor a float holds all
-        return hint in (int, float) and abs(value) < 2**63
-    return type(value) is hint
+    raise ValueError(f"'{where}' has the unknown name {short(name)}")

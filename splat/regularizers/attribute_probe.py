@@ -118,6 +118,10 @@ class Magnitude:
     uncapped: float
     rho: float
 
+    def __post_init__(self) -> None:
+        if not (isfinite(self.trace) and all(0 <= value < inf for value in (self.tau, self.uncapped, self.rho))):
+            raise ValueError(f"expected a finite trace, and finite tau and rho of at least 0, got {self}")
+
     @property
     def capped(self) -> bool:
         return self.rho < self.uncapped

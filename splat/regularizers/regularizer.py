@@ -24,6 +24,7 @@ from splat.densify import Densified
 from splat.gaussians import Gaussians
 from splat.losses_cpu import ViewLoss
 from splat.photometric import Photometric
+from splat.plain_types import fits, short
 from splat.scenes.view import View
 
 if TYPE_CHECKING:
@@ -93,7 +94,25 @@ class Regularizer:
     def restore(self, state: dict[str, Any]) -> None:
         """Take over a state.  ValueError, KeyError or RuntimeError where it does not fit."""
         self.generator.set_state(state["generator"])
+        if type(state["history"]) is not list:
+            raise ValueError(f"expected the history as a list of rows, found {short(state['history'])}")
+        for row in state["history"]:
+            _require_row(row)
         self.history = list(state["history"])
+
+
+def _require_row(row: Any) -> None:
+    """ValueError unless a row of a history holds plain values, its step and its counts whole numbers of at least 0."""
+    plain = fits(row, dict[str, int | float | bool | str]) and "step" in row
+    if (
+        not plain
+        or any(type(row.get(name, 0)) is not int for name in ("step", "count"))
+        or any(type(value) is int and value < 0 for value in row.values())
+    ):
+        raise ValueError(
+            "expected a row of the history with plain values, its step and its counts whole numbers of at least 0, "
+            f"found {short(row)}"
+        )
 
 
 @dataclass(frozen=True)

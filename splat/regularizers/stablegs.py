@@ -30,7 +30,9 @@ from splat.curvature import NothingInSight, SceneHessian
 from splat.densify import on_screen
 from splat.loss_functions import consistency_loss
 from splat.photometric import Photometric, photometric
+from splat.plain_types import fits, short
 from splat.regularizers.attribute_probe import (
+    Attribute,
     Magnitude,
     Probed,
     ProbeSettings,
@@ -98,6 +100,11 @@ class StableRegularizer(Regularizer):
     def begin(self, training: Training, views: Sequence[View]) -> None:
         if self.settings.vsp_weight:
             self.geometry = capture_geometry([view.camera for view in views])
+        if len(self.normals) not in (0, len(views)):  # restored
+            raise ValueError(
+                f"expected an edge's normal for each of {len(views)} training views, found {len(self.normals)} in the saved "
+                "training; take another copy of it, or train anew"
+            )
 
     def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
         settings = self.settings
@@ -188,8 +195,14 @@ class StableRegularizer(Regularizer):
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
+        if not fits(state["magnitudes"], dict[Attribute, dict[str, float]]):
+            raise ValueError(
+                f"expected numbers for the magnitude of each attribute, found {short(state['magnitudes'])}"
+            )
         self.magnitudes = {name: Magnitude(**values) for name, values in state["magnitudes"].items()}
-        self.normals = list(state["normals"])
+        self.normals = state["normals"]
+        if type(self.normals) is not list or not all(isinstance(n, Tensor) and n.shape == (2,) for n in self.normals):
+            raise ValueError(f"expected the normals as vectors of two numbers, found {short(self.normals)}")
 
 
 def _edge_normal(step: Step, camera: Camera) -> Float[Tensor, "2"]:

@@ -9,6 +9,7 @@ import torch
 
 from analysis import measurement
 from analysis.accuracy_cases import splat_cases
+from analysis.budget import Share
 from analysis.measurement import ProbeSettings, _density, _within, measure
 from landscape import CountingOperator, EigenSettings, extreme_eigenpairs
 from landscape.density import spectral_density
@@ -36,8 +37,9 @@ DIM = 50
 )
 def test_a_density_has_as_many_products_as_time_allows_in_runs_that_memory_has_room_for(seconds, room, shape, said):
     operator = CountingOperator(DenseOperator(torch.diag(torch.linspace(-1, 3, DIM, dtype=torch.float64))))
-    run, notes = partial(spectral_density, operator, torch.Generator().manual_seed(0)), []
-    density = _density(run, room, ProbeSettings(density_matvecs=60), seconds, 1.0, notes)
+    run, notes = partial(spectral_density, operator), []
+    share = Share(seconds, torch.Generator().manual_seed(0), lambda *_: None, notes)
+    density = _density(run, room, ProbeSettings(density_matvecs=60), 1.0, share)
     assert (None if density is None else tuple(density.nodes.shape)) == shape
     assert len(notes) == len(said) and all(words in note for words, note in zip(said, notes, strict=True))
     assert operator.matvecs == (shape[0] * shape[1] if shape else 0)  # none for the time alone
@@ -65,13 +67,13 @@ def test_every_kernel_has_worked_before_the_time_runs_and_own_blocks_are_made_on
     for name in ("block_diagonal", "evaluate"):
         counted(SceneObjective, name)
     counted(measurement, "check_against_gradient")
-    counted(measurement, "_Budget")
+    counted(measurement, "Budget")
     objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
     settings = replace(ProbeSettings.quick(), slice_points=5, seconds=60.0)
     found = measure(
         objective, LossSettings(), settings, torch.Generator().manual_seed(0), lambda name: nullcontext(lambda *_: None)
     )
-    first = calls[: calls.index("_Budget")]
+    first = calls[: calls.index("Budget")]
     assert {"block_diagonal", "evaluate", "check_against_gradient"} <= {*first}
     assert calls.count("block_diagonal") == 1 and calls.count("gauss_newton") == 1
     assert found.value == pytest.approx(objective.loss(objective.active.flat))

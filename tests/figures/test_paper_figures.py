@@ -178,3 +178,21 @@ def test_a_missing_record_is_named_with_the_command_that_makes_it(runs, tmp_path
     refused(fig1, f"run: landscape slice {runs[1] / 'checkpoint.pt'}")
     slice_at(runs[1], 1.0)
     refused(fig1, "run landscape train to its end")
+
+
+@pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
+def test_all_that_is_missing_is_named_at_once(runs, module):
+    for run in (*runs, runs[0] / "start"):
+        shutil.rmtree(run / "slice-eigenvectors-2d")
+    missing = [f"run: landscape slice {run / 'checkpoint.pt'}" for run in runs]
+    if module is fig1:
+        shutil.rmtree(runs[0] / "test")
+        missing.append(f"expected renders of held-out views in {runs[0] / 'test'}")
+    else:
+        (runs[1] / "trajectory.csv").unlink()
+        missing.append(f"expected trajectory.csv in the run {runs[1]}, found none; train anew with --probe-every")
+        missing.append(f"run: landscape slice {runs[0] / 'start' / 'checkpoint.pt'}")
+    with pytest.raises(ValueError) as refused:
+        module.draw(runs)
+    assert all(words in str(refused.value) for words in missing) and "\n" not in str(refused.value)
+    assert str(refused.value).count("expected") == len(missing)

@@ -53,6 +53,26 @@ def test_a_killed_slice_continues_and_ends_as_if_it_had_not_been(tmp_path, setti
     assert [path.name for path in store.parent.iterdir()] == ["slice.npz"]
 
 
+def test_a_slice_that_continues_has_its_evaluations_in_total(tmp_path):
+    store = tmp_path / "slice.npz"
+    with pytest.raises(KeyboardInterrupt):
+        sliced(Objective(dies_after=50), store, max_evaluations=100)
+    rest = Objective()
+    found = sliced(rest, store, max_evaluations=100)
+    assert found.reason == "evaluation budget" and found.evaluations == 100 and rest.calls == 100 - 48
+
+
+def test_a_slice_that_continues_has_its_time_anew_and_keeps_to_it(tmp_path, monkeypatch):
+    store, rest, limit = tmp_path / "slice.npz", Objective(), 80.0
+    settings = {"tolerance": 1e-4, "batch": 16, "holdout": 8}
+    with pytest.raises(KeyboardInterrupt):
+        sliced(Objective(dies_after=150), store, **settings)
+    monkeypatch.setattr("landscape.refinement.monotonic", lambda: float(rest.calls))  # a second each
+    found = sliced(rest, store, **settings, max_seconds=limit)
+    assert found.reason == "time budget" and found.evaluations > 150 + limit / 2
+    assert abs(rest.calls - limit) <= 16 + 8  # what is added between two looks at the clock
+
+
 def test_a_finer_tolerance_starts_from_what_a_coarser_one_found(tmp_path):
     store = tmp_path / "slice.npz"
     coarse = sliced(Objective(), store, tolerance=0.1)

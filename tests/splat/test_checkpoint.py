@@ -127,6 +127,18 @@ def test_a_bit_that_flipped_anywhere_among_the_numbers_is_noticed(path, training
     load_checkpoint(path)
 
 
+def test_what_is_loaded_is_what_was_checked_though_a_training_replaces_it_meanwhile(path, training, monkeypatch):
+    checked = zipfile.ZipFile.testzip
+
+    def replaced(archive):
+        found = checked(archive)
+        write_atomically(path, b"another")
+        return found
+
+    monkeypatch.setattr(zipfile.ZipFile, "testzip", replaced)
+    assert torch.equal(load_checkpoint(path).training.gaussians.flat, training.gaussians.flat)
+
+
 def test_an_archive_that_torch_stumbles_over_in_its_own_way_is_refused(path):
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}

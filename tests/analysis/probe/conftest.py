@@ -1,0 +1,74 @@
+"""A checkpoint that was probed, and its dense Hessian: made once, for all tests of this folder."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from analysis.cli import main
+from analysis.probe import scene_objective
+from analysis.records import Record
+from splat.adam import Adam
+from splat.checkpoint import load_checkpoint, save_checkpoint
+from splat.densify import ScreenGradients
+from splat.losses import photometric_loss
+from splat.render import render
+from splat.scenes.synthetic import synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from tests.analysis.probe.probed import SCENE, unlimited
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory) -> Path:
+    """A run folder with its scene beside it; the checkpoint is in double precision."""
+    folder = tmp_path_factory.mktemp("probe")
+    write_transforms_scene(synthetic_scene(SCENE).scene, folder / "still")
+    out = folder / "run"
+    settings = ["--iterations", "30", "--no-densify", "--sh-degree", "1"]
+    assert main(["train", str(folder / "still"), "--out", str(out), *settings]) == 0
+    loaded = load_checkpoint(out / "checkpoint.pt")
+    gaussians = loaded.training.gaussians.to(torch.float64)
+    state = Adam.zero(gaussians), ScreenGradients.zero(len(gaussians), torch.float64)
+    training = replace(loaded.training, gaussians=gaussians, adam=state[0], screen_gradients=state[1])
+    save_checkpoint(out / "double.pt", training, loaded.scene)
+    return out
+
+
+@pytest.fixture(scope="session")
+def record(run) -> Record:
+    return unlimited(run / "double.pt", run / "recorded")
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """For tests of the numbers alone."""
+    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(lambda target: []))
+
+
+@pytest.fixture(scope="session")
+def dense(run):
+    """(objective, P H P, L, gradient): double backward through the reference renderer, on the quaternions' tangent spaces."""
+    path = run / "double.pt"
+    loaded = load_checkpoint(path)
+    objective = scene_objective(loaded, loaded.load_scene(path))
+    active, settings = objective.active, loaded.training.config.loss
+
+    def loss(flat):
+        images = (render(active.with_flat(flat), v.camera, backend="reference").image for v in objective.views)
+        losses = [photometric_loss(i, v.image.double(), settings) for i, v in zip(images, objective.views, strict=True)]
+        return torch.stack(losses).mean()
+
+    point = active.flat.clone().requires_grad_()
+    value = loss(point)
+    (gradient,) = torch.autograd.grad(value, point, create_graph=True)
+    (H,) = torch.autograd.grad(
+        gradient, point, torch.eye(len(point), dtype=torch.float64), retain_graph=True, is_grads_batched=True
+    )
+    gradient = gradient.detach()
+    for i, q in enumerate(active.quats):
+        rows = slice(active.blocks["quats"].start + 4 * i, active.blocks["quats"].start + 4 * i + 4)
+        H[rows] -= torch.outer(q, q @ H[rows])
+        H[:, rows] -= torch.outer(H[:, rows] @ q, q)
+    return objective, H, float(value.detach()), gradient

@@ -1,0 +1,155 @@
+"""The record of a probe, its table, and what they say of budgets and of failed checks."""
+
+import json
+from contextlib import nullcontext
+from dataclasses import replace
+
+import pytest
+
+from analysis.budget import SHARES
+from analysis.cli import main
+from analysis.measurement import ProbeSettings
+from analysis.options import ProbeOptions
+from analysis.probe import run_probe
+from analysis.records import Record, read_record
+from splat.checkpoint import load_checkpoint
+from tests.analysis.probe.probed import unlimited
+
+
+def test_the_record_has_the_layout_and_says_what_was_skipped_and_from_where_it_comes(record, dense, run):
+    objective, H, value, gradient = dense
+    data = record.data
+    for key in ("traces", "eigenvalues", "anisotropy", "counts", "checks", "timing", "provenance"):
+        assert data[key], key
+    assert {"max", "min"} <= set(data["eigenvalues"]) and {"literal", "saddle"} <= set(data["anisotropy"])
+    counts, loaded = data["counts"], load_checkpoint(run / "double.pt")
+    assert counts["gaussians"] == len(loaded.training.gaussians) and counts["views"] == 3
+    assert counts["visible_gaussians"] == counts["gaussians"] - counts["skipped_gaussians"] == len(objective.active)
+    assert counts["active_parameters"] == len(H) - len(objective.active) and counts["rank"] <= len(H)
+    assert all(check["passed"] for check in data["checks"].values())
+    assert set(data["checks"]) == {"symmetry", "round_off", "finiteness", "finite_difference"}
+    assert data["objective"]["value"] == pytest.approx(value, rel=1e-12)
+    assert data["objective"]["gradient_norm"] == pytest.approx(float(gradient.norm()), rel=1e-9)
+    stages = ["load", "linearise", "checks", *SHARES, "skips", "pictures"]
+    assert list(data["timing"]) == [*stages, "total"]
+    assert sum(data["timing"][stage] for stage in stages) <= data["timing"]["total"]
+    provenance = data["provenance"]
+    assert (provenance["seed"], provenance["iteration"], provenance["dtype"]) == (0, 30, "float64")
+    assert provenance["scene_folder"] == str(run.parent / "still") and provenance["command"].startswith(
+        "landscape probe"
+    )
+    assert record.arrays["spectrum"]["ritz_values"][-1] == pytest.approx(data["eigenvalues"]["max"]["value"], rel=1e-9)
+    files = ["slice2d.png", "spectrum.png", "surface.png", "traces.png", "report.html", "probe.json"]
+    assert all((record.folder / file).stat().st_size > 5000 for file in files)
+
+
+def test_what_was_skipped_is_counted_and_its_time_said(record, dense, run):
+    objective, _, _, _ = dense
+    skipped, gaussians = record.data["skipped"], load_checkpoint(run / "double.pt").training.gaussians
+    views = list(objective.linearized)
+    assert {name: skip["count"] for name, skip in skipped.items()} == {
+        "gaussians_out_of_sight": len(gaussians) - len(objective.active),
+        "sh_bands_not_in_use": 0,
+        "entries_behind_opaque_fronts": sum(view.entries_behind for view in views),
+        "tiles_of_zero_cotangent": sum(view.dark_tiles for view in views),
+        "products_of_views_not_concerned": 0,
+        "samples_of_finished_traces": sum(128 - trace["probes"] for trace in record.data["traces"].values()),
+        "points_of_the_slice_predicted": int((~record.arrays["slice"]["evaluated"]).sum()),
+    }
+    assert all((skip["seconds_saved"] > 0) <= (skip["count"] > 0) for skip in skipped.values())
+
+
+def test_the_record_is_strict_json(record):
+    json.loads((record.folder / "probe.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+
+
+def numbers(record: Record) -> tuple[dict, dict]:
+    """All that may not differ between two runs."""
+    data = {key: value for key, value in record.data.items() if key not in ("timing", "provenance")}
+    data["skipped"] = {name: skip["count"] for name, skip in data["skipped"].items()}
+    return data, {group: {k: v.tolist() for k, v in arrays.items()} for group, arrays in record.arrays.items()}
+
+
+def test_the_same_seed_gives_the_same_numbers_and_another_seed_does_not(run, record, no_pictures):
+    for seed, same in ((0, True), (1, False)):
+        again = unlimited(run / "double.pt", run / f"seed{seed}", "--seed", str(seed))
+        assert (numbers(again) == numbers(record)) == same
+
+
+def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_pictures, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "140")
+    assert main(["probe", str(run / "checkpoint.pt"), "--quick"]) == 0
+    said = capsys.readouterr()
+    data = read_record(run / "probe").data
+    assert data["provenance"]["dtype"] == "float32" and data["slice"]["points"] == 41 * 41
+    assert set(data["eigenvalues"]) == {"max", "second", "min"} and "power iteration" not in said.out
+    # what it left out is said, in the record and aloud
+    assert any("surface was left out" in note for note in data["notes"]) and "surface was left out" in " ".join(
+        said.out.split()
+    )
+    assert data["finite_probe"] is None and "the finite probe was left out" in data["notes"]
+    assert data["depth"] is None and "positions along and across the rays were left out" in data["notes"]
+    assert data["anisotropy"]["share"]["value"] is None and "density" not in data["timing"]
+    assert "the spectral density was left out, and the indices that need it" in data["notes"]
+    skips = data["skipped"]
+    assert skips["entries_behind_opaque_fronts"]["seconds_saved"] is None
+    assert skips["gaussians_out_of_sight"]["count"] == data["counts"]["skipped_gaussians"]
+    for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
+        assert f"trace of {label}" in said.out
+    for label in ("largest eigenvalue", "smallest eigenvalue", "literal", "saddle", "check: symmetry"):
+        assert label in said.out
+    assert str(run / "probe" / "report.html") in said.out and "probe.json" in said.out
+    for stage in ("traces", "eigenvalues", "slice"):
+        assert stage in said.err
+
+
+def test_a_quick_probe_leaves_the_same_pictures_out_whoever_starts_their_drawing(run, tmp_path, monkeypatch):
+    begun, drawn = [], []
+    monkeypatch.setattr("analysis.drawing.drawing", lambda *told: begun.append(told) or nullcontext(lambda target: []))
+    assert main(["probe", str(run / "checkpoint.pt"), "--quick", "--out", str(tmp_path / "command")]) == 0
+    monkeypatch.setattr("analysis.recording.draw", lambda module, target, *told: drawn.append((module, *told)) or [])
+    assert run_probe(ProbeOptions(run / "checkpoint.pt", quick=True, out=tmp_path / "function")) == 0
+    assert begun == drawn == [("make_all", "--without", "surface")]
+
+
+def test_a_budget_that_ends_is_said_and_what_was_reached_is_recorded(run, tmp_path, capsys, no_pictures):
+    out = tmp_path / "short"
+    assert main(["probe", str(run / "checkpoint.pt"), "--out", str(out), "--seconds", "1e-6"]) == 0
+    data = read_record(out).data
+    assert data["eigenvalues"]["max"]["reason"] == "time budget"
+    assert data["slice"]["points"] == 41 * 41 > 30 * data["slice"]["evaluated_points"]
+    assert any("the slice's interpolation stopped" in note for note in data["notes"])
+    assert data["anisotropy"]["share"]["value"] is None
+    assert any("density was left out" in note for note in data["notes"])
+    assert data["depth"]["rises"] == [] and any("steps along the rays were left out" in note for note in data["notes"])
+    assert "density was left out" in " ".join(capsys.readouterr().out.split())
+
+
+def skewed(run):
+    """SceneHessian.apply with a hundredth of the result moved to the next row."""
+    from splat.curvature import SceneHessian
+
+    original = SceneHessian.apply
+
+    def apply(self, V):
+        product = original(self, V)
+        return product + 0.01 * product.roll(1, dims=0)
+
+    return apply
+
+
+def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_path, no_pictures, monkeypatch, capsys):
+    monkeypatch.setattr("splat.curvature.SceneHessian.apply", skewed(run))
+    quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
+    assert main([*quick, str(tmp_path / "lenient")]) == 0
+    assert main([*quick, str(tmp_path / "strict"), "--strict"]) == 1
+    for name in ("lenient", "strict"):
+        checks = read_record(tmp_path / name).data["checks"]
+        assert checks["symmetry"]["passed"] is False and checks["finite_difference"]["passed"] is False
+    assert "The check of symmetry failed" in " ".join(capsys.readouterr().out.split())
+
+
+def test_settings_out_of_range_are_refused():
+    for wrong in ({"slice_points": 3}, {"slice_points": 6}, {"slice_rise": 0.0}, {"seconds": 0.0}, {"memory": -1.0}):
+        with pytest.raises(ValueError, match="expected"):
+            replace(ProbeSettings(), **wrong)

@@ -1,0 +1,102 @@
+"""Probes that are refused, interrupted or killed, or whose pictures fail: what they say and what they leave."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+from analysis.cli import main
+from analysis.records import read_record
+from splat.scenes.synthetic import synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from tests.analysis.probe.probed import SCENE
+
+ROOT = Path(__file__).parents[3]
+
+
+def refused(capsys, arguments: list[str], *expected: str) -> None:
+    assert main(["probe", *arguments]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("landscape: ") and "Traceback" not in said.err and said.out == ""
+    message = said.err.strip()
+    assert message.count("\n") == 0, message
+    for part in expected:
+        assert part in message, message
+
+
+def test_a_seed_below_zero_is_refused_as_that_of_a_training_is(run, tmp_path, capsys):
+    refused(capsys, [str(run / "double.pt"), "--out", str(tmp_path / "out"), "--seed=-1"], "seed in [0, 2^63), got -1")
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(run.parent / "still", tmp_path / "scene")
+    copy.mkdir()
+    path = copy / "checkpoint.pt"
+    refused(capsys, [str(path)], "expected a checkpoint", "found no such file")
+    refused(capsys, [str(copy)], "expected a checkpoint", f"found a folder; name the {path} in it")
+    path.write_bytes(b"not a checkpoint")
+    refused(capsys, [str(path)], "not one or is damaged")
+    shutil.copy(run / "checkpoint.pt", path)
+    refused(capsys, [str(path), "--scene", str(tmp_path / "nowhere")], "does not exist")
+    write_transforms_scene(synthetic_scene(replace(SCENE, views=2)).scene, tmp_path / "other")
+    refused(
+        capsys, [str(path), "--scene", str(tmp_path / "other")], f"the training's scene still in {tmp_path / 'other'}"
+    )
+    refused(capsys, [str(path), "--slice-points", "4"], "odd number")
+    refused(capsys, [str(path), "--seconds", "0"], "seconds")
+    (copy / "probe").mkdir()
+    (copy / "probe" / "thesis.txt").write_text("years of work")
+    refused(capsys, [str(path), "--scene", str(tmp_path / "scene")], "older record to replace", "move it away")
+    assert sorted(p.name for p in copy.rglob("*")) == ["checkpoint.pt", "probe", "thesis.txt"]
+
+
+def test_a_scene_that_has_moved_is_named_with_the_option_and_found_there(run, tmp_path, capsys, no_pictures):
+    still, away = run.parent / "still", tmp_path / "away"
+    still.rename(away)
+    try:
+        refused(capsys, [str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe")], "--scene")
+        options = ["--scene", str(away), "--out", str(tmp_path / "probe"), "--quick"]
+        assert main(["probe", str(run / "checkpoint.pt"), *options]) == 0
+    finally:
+        away.rename(still)
+    assert read_record(tmp_path / "probe").data["provenance"]["scene_folder"] == str(away)
+
+
+def test_a_probe_that_is_killed_leaves_the_old_record_whole(run, record, tmp_path):
+    out = tmp_path / "kept"
+    shutil.copytree(record.folder, out)
+    before = (out / "probe.json").read_bytes()
+    command = ["probe", str(run / "checkpoint.pt"), "--out", str(out), "--quick"]
+    process = subprocess.Popen([sys.executable, "-m", "analysis.cli", *command], cwd=ROOT, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 100
+    while not list(tmp_path.glob(".kept.partial-*/probe.json")):  # it is writing the new one
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.002)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert (out / "probe.json").read_bytes() == before and read_record(out).data["provenance"]["dtype"] == "float64"
+
+
+def test_an_interrupted_probe_writes_nothing(run, tmp_path, monkeypatch):
+    def interrupt(target):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(interrupt))
+    assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
+    def fail(target):
+        raise RuntimeError("drawing failed: no fonts")
+
+    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(fail))
+    assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 0
+    assert "drawing failed: no fonts" in read_record(tmp_path / "probe").data["notes"]
+    assert "Drawing failed: no fonts." in (tmp_path / "probe" / "report.html").read_text()
