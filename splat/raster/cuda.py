@@ -33,7 +33,8 @@ TILE = {"WIDTH": WIDTH, "HEIGHT": HEIGHT}
 LAUNCH = {"num_warps": 1}
 BLOCK = 128  # splats a program of the kernels that run over splats
 SPLATS = {"BLOCK": BLOCK, "num_warps": 4}
-ROWS = 8  # splats whose slots a program sums
+ROWS = 2  # splats whose slots a program sums
+SIDE_BY_SIDE = 256  # numbers of a splat's slots that it reads at a time
 
 
 class CudaRaster:
@@ -166,10 +167,7 @@ class CudaRaster:
         if not ordered:
             return sums
         totals = self._empty(n, vectors, width, dtype=torch.float64)
-        launch(
-            cuda_packing.sum_slots, (*grid(n, ROWS), vectors), self.slots.first, self.slots.last, sums, totals, n, vectors,
-            WIDTH=width, PADDED=triton.next_power_of_2(width), BLOCK=ROWS, num_warps=1,
-        )  # fmt: skip
+        sum_slots(self.slots.first, self.slots.last, sums, totals)
         return totals
 
     def backward(self, cotangent: Float[Tensor, "4 h w"]) -> "CudaAdjoint":
@@ -191,6 +189,16 @@ class CudaRaster:
     def jvp(self, directions: Float[Tensor, "n K 9"]) -> "CudaTangent":
         """J u for directions of the splats."""
         return CudaTangent(self, directions)
+
+
+def sum_slots(first: Int[Tensor, "n"], last: Int[Tensor, "n"], sums: Tensor, totals: Tensor) -> None:
+    """totals (n, vectors, width) of the sums (slots, vectors, width): those of splat i lie at first[i] .. last[i] - 1."""
+    n, vectors, width = totals.shape
+    padded = triton.next_power_of_2(width)
+    launch(
+        cuda_packing.sum_slots, (*grid(n, ROWS), vectors), first, last, sums, totals, n, vectors,
+        WIDTH=width, PADDED=padded, SLOTS=SIDE_BY_SIDE // padded, BLOCK=ROWS, num_warps=1,
+    )  # fmt: skip
 
 
 def _frame(background: Tensor, settings: RenderSettings, dtype: torch.dtype, device: torch.device) -> Tensor:

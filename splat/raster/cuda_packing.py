@@ -115,24 +115,26 @@ def pack_tangents(splats, directions, tangents, moved, n, K, begin, size, BLOCK:
 
 
 @sized("n", "K")
-def sum_slots(first, last, sums, totals, n, K, WIDTH: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr):
-    """totals (n, K, WIDTH) in double precision of the sums (slots, K, WIDTH), slot by slot: in a fixed order.
+def sum_slots(
+    first, last, sums, totals, n, K, WIDTH: tl.constexpr, PADDED: tl.constexpr, SLOTS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """totals (n, K, WIDTH) in double precision of the sums (slots, K, WIDTH): in a fixed order.
 
-    A row of threads has a splat's sums side by side, so that it reads whole sectors.  PADDED: WIDTH rounded up to a power of 2.
+    A splat's slots lie side by side and are read SLOTS at a time: a splat in thousands of tiles would have the others wait.  A
+    row of threads has a slot's sums, so that it reads whole sectors.  PADDED: WIDTH rounded up to a power of 2.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    j = tl.arange(0, PADDED)[None, :]
+    ahead, j = tl.arange(0, SLOTS)[None, :, None], tl.arange(0, PADDED)[None, None, :]
     start, stop = tl.load(first + i, i < n, other=0), tl.load(last + i, i < n, other=0)
     k = tl.program_id(1)
-    total = tl.zeros((BLOCK, PADDED), tl.float64)
+    total = tl.zeros((BLOCK, SLOTS, PADDED), tl.float64)
     longest = tl.max(stop - start, 0)
-    for s in range(0, longest):
-        slot = (start + s)[:, None]
-        total += tl.load(sums + (slot * K + k) * WIDTH + j, (slot < stop[:, None]) & (j < WIDTH), other=0.0).to(
-            tl.float64
-        )
-    at = (i.to(tl.int64)[:, None] * K + k) * WIDTH
-    tl.store(totals + at + j, total, (i < n)[:, None] & (j < WIDTH))
+    for s in range(0, longest, SLOTS):
+        slot = (start + s)[:, None, None] + ahead
+        inside = (slot < stop[:, None, None]) & (j < WIDTH)
+        total += tl.load(sums + (slot * K + k) * WIDTH + j, inside, other=0.0).to(tl.float64)
+    at, j = (i.to(tl.int64)[:, None] * K + k) * WIDTH, tl.arange(0, PADDED)[None, :]
+    tl.store(totals + at + j, tl.sum(total, 1), (i < n)[:, None] & (j < WIDTH))
 
 
 @sized("n")

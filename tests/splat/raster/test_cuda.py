@@ -12,7 +12,8 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip inst
 
 from splat.projection import Splats
 from splat.raster import functions
-from splat.raster.cuda import TOGETHER, CudaRaster
+from splat.raster.cuda import TOGETHER, CudaRaster, sum_slots
+from splat.raster.cuda_packing import SUMS
 from splat.settings import RenderSettings, Sums
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, NUMPY, relative_error
 from tests.splat.raster.compositing_cases import BACKGROUND, BLOCKS, CASES, TINY, truth
@@ -198,6 +199,17 @@ def test_the_splats_with_entries_are_those_with_slots(device):
     assert raster.touched.tolist() == (slots.last > slots.first).nonzero()[:, 0].tolist()
     assert 0 < len(raster.touched) < len(raster.splats)
     assert raster.bytes > raster.params.nbytes
+
+
+def test_slots_are_summed_however_many_a_splat_has(device):
+    numbers, K, width = torch.tensor([0, 1, 40, 16, 0, 3]), 2, SUMS
+    last = numbers.cumsum(0)
+    sums = torch.randn(int(last[-1]), K, width, generator=torch.Generator().manual_seed(0))
+    totals = torch.full((len(numbers), K, width), torch.nan, dtype=torch.float64, device=device)
+    arguments = (tensor.to(device) for tensor in (last - numbers, last, sums))
+    sum_slots(*arguments, totals)
+    expected = torch.stack([part.double().sum(0) for part in sums.split(numbers.tolist())])
+    assert torch.allclose(totals.cpu(), expected, rtol=0, atol=1e-14)
 
 
 def test_as_a_torch_function_it_has_the_derivatives_of_the_cpu(device, monkeypatch):

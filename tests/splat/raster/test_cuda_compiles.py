@@ -24,12 +24,12 @@ def types(real: str) -> dict[str, str]:
 def kernels() -> list[tuple]:
     """Every kernel with the types of its parameters, its constants and its warps, as `cuda.py` launches it."""
     from splat.raster import cuda_binning, cuda_blocks, cuda_compositing, cuda_packing
-    from splat.raster.cuda import BLOCK, LAUNCH, ROWS, TILE, TOGETHER
+    from splat.raster.cuda import BLOCK, LAUNCH, ROWS, SIDE_BY_SIDE, TILE, TOGETHER
 
     single, double = types("fp32"), types("fp64")  # the latter for a probe's own check and `analysis.gpu_check`
     tiled, blocked = LAUNCH["num_warps"], {"BLOCK": BLOCK}
     strips = {"BLOCK": cuda_binning.BLOCK, "WIDTH": cuda_binning.WIDTH}
-    slots = {"WIDTH": cuda_packing.SUMS, "PADDED": 16, "BLOCK": ROWS}
+    slots = {"WIDTH": cuda_packing.SUMS, "PADDED": 16, "SLOTS": SIDE_BY_SIDE // 16, "BLOCK": ROWS}
     to_first = {"first": "*i32"}
     return [
         (cuda_binning.count_strips, single | to_first, strips, 4),
