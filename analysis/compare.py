@@ -117,10 +117,11 @@ def cautions(runs: Sequence[Run]) -> list[str]:
         "held-out views": lambda run: run.checkpoint.scene.test,
         "random background": lambda run: run.checkpoint.training.config.random_background,
         "precision": lambda run: run.data["provenance"].get("dtype"),
-        "units of the families": lambda run: [row["unit"] for row in run.data.get("families", [])][:1],
     }
     lines = [f"The {what} are not the same." if what.endswith("s") else f"The {what} is not the same."
              for what, of in settings.items() if any(of(run) != of(runs[0]) for run in runs)]  # fmt: skip
+    if len({row["unit"] for run in runs for row in run.data.get("families", [])}) > 1:
+        lines.append("The units of the families are not the same.")
     found = [leaves(run.data["provenance"].get("settings", {})) for run in runs]
     different = [
         f"{name} {', '.join(str(settings.get(name)) for settings in found)}"

@@ -5,6 +5,7 @@ renderer that ends its process (VTK does, where OpenGL is missing) cannot take a
 """
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -20,36 +21,41 @@ Draw = Callable[[Path], list[str]]
 def drawing(module: str, *options: str) -> Iterator[Draw]:
     """`python -m figures.MODULE OPTIONS` of a folder that is named later: the process loads its libraries meanwhile."""
     command = [sys.executable, "-m", f"figures.{module}", *options]
-    process = subprocess.Popen(
-        [*command, "-"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=module_environment(),
-    )
-
-    def draw(target: Path) -> list[str]:
-        said = process.communicate(str(target))[1]
-        return _warnings([*command, str(target)], process.returncode, said)
-
-    try:
-        yield draw
-    finally:  # without a folder there is nothing to draw
-        process.kill()
-        process.communicate()
+    with _group([*command, "-"]) as process:  # without a folder there is nothing to draw
+        yield lambda target: _said(process, [*command, str(target)], str(target))
 
 
 def draw(module: str, target: Path, *options: str) -> list[str]:
     """Run `python -m figures.MODULE OPTIONS TARGET`, a folder or a file; as `Draw` does."""
     command = [sys.executable, "-m", f"figures.{module}", *options, str(target)]
-    done = subprocess.run(command, capture_output=True, text=True, env=module_environment())
-    return _warnings(command, done.returncode, done.stderr)
+    with _group(command) as process:
+        return _said(process, command)
 
 
-def _warnings(command: list[str], returncode: int, said: str) -> list[str]:
-    lines = [line for line in said.splitlines() if line.strip()]
-    if returncode:
+@contextmanager
+def _group(command: list[str]) -> Iterator[subprocess.Popen[str]]:
+    """A process that ends with the block, and with it those that it has started: they would keep its output open for ever."""
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=module_environment(),
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def _said(process: subprocess.Popen[str], command: list[str], told: str = "") -> list[str]:
+    """What the process warned of, once it is told this and has ended.  command: does the same by hand."""
+    lines = [line for line in process.communicate(told)[1].splitlines() if line.strip()]
+    if process.returncode:
         raise RuntimeError(f"drawing failed; draw again with: {' '.join(command)}\n" + "\n".join(lines))
     return [line.split("Warning: ", 1)[1] for line in lines if "Warning: " in line]
 

@@ -7,11 +7,12 @@ VALUE   a plain value, or text that is read by the setting's type: a number, tru
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from splat.regularizers.regularizer import Method
 from splat.train import TrainConfig
 
 T = TypeVar("T")
@@ -51,13 +52,18 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     own = _settable(TrainConfig)
     for key, value in changes.items():
         path = key.split(".")
-        if path[0] not in own + (of_method := _settable(type(config.method))):
+        if path[0] not in own + _settable(type(config.method)):
             raise ValueError(
-                f"expected a setting of the training ({', '.join(own)}) or of the method {config.method.name} "
-                f"({', '.join(of_method) or 'which has none'}), got {key!r}"
+                f"expected a setting of the training ({', '.join(_names(config))}) or of the method {config.method.name} "
+                f"({', '.join(_names(config.method)) or 'which has none'}), got {key!r}"
             )
         config = _changed(config, path if path[0] in own else ["method", *path], value, key)
     return config
+
+
+def _names(settings: TrainConfig | Method) -> list[str]:
+    """Of every single setting, but for the method's among the training's."""
+    return [name for name in leaves(asdict(settings)) if name != "name" and not name.startswith("method.")]
 
 
 def _settable(kind: type) -> list[str]:

@@ -236,12 +236,8 @@ def _follow(
                     console.print(f"after step {done.step}: {warned}", **WARNING)
             stop = interrupted.is_set()
             if stop or done.step % every == 0 or done.step == total:
-                if trajectory:
-                    trajectory.keep()
                 save_checkpoint(path, training, reference)
                 spent.write(path.parent)
-                if trajectory:
-                    trajectory.forget()
                 _write_history(training, path.with_name(HISTORY))
             if stop:
                 return done.step == total

@@ -195,6 +195,7 @@ def draw_sections(records: Records) -> Figure:
         for axes, which in zip(panels, ("steepest", "second"), strict=True):
             axes.set_xlabel(f"step, param. units{unit_suffix(steps)}")
             axes.set_title(f"Along the {which} direction", loc="left")
+            axes.xaxis.set_major_locator(MaxNLocator(5))
             axes.grid(True)
         panels[0].set_ylabel(f"change of loss{unit_suffix(power)}")
         _legend(figure, records)

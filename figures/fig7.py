@@ -16,11 +16,10 @@ from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from figures.manifold import Scale, landscape_of, require_same_function, section, start_of, surface
 from figures.style import BLUE, RUNS, literal, new_figure, save, style
-from figures.trajectory import index_over_steps, marker_words
+from figures.trajectory import index_over_steps, marker_words, step_ticks
 
 RECORDS = "trajectory.csv"
 PAGE = 6.9  # inches
@@ -46,7 +45,7 @@ def draw(runs: Sequence[Path]) -> Figure:
         index = figure.add_subplot(2, 3, 1)
         index_over_steps(index, measured, dict(zip(names, RUNS, strict=False)), "literal")
         index.set(xlabel="step", ylabel="|λmax / λmin|", title="Anisotropy index")
-        index.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        index.xaxis.set_major_locator(step_ticks())
         index.grid(True)
         drawn = [surface(figure, (2, 3, 2 + i), end, scale, f"{names[i]}, end") for i, end in enumerate(ends)]
         figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], **BAR)

@@ -69,12 +69,17 @@ def draw(table: pd.DataFrame) -> Figure:
             axes.set_xlabel("step")
         for axes in panels.flat:
             axes.grid(True)
-            axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+            axes.xaxis.set_major_locator(step_ticks())
         handles = [Line2D([], [], color=colour, label=literal(name)) for name, colour in runs.items()]
         handles += marker_words(measured, *INDICES)
         handles.append(Line2D([], [], linestyle="none", label=UNITS))
         figure.legend(handles=handles, loc="outside lower center", ncols=1)
     return figure
+
+
+def step_ticks() -> MaxNLocator:
+    """A few ticks at round steps, such as are recorded: 100, 200, 300 and not 120, 180, 240."""
+    return MaxNLocator(4, integer=True, steps=[1, 2, 2.5, 5, 10])
 
 
 def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], name: str) -> None:

@@ -23,7 +23,7 @@ The published code orders a step otherwise, which makes one update more or less 
 An update moves a parameter by about its rate, and from 2,000 steps on a hundred others lie between two that differ.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite
 
@@ -137,7 +137,6 @@ class Training:
 
     extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.
     order: indices of the epoch's views still to come, last first.
-    watchers: called with every change of the set of Gaussians; no part of what is saved.
     """
 
     config: TrainConfig
@@ -149,7 +148,6 @@ class Training:
     regularizer: Regularizer
     order: list[int] = field(default_factory=list)
     step: int = 0
-    watchers: list[Callable[[Densified], None]] = field(default_factory=list)
 
     @classmethod
     def start(cls, gaussians: Gaussians, extent: float, config: TrainConfig) -> "Training":
@@ -223,8 +221,6 @@ class Training:
         flat = change.gaussians.flat
         self.screen_gradients = ScreenGradients.zero(len(change.gaussians), flat.dtype, flat.device)
         self.regularizer.follow(change)
-        for watch in self.watchers:
-            watch(change)
 
     def raise_sh_degree(self, degree: int) -> None:
         """Add bands of zeros up to this degree."""

@@ -11,7 +11,7 @@ import pytest
 from analysis.cli import main
 from analysis.family_table import bracketed
 from analysis.quantities import measured, quantity
-from analysis.records import record_folder, write_record
+from analysis.records import read_record, record_folder, write_record
 from splat.checkpoint import load_checkpoint, save_checkpoint
 from splat.losses import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -78,6 +78,11 @@ def changed(run: str, **config) -> None:
     loaded = load_checkpoint(path)
     loaded.training.config = replace(loaded.training.config, **config)
     save_checkpoint(path, loaded.training, loaded.scene)
+
+
+def other_units(run: str) -> dict:
+    """A family of the run in other units."""
+    return read_record(Path(run) / "probe").data["families"][0] | {"unit": "steps of the optimiser"}
 
 
 def refused(capsys, words: list[str], *expected: str) -> None:
@@ -229,6 +234,17 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         assert part in said and part in " ".join(
             (Path(runs[0]).parents[1] / "compare/compare.html").read_text().split()
         )
+
+
+def test_families_that_only_one_run_has_are_in_no_other_units(runs, capsys, no_pictures):
+    words, folder = "The units of the families are not the same.", Path(runs[1]) / "probe"
+    data, arrays = synthetic()
+    data["provenance"] |= {"iteration": ITERATIONS}
+    for changes, said in (({"families": []}, False), ({"families": [other_units(runs[0])]}, True)):
+        with record_folder(folder) as partial:
+            write_record(partial, data | changes, arrays)
+        assert main(["compare", *runs]) == 0
+        assert (words in capsys.readouterr().out) == said
 
 
 def test_damaged_scores_are_named(runs, capsys):

@@ -75,3 +75,10 @@ def test_an_assignment_has_a_key_and_an_equals_sign():
             assignments([text])
     with pytest.raises(ValueError, match="expected each KEY once, got --set a twice"):
         assignments(["a=1", " a = 2"])
+
+
+def test_an_unknown_name_is_answered_with_those_of_all_single_settings():
+    with pytest.raises(ValueError, match="got 'densify_start'") as refused:
+        overridden(STABLE, {"densify_start": "50"})
+    for name in ("densify.start", "render.near", "warm_up", "probe.gamma"):
+        assert f"{name}," in str(refused.value)

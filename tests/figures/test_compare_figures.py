@@ -1,13 +1,15 @@
 """The figures of a comparison: common limits, signs, and runs of which something was not recorded."""
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from analysis.records import Record
 from figures.compare import ALONE, beyond, draw_comparison, draw_densities, draw_sections, draw_slices, draw_traces
-from figures.style import RUNS
+from figures.style import RUNS, style
+from tests.figures.test_figures import POINT, laid_out
 from tests.recorded import synthetic
 
 
@@ -85,6 +87,20 @@ def test_a_side_of_which_only_ends_are_known_says_so_and_the_legend_names_them(t
     assert [text.get_text() for text in figure.axes[0].texts] == ["none found"] and len(
         figure.legends[0].get_texts()
     ) == 1
+
+
+def test_the_numbers_along_the_steps_of_sections_stay_apart(tmp_path):
+    pair = records(tmp_path, 1.0, 0.25)
+    for record in pair.values():
+        for axis in "xy":
+            record.arrays["slice"][axis] *= 0.1 / record.arrays["slice"][axis].max()
+    figure = draw_sections(pair)
+    renderer = laid_out(figure, dpi=300)
+    for axes in figure.axes:
+        with style():  # the ticks are made anew
+            boxes = [label.get_window_extent(renderer) for label in axes.get_xticklabels() if label.get_text()]
+        assert len(boxes) >= 3
+        assert all(right.x0 - left.x1 > 4 * POINT * figure.dpi for left, right in pairwise(boxes))
 
 
 def test_a_run_without_slice_or_density_is_left_out_of_those_pictures_alone(tmp_path):

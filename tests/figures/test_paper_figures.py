@@ -49,6 +49,21 @@ def test_everything_stays_inside_the_page(runs, module):
     assert drawn.x1 <= figure.get_figwidth() + POINT and drawn.y1 <= figure.get_figheight() + POINT
 
 
+def test_contours_have_the_few_ticks_of_sections_whose_room_the_layout_knows(runs):
+    for run, reach in zip(runs, (0.0532, 0.1005), strict=True):
+        record = read_record(run / "slice-eigenvectors-2d")
+        for axis in "xy":
+            record.arrays["slice"][axis] *= reach / record.arrays["slice"][axis].max()
+        with record_folder(run / "slice-eigenvectors-2d", SLICE) as anew:
+            write_record(anew, {k: v for k, v in record.data.items() if k != "arrays"}, record.arrays, SLICE)
+    figure = fig1.draw(runs)
+    laid_out(figure)
+    first, second = figure.axes[:2]
+    sections = [axes for axes in figure.axes if axes.get_xlabel().startswith("step along e₁, e₂")]
+    for axes in (first, second):
+        assert axes.get_xticks().tolist() == axes.get_yticks().tolist() == sections[0].get_xticks().tolist()
+
+
 def test_both_ends_share_their_axes_and_the_start_says_how_far_it_reaches(runs):
     figure = fig7.draw(runs)
     surfaces = [axes for axes in figure.axes if hasattr(axes, "get_zlim")]

@@ -72,6 +72,10 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
     assert list(np.asarray(gaussians.get_ydata())) == [1000, 2000, 3000, 4000]
 
 
+def test_ticks_are_at_steps_such_as_are_recorded():
+    assert list(trajectory.step_ticks().tick_values(90, 310)) == [0, 100, 200, 300, 400]
+
+
 def test_runs_at_the_same_steps_stand_symmetrically_beside_each_other():
     table = pd.concat([rows().assign(run=name) for name in "abc"])
     axes = {each.get_title(): each for each in trajectory.draw(table).axes}["|λmax / λmin|"]
