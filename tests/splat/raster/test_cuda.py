@@ -206,8 +206,7 @@ def test_slots_are_summed_however_many_a_splat_has(device):
     last = numbers.cumsum(0)
     sums = torch.randn(int(last[-1]), K, width, generator=torch.Generator().manual_seed(0))
     totals = torch.full((len(numbers), K, width), torch.nan, dtype=torch.float64, device=device)
-    arguments = (tensor.to(device) for tensor in (last - numbers, last, sums))
-    sum_slots(*arguments, totals)
+    sum_slots((last - numbers).to(device), last.to(device), sums.to(device), totals)
     expected = torch.stack([part.double().sum(0) for part in sums.split(numbers.tolist())])
     assert torch.allclose(totals.cpu(), expected, rtol=0, atol=1e-14)
 
