@@ -140,7 +140,8 @@ class ProbeOptions:
     metric: Literal["parameters", "scene", "optimiser"] = "parameters"
     """Units in which the families compare curvature.
     parameters: as stored.
-    scene: positions in units of the scene's size, the rest as stored.
+    scene: positions in units of the scene's size (the median depth where all views face one way, else the cameras' mean
+    distance from their centre), the rest as stored.
     optimiser: each parameter in units of its learning rate at the first step.
     Any but parameters measures the families, as --families does."""
     family_seconds: float = 1800.0

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from analysis.budget import NEEDS_DENSITY
 from analysis.measurement import Findings, PlaneSlice
 from landscape import EigenEnds, Eigenpairs, SpectralDensity, TraceEstimate, anisotropy, literal
 from landscape.checks import ROUND_OFFS
@@ -120,7 +121,7 @@ def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
     family: dict[str, Any] = anisotropy(findings.ends, findings.density).record()
     if findings.power is not None:
         family["literal"] = literal_index(findings.ends, findings.power)
-    left_out = {"value": None, "low": None, "high": None, "note": "needs the spectral density, which was left out"}
+    left_out = {"value": None, "low": None, "high": None, "note": NEEDS_DENSITY}
     return {**family, **{name: left_out for name in ("share", "effective_rank", "mass_quantile") if name not in family}}
 
 

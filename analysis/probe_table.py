@@ -6,6 +6,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
+from analysis.budget import NEEDS_DENSITY
 from analysis.quantities import limits, measured, quantity
 from analysis.verdict import attribute_name
 
@@ -21,13 +22,14 @@ COUNTS = {
     "active parameters": ("active_parameters", "parameters"),
     "SH degree in use": ("sh_degree_active", "sh_degree_stored"),
 }
+ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
 NARROW = 0.1  # of the value
 OUTCOMES = {True: "[green]passed[/]", False: "[red]FAILED[/]", None: "[yellow]could not run[/]"}
 
 
 def probe_table(data: Mapping[str, Any]) -> Table:
     """Traces, eigenvalues, anisotropy, counts and checks of a record's data."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=ERRORS, caption_justify="left")
     table.add_column("", no_wrap=True)
     table.add_column("value ± error", justify="right", no_wrap=True)
     table.add_column("τ", justify="right", no_wrap=True)
@@ -43,7 +45,8 @@ def probe_table(data: Mapping[str, Any]) -> Table:
         table.add_row(ENDS[name], measured(end["value"], end["residual"]), "", about)
     table.add_section()
     for name, index in data["anisotropy"].items():
-        table.add_row(name.replace("_", " "), *_index(index))
+        if index["note"] != NEEDS_DENSITY:  # the record's notes say that these were left out
+            table.add_row(name.replace("_", " "), *_index(index))
     table.add_section()
     for row in _depth_rows(data.get("depth")):
         table.add_row(*row)

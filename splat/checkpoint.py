@@ -214,6 +214,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found {found}")
     damaged = ValueError(
         f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
+        f"{' (Gaussians from a PLY file cannot be read)' if path.suffix.lower() == '.ply' else ''}"
     )
     with path.open("rb") as file:  # one file throughout: a training may replace it meanwhile
         try:
@@ -271,13 +272,13 @@ def restored_training(content: dict[str, Any]) -> Training:
         extent=_get(content, "extent", float),
         gaussians=gaussians,
         adam=Adam(
-            gaussians.with_flat(_tensor(adam, "first", flat.shape, flat.dtype)),
-            gaussians.with_flat(_tensor(adam, "second", flat.shape, flat.dtype)),
+            gaussians.with_flat(_finite(adam, "first", flat.shape, flat.dtype, signed=True)),
+            gaussians.with_flat(_finite(adam, "second", flat.shape, flat.dtype)),
             _get(adam, "updates", int),
         ),
         screen_gradients=ScreenGradients(
-            _tensor(screen, "total", (len(gaussians),), flat.dtype),
-            _tensor(screen, "renders", (len(gaussians),), flat.dtype),
+            _finite(screen, "total", (len(gaussians),), flat.dtype),
+            _finite(screen, "renders", (len(gaussians),), flat.dtype),
         ),
         generator=_generator(_get(content, "generator", Tensor)),
         regularizer=regularizer,
@@ -312,6 +313,13 @@ def _tensor(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype) -
         raise ValueError(f"{key!r} is {kind}, expected {dtype} {tuple(shape)}")
     if value.device.type != "cpu" or not value.is_contiguous():
         raise ValueError(f"{key!r} is {kind} that does not hold its numbers one by one")
+    return value
+
+
+def _finite(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype, signed: bool = False) -> Tensor:
+    value = _tensor(content, key, shape, dtype)
+    if not (value.isfinite() & (signed | (value >= 0))).all():
+        raise ValueError(f"{key!r} holds a number that is not finite{'' if signed else ', or a negative one'}")
     return value
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from analysis.budget import NEEDS_DENSITY
 from analysis.provenance import provenance
 
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
@@ -37,7 +38,7 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
         "anisotropy": {
             "literal": {"value": top / bottom, "low": -143.0, "high": -139.0, "note": ""},
             "saddle": {"value": -top / bottom, "low": 139.0, "high": 143.0, "note": ""},
-            "share": {"value": None, "low": None, "high": None, "note": "needs the spectral density"},
+            "share": {"value": None, "low": None, "high": None, "note": NEEDS_DENSITY},
         },
         "slice": _plane(scale),
         "counts": {

@@ -23,14 +23,19 @@ counted from the formulas a pixel as `analysis/bench_scene.py` does; bytes come 
 
                      instructions a warp   operations a pixel   bytes an entry             bytes a pixel of the image
     forward          169                   17                   4 + 64                     24
-    backward         354                   30                   8 + 64 + 36               24
-    tangent K = 1    234                   25                   4 + 64 + 48                4 + 20
-    tangent K = 2    334                   36                   4 + 64 + 96                4 + 40
-    curvature K = 1  517                   46                   8 + 64 + 48 + 36          24 + 20
-    curvature K = 2  812                   70                   8 + 64 + 96 + 72          24 + 40
+    backward         362                   30                   8 + 64 + 36               24
+    tangent K = 1    235                   25                   4 + 64 + 48                4 + 20
+    tangent K = 2    335                   36                   4 + 64 + 96                4 + 40
+    curvature K = 1  518                   46                   8 + 64 + 48 + 36          24 + 20
+    curvature K = 2  827                   70                   8 + 64 + 96 + 72          24 + 40
 
 Deterministic mode reads the 36 bytes (a tangent) of an entry once more.  Around that a splat costs 72 + 64 bytes to pack,
 72 + 48 a tangent to pack, 72 for the totals and 3 x 72 to turn them into a gradient, 5 x 72 into the gradient's tangent.
+
+The loops of gsplat 1.5.3 (by nvcc 13.5, for the same processor) take 28 instructions forward and 40 backward for each of a
+tile's eight warps, 46 and 215 where an entry reaches a pixel of the warp.  On 500,000 Gaussians at 1600 x 1060 (150 tiles of
+the synthetic scene) these here are 0.52 of its instructions forward and 0.41 backward: there are 0.82 as many entries, and it
+adds up nine sums by 45 exchanges in every warp.
 """
 
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false

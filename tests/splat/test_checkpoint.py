@@ -3,6 +3,7 @@
 import builtins
 import errno
 import io
+import math
 import os
 import pickle
 import zipfile
@@ -195,6 +196,23 @@ def test_every_key_is_checked(path, key):
     del content[key]
     torch.save(content, path)
     refused(path, "missing|format")
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "number"),
+    [("adam", "first", math.nan), ("adam", "second", -1e-9), ("screen_gradients", "total", math.inf)],
+)
+def test_what_a_training_goes_on_from_is_finite_and_what_was_squared_not_negative(path, part, key, number):
+    content = torch.load(path, weights_only=True)
+    content[part][key][1] = number
+    torch.save(content, path)
+    refused(path, f"'{key}' holds a number that is not finite")
+
+
+def test_a_ply_file_is_refused_by_its_name(tmp_path):
+    path = tmp_path / "point_cloud.ply"
+    path.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
+    refused(path, r"damaged \(Gaussians from a PLY file cannot be read\)")
 
 
 def test_a_checkpoint_from_before_sums_had_a_name_has_ordered_ones(path):

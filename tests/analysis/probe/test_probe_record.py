@@ -98,6 +98,7 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
         assert f"trace of {label}" in said.out
     for label in ("largest eigenvalue", "smallest eigenvalue", "literal", "saddle", "check: symmetry"):
         assert label in said.out
+    assert "effective rank" not in said.out and "not necessarily the end" in said.out
     assert str(run / "probe" / "report.html") in said.out and "probe.json" in said.out
     for stage in ("traces", "eigenvalues", "slice"):
         assert stage in said.err
