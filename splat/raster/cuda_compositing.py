@@ -32,10 +32,10 @@ counted from the formulas a pixel as `analysis/bench_scene.py` does; bytes come 
 Deterministic mode reads the 36 bytes (a tangent) of an entry once more.  Around that a splat costs 72 + 64 bytes to pack,
 72 + 48 a tangent to pack, 72 for the totals and 3 x 72 to turn them into a gradient, 5 x 72 into the gradient's tangent.
 
-The loops of gsplat 1.5.3 (by nvcc 13.5, for the same processor) take 28 instructions forward and 40 backward for each of a
-tile's eight warps, 46 and 215 where an entry reaches a pixel of the warp.  On 500,000 Gaussians at 1600 x 1060 (150 tiles of
-the synthetic scene) these here are 0.52 of its instructions forward and 0.41 backward: there are 0.82 as many entries, and it
-adds up nine sums by 45 exchanges in every warp.
+The loops of gsplat 1.5.3 (by nvcc 13.5, for the same processor) take 31 instructions forward and 39 backward for each of a
+tile's eight warps, 52 and 236 where an entry reaches a pixel of the warp.  On 500,000 Gaussians at 1600 x 1060 (200 tiles of
+the synthetic scene) those here are 0.48 of its instructions forward and 0.38 backward, on fern after 2,000 steps 0.30 and 0.23:
+there are fewer entries (0.82 and 0.50), and it adds up nine sums by 45 exchanges in every warp.
 """
 
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
