@@ -64,8 +64,8 @@ def operation(opcode: tuple[str, ...]) -> Operation:
         return Operation(kind, (kind, kind, "pred"), lambda x, y, which: np.where(which, x, y))
     if name in ("shl", "shr"):
         return Operation(kind, (kind, "u32"), np.left_shift if name == "shl" else np.right_shift)
-    if name == "bfe" and kind == "u32":
-        return Operation(kind, (kind, kind, kind), lambda x, start, size: (x >> start) & ((np.uint32(1) << size) - 1))
+    if name == "bfe" and kind in ("u32", "s32"):  # with its sign, where numbers have one
+        return Operation(kind, (kind, kind, kind), lambda x, start, size: (x << 32 - start - size) >> 32 - size)
     if "wide" in opcode:
         wide = kind[0] + str(2 * int(kind[1:]))
         multiply = lambda x, y, z=0: x.astype(dtype(wide)) * y.astype(dtype(wide)) + z  # noqa: E731

@@ -46,6 +46,8 @@ def _step(line: Instruction, program: Program) -> Step:
     if name == "bar":
         waits = "warp" not in line.opcode
         return lambda threads, lanes: threads.wait(lanes) if waits else _complete(threads, lanes)
+    if name == "atom":  # a sum that gives what was there before, which nobody may want here
+        return _both(_move(kind, (operands[0], "-1")), _access(("red", *line.opcode[1:]), operands[1:]))
     if name in ("ld", "st", "red"):
         return _access(line.opcode, operands)
     if name == "stmatrix":
@@ -57,6 +59,14 @@ def _step(line: Instruction, program: Program) -> Step:
     if name == "mov":
         return _move(kind, operands)
     return _computation(operation(line.opcode), operands)
+
+
+def _both(first: Step, second: Step) -> Step:
+    def both(threads: Threads, lanes: Lanes) -> None:
+        first(threads, lanes)
+        second(threads, lanes)
+
+    return both
 
 
 def _complete(threads: Threads, lanes: Lanes) -> None:

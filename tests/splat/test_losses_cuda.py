@@ -27,7 +27,8 @@ def test_kernels_on_the_gpu_give_the_specifications_value_gradient_and_products(
     loss, image = CudaViewLoss(expected.target.to(device), settings, dtype), expected.image.to(device, dtype)
     held = loss.linearize(image)
     assert held.value == pytest.approx(float(expected.value), rel=IMAGE[dtype], abs=IMAGE[dtype])
-    assert loss.value(image) == held.value
+    # kernels of their own, in which compilers fuse other products (Triton 3.6 does)
+    assert loss.value(image) == pytest.approx(held.value, rel=8 * torch.finfo(dtype).eps)
     assert relative_error(held.gradient[:3].cpu(), expected.gradient) < DERIVATIVE[dtype]
     tangents = torch.cat([expected.v, expected.v[:, :1]], dim=1).to(device, dtype)
     products = held.hvp(tangents)
