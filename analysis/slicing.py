@@ -258,7 +258,7 @@ def _finite_curvature(probe: dict[str, Any]) -> str:
         return f"at finite steps: round-off hides the curvature at all {len(sure)} steps"
     values = np.array(probe["curvatures"], float)[sure]
     crossed = int((sure & np.array(probe["crossed"] or [False] * len(sure))).sum())
-    across = f", {crossed} of them across sorts that changed" if crossed else ""
+    across = f", {crossed} of them with another order of splats" if crossed else ""
     return (
         f"at finite steps: curvature from {quantity(values.min())} to {quantity(values.max())}, at the {sure.sum()} of "
         f"{len(sure)} steps that round-off does not hide (±{quantity(steps[sure].min())} to ±{quantity(steps[sure].max())})"

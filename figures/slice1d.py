@@ -3,8 +3,8 @@
 Above: dots are true renders, blue where the order of the splats or the set of visible ones is not the checkpoint's; between
 them the loss is interpolated.  Dashed: the quadratic model.  Below: second differences of renders at steps to both sides, with
 the bounds of their round-off (grey where it hides them; a triangle where a value lies beyond the axis); hollow where an end is
-crossed.  The line is the infinitesimal curvature.  What steps that cross sorts see beside it is the loss's shape at that
-distance: its kinks and jumps, smoothed.
+crossed.  The line is the infinitesimal curvature.  What steps to another order of splats see beside it is the loss's shape at
+that distance: its kinks and jumps, smoothed.
 """
 
 from typing import Any
@@ -55,7 +55,7 @@ def _draw_loss(axes: Axes, along: Direction, about: dict[str, Any], arrays: dict
     axes.plot(along.scaled, change, color=BLACK, linewidth=0.8)
     axes.plot(along.scaled[known & ~crossed], change[known & ~crossed], **{**RENDERED, **DOT}, label="render")
     if crossed.any():
-        axes.plot(along.scaled[crossed], change[crossed], **{**CROSSED, **DOT}, label="render, sorts crossed")
+        axes.plot(along.scaled[crossed], change[crossed], **{**CROSSED, **DOT}, label="render, order changed")
     if "model" in arrays:
         model = (arrays["model"] - about["center_loss"]) / 10.0**exponent
         low, high = axes.get_ylim()
@@ -88,7 +88,7 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> Non
         axes.errorbar(steps[~sure], values[~sure], bounds[~sure], **hidden)
     for where, face, label in (
         (~crossed, BLUE, "at finite steps"),
-        (crossed, "white", "at finite steps, sorts crossed"),
+        (crossed, "white", "at finite steps, order changed"),
     ):
         if (where & sure).any():
             drawn: dict[str, Any] = {"color": BLUE, "markerfacecolor": face, "markersize": 3.5, "elinewidth": 0.8}

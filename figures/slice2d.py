@@ -113,7 +113,7 @@ def _legend(field: Plane) -> list[Line2D]:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
     if field.crossed_share:
         handles.append(
-            Line2D([], [], label=f"sorts crossed: {field.crossed_share:.0%}", **{**CROSSED, "markersize": 6})
+            Line2D([], [], label=f"order changed: {field.crossed_share:.0%}", **{**CROSSED, "markersize": 6})
         )
     handles.append(Line2D([], [], linestyle="none", label=f"1 unit: ΔL = {quantity(field.loss_scale)}"))
     return handles

@@ -194,7 +194,7 @@ def test_what_finite_steps_see_is_said_as_the_range_over_those_that_round_off_do
     probe = synthetic_line()[0]["finite_probe"]
     said = _finite_curvature(probe)
     assert "from 41.0 to 70.0, at the 3 of 4 steps that round-off does not hide (±1.00 × 10⁻⁵ to ±0.00100)" in said
-    assert said.endswith(", 2 of them across sorts that changed")
+    assert said.endswith(", 2 of them with another order of splats")
     hidden = probe | {"curvatures": [None] * 4, "round_off": [None] * 4, "crossed": None}
     assert _finite_curvature(hidden) == "at finite steps: round-off hides the curvature at all 4 steps"
 
