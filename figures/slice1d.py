@@ -87,8 +87,8 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> Non
         hidden: dict[str, Any] = {"fmt": "none", "ecolor": "0.8", "elinewidth": 1.2, "label": "hidden by round-off"}
         axes.errorbar(steps[~sure], values[~sure], bounds[~sure], **hidden)
     for where, face, label in (
-        (~crossed, BLUE, "at finite steps"),
-        (crossed, "white", "at finite steps, order changed"),
+        (~crossed, BLUE, "finite steps"),
+        (crossed, "white", "finite steps, order changed"),
     ):
         if (where & sure).any():
             drawn: dict[str, Any] = {"color": BLUE, "markerfacecolor": face, "markersize": 3.5, "elinewidth": 0.8}

@@ -22,5 +22,6 @@ def on_ranks(size: int, folder: Path, work: Callable[[Ranks], Findings]) -> list
 def _process(rank: int, size: int, folder: str, work: Callable[[Ranks], Findings]) -> None:
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=size)
+    dist.barrier()  # a process that leaves at once would cut others off that are still connecting
     torch.save(work(Ranks.joined()), f"{folder}/{rank}.pt")
     dist.destroy_process_group()
