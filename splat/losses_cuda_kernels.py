@@ -12,13 +12,12 @@ place along the grid's second axis.
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
 # (in a kernel names mean tensors)
 
-import triton
 import triton.language as tl
 
 from splat import consistency_kernels, losses_formulas
 from splat.losses import WINDOW
 from splat.losses_formulas import seconds_of, similarity, slopes_of
-from splat.raster.triton_formulas import device
+from splat.raster.triton_formulas import jit
 from splat.traced import digest, traced
 
 EPS, PIXEL, STRUCTURAL = tl.constexpr(WINDOW), tl.constexpr(WINDOW + 1), tl.constexpr(WINDOW + 2)
@@ -52,14 +51,14 @@ FORMULAS = digest()
 # --- the window -------------------------------------------------------------------------------------------------------
 
 
-@device
+@jit
 def pixels(height, width, BLOCK: tl.constexpr):
     """A program's values, their columns and rows, and which of them exist."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     return at, at % width, (at // width) % height, at < 3 * height * width
 
 
-@device
+@jit
 def near(pointer, at, place, distance, step, limit, here):
     """The value so far along an axis, at `place` of `limit` there; 0 outside the image."""
     return tl.load(
@@ -67,7 +66,7 @@ def near(pointer, at, place, distance, step, limit, here):
     )
 
 
-@device
+@jit
 def windowed(pointer, at, place, step, limit, constants, here):
     """The window along an axis."""
     total = tl.load(pointer + at, here, other=0.0) * tl.load(constants + REACH)
@@ -77,19 +76,19 @@ def windowed(pointer, at, place, step, limit, constants, here):
     return total
 
 
-@device
+@jit
 def product(value, residual, aim, FIELD: tl.constexpr):
     """v, r v or (y - c) v."""
     return value if FIELD == 0 else value * residual if FIELD == 1 else value * aim
 
 
-@device
+@jit
 def partial_sum(values, here, out):
     """A program's sum in double precision, to its place in out."""
     tl.store(out + tl.program_id(0), tl.sum(tl.where(here, values.to(tl.float64), 0.0), 0))
 
 
-@triton.jit
+@jit
 def blur_along(fields, out, constants, height, width, BLOCK: tl.constexpr):
     """Every field blurred along its rows."""
     at, x, _y, here = pixels(height, width, BLOCK)
@@ -97,7 +96,7 @@ def blur_along(fields, out, constants, height, width, BLOCK: tl.constexpr):
     tl.store(out + first + at, windowed(fields + first, at, x, 1, width, constants, here), here)
 
 
-@triton.jit
+@jit
 def feed(v, v_stride, residual, target, out, constants, height, width, BLOCK: tl.constexpr):
     """v, r v and (y - c) v blurred along the rows: three fields a vector."""
     at, x, _y, here = pixels(height, width, BLOCK)
@@ -120,12 +119,12 @@ def feed(v, v_stride, residual, target, out, constants, height, width, BLOCK: tl
 # --- one image against a target ---------------------------------------------------------------------------------------
 
 
-@device
+@jit
 def moments_of(middle, shift, square):
     return middle + shift, square - shift * shift
 
 
-@triton.jit
+@jit
 def moments_along(x, y, out, constants, height, width, BLOCK: tl.constexpr):
     """The window's mean and variance of (x + y) / 2 along the rows: two fields."""
     at, column, _row, here = pixels(height, width, BLOCK)
@@ -141,7 +140,7 @@ def moments_along(x, y, out, constants, height, width, BLOCK: tl.constexpr):
     tl.store(out + 3 * height * width + at, variance, here)
 
 
-@device
+@jit
 def moments(along, at, y, height, width, constants, here):
     """The window's mean and variance, from those along the rows."""
     size = 3 * height * width
@@ -157,7 +156,7 @@ def moments(along, at, y, height, width, constants, here):
     return mean, within + variance
 
 
-@triton.jit
+@jit
 def moments_down(along, out, constants, height, width, BLOCK: tl.constexpr):
     """mu and var: two fields."""
     at, _x, y, here = pixels(height, width, BLOCK)
@@ -166,7 +165,7 @@ def moments_down(along, out, constants, height, width, BLOCK: tl.constexpr):
     tl.store(out + 3 * height * width + at, variance, here)
 
 
-@triton.jit
+@jit
 def differentiate(
     fed, target_moments, out, second, distances, constants, height, width,
     SLOPES: tl.constexpr, SECOND: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
@@ -190,7 +189,7 @@ def differentiate(
             tl.store(second + j * size + at, bends[j], here)
 
 
-@triton.jit
+@jit
 def finish_gradient(
     blurred, residual, target, gradient, blurred_sp, losses, constants, height, width,
     KIND: tl.constexpr, SSIM: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
@@ -213,7 +212,7 @@ def finish_gradient(
         tl.store(gradient + at, total, here)
 
 
-@device
+@jit
 def changes(fed, at, y, height, width, constants, here):
     """m', p' and q' of a vector."""
     size = 3 * height * width
@@ -222,7 +221,7 @@ def changes(fed, at, y, height, width, constants, here):
     return dm, 2.0 * dp, windowed(fed + 2 * size, at, y, width, height, constants, here)
 
 
-@device
+@jit
 def second_derivatives(second, at, size, here):
     bends = ()
     for j in tl.static_range(SECONDS):
@@ -230,7 +229,7 @@ def second_derivatives(second, at, size, here):
     return bends
 
 
-@triton.jit
+@jit
 def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr, FORMULAS: tl.constexpr):
     """S_m', S_p', S_q' of every vector."""
     at, _x, y, here = pixels(height, width, BLOCK)
@@ -242,7 +241,7 @@ def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr, FORMU
         tl.store(out + first + j * size + at, found[j], here)
 
 
-@triton.jit
+@jit
 def finish_product(
     v, v_stride, blurred, residual, target, blurred_sp, out, out_stride, constants, height, width,
     KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
@@ -263,7 +262,7 @@ def finish_product(
     tl.store(out + vector * out_stride + at, total, here)
 
 
-@triton.jit
+@jit
 def forms(
     v, v_stride, fed, second, residual, blurred_sp, diagonal, full, pixelwise, constants, height, width,
     KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
@@ -282,7 +281,7 @@ def forms(
     partial_sum(tl.load(diagonal + at, here, other=0.0) * squared, here, pixelwise + vector * tl.num_programs(0))
 
 
-@triton.jit
+@jit
 def finish_diagonal(
     along, residual, target, blurred_sp, out, constants, squared, height, width,
     KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
@@ -305,7 +304,7 @@ def finish_diagonal(
 # --- two images that both depend on the parameters --------------------------------------------------------------------
 
 
-@triton.jit
+@jit
 def feed_pair(x, y, out, constants, height, width, BLOCK: tl.constexpr):
     """r and r^2 blurred along the rows, r = x - y: two fields."""
     at, column, _row, here = pixels(height, width, BLOCK)
@@ -321,7 +320,7 @@ def feed_pair(x, y, out, constants, height, width, BLOCK: tl.constexpr):
         tl.store(out + field * 3 * height * width + at, total, here)
 
 
-@triton.jit
+@jit
 def differentiate_pair(
     fed, along, out, distances, constants, height, width, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
 ):  # fmt: skip
@@ -337,7 +336,7 @@ def differentiate_pair(
         tl.store(out + j * size + at, found[1 + j], here)
 
 
-@triton.jit
+@jit
 def finish_pair(
     blurred, x, y, in_x, in_y, losses, constants, height, width,
     KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,

@@ -23,7 +23,7 @@ from splat.projection_formulas import (
     to_camera,
 )
 from splat.projection_linear import add_symmetric
-from splat.raster.triton_formulas import device, sized
+from splat.raster.triton_formulas import jit, sized
 from splat.raster.whitening import plain, whitened, whitened_adjoint, whitening
 from splat.traced import digest, tangent_of, traced, variable
 
@@ -102,20 +102,20 @@ FORMULAS = digest()
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-@device
+@jit
 def start_of(attribute: tl.constexpr, n):
     """Where an attribute begins in the flat vector: 0 means, 1 log-scales, 2 quaternions, 3 opacity logits, 4 SH."""
     return n * (11 if attribute == 4 else 10 if attribute == 3 else 3 * attribute)
 
 
-@device
+@jit
 def places(BLOCK: tl.constexpr, WIDTH: tl.constexpr):
     """A program's Gaussians and, for each, WIDTH directions or vectors: one layout for all that it computes."""
     lane = tl.arange(0, BLOCK * WIDTH)
     return tl.program_id(0).to(tl.int64) * BLOCK + lane // WIDTH, lane % WIDTH
 
 
-@device
+@jit
 def numbers(pointer, count: tl.constexpr):
     """The first numbers at a pointer."""
     found = ()
@@ -124,7 +124,7 @@ def numbers(pointer, count: tl.constexpr):
     return found
 
 
-@device
+@jit
 def row(pointer, i, width: tl.constexpr, count: tl.constexpr, mask):
     """The first numbers of row i of an array of so many columns, in double precision."""
     found = ()
@@ -133,7 +133,7 @@ def row(pointer, i, width: tl.constexpr, count: tl.constexpr, mask):
     return found
 
 
-@device
+@jit
 def columns(pointer, e, m, count: tl.constexpr, mask):
     """What is held at place e of so many arrays of m, one after the other."""
     found = ()
@@ -142,7 +142,7 @@ def columns(pointer, e, m, count: tl.constexpr, mask):
     return found
 
 
-@device
+@jit
 def sigmoid(x):
     smaller = tl.exp(-tl.abs(x))
     return tl.where(x >= 0, 1.0, smaller) / (1.0 + smaller)
@@ -179,7 +179,7 @@ def project_splats(
         tl.store(splats + i * 9 + 6 + c, tl.where(ahead, tl.maximum(colour, 0.0), 0.0), here)
 
 
-@device
+@jit
 def colour_bars(bar, splats, i, mask):
     """The adjoints of the three colours before their clamp at 0, and 1 where that does not hold."""
     found, visible = (), ()
@@ -190,7 +190,7 @@ def colour_bars(bar, splats, i, mask):
     return found, visible
 
 
-@device
+@jit
 def harmonic_weights(flat, colour_bar, i, n, BANDS: tl.constexpr, mask):
     """sum_c sh[k, c] colour_bar[c], sixteen of them."""
     found = ()
@@ -304,7 +304,7 @@ def plain_jacobian(splats, index, jacobian, out, start, count, m, BLOCK: tl.cons
 # --- products with a block of vectors: Gaussians by rows, vectors by columns ------------------------------------------
 
 
-@device
+@jit
 def tangents_at(block, i, k, K, n, here):
     """The ten tangents of mean, log-scales and quaternion."""
     found = ()

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splat.raster import binning
-from splat.raster.triton_formulas import device, launch, sized, twins
+from splat.raster.triton_formulas import jit, launch, sized, twins
 
 WIDTH, HEIGHT = 16, 16  # of a tile, in pixels
 BLOCK = 256
@@ -57,7 +57,7 @@ class Slots(NamedTuple):
     last: Int[Tensor, "n"]
 
 
-@device
+@jit
 def load_splat(splats, i, inside):
     """Mean, conic and opacity of the splats i; nowhere drawn outside."""
     at = splats + i.to(tl.int64) * 9

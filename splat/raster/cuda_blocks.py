@@ -20,7 +20,7 @@ from splat.raster.cuda_compositing import (
     pixels_of,
 )
 from splat.raster.cuda_packing import ALPHA_MAX, CAP, RED
-from splat.raster.triton_formulas import device, jit, reciprocal, twins
+from splat.raster.triton_formulas import jit, reciprocal, twins
 from splat.raster.whitening import LEAST_RATIO, LOG2_E, ROUND, plain_adjoint
 
 step_block, cross_terms = twins(blocks.step_block, blocks.cross_terms)
@@ -29,7 +29,7 @@ PADDED = 64
 CROSS, COLOUR, DEGREE2 = tl.constexpr(blocks.CROSS), tl.constexpr(blocks.COLOUR), tl.constexpr(blocks.DEGREE2)
 
 
-@device
+@jit
 def powers_of_columns(total, j, place, rows, u, degree: tl.constexpr):
     """The moments to a degree, to their places of `total`, from the sums over rows of a weight times v^k."""
     for b in tl.static_range(degree + 1):
@@ -85,7 +85,7 @@ def block_moments(
             tl.store(sums + at + j, total, j < 36)
 
 
-@device
+@jit
 def block_sums(u, v, w, free, D, weight, g, h):
     """The 36 sums over a tile, (1, 64) with zeros after them."""
     j, u, vv = tl.arange(0, 64)[None, :], tl.sum(u, 1), v * v

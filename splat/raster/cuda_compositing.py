@@ -61,7 +61,7 @@ from splat.raster.cuda_packing import (
     X,
     Y,
 )
-from splat.raster.triton_formulas import device, fma, jit, twins
+from splat.raster.triton_formulas import fma, jit, twins
 
 NEVER = tl.constexpr(2**31 - 1)  # the stop index of a pixel that does not stop
 CHUNK = tl.constexpr(16)  # entries between two looks whether all pixels of a tile have stopped
@@ -81,7 +81,7 @@ step_back, step_tangent, step_curvature, row_terms, column_terms = twins(
 # --- what the kernels share -------------------------------------------------------------------------------------------
 
 
-@device
+@jit
 def pixels_of(tile, columns, width, height, WIDTH, HEIGHT):
     """A tile's first pixel, its pixels' offsets from there, their indices in a plane, and whether they are in the image."""
     x0, y0 = tile % columns * WIDTH, tile // columns * HEIGHT
@@ -90,7 +90,7 @@ def pixels_of(tile, columns, width, height, WIDTH, HEIGHT):
     return x0, y0, x, y, (y0 + y) * width + (x0 + x), inside
 
 
-@device
+@jit
 def exponent_terms(params, x0, y0, x, y):
     """u of a tile's columns, v of its pixels, and what log2 alpha is made of: `alpha_terms` and `row_v` of the CPU.
 
@@ -104,12 +104,12 @@ def exponent_terms(params, x0, y0, x, y):
     return u, v, (v, across, fma(-u, u, tl.load(params + LO)), tl.load(params + CUT))
 
 
-@device
+@jit
 def load3(array, at):
     return tl.load(array + at), tl.load(array + at + 1), tl.load(array + at + 2)
 
 
-@device
+@jit
 def load_planes(planes, p, size, inside):
     """Four planes of a tile, 0 outside the image."""
     return (
@@ -120,7 +120,7 @@ def load_planes(planes, p, size, inside):
     )
 
 
-@device
+@jit
 def store_planes(planes, p, size, image, alpha, inside):
     tl.store(planes + p, image[0], inside)
     tl.store(planes + size + p, image[1], inside)
@@ -128,21 +128,21 @@ def store_planes(planes, p, size, image, alpha, inside):
     tl.store(planes + 3 * size + p, alpha, inside)
 
 
-@device
+@jit
 def any_lit(g):
     """Whether a cotangent's four planes are not all exactly 0 in a tile; NaN is not 0."""
     lit = (g[0] != 0) | (g[1] != 0) | (g[2] != 0) | (g[3] != 0)
     return tl.max(tl.max(tl.max(lit.to(tl.int32), 2), 1), 0) > 0
 
 
-@device
+@jit
 def side_by_side(one, other, lane, axis: tl.constexpr):
     """The sums of two arrays over an axis of length 2, one at either place of it."""
     first = (lane >> (5 - axis)) % 2 == 0
     return tl.where(first, tl.sum(one, axis, True), tl.sum(other, axis, True))
 
 
-@device
+@jit
 def nine_sums(v, u, s, w, h, K: tl.constexpr, HEIGHT: tl.constexpr):
     """The nine sums over a tile, (K, 16): sum j at `place_of_sums` j.
 
@@ -169,12 +169,12 @@ def nine_sums(v, u, s, w, h, K: tl.constexpr, HEIGHT: tl.constexpr):
     return tl.reshape(tl.sum(side_by_side(eight, ninth, lane, 4), 5), (K, 16))
 
 
-@device
+@jit
 def threads(x, K: tl.constexpr):
     return tl.reshape(x, (K, 2, 2, 2, 2, 2))
 
 
-@device
+@jit
 def place_of_sums():
     """Which sum lies at each of the 16 places that `nine_sums` fills, (1, 16), and where it is no copy."""
     place = tl.arange(0, 16)[None, :]
@@ -182,7 +182,7 @@ def place_of_sums():
     return tl.where(even, place // 8 + place // 4 % 2 * 2 + place // 2 % 2 * 4, 8), even | (place == 1)
 
 
-@device
+@jit
 def put_sums(sums, at, total, K: tl.constexpr, ATOMIC: tl.constexpr):
     """Write or add an entry's sums, K times nine from at * K * 9."""
     j, kept = place_of_sums()
@@ -194,7 +194,7 @@ def put_sums(sums, at, total, K: tl.constexpr, ATOMIC: tl.constexpr):
         tl.store(place, total, kept & (k < K))
 
 
-@device
+@jit
 def clear_slots(slots, first, count, sums, WIDTH: tl.constexpr):
     """Zeros for the sums, WIDTH an entry, of a tile's entries."""
     j = tl.arange(0, 16)
@@ -281,7 +281,7 @@ def backward(
         put_sums(sums, at, nine_sums(v, u, s, w, g, 1, HEIGHT), 1, ATOMIC)
 
 
-@device
+@jit
 def load_background(frame, real: tl.constexpr):
     background = load3(frame, BACKGROUND)
     return background[0].to(real), background[1].to(real), background[2].to(real)
@@ -290,7 +290,7 @@ def load_background(frame, real: tl.constexpr):
 # --- second order -----------------------------------------------------------------------------------------------------
 
 
-@device
+@jit
 def tangents_of(tangents, splat, k, K):
     """K tangents of a splat: the coefficients of q', and of its colour."""
     at = tangents + (splat.to(tl.int64) * K + k) * 12
@@ -298,7 +298,7 @@ def tangents_of(tangents, splat, k, K):
     return q, load3(at, 6)
 
 
-@device
+@jit
 def any_moved(moved, splat_of, first, count, K: tl.constexpr):
     """Whether any of K tangents moves a splat of a tile's entries; a look at the first few, unless few splats are moved."""
     k, lane = tl.arange(0, K)[:, None], tl.arange(0, 32)[None, :]

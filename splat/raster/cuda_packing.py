@@ -15,7 +15,7 @@ import triton.language as tl
 
 from splat.raster import packing, whitening
 from splat.raster.cuda_binning import load_splat
-from splat.raster.triton_formulas import device, sized, twin, twins
+from splat.raster.triton_formulas import jit, sized, twin, twins
 
 PARAMS = 16
 X, Y, U, V, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT, CAP = (tl.constexpr(i) for i in range(14))
@@ -32,12 +32,12 @@ whiten = twin(whitening.whitening)
 exponent_tangent, first_order, second_order = twins(packing.exponent_tangent, packing.first_order, packing.second_order)
 
 
-@device
+@jit
 def nearest(x):
     return tl.minimum(tl.maximum(tl.floor(x + 0.5), -FARTHEST), FARTHEST)
 
 
-@device
+@jit
 def load_six(array, at, inside):
     """Six numbers side by side, in double precision."""
     return (
@@ -50,13 +50,13 @@ def load_six(array, at, inside):
     )
 
 
-@device
+@jit
 def store_six(array, at, numbers, inside):
     for j in tl.static_range(6):
         tl.store(array + at + j, numbers[j], inside)
 
 
-@device
+@jit
 def copy_colour(target, to, source, at, inside):
     for j in tl.static_range(6, 9):
         tl.store(target + to + j, tl.load(source + at + j, inside, other=0.0), inside)

@@ -7,7 +7,7 @@ this module.  Formulas therefore take and give numbers and tuples of numbers, in
 
     quadratic, dot = twins(formulas.quadratic, formulas.dot)
 
-`jit` and `sized` mark kernels and `device` what they call.
+`jit` and `sized` mark kernels, `jit` what they call, too.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ import triton.language as tl
 
 
 def jit(function: Callable) -> Any:
-    """A kernel, run by `launch`.  No parameter may be called params: Triton's code round it uses the name."""
+    """A kernel, run by `launch`, or what kernels call.  No kernel's parameter may be called params, which Triton's code uses."""
     return triton.jit(function)
 
 
@@ -40,11 +40,6 @@ def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants:
             kernel[programs](*arguments, enable_fp_fusion=True, **constants)
 
 
-def device(function: Callable) -> Any:
-    """A function that kernels call."""
-    return triton.jit(function)
-
-
 def twin(formula: Callable) -> Any:
     """A formula of the CPU as a function that kernels call."""
     return _twin(getattr(formula, "py_func", formula))
@@ -59,7 +54,7 @@ def _twin(function: FunctionType) -> Any:
     meaning = {name: _meaning(name, function.__globals__) for name in _names(function)}
     copied = FunctionType(function.__code__, {"__name__": function.__module__, "tl": tl, **meaning}, function.__name__)
     copied.__module__, copied.__qualname__ = function.__module__, function.__qualname__
-    return device(copied)
+    return jit(copied)
 
 
 def _names(function: FunctionType) -> list[str]:
@@ -82,27 +77,27 @@ def _meaning(name: str, names: dict[str, Any]) -> Any:
 # --- what the names of the formulas mean ------------------------------------------------------------------------------
 
 
-@device
+@jit
 def fma(x, y, z):
     return tl.fma(x, y, z)
 
 
-@device
+@jit
 def select(condition, x, y):
     return tl.where(condition, x, y)
 
 
-@device
+@jit
 def minimum(x, y):
     return tl.minimum(x, y)
 
 
-@device
+@jit
 def maximum(x, y):
     return tl.maximum(x, y)
 
 
-@device
+@jit
 def reciprocal(x):
     """1 / x for positive x, to the last bit or the one before: by the hardware's inverse square root and a step of Newton's.
 
@@ -113,42 +108,42 @@ def reciprocal(x):
     return tl.fma(r, tl.fma(-x, r, 1.0), r)
 
 
-@device
+@jit
 def sqrt(x):
     return tl.sqrt(x)
 
 
-@device
+@jit
 def exp(x):
     return tl.exp(x)
 
 
-@device
+@jit
 def log(x):
     return tl.log(x)
 
 
-@device
+@jit
 def exp2(x):
     return tl.exp2(x)
 
 
-@device
+@jit
 def log2(x):
     return tl.log2(x)
 
 
-@device
+@jit
 def ceil(x):
     return tl.ceil(x)
 
 
-@device
+@jit
 def floor(x):
     return tl.floor(x)
 
 
-@device
+@jit
 def truncated(x):
     return x.to(tl.int32)
 

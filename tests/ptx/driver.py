@@ -7,11 +7,30 @@ import torch
 from torch import Tensor
 
 
-def install() -> None:
-    """For this process, which has not launched anything."""
+def target() -> Any:
+    """An H100 or H200, as Triton knows it."""
     from triton.backends.compiler import GPUTarget
-    from triton.compiler.compiler import CompiledKernel
+
+    return GPUTarget("cuda", 90, 32)
+
+
+def stand_in() -> None:
+    """A driver for this process, which has not launched anything: all of it that Triton needs to compile and to choose kernels."""
     from triton.runtime import driver
+
+    driver.set_active(
+        SimpleNamespace(  # pyright: ignore[reportArgumentType]
+            get_current_device=lambda: 0,
+            get_current_stream=lambda _device: 0,
+            get_current_target=target,
+            utils=SimpleNamespace(unload_module=lambda _module: None),
+        )
+    )
+
+
+def install() -> None:
+    """The driver, and the machine for what is launched."""
+    from triton.compiler.compiler import CompiledKernel
 
     from tests.ptx import machine
 
@@ -26,15 +45,7 @@ def install() -> None:
         constants = [(i,) in kernel.src.constants for i in range(len(kernel.src.fn.arg_names))]
         kernel.module = kernel._run = run
 
-    target = GPUTarget("cuda", 90, 32)
-    driver.set_active(
-        SimpleNamespace(  # pyright: ignore[reportArgumentType]
-            get_current_device=lambda: 0,
-            get_current_stream=lambda _device: 0,
-            get_current_target=lambda: target,
-            utils=SimpleNamespace(unload_module=lambda _module: None),
-        )
-    )
+    stand_in()
     CompiledKernel._init_handles = handles  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -94,7 +94,7 @@ def _computation(op: Operation, operands: tuple[str, ...]) -> Step:
 def _reader(operand: str, kind: str) -> Callable[[Threads, Lanes], Array]:
     """How an operand is read: a register, of which the lower part may be meant, a number, or a shared array's address."""
     wanted = dtype(kind)
-    if (operand.startswith("%") and "." not in operand) or operand == "tmp":
+    if operand.startswith("%") and "." not in operand:
 
         def get(threads: Threads, lanes: Lanes) -> Array:
             bits = threads.registers[operand][lanes]

@@ -97,7 +97,10 @@ def parse(text: str) -> Program:
         raise ValueError(f"expected one kernel, got {len(entries)}")
     (name, parameters, body) = entries[0]
     registers = {prefix: (WIDTHS[kind], int(count)) for kind, prefix, count in _DECLARATION.findall(body)}
-    body = _HALVES.sub(r"\1", re.sub(r"^\s*\.(loc|reg|file|section)\b[^\n]*", "", body, flags=re.MULTILINE))
+    body = _HALVES.sub(
+        lambda found: found[1].replace("tmp", "_"),
+        re.sub(r"^\s*\.(loc|reg|file|section)\b[^\n]*", "", body, flags=re.MULTILINE),
+    )
     instructions, labels = [], {}
     for statement in re.sub(r"^(\$\w+:)", r"\1;", body, flags=re.MULTILINE).split(";"):
         statement = statement.strip()

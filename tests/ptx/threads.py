@@ -34,7 +34,7 @@ class Threads:
             f"%{prefix}{i}": np.zeros(self.count, bool if prefix == "p" else f"u{bits // 8}")
             for prefix, (bits, many) in program.registers.items()
             for i in range(many)
-        } | {name: np.zeros(self.count, np.uint32) for name in ("tmp", "_")}  # where halves go that nobody wants
+        } | {"_": np.zeros(self.count, np.uint32)}  # where halves go that nobody wants
         index = np.unravel_index(self.block, grid[::-1])[::-1]
         self.special = {f"%ctaid.{axis}": place.astype(np.uint32) for axis, place in zip("xyz", index, strict=True)}
         self.special |= {

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from tests.ptx.driver import target
+
 
 def compile_kernel(kernel: Any, types: dict[str, str], constants: dict[str, Any], num_warps: int) -> tuple[int, int]:
     """Registers and bytes of stack (where registers are spilled) a thread of a kernel.
@@ -17,13 +19,12 @@ def compile_kernel(kernel: Any, types: dict[str, str], constants: dict[str, Any]
     types: of its parameters by name, 32-bit integers where none is given.
     """
     import triton
-    from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
     signature = {name: "constexpr" if name in constants else types.get(name, "i32") for name in kernel.arg_names}
     source = ASTSource(kernel, signature, constants)
     options = {"num_warps": num_warps, "enable_fp_fusion": True}
-    assembly = triton.compile(source, target=GPUTarget("cuda", 90, 32), options=options).asm
+    assembly = triton.compile(source, target=target(), options=options).asm
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         file.write(assembly["cubin"])
         file.flush()

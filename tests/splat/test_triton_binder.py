@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tests.ptx.driver import stand_in
 from tests.splat.ahead_of_time import run_as_script
 
 
@@ -21,10 +22,8 @@ def test_every_kernel_takes_its_arguments_and_no_number_of_gaussians_or_vectors_
         assert few == more, f"{name} was compiled anew for other numbers"
 
 
-def stand_in() -> Counter[str]:
+def compile_none() -> Counter[str]:
     """Have Triton launch nothing; counts how often each kernel would be compiled."""
-    from triton.backends.compiler import GPUTarget
-    from triton.runtime import driver
     from triton.runtime.jit import JITFunction
 
     compiled = Counter[str]()
@@ -36,12 +35,7 @@ def stand_in() -> Counter[str]:
         kernel.device_caches[device][0][key] = found
         return found
 
-    target = GPUTarget("cuda", 90, 32)
-    driver.set_active(
-        SimpleNamespace(  # pyright: ignore[reportArgumentType]
-            get_current_device=lambda: 0, get_current_stream=lambda _device: 0, get_current_target=lambda: target
-        )
-    )
+    stand_in()
     JITFunction._do_compile = compile_nothing  # pyright: ignore[reportAttributeAccessIssue]
     return compiled
 
@@ -103,7 +97,7 @@ if __name__ == "__main__":
     splat.device.EMULATED = True  # tensors on the CPU for the GPU's path
     torch.empty, torch.empty_like = zeros(torch.empty), zeros(torch.empty_like)
     Tensor.new_empty = zeros(Tensor.new_empty)
-    compiled = stand_in()
+    compiled = compile_none()
     for vectors in (1, 2, 10):
         launch_all(37, 33, vectors)
     few = compiled.copy()
