@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splat.backend.cpu.threads import over_batch
-from splat.projection.formulas import GEOMETRY, Held
+from splat.projection.formulas import GEOMETRY, ProjectionJacobian
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
 CHUNK = 4096  # Gaussians at a time
@@ -65,7 +65,7 @@ def _alone(rows: Tensor) -> Tensor:
     return rows
 
 
-def seen_harmonics(views: Sequence[Held], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
+def seen_harmonics(views: Sequence[ProjectionJacobian], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
     """The SH directions (k of one channel; the three are alike) in which the Hessian can be non-zero.
 
     stacked: completes the rows of these views to those of all views, where other processes hold some.
@@ -78,7 +78,7 @@ def seen_harmonics(views: Sequence[Held], n: int, bands: int, stacked: Stacked =
     return _row_space(stacked(rows), _like(views).dtype)
 
 
-def seen_parameters(views: Sequence[Held], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
+def seen_parameters(views: Sequence[ProjectionJacobian], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
     """The directions of a Gaussian's parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
     parts = [
         _row_space(stacked(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), _like(views).dtype)
@@ -89,12 +89,12 @@ def seen_parameters(views: Sequence[Held], n: int, bands: int, stacked: Stacked 
     return RowSpace(torch.cat(padded), torch.cat([part.rank for part in parts]))
 
 
-def _like(views: Sequence[Held]) -> Tensor:
+def _like(views: Sequence[ProjectionJacobian]) -> Tensor:
     """An empty tensor of the views' precision, on their device."""
     return torch.as_tensor(views[0].jacobian[:0])
 
 
-def _jacobian_rows(views: Sequence[Held], start: int, stop: int, bands: int) -> Float[Tensor, "n r d"]:
+def _jacobian_rows(views: Sequence[ProjectionJacobian], start: int, stop: int, bands: int) -> Float[Tensor, "n r d"]:
     """The Jacobians of the splats of Gaussians start..stop in every view, stacked: nine rows a view, zero where unseen."""
     width = GEOMETRY + 1 + 3 * bands
     rows = _like(views).new_zeros(stop - start, 9 * len(views), width, dtype=torch.float64)
