@@ -201,10 +201,7 @@ class Trajectory:
 
 
 def measure(
-    objective: SceneObjective,
-    generator: torch.Generator,
-    settings: TrajectorySettings,
-    seconds: float = inf,
+    objective: SceneObjective, generator: torch.Generator, settings: TrajectorySettings, seconds: float = inf
 ) -> Found:
     """One record, in about so many seconds, counted from the call."""
     began, streams = perf_counter(), [split(generator) for _ in range(3)]

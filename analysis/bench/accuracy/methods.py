@@ -164,10 +164,7 @@ def end_methods() -> Iterator[Method]:
 
 
 def _lanczos(
-    text: str,
-    settings: EigenSettings,
-    origin: Origin = "own",
-    applies: Callable[[Case], bool] = lambda case: True,
+    text: str, settings: EigenSettings, origin: Origin = "own", applies: Callable[[Case], bool] = lambda case: True
 ) -> Method:
     def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         return end_answers(extreme_eigenpairs(operator, generator(seed), settings))
