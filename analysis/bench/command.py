@@ -161,7 +161,7 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
         bench = ViewBench(workload)
         console.print(
             f"[bold]{workload.name}[/]: {len(workload.gaussians)} Gaussians, {bench.view.camera.width} x "
-            f"{bench.view.camera.height} px, {bench.linearized.touched} visible, {bench.linearized.entries} tile entries",
+            f"{bench.view.camera.height} px, {bench.linearized.touched} visible, {bench.linearized.intersections} tile entries",
             highlight=False,
         )
         calls = {**bench.stages(), **bench.wholes(), **bench.peers()}
@@ -254,11 +254,11 @@ def _bounds(
 ) -> pd.DataFrame:
     """What is asked for as ratios: of times, and of bytes over what the view's size allows."""
     view, lines = bench.linearized, ratios(times, by_triton(workload.gaussians.flat))
-    kept, allowed = bench.kept(), 1000 * view.touched + 200 * workload.pixels + 24 * view.entries
+    kept, allowed = bench.kept(), 1000 * view.touched + 200 * workload.pixels + 24 * view.intersections
     lines.append(_line(f"kept linearisation ({kept / 1e6:.1f} MB) / allowance", kept / allowed, 1.0))
     workspaces = {K: bench.workspace(K, meter) for K in VECTORS}
     for K, used in workspaces.items():
-        allowed = K * (40 * view.entries + 28 * workload.pixels + 500 * view.touched)
+        allowed = K * (40 * view.intersections + 28 * workload.pixels + 500 * view.touched)
         lines.append(_line(f"workspace of K = {K} ({used / 1e6:.1f} MB) / allowance", used / allowed, 1.0))
     if reference:
         seconds, work = times["H v 1"].minimum, workspaces[1]

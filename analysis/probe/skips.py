@@ -50,7 +50,9 @@ def product_skips(
     counts = {
         "gaussians_out_of_sight": len(gaussians) - len(active),
         "sh_bands_not_in_use": (stored + 1) ** 2 - (active.sh_degree + 1) ** 2,
-        "entries_behind_opaque_fronts": objective.total(sum(view.entries_behind for view in objective.linearized)),
+        "entries_behind_opaque_fronts": objective.total(
+            sum(view.intersections_behind for view in objective.linearized)
+        ),
         "tiles_of_zero_cotangent": objective.total(sum(view.dark_tiles for view in objective.linearized)),
     }
     spared = objective.total(spared)
@@ -102,7 +104,7 @@ def _with_every_entry(objective: SceneObjective) -> LinearizedView:
     view = objective.linearize(0)
     raster = rasterize_view(objective.active, objective.views[0].camera, objective.background, objective.settings)
     per_tile = np.diff(raster.lists.start)
-    view._raster.lists, view._raster._slot_start = reached_lists(raster.lists, per_tile, len(objective.active))
+    view._raster.reached = reached_lists(raster.lists, per_tile, len(objective.active))
     return view
 
 

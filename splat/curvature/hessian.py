@@ -37,7 +37,7 @@ class SceneHessian:
     @cached_property
     def _row_space(self) -> RowSpace:
         n, bands = len(self.objective.active), self.objective.active.sh.shape[1]
-        held = [view.held for view in self.objective.linearized]
+        held = [view.jacobian for view in self.objective.linearized]
         seen = seen_parameters if self.gauss_newton else seen_harmonics
         return seen(held, n, bands, self.objective.stacked)
 

@@ -103,7 +103,7 @@ class SceneObjective:
         flat, degree = gaussians.flat, gaussians.sh_degree if sh_degree is None else sh_degree
         self.views = tuple(views)
         # products are repeatable, however the training's steps were made
-        self.settings = replace(settings, sums="ordered")
+        self.settings = replace(settings, accumulation="deterministic")
         self.background = flat.new_zeros(3) if background is None else background.to(flat)
         self.couples_pixels = loss.ssim_weight > 0
         self._losses = [loss_against(view.image, loss, flat) for view in views]
@@ -171,7 +171,7 @@ class SceneObjective:
     def evaluate_view(self, index: int, gaussians: Gaussians) -> tuple[float, Hashable]:
         """The same of one view that this process holds, at finite Gaussians in place of the active ones."""
         raster = rasterize_view(gaussians, self.views[index].camera, self.background, self.settings, finite=True)
-        return self._losses[index].value(raster.planes), raster.order
+        return self._losses[index].value(raster.planes), raster.draw_order
 
     def loss(self, flat: Float[Tensor, " p"]) -> float:
         """L alone, as of `evaluate`."""

@@ -74,7 +74,7 @@ def _alphas(splats: Splats, index: Tensor, xs: Tensor, ys: Tensor, settings: Ren
     alpha = splats.opacities[index, None, None] * torch.exp(-squared / 2)
     capped = alpha.clamp_max(settings.alpha_max)
     if settings.gradient_through_cap:
-        capped = capped.detach() * (alpha / alpha.detach())
+        capped = capped.detach() * (alpha / torch.where(alpha > 0, alpha, 1).detach())  # alpha may underflow
     active = alpha >= settings.alpha_min
     if settings.contour_sigma is not None:
         active = active & (squared <= settings.contour_sigma**2)

@@ -31,6 +31,7 @@ import torch
 from torch import Tensor
 
 from splat.model.gaussians import Gaussians
+from splat.model.settings import current_settings
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split
 from splat.training.densify import ScreenGradients
@@ -259,7 +260,7 @@ def restored_training(content: dict[str, Any]) -> Training:
     gaussians.require_finite()
     config = _get(content, "config", dict)
     if isinstance(thresholds := config.get("render"), dict):
-        config = {**config, "render": {"sums": "ordered", **thresholds}}  # a choice that older checkpoints did not have
+        config = {**config, "render": current_settings(thresholds)}
     config = _dataclass(TrainConfig, config, "config")
     regularizer = config.method.regularizer(config.seed)
     _restore(regularizer, _get(content, "regularizer", dict))

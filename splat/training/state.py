@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.curvature.objective import SceneObjective
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.protocols import ViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians

@@ -5,14 +5,13 @@ A row is one stage as a view pays for it; arrays are allocated beforehand, and i
     binning               sort by depth, tile lists, order of the tiles
     packing               parameters of the splats as the kernels read them
     forward
-    slots                 numbering of the entries that are reached
-    backward + reduce     and the sum over each splat's entries
-    tangents K            packing of K tangents
+    slots                 numbering of the intersections that are reached
+    backward + reduce     and the sum over each splat's intersections
     J u K
     tangent of backward K
-    reduce K              the sum over each splat's entries
+    reduce K              the sum over each splat's intersections
 
-The last four are per tangent.  A gradient is the first five rows; H u is the last four.
+The last three are per tangent.  A gradient is the first five rows; H u is the last three.
 """
 
 from collections.abc import Callable
@@ -20,6 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+import torch
+from torch import Tensor
 
 from analysis.bench.speed.prototype import Prototype
 from analysis.bench.workloads import BACKGROUND, TANGENTS, Problem, Size, random_splats, splat_problem
@@ -27,8 +28,10 @@ from analysis.console.timing import Timing, interleaved
 from splat.backend.cpu.planes import aligned
 from splat.backend.cpu.threads import over_range, over_tiles, thread_count
 from splat.model.settings import RenderSettings
-from splat.raster.cpu import binning, compositing, packing, tangents, tile
-from splat.raster.cpu.raster import Adjoint, Raster
+from splat.projection.dispatch import coefficients_of, plain_gradient
+from splat.raster.cpu import compositing, packing, tangents
+from splat.raster.cpu.raster import CpuAdjoint, CpuRaster
+from splat.raster.formulas import SPLAT
 
 BOUNDS = (1.6, 1.1)  # of H u over a gradient, for each of TANGENTS
 LISTS = ("binning", "packing", "slots")
@@ -41,70 +44,78 @@ class Stages:
 
     calls: dict[str, Callable[[], object]]
     results: Callable[[], dict[str, np.ndarray]]
-    raster: Raster
+    raster: CpuRaster
 
 
 def own_stages(p: Problem) -> Stages:
     """The stages of the project's kernels."""
-    settings, drawn = RenderSettings(), np.ones(len(p.splats), np.bool_)
-    size = p.size
-    raster = Raster(p.splats, p.depths, drawn, np.array(BACKGROUND), size.width, size.height, settings)
-    by_entries = raster.lists
-    planes = raster.pad(np.concatenate([p.cotangents, np.zeros_like(p.cotangents[:, :1])], axis=1))
+    size, drawn = p.size, torch.ones(len(p.splats), dtype=torch.bool)
+    splats, depths = torch.from_numpy(p.splats), torch.from_numpy(p.depths)
+    raster = CpuRaster(splats, depths, drawn, torch.tensor(BACKGROUND), size.width, size.height, RenderSettings())
+    cotangents = torch.from_numpy(p.cotangents)
+    planes = raster.pad(torch.cat([cotangents, torch.zeros_like(cotangents[:, :1])], dim=1))
     adjoint = raster.backward(planes[0])
-    slot_start, splats = raster.slot_start, raster.splats
-    n = len(splats)
-    entries, scalars = int(slot_start[-1]), (raster.params, raster.lists, raster.frame, raster.pixels)
-    sums = aligned((entries * tile.SUMS,), p.splats.dtype)
-    cut = np.log2(settings.alpha_min)
-
-    def slots():
-        raster.lists, raster._slot_start = by_entries, None
-        return raster.slot_start
+    lists, splat_start = raster.reached
+    scalars = (raster.params, lists, raster.frame, raster.pixels)
+    sums, moments = aligned((int(splat_start[-1]) * SPLAT,), raster.dtype), adjoint.moments.numpy()
 
     def backward():
-        over_tiles(compositing.backward, *scalars, adjoint.cotangent, sums)
-        over_range(n, packing.reduce_gradient, splats, slot_start, sums, adjoint.moments, adjoint.gradient)
+        over_tiles(compositing.backward, *scalars, raster.flat(adjoint.cotangent), sums)
+        over_range(len(splats), packing.reduce_sums, splat_start, sums, moments)
 
     calls: dict[str, Callable[[], object]] = {
-        "binning": lambda: binning.bin_splats(splats, p.depths, drawn, size.width, size.height, settings),
-        "packing": lambda: over_range(n, packing.pack_splats, splats, cut, np.inf, raster.params),
-        "forward": lambda: over_tiles(compositing.forward, raster.params, by_entries, raster.frame, raster.pixels),
-        "slots": slots,
+        "binning": lambda: raster.bin(depths, drawn),
+        "packing": raster.pack,
+        "forward": raster.forward,
+        "slots": raster.number_accumulators,
         "backward + reduce": backward,
     }
-    results: dict[str, np.ndarray] = {}
+    results: dict[str, Callable[[], np.ndarray]] = {}
     for K in TANGENTS:
         calls |= _own_tangent_stages(p, raster, adjoint, planes[1 : 1 + K], K, results)
 
     def finished() -> dict[str, np.ndarray]:
-        return {"forward": raster.crop(raster.planes[:3]), "backward + reduce": adjoint.gradient, **results}
+        gradient = plain_gradient(raster.splats, adjoint.moments).numpy()
+        tangents = {name: result() for name, result in results.items()}
+        return {"forward": raster.crop(raster.planes[:3]).numpy(), "backward + reduce": gradient, **tangents}
 
     return Stages(calls, finished, raster)
 
 
 def _own_tangent_stages(
-    p: Problem, raster: Raster, adjoint: Adjoint, cotangents: np.ndarray, K: int, results: dict[str, np.ndarray]
+    p: Problem,
+    raster: CpuRaster,
+    adjoint: CpuAdjoint,
+    cotangents: Tensor,
+    K: int,
+    results: dict[str, Callable[[], np.ndarray]],
 ) -> dict[str, Callable[[], object]]:
-    splats, dtype, size, slot_start = raster.splats, raster.dtype, raster.frame.size, raster.slot_start
-    n, directions = len(splats), np.ascontiguousarray(p.directions[:, :K], np.float64)
-    packed = aligned((n * K * tile.TANGENTS,), dtype)
+    dtype, size, (lists, splat_start) = raster.dtype, raster.frame.size, raster.reached
+    n, directions = len(raster.splats), torch.from_numpy(p.directions[:, :K]).double()
+    packed = torch.stack([coefficients_of(raster.splats, each.contiguous()) for each in directions.unbind(1)], dim=1)
+    packed = np.ascontiguousarray(packed.numpy(), dtype)
     planes, transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
-    sums = aligned((int(slot_start[-1]) * K * tile.SUMS,), dtype)
-    primal, cotangents = (raster.lists, raster.frame, raster.pixels), np.ascontiguousarray(cotangents).reshape(-1)
-    product = np.empty_like(directions)
-    results[f"J u {K}"] = raster.crop(planes.reshape(K, 4, *raster.plane)[:, :3])
-    results[f"reduce {K}"] = product
+    sums = aligned((int(splat_start[-1]) * K * SPLAT,), dtype)
+    primal, v_planes, dv_planes = (
+        (lists, raster.frame, raster.pixels),
+        raster.flat(adjoint.cotangent),
+        raster.flat(cotangents),
+    )
+    product, moments = np.empty_like(packed), adjoint.moments.numpy()
+    results[f"J u {K}"] = lambda: raster.crop(torch.from_numpy(planes).view(K, 4, *raster.plane)[:, :3]).numpy()
+    results[f"reduce {K}"] = lambda: np.stack(
+        [plain_gradient(raster.splats, each.contiguous()).numpy() for each in torch.from_numpy(product).unbind(1)],
+        axis=1,
+    )
     return {
-        f"tangents {K}": lambda: over_range(n, packing.pack_tangents, splats, directions, packed),
         f"J u {K}": lambda: over_tiles(
-            tangents.tangent, raster.params, packed, *primal, planes, transmittances
+            tangents.tangent, raster.params, packed.reshape(-1), *primal, planes, transmittances
         ),
         f"tangent of backward {K}": lambda: over_tiles(
-            tangents.curvature, raster.params, packed, *primal, adjoint.cotangent, transmittances, cotangents, sums
+            tangents.backward_tangent, raster.params, packed.reshape(-1), *primal, v_planes, transmittances, dv_planes, sums
         ),
         f"reduce {K}": lambda: over_range(
-            n, packing.reduce_curvature, splats, directions, slot_start, sums, adjoint.moments, product
+            n, packing.reduce_tangents, packed, splat_start, sums, moments, product
         ),
     }  # fmt: skip
 
@@ -164,7 +175,7 @@ def with_totals(rows: list[Row]) -> list[Row]:
     sums = {"gradient": (*LISTS, *COMPOSITING), "gradient, compositing": COMPOSITING}
     for K in TANGENTS:
         kernels = (f"J u {K}", f"tangent of backward {K}")
-        sums |= {f"H u {K}": (f"tangents {K}", *kernels, f"reduce {K}"), f"H u {K}, compositing": kernels}
+        sums |= {f"H u {K}": (*kernels, f"reduce {K}"), f"H u {K}, compositing": kernels}
     return [*rows, *(_total(name, [of[stage] for stage in stages]) for name, stages in sums.items())]
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.linearize import LinearizedView
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings, photometric_loss
 from splat.model.gaussians import Gaussians
 from splat.model.settings import SMOOTH, RenderSettings
@@ -47,7 +47,7 @@ def hold(
     dtype: torch.dtype = torch.float64,
     settings: RenderSettings = RenderSettings(),
 ) -> LinearizedView:
-    target = ViewLoss.of(view.image.to(dtype), loss, dtype)
+    target = CpuViewLoss(view.image.to(dtype), loss, dtype)
     return LinearizedView(gaussians.to(dtype), view.camera, target, BACKGROUND, settings)
 
 
@@ -208,7 +208,7 @@ def test_entries_behind_opaque_fronts_are_those_that_a_view_without_stops_has_mo
     held = hold(gaussians, view, loss)
     endless = hold(gaussians, view, loss, settings=RenderSettings(transmittance_min=0.0))
     assert held.entries_behind > 0 == endless.entries_behind
-    assert held.entries + held.entries_behind == endless.entries
+    assert held.intersections + held.intersections_behind == endless.intersections
 
 
 def test_tiles_are_dark_where_the_picture_is_met_exactly_and_the_loss_does_not_couple_pixels():

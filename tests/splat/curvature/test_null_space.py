@@ -108,7 +108,7 @@ def test_row_spaces_are_the_same_on_any_number_of_threads() -> None:
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            found.append(seen_parameters([view.held for view in objective.linearized], len(objective.active), 4))
+            found.append(seen_parameters([view.jacobian for view in objective.linearized], len(objective.active), 4))
     finally:
         torch.set_num_threads(before)
     assert torch.equal(found[0].basis, found[1].basis) and torch.equal(found[0].rank, found[1].rank)
