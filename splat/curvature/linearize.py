@@ -1,4 +1,4 @@
-"""One view held still: the loss, its gradient, and exact derivatives of first and second order as products with blocks.
+"""One view, linearised: the loss, its gradient, and exact derivatives of first and second order as products with blocks.
 
 Everything that depends on the scene alone is done once: projection with its Jacobian and curvature per Gaussian, order,
 tile lists, final transmittances, first-order adjoints, the loss's own derivatives.  Each product is then two passes over
@@ -10,7 +10,7 @@ the pixels for K vectors together.  With y the splats, P the projection, R the c
     H u       P'^T [ R'^T l'' R' P' u + (g . R'')(P' u) ] + (a . P'') u
 
 Vectors are columns of (p, K) blocks laid out like `Gaussians.flat`.  The order of the splats, the alpha_min cut, the stop and
-the clamps are held fixed; they are piecewise constant.
+the clamps are constants of every derivative; they are piecewise constant.
 
 Between P and R tangents and adjoints of splats are in the coordinates of `projection/whitening.py`.  The pieces (raster,
 projection, loss) are those of the device of the Gaussians.  On a GPU no product waits for the device.
@@ -128,12 +128,12 @@ class LinearizedView:
         return self._pulled([self._raster.backward(cotangent) for cotangent in cotangents])
 
     def block_diagonal(self, *, gauss_newton: bool = False) -> PerGaussianBlocks:
-        """Every Gaussian's own block of the Hessian, or of its Gauss-Newton part, exactly, in one pass over the pixels.
+        """Every Gaussian's diagonal block of the Hessian, or of its Gauss-Newton part, exactly, in one pass over the pixels.
 
         "Exactly" for losses that are sums over pixels; of SSIM's l'' the coupling between pixels is left out.
         """
-        own = self._raster.gaussian_blocks(self._adjoint, self._loss.diagonal, self._index, gauss_newton)
-        return PerGaussianBlocks(*self._projection.blocks(own, not gauss_newton))
+        blocks = self._raster.gaussian_blocks(self._adjoint, self._loss.diagonal, self._index, gauss_newton)
+        return PerGaussianBlocks(*self._projection.blocks(blocks, not gauss_newton))
 
     def loss_curvatures(self, U: Float[Tensor, "p k"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
         """(J u)^T l'' (J u) of every column, and the same with l'' replaced by its pixel-diagonal: no backward pass."""

@@ -137,7 +137,7 @@ class CudaProjection:
         return out
 
     def blocks(
-        self, own: Float64[Tensor, "m 9 9"], second_order: bool
+        self, blocks: Float64[Tensor, "m 9 9"], second_order: bool
     ) -> tuple[Float[Tensor, "n 11 11"], Float[Tensor, "n b 3"]]:
         """The blocks of splats in stored parameters."""
         like, m = self._at.jacobian, self._at.index.numel()
@@ -146,18 +146,18 @@ class CudaProjection:
         for start in range(0, m, CHUNK):
             some = slice(start, start + CHUNK)
             at = ProjectionJacobian(self._at.index[some], *(array[..., some].double() for array in self._at[1:]))
-            J = own.new_zeros(len(at.index), 9, GEOMETRY + 1)
+            J = blocks.new_zeros(len(at.index), 9, GEOMETRY + 1)
             J[:, 0, GEOMETRY] = at.logit_slope
             J[:, 1:6, :GEOMETRY] = at.jacobian.movedim(-1, 0)
             J[:, 6:, :3] = (at.visible[:, None] * at.colour_slope).movedim(-1, 0)
-            blocks = J.mT @ own[some] @ J
+            product = J.mT @ blocks[some] @ J
             if second_order:
-                j, k = torch.tril_indices(GEOMETRY, GEOMETRY, device=own.device)
-                bends = torch.zeros_like(blocks)
+                j, k = torch.tril_indices(GEOMETRY, GEOMETRY, device=blocks.device)
+                bends = torch.zeros_like(product)
                 bends[:, j, k] = bends[:, k, j] = at.curvature.T
                 bends[:, GEOMETRY, GEOMETRY] = at.logit_curvature
-                blocks += bends
-            geometry[at.index] = blocks.to(like.dtype)
-            weight = at.visible * own[some].diagonal(dim1=1, dim2=2)[:, 6:].T
+                product += bends
+            geometry[at.index] = product.to(like.dtype)
+            weight = at.visible * blocks[some].diagonal(dim1=1, dim2=2)[:, 6:].T
             sh[at.index] = (at.harmonic[: self.bands, None] ** 2 * weight).movedim(-1, 0).to(like.dtype)
         return geometry, sh

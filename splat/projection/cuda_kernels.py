@@ -284,8 +284,8 @@ def linearize_colour(
     weight = harmonic_weights(flat, bars, i, n, BANDS, here)
     values, slopes, along = linearized_colour(numbers(lens, LENS), row(flat, i, 3, 3, here), weight, BANDS, lane)
     for j in tl.static_range(3):
-        at, held = curvature + (j * (j + 1) // 2 + lane) * m + e, here & (lane <= j)
-        tl.store(at, tl.load(at, held, other=0.0) + along[j], held)
+        at, lower = curvature + (j * (j + 1) // 2 + lane) * m + e, here & (lane <= j)
+        tl.store(at, tl.load(at, lower, other=0.0) + along[j], lower)
     for k in tl.static_range(16):
         tl.store(harmonic + k * m + e, values[k], here & (lane == 0))
         tl.store(slope + (k * 3 + lane) * m + e, slopes[k], here & (lane < 3))

@@ -51,9 +51,9 @@ class Projection(Protocol):
         ...
 
     def blocks(
-        self, own: Float64[Tensor, "m 9 9"], second_order: bool
+        self, blocks: Float64[Tensor, "m 9 9"], second_order: bool
     ) -> tuple[Float[Tensor, "n 11 11"], Float[Tensor, "n b 3"]]:
-        """Own blocks of the splats at index in stored parameters: P'^T own P', plus (a . P'') where second_order.
+        """Diagonal blocks of the splats at index in stored parameters: P'^T B P', plus (a . P'') where second_order.
 
         Over mean, log-scales, quaternion and opacity logit; and the diagonal of the SH block.
         """

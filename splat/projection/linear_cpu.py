@@ -209,8 +209,8 @@ def pull_back(
 
 
 @kernel
-def chain_blocks(start, stop, at, own, second_order, geometry_out, sh_out):
-    """Own blocks of splats, (m, 9, 9), in stored parameters: P'^T own P', plus (a . P'') where second_order.
+def chain_blocks(start, stop, at, blocks, second_order, geometry_out, sh_out):
+    """Diagonal blocks of splats, B (m, 9, 9), in stored parameters: P'^T B P', plus (a . P'') where second_order.
 
     geometry_out: (n, 11, 11) over mean, log-scales, quaternion and opacity logit; sh_out: (n, k, 3), the diagonal of SH's.
     """
@@ -224,12 +224,12 @@ def chain_blocks(start, stop, at, own, second_order, geometry_out, sh_out):
             for j in range(3):
                 J[6 + c, j] = at.visible[e, c] * at.colour_slope[e, c, j]
             for b in range(bands):
-                sh_out[i, b, c] = at.visible[e, c] * at.harmonic[e, b] * at.harmonic[e, b] * own[e, 6 + c, 6 + c]
+                sh_out[i, b, c] = at.visible[e, c] * at.harmonic[e, b] * at.harmonic[e, b] * blocks[e, 6 + c, 6 + c]
         for j in range(GEOMETRY + 1):
             for r in range(9):
                 product[r] = 0
                 for s in range(9):
-                    product[r] += own[e, r, s] * J[s, j]
+                    product[r] += blocks[e, r, s] * J[s, j]
             for k in range(j + 1):
                 total = 0.0
                 for r in range(9):
@@ -289,12 +289,12 @@ class CpuProjection:
         return torch.from_numpy(out)
 
     def blocks(
-        self, own: Float64[Tensor, "m 9 9"], second_order: bool
+        self, blocks: Float64[Tensor, "m 9 9"], second_order: bool
     ) -> tuple[Float[Tensor, "n 11 11"], Float[Tensor, "n b 3"]]:
         """The blocks of splats in stored parameters: `chain_blocks`."""
         shapes = ((GEOMETRY + 1, GEOMETRY + 1), ((self.sh_degree + 1) ** 2, 3))
         geometry, sh = (np.zeros((self.n, *shape), self._at.jacobian.dtype) for shape in shapes)
-        over_range(len(self._at.index), chain_blocks, self._at, own.numpy(), second_order, geometry, sh)
+        over_range(len(self._at.index), chain_blocks, self._at, blocks.numpy(), second_order, geometry, sh)
         return torch.from_numpy(geometry), torch.from_numpy(sh)
 
     def _split(self, block: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -106,7 +106,7 @@ class Raster(Protocol):
     def gaussian_blocks(
         self, adjoint: Any, curvature: Float[Tensor, "3 H W"], index: Int[Tensor, " m"], gauss_newton: bool
     ) -> Float64[Tensor, "m 9 9"]:
-        """Own blocks of the splats at index: of the Hessian or of its Gauss-Newton part.
+        """Diagonal blocks of the splats at index: of the Hessian or of its Gauss-Newton part.
 
         adjoint: of the loss's gradient; curvature: the pixel-diagonal of l''.
         """

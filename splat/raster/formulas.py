@@ -247,7 +247,7 @@ def box_of(splat, ellipse, width, height):
     return x0, select(level > 0, x1, x0 - 1), y0, y1
 
 
-# --- a splat's own block of the Hessian -------------------------------------------------------------------------------
+# --- a splat's diagonal block of the Hessian --------------------------------------------------------------------------
 
 
 def _moment_index() -> np.ndarray:
@@ -266,7 +266,7 @@ MOMENT2 = np.array([[0, 3, 5], [1, 4, -1], [2, -1, -1]])  # of the six of degree
 
 
 def _block_index() -> np.ndarray:
-    """Which of a splat's sums is the entry of its own block, (9, 9) over coefficients and colour; BLOCK_SUMS: none, 0."""
+    """Which of a splat's sums is the entry of its diagonal block, (9, 9) over coefficients and colour; BLOCK_SUMS: none, 0."""
     powers = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of u and v in q', by Q0, QU, ...
     index = np.full((9, 9), BLOCK_SUMS, np.int64)
     for p, (j, k) in enumerate(powers):
@@ -280,7 +280,7 @@ def _block_index() -> np.ndarray:
 
 
 def _bends() -> np.ndarray:
-    """sum s d2q of a splat, (3, 9, 9) over its own coefficients: factors of its moments S, Su, Sv (`second_order`)."""
+    """sum s d2q of a splat, (3, 9, 9) over its coefficients: factors of its moments S, Su, Sv (`second_order`)."""
     bends = np.zeros((3, 9, 9))
     terms = (
         (0, Q0, Q0, -1.0), (0, QU, QU, -1 / ROUND), (0, QV, QV, -1 / ROUND), (1, QU, QUU, -2 / ROUND),

@@ -7,7 +7,7 @@ order of depth, d = p - mean:
     w     = alpha T,  T <- T - w;  the pixel stops before T would fall below transmittance_min
     colour = sum w colour_i + T background,  alpha of the pixel = 1 - T,  expected depth = sum w z_i
 
-The order, the alpha_min cut and the stop are held fixed under differentiation (they are piecewise constant).
+The order, the alpha_min cut and the stop are constants under differentiation: they are piecewise constant.
 """
 
 import torch

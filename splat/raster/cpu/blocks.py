@@ -1,6 +1,6 @@
-"""Every splat's own block of the Hessian, exactly, in one pass over the pixels.
+"""The diagonal block of the Hessian of every splat, exactly, in one pass over the pixels.
 
-A pixel is multilinear in the alphas of the splats over it, so a splat's own second derivatives need that splat alone.  With
+A pixel is multilinear in the alphas of the splats over it, so second derivatives in a splat's numbers need it alone.  With
 q = ln alpha, w = alpha T, c the splat's colour, R_c the colour behind it, D_c = dI_c/dq = w c - beta R_c = d2I_c/dq2,
 g = dl/dI and h_c = d2l/dI_c2 (the pixel-diagonal of l''), the block of one pixel in (q, colour) is
 
@@ -144,7 +144,7 @@ def store_powers(sums, at, u, m0, m1, m2, m3, m4):
 
 @kernel
 def reduce_blocks(start, stop, index, splat_start, sums, moments, second_order, blocks):
-    """The own blocks (m, 9, 9) of the splats at index, over coefficients and colour; moments: the gradient's."""
+    """The diagonal blocks (m, 9, 9) of the splats at index, over coefficients and colour; moments: the gradient's."""
     total = np.zeros(BLOCK_SUMS + 1)
     for e in range(start, stop):
         i = index[e]

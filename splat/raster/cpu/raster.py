@@ -136,7 +136,7 @@ class CpuRaster:
     def gaussian_blocks(
         self, adjoint: "CpuAdjoint", curvature: Float[Tensor, "3 H W"], index: Int[Tensor, " m"], gauss_newton: bool
     ) -> Float64[Tensor, "m 9 9"]:
-        """Own blocks of the splats at index: of the Hessian or of its Gauss-Newton part."""
+        """Diagonal blocks of the splats at index: of the Hessian or of its Gauss-Newton part."""
         (lists, splat_start), found = self.reached, np.empty((len(index), SPLAT, SPLAT))
         sums = aligned((splat_start[-1] * blocks.BLOCK_SUMS,), self.dtype)
         v_planes = torch.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent

@@ -1,4 +1,4 @@
-"""Every splat's own block of the Hessian on the GPU: `raster/cpu/blocks.py`, whose glossary and formulas hold here."""
+"""Every splat's diagonal block of the Hessian, on the GPU: `raster/cpu/blocks.py`, whose glossary and formulas hold here."""
 
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
 # (Triton tells type checkers little of its language)
@@ -107,7 +107,7 @@ def block_sums(u, v, w, free, D, weight, g, h):
 def gaussian_blocks(
     total: Float[Tensor, "m 36"], moments: Float[Tensor, "m 9"], second_order: bool
 ) -> Float64[Tensor, "m 9 9"]:
-    """The own blocks of splats over coefficients and colour, from their sums; moments: the gradient's."""
+    """The diagonal blocks of splats over coefficients and colour, from their sums; moments: the gradient's."""
     index = torch.from_numpy(formulas.BLOCK_INDEX).to(total.device, non_blocking=True)
     blocks = torch.nn.functional.pad(total.double(), (0, 1))[:, index]
     if second_order:

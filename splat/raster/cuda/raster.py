@@ -151,14 +151,14 @@ class CudaRaster:
 
         Its first arguments are those of `backward`, its last the sums.
         """
-        n, own = len(self.splats), self.deterministic
-        sums = self._empty(self.intersections if own else n, vectors, width)
-        where = self.accumulators.place if own else self.lists.splat
+        n, each = len(self.splats), self.deterministic
+        sums = self._empty(self.intersections if each else n, vectors, width)
+        where = self.accumulators.place if each else self.lists.splat
         self._launch(
             kernel, self.lists.start, self._reached, self.lists.splat, where, self.params, self.frame, self._transmittance,
-            self._stop, *arguments, sums if own else sums.zero_(), ATOMIC=not own, **constants,
+            self._stop, *arguments, sums if each else sums.zero_(), ATOMIC=not each, **constants,
         )  # fmt: skip
-        if not own:
+        if not each:
             return sums
         totals = self._empty(n, vectors, width, dtype=torch.float64)
         reduce_sums(self.accumulators.first, self.accumulators.last, sums, totals)
@@ -171,7 +171,7 @@ class CudaRaster:
     def gaussian_blocks(
         self, adjoint: "CudaAdjoint", curvature: Float[Tensor, "3 h w"], index: Int[Tensor, " m"], gauss_newton: bool
     ) -> Float64[Tensor, "m 9 9"]:
-        """Own blocks of the splats at index: of the Hessian or of its Gauss-Newton part."""
+        """Diagonal blocks of the splats at index: of the Hessian or of its Gauss-Newton part."""
         v_planes = torch.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent
         totals = self.totals(blocks.block_moments, 1, blocks.BLOCK_SUMS, v_planes, self.pad(curvature))[:, 0]
         return blocks.gaussian_blocks(totals[index], adjoint.moments[index], not gauss_newton)

@@ -177,7 +177,7 @@ def test_what_a_product_takes_is_free_before_its_result_is_made():
     held.hvp(U)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    cotangents = 8 * 9 * U.shape[1] * len(gaussians)  # of the splats, in float64: what the result is made of
+    cotangents = 4 * 9 * U.shape[1] * len(gaussians)  # of the splats: what the result is made of
     assert result.nbytes + cotangents <= peak <= result.nbytes + 1.5 * cotangents
 
 
