@@ -112,5 +112,5 @@ def _with_every_tile(objective: SceneObjective) -> LinearizedView:
     """The first view with a cotangent that is nowhere 0, if next to it."""
     view = objective.linearize(0)
     cotangent = view._adjoint.cotangent
-    cotangent[cotangent == 0] = np.finfo(cotangent.dtype).tiny
+    cotangent[cotangent == 0] = torch.finfo(cotangent.dtype).tiny
     return view
