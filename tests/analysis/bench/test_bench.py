@@ -24,7 +24,9 @@ from analysis.console.timing import Timing, interleaved
 from figures import bench as figure
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import SceneObjective
-from splat.raster.cpu.tile import SUMS
+from splat.projection.dispatch import plain_gradient
+from splat.raster.formulas import SPLAT
+from tests.splat.raster.compositing_cases import plain_jvp, plain_product
 
 ROOT = Path(__file__).parents[3]
 TINY = Size(60, 40, 24)
@@ -117,9 +119,9 @@ def test_the_stages_of_a_scene_run_and_leave_the_view_as_it_was(bench):
 
 
 def test_pairs_are_the_pixels_of_the_rows_that_are_passed(bench):
-    lists = bench.raster.lists
+    lists, _ = bench.raster.reached
     count = sum((int(r) >> 8 & 255) - (int(r) & 255) + 1 for r in lists.rows)
-    assert bench.linearized.entries == lists.rows.size > 0
+    assert bench.linearized.intersections == lists.rows.size > 0
     assert bench.pairs == count * lanes_of(np.float32)
 
 
@@ -127,8 +129,8 @@ def test_memory_is_that_of_the_arrays(bench):
     view = bench.linearized
     shared = 4 * 3 * view._raster.frame.size  # the image, which the loss holds as a view of the raster's planes
     assert view.bytes - shared <= bench.kept() <= 1.1 * view.bytes
-    for K in (1, 8):  # the sums of the entries, the planes of the tangents
-        least = 4 * K * (SUMS * view.entries + 5 * view._raster.frame.size)
+    for K in (1, 8):  # the sums of the intersections, the planes of the tangents
+        least = 4 * K * (SPLAT * view.intersections + 5 * view._raster.frame.size)
         blocks = 4 * 4 * K * view.gradient.numel()  # the argument, the result and their copies
         objects = 64 * 1024  # Python's own
         assert least <= bench.workspace(K, HostMeter()) <= view.workspace(K) + blocks + objects
