@@ -20,6 +20,7 @@ from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
 from splat.raster.cpu.binning import reached_lists
+from splat.raster.cpu.raster import CpuRaster
 from splat.render.forward import rasterize_view
 
 REPETITIONS = 3
@@ -103,6 +104,7 @@ def _with_every_entry(objective: SceneObjective) -> LinearizedView:
     """The first view with its tile lists as they were before any entry was dropped."""
     view = objective.linearize(0)
     raster = rasterize_view(objective.active, objective.views[0].camera, objective.background, objective.settings)
+    assert isinstance(raster, CpuRaster) and isinstance(view._raster, CpuRaster)  # on a GPU nothing is timed
     per_tile = np.diff(raster.lists.start)
     view._raster.reached = reached_lists(raster.lists, per_tile, len(objective.active))
     return view

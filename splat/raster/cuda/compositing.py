@@ -291,28 +291,28 @@ def tangents_of(tangents, splat, k, stride):
 
 
 @jit
-def any_moved(moved, splat_of, first, count, stride, K: tl.constexpr):
+def any_moved(moved, splat_of, first, count, begin, stride, K: tl.constexpr):
     """Whether any of K tangents moves a splat of a tile; a look at the first few, unless few splats are moved."""
     k, lane = tl.arange(0, K)[:, None], tl.arange(0, 32)[None, :]
     done, found = 0, 0
     while done < count:
         e = done + lane
         splat = tl.load(splat_of + first + e, e < count, other=0).to(tl.int64)
-        some = tl.load(moved + splat * stride + k, e < count, other=0)
+        some = tl.load(moved + splat * stride + begin + k, e < count, other=0)
         found = tl.max(tl.max(some.to(tl.int32), 1), 0)
         done = tl.where(found > 0, count, done + 32)
     return found > 0
 
 
-@sized("stride")
+@sized("begin", "stride")
 def tangent(
-    order, start, reached, splat_of, packed, frame, stop, tangents, moved, planes, transmittances, moves, stride, columns,
-    width, height, K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
+    order, start, reached, splat_of, packed, frame, stop, tangents, moved, planes, transmittances, moves, begin, stride,
+    columns, width, height, K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
 ):  # fmt: skip
     """J u for K tangents: their planes (K, 4, h, w) and the tangents of the final transmittance (K, h, w).
 
-    tangents: the first K of (n, stride, 9); moved: (n, stride), which splats they move; moves: whether they move any in a
-    tile.  Where none, all is 0.
+    tangents: begin, begin + 1, ... of (n, stride, 9); moved: (n, stride), which splats they move; moves: whether they move
+    any in a tile.  Where none, all is 0.
     """
     real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
@@ -325,7 +325,7 @@ def tangent(
     T = tl.full((1, HEIGHT, WIDTH), 1.0, real)
     dT = tl.zeros((K, HEIGHT, WIDTH), real)
     red, green, blue = dT, dT, dT
-    some = any_moved(moved, splat_of, first, count, stride, K)
+    some = any_moved(moved, splat_of, first, count, begin, stride, K)
     tl.store(moves + tile, some.to(tl.int32))
     count = tl.where(some, count, 0)
     following = tl.load(splat_of + first, count > 0, other=0)
@@ -337,7 +337,7 @@ def tangent(
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         w = alpha * T
         T = fma(-alpha, T, T)
-        q, dcolour = tangents_of(tangents, s_index, i, stride)
+        q, dcolour = tangents_of(tangents, s_index, begin + i, stride)
         w_dq = tl.where(uncapped <= tl.load(splat + CAP), w, 0.0) * quadratic(v, along_row(q, u))
         dT, image = step_tangent(dT, (red, green, blue), alpha, w, w_dq, load3(splat, RED), dcolour)
         red, green, blue = image
@@ -347,10 +347,10 @@ def tangent(
     tl.store(transmittances + i * size + p, dT, inside & (i < K))
 
 
-@sized("stride")
+@sized("begin", "stride")
 def backward_tangent(
     order, start, reached, splat_of, accumulators, packed, frame, transmittance, stop, v_planes, tangents, moves,
-    transmittances, dv_planes, stride, sums, columns, width, height,
+    transmittances, dv_planes, begin, stride, sums, columns, width, height,
     K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
 ):  # fmt: skip
     """The nine sums of the tangent of `backward`, K times nine an intersection or, added up, a splat.
@@ -387,7 +387,7 @@ def backward_tangent(
         free = uncapped <= tl.load(splat + CAP)
         colour = load3(splat, RED)
         T, after, w, beta, r, _we = step_back(alpha, T, R, v_pixel, colour)
-        q, dcolour = tangents_of(tangents, s_index, i, stride)
+        q, dcolour = tangents_of(tangents, s_index, begin + i, stride)
         dq = tl.where(free, quadratic(v, along_row(q, u)), 0.0)
         tau, dR, ds, h = step_backward_tangent(
             tau, dR, (dv_pixel[0], dv_pixel[1], dv_pixel[2]), w, beta, r * R, dq, v_pixel, colour, dcolour

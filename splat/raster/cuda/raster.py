@@ -223,8 +223,8 @@ class CudaTangent:
         for part, moves in zip(_parts(K), self._moves, strict=True):
             raster._launch(
                 compositing.tangent, raster.lists.start, raster._reached, raster.lists.splat, raster.params, raster.frame,
-                raster._stop, self._directions[:, part], moved[:, part], self.planes[part], self._transmittances[part],
-                moves, K, K=part.stop - part.start,
+                raster._stop, self._directions, moved, self.planes[part], self._transmittances[part],
+                moves, part.start, K, K=part.stop - part.start,
             )  # fmt: skip
 
     def backward_tangent(self, adjoint: CudaAdjoint, cotangents: Float[Tensor, "k 4 h w"]) -> Float[Tensor, "n k 9"]:
@@ -234,8 +234,8 @@ class CudaTangent:
         for moves, part in zip(self._moves, _parts(K), strict=True):
             size = part.stop - part.start
             totals = raster.totals(
-                compositing.backward_tangent, size, SPLAT, adjoint.cotangent, self._directions[:, part], moves,
-                self._transmittances[part], cotangents[part], K, K=size,
+                compositing.backward_tangent, size, SPLAT, adjoint.cotangent, self._directions, moves,
+                self._transmittances[part], cotangents[part], part.start, K, K=size,
             )  # fmt: skip
             arguments = (self._directions, adjoint.moments, totals, product, n, K, part.start, size)
             launch(packing.reduce_tangents, (*grid(n, BLOCK), size), *arguments, **SPLATS)
