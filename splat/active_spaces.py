@@ -1,8 +1,8 @@
 """What the exact null space of a scene's Hessian leaves, of all attributes together and of each: for `landscape.families`.
 
-Exactly null (`null_space.py`): the lengths of the quaternions, SH directions that no view sees and,
-of Gauss-Newton as a whole, all that no view sees.  In another metric (`metrics.py`) the operator is D P H P D, and what is not
-null is the space of all D P x.
+Exactly null (`null_space.py`): the lengths of the quaternions, SH directions that no view sees (of SH by itself, those too that
+couple to the mean alone) and, of Gauss-Newton as a whole, all that no view sees.  In another metric (`metrics.py`) the operator
+is D P H P D, and what is not null is the space of all D P x.
 """
 
 from collections.abc import Callable
@@ -23,13 +23,13 @@ def active_spaces(hessian: SceneHessian, scale: Float[Tensor, " p"] | None = Non
     """
     if hessian.keep_null:
         return {}
-    exact = SceneHessian(hessian.objective) if hessian.gauss_newton else hessian
-    whole, each = (h.project if scale is None else h.scaled_projector(scale) for h in (hessian, exact))
-    return {WHOLE: ActiveSpace(whole, hessian.rank), **_of_attributes(exact, each)}
+    apart = hessian.apart
+    whole, each = (h.project if scale is None else h.scaled_projector(scale) for h in (hessian, apart))
+    return {WHOLE: ActiveSpace(whole, hessian.rank), **_of_attributes(apart, each)}
 
 
 def _of_attributes(hessian: SceneHessian, project: Callable[[Tensor], Tensor]) -> dict[str, ActiveSpace]:
-    """The Hessian's projector acts on each attribute by itself, and leaves 3 of a quaternion's 4 rows."""
+    """`SceneHessian.apart`'s projector acts on each attribute by itself, and leaves 3 of a quaternion's 4 rows."""
     count = len(hessian.objective.active)
     ranks = {name: rows.stop - rows.start for name, rows in hessian.blocks.items()}
     ranks["quats"] -= count

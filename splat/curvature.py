@@ -24,7 +24,7 @@ from splat.gaussians import Gaussians
 from splat.linearize import LinearizedView, OwnBlocks, rasterize_view, touches
 from splat.loss_functions import loss_against
 from splat.losses import LossSettings
-from splat.null_space import RowSpace, seen_harmonics, seen_parameters
+from splat.null_space import RowSpace, SeenColours, seen_colours, seen_parameters
 from splat.recording import CudaGraphs, Recordings
 from splat.scenes.view import View
 from splat.settings import RenderSettings
@@ -274,51 +274,67 @@ class SceneHessian:
         self.passes, self.spared = 0, 0
 
     @cached_property
-    def _row_space(self) -> RowSpace:
-        n, bands = len(self.objective.active), self.objective.active.sh.shape[1]
+    def _colours(self) -> SeenColours:
+        scene = self.objective
+        views = (view.held for view in scene.linearized)
+        return seen_colours(views, len(scene.views), scene.active, scene.stacked, scene.mean)
+
+    @cached_property
+    def _seen(self) -> RowSpace | SeenColours:
+        if not self.gauss_newton:
+            return self._colours
+        n, bands = self.objective.active.sh.shape[:2]
         held = [view.held for view in self.objective.linearized]
-        seen = seen_parameters if self.gauss_newton else seen_harmonics
-        return seen(held, n, bands, self.objective.stacked)
+        return seen_parameters(held, n, bands, self.objective.stacked)
+
+    @property
+    def apart(self) -> "SceneHessian":
+        """The Hessian, of Gauss-Newton too, with P for each attribute by itself.
+
+        SH's block is flat along what couples SH to positions alone: this is left out too.
+        """
+        apart = SceneHessian(self.objective)
+        apart._seen = self._colours.alone
+        return apart
 
     @property
     def rank(self) -> int:
         """The dimension of what P keeps."""
         if self.keep_null:
             return self.dim
-        seen = int(self._row_space.rank.sum())
-        n = len(self.objective.active)
-        return seen if self.gauss_newton else 10 * n + 3 * seen  # mean 3, log-scales 3, quaternion 3, logit 1
+        seen = int(self._seen.rank.sum())
+        return (
+            seen if self.gauss_newton else 10 * len(self.objective.active) + seen
+        )  # mean, log-scales, quaternion, logit
 
     def project(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """P V."""
         if self.keep_null:
             return V
-        return self._projected(V, self._row_space, self.objective.active.quats)
+        return self._projected(V, self._seen, self.objective.active.quats)
 
     def scaled_projector(self, scale: Float[Tensor, " p"]) -> Callable[[Tensor], Tensor]:
-        """Of D P H P D, D = diag(scale) > 0 and alike for the channels of a colour: the orthogonal projector onto all D P x."""
+        """Of D P H P D, D = diag(scale) > 0: the orthogonal projector onto all D P x."""
         if self.keep_null:
             return self.project
         n, quats = len(self.objective.active), self.objective.active.quats
         parts = {name: scale[rows].view(n, -1) for name, rows in self.blocks.items()}
-        space = self._row_space.scaled(
-            torch.cat([*parts.values()], dim=1) if self.gauss_newton else parts["sh"][:, ::3]
-        )
+        space = self._seen.scaled(torch.cat([*parts.values()], dim=1) if self.gauss_newton else parts["sh"])
         radial = torch.nn.functional.normalize(quats / parts["quats"], dim=1)
         return lambda V: self._projected(V, space, radial)
 
-    def _projected(self, V: Tensor, seen: RowSpace, radial: Tensor) -> Tensor:
-        """What of V is seen; of the Hessian: the part of V in the seen harmonics and at right angles to `radial`."""
+    def _projected(self, V: Tensor, seen: RowSpace | SeenColours, radial: Tensor) -> Tensor:
+        """What of V is seen; of the Hessian: the part of V in the seen colours and at right angles to `radial`."""
         n, K = len(self.objective.active), V.shape[1]
-        if self.gauss_newton:
+        if isinstance(seen, RowSpace):
             parts = [V[rows].reshape(n, -1, K) for rows in self.blocks.values()]
             sizes = [part.shape[1] for part in parts]
             kept = seen.project(torch.cat(parts, dim=1)).split(sizes, dim=1)
             return torch.cat([part.reshape(-1, K) for part in kept])
         V = V.clone()
-        turns, harmonics = V[self.blocks["quats"]].view(n, 4, K), V[self.blocks["sh"]]
+        turns, colours = V[self.blocks["quats"]].view(n, 4, K), V[self.blocks["sh"]]
         turns -= radial[:, :, None] * (radial[:, :, None] * turns).sum(dim=1, keepdim=True)
-        harmonics.copy_(seen.project(harmonics.view(n, -1, 3 * K)).reshape(-1, K))
+        colours.copy_(seen.project(colours.view(n, -1, K)).view(-1, K))
         return V
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:

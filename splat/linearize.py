@@ -158,8 +158,10 @@ class LinearizedView:
 
     @property
     def held(self) -> Held:
-        """The projection's derivatives, Gaussian by Gaussian."""
-        return self._projection.held
+        """The projection's derivatives of the Gaussians that have weight in a pixel; takes a pass over the pixels."""
+        held = self._projection.held
+        seen = native(touches(self._raster))[held.index]
+        return Held(held.index[seen], held.splats, held.opacity_bar, *(part[seen] for part in held[3:]))
 
     @property
     def bytes(self) -> int:

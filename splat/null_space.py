@@ -2,15 +2,24 @@
 
 A Gaussian enters a view only through its splat of nine numbers, so over M views Gauss-Newton sees at most
 min(9 M, 10 + 3 min(M, k)) of its 11 + 3 k parameters (k SH coefficients a channel): with SH degree 3 and three views a third of
-the spectrum is zeros that say nothing.  The row space of all its projections' Jacobians, stacked, is what is left.  The
-Hessian sees more: everything but the SH directions that vanish in all view directions together with their slope in the mean,
-and (by choice, see `curvature.py`) the lengths of the quaternions.
+the spectrum is zeros that say nothing.  The row space of all its projections' Jacobians, stacked, is what is left.
+
+The Hessian sees the whole geometry but, by choice (`SceneHessian`), the lengths of the quaternions.  It sees SH coefficients f
+through colours alone.  With d_m the direction from view m to the mean mu, Y the harmonics, a_mc the loss's derivative in the
+colour, and x any parameter,
+
+    colour_mc      = sum_k f_kc Y_k(d_m) + 1/2
+    d2L / df_kc dx = sum_m Y_k(d_m) da_mc/dx + sum_m a_mc dY_k(d_m)/dx
+
+where a_mc = 0 if view m clamps channel c.  So it sees Y(d_m) of every view that draws the Gaussian and does not clamp the
+channel and, over the channels together, three slopes sum_m a_mc dY_k(d_m)/dmu_j.  They couple SH to the mean alone: the block
+of SH by itself is flat along what they have at right angles to the harmonics.
 
 A basis is found per Gaussian by a small singular value decomposition of its rows, each scaled to unit length; directions
-whose singular value is beneath TOLERANCE of the largest are null.
+whose singular value is beneath TOLERANCE of the largest are null.  Slopes are compared with what they are sums of.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,6 +27,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from splat.gaussians import Gaussians
 from splat.projection_linear import GEOMETRY, Held
 from splat.raster.threads import over_batch
 
@@ -46,16 +56,68 @@ class RowSpace:
 
     def scaled(self, scale: Float[Tensor, "n d"]) -> "RowSpace":
         """The space of all D x, D = diag(scale) > 0 and x in this space."""
-        rows = (self.basis.double() * scale[:, None].double()).cpu()  # CUDA forms one Q after the other
-        directions = torch.empty_like(rows)
+        return _orthonormal(self.basis * scale[:, None], self.rank)
 
-        def decompose(first: int, last: int) -> None:
-            directions[first:last] = torch.linalg.qr(rows[first:last].mT).Q.mT
 
-        over_batch(len(rows), decompose, rows.device)
-        # the padding is at the end
-        held = torch.arange(self.basis.shape[1], device=self.basis.device) < self.rank[:, None]
-        return RowSpace(torch.where(held[:, :, None], directions.to(self.basis), 0.0), self.rank)
+def _orthonormal(rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSpace:
+    """The space of rows that are independent of each other, followed by padding."""
+    matrices = rows.mT.double().cpu()  # CUDA forms one Q after the other
+    directions = torch.empty_like(matrices.mT, memory_format=torch.contiguous_format)
+
+    def decompose(first: int, last: int) -> None:
+        directions[first:last] = torch.linalg.qr(matrices[first:last]).Q.mT
+
+    over_batch(len(rows), decompose, matrices.device)
+    held = torch.arange(rows.shape[1], device=rows.device) < rank[:, None]
+    return RowSpace(torch.where(held[:, :, None], directions.to(rows), 0.0), rank)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenColours:
+    """What the Hessian sees of the SH coefficients: of each channel by itself, and at right angles to it over all channels.
+
+    channels: the harmonics, one space a channel (rows of k); slopes: what they add, rows of k x 3, zero-padded.
+    """
+
+    channels: tuple[RowSpace, ...]
+    slopes: RowSpace
+
+    @property
+    def rank(self) -> Int[Tensor, " n"]:
+        """Of every Gaussian."""
+        return sum((space.rank for space in self.channels), self.slopes.rank)
+
+    @property
+    def alone(self) -> "SeenColours":
+        """What the block of SH by itself sees."""
+        return SeenColours(self.channels, RowSpace(self.slopes.basis[:, :0], torch.zeros_like(self.slopes.rank)))
+
+    def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
+        """x without its null components."""
+        return _in_channels(self.channels, x) + self.slopes.basis.mT @ (self.slopes.basis @ x)
+
+    def scaled(self, scale: Float[Tensor, "n d"]) -> "SeenColours":
+        """The space of all D x, D = diag(scale) > 0 and x in this space."""
+        channels = tuple(space.scaled(scale[:, c::3]) for c, space in enumerate(self.channels))
+        return SeenColours(channels, _beyond(channels, self.slopes.basis * scale[:, None], self.slopes.rank))
+
+
+def _in_channels(channels: Sequence[RowSpace], x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
+    """The part of x in the channels' spaces."""
+    n, d, K = x.shape
+    parts = x.view(n, d // 3, 3, K).unbind(dim=2)
+    return torch.stack([space.project(part) for space, part in zip(channels, parts, strict=True)], dim=2).view_as(x)
+
+
+def _across(channels: Sequence[RowSpace], rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n r d"]:
+    """The part of rows at right angles to the channels' spaces."""
+    return rows - _in_channels(channels, rows.mT.contiguous()).mT
+
+
+def _beyond(channels: Sequence[RowSpace], rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSpace:
+    """What these rows, of a rank, add to the channels' spaces; what rounding leaves of those goes in the second go."""
+    once = _orthonormal(_across(channels, rows), rank)
+    return _orthonormal(_across(channels, once.basis), rank)
 
 
 Stacked = Callable[[Tensor], Tensor]
@@ -65,27 +127,54 @@ def _alone(rows: Tensor) -> Tensor:
     return rows
 
 
-def seen_harmonics(views: Sequence[Held], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
-    """The SH directions (k of one channel; the three are alike) in which the Hessian can be non-zero.
+def seen_colours(
+    views: Iterable[Held], count: int, gaussians: Gaussians, stacked: Stacked = _alone, summed: Stacked = _alone
+) -> SeenColours:
+    """The directions of SH coefficients in which the Hessian can be non-zero; count: of these views.
 
-    stacked: completes the rows of these views to those of all views, where other processes hold some.
+    stacked, summed: complete the rows of these views, and what is summed over them (up to a factor), to those of all views,
+    where other processes hold some.
     """
-    rows = _like(views).new_zeros(n, 4 * len(views), bands, dtype=torch.float64)
+    like, (n, bands) = gaussians.flat, gaussians.sh.shape[:2]
+    rows = like.new_zeros(n, count, bands + 3)  # harmonics, and which channels are not clamped
+    slopes, sizes = like.new_zeros(n, 3, 3 * bands), like.new_zeros(n)
     for m, held in enumerate(views):
-        index = torch.as_tensor(held.index)
-        rows[index, 4 * m] = torch.as_tensor(held.harmonic[:, :bands]).double()
-        rows[index, 4 * m + 1 : 4 * m + 4] = torch.as_tensor(held.slope[:, :bands]).double().mT
-    return _row_space(stacked(rows), _like(views).dtype)
+        index, harmonic, slope = (torch.as_tensor(part) for part in (held.index, held.harmonic, held.slope))
+        bar, visible = (torch.as_tensor(part) for part in (held.colour_bar, held.visible))
+        rows[index, m] = torch.cat([harmonic[:, :bands], visible], dim=1)
+        bent = torch.einsum("ekj,ec->ejkc", slope[:, :bands], bar).flatten(2)
+        slopes[index] += bent
+        sizes[index] += bent.flatten(1).norm(dim=1)
+    rows, slopes, sizes = (x.split(CHUNK) for x in (stacked(rows), summed(slopes), summed(sizes)))
+    parts = [_colours_of(*some, TOLERANCE[like.dtype]) for some in zip(rows, slopes, sizes, strict=True)]
+    channels = tuple(_joined([part.channels[c] for part in parts], like.dtype) for c in range(3))
+    return SeenColours(channels, _joined([part.slopes for part in parts], like.dtype))
+
+
+def _colours_of(
+    rows: Float[Tensor, "n m _"], slopes: Float[Tensor, "n 3 d"], sizes: Float[Tensor, " n"], tolerance: float
+) -> SeenColours:
+    """Of some Gaussians, in double precision."""
+    harmonics, visible = rows[:, :, :-3].double(), rows[:, :, -3:].double()
+    channels = tuple(_row_space(harmonics * visible[:, :, c, None], tolerance) for c in range(3))
+    added = _spanned(_across(channels, slopes.double()), sizes.double(), tolerance)
+    return SeenColours(channels, _beyond(channels, added.basis, added.rank))
 
 
 def seen_parameters(views: Sequence[Held], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
     """The directions of a Gaussian's parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
+    dtype = _like(views).dtype
     parts = [
-        _row_space(stacked(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), _like(views).dtype)
+        _row_space(stacked(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), TOLERANCE[dtype])
         for start in range(0, n, CHUNK)
     ]
+    return _joined(parts, dtype)
+
+
+def _joined(parts: Sequence[RowSpace], dtype: torch.dtype) -> RowSpace:
+    """Those of all Gaussians, given those of some at a time."""
     width = max(part.basis.shape[1] for part in parts)
-    padded = [torch.nn.functional.pad(part.basis, (0, 0, 0, width - part.basis.shape[1])) for part in parts]
+    padded = [torch.nn.functional.pad(part.basis.to(dtype), (0, 0, 0, width - part.basis.shape[1])) for part in parts]
     return RowSpace(torch.cat(padded), torch.cat([part.rank for part in parts]))
 
 
@@ -114,14 +203,17 @@ def _jacobian_rows(views: Sequence[Held], start: int, stop: int, bands: int) -> 
     return rows
 
 
-def _row_space(rows: Float[Tensor, "n r d"], dtype: torch.dtype) -> RowSpace:
-    """An orthonormal basis of each Gaussian's rows: the leading right singular vectors."""
-    rows = rows / rows.norm(dim=2, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny)
+def _row_space(rows: Float[Tensor, "n r d"], tolerance: float) -> RowSpace:
+    """An orthonormal basis of each Gaussian's rows, whatever their lengths."""
+    return _spanned(rows / rows.norm(dim=2, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny), None, tolerance)
+
+
+def _spanned(rows: Float[Tensor, "n r d"], sizes: Float[Tensor, " n"] | None, tolerance: float) -> RowSpace:
+    """The leading right singular vectors: of values above tolerance of sizes, by default of the largest."""
     values, basis = _singular(rows)
-    kept = (values > TOLERANCE[dtype] * values[:, :1]) & (values > 0)
-    basis = torch.where(kept[:, :, None], basis, torch.zeros_like(basis))
+    kept = (values > tolerance * (values[:, :1] if sizes is None else sizes[:, None])) & (values > 0)
     rank = kept.sum(dim=1)
-    return RowSpace(basis[:, : int(rank.max())].to(dtype), rank)
+    return RowSpace(torch.where(kept[:, :, None], basis, 0.0)[:, : int(rank.max())], rank)
 
 
 def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m d"]]:
