@@ -24,7 +24,7 @@ from splat.gaussians import Gaussians
 from splat.linearize import LinearizedView, OwnBlocks, rasterize_view, touches
 from splat.loss_functions import loss_against
 from splat.losses import LossSettings
-from splat.null_space import RowSpace, SeenColours, seen_colours, seen_parameters
+from splat.null_space import RowSpace, seen_colours, seen_parameters
 from splat.recording import CudaGraphs, Recordings
 from splat.scenes.view import View
 from splat.settings import RenderSettings
@@ -274,27 +274,25 @@ class SceneHessian:
         self.passes, self.spared = 0, 0
 
     @cached_property
-    def _colours(self) -> SeenColours:
+    def _seen(self) -> RowSpace:
+        if not self.gauss_newton:
+            return self._colours()
+        n, bands = self.objective.active.sh.shape[:2]
+        return seen_parameters([view.held for view in self.objective.linearized], n, bands, self.objective.stacked)
+
+    def _colours(self, *, apart: bool = False) -> RowSpace:
         scene = self.objective
         views = (view.held for view in scene.linearized)
-        return seen_colours(views, len(scene.views), scene.active, scene.stacked, scene.mean)
-
-    @cached_property
-    def _seen(self) -> RowSpace | SeenColours:
-        if not self.gauss_newton:
-            return self._colours
-        n, bands = self.objective.active.sh.shape[:2]
-        held = [view.held for view in self.objective.linearized]
-        return seen_parameters(held, n, bands, self.objective.stacked)
+        return seen_colours(views, len(scene.views), scene.active, scene.stacked, scene.mean, apart=apart)
 
     @property
     def apart(self) -> "SceneHessian":
-        """The Hessian, of Gauss-Newton too, with P for each attribute by itself.
+        """The Hessian, of Gauss-Newton too, with P for each attribute by itself: with the same blocks on its diagonal.
 
-        SH's block is flat along what couples SH to positions alone: this is left out too.
+        SH's block is flat along what couples SH to positions alone, which P leaves out here.
         """
         apart = SceneHessian(self.objective)
-        apart._seen = self._colours.alone
+        apart._seen = self._colours(apart=True)
         return apart
 
     @property
@@ -323,10 +321,10 @@ class SceneHessian:
         radial = torch.nn.functional.normalize(quats / parts["quats"], dim=1)
         return lambda V: self._projected(V, space, radial)
 
-    def _projected(self, V: Tensor, seen: RowSpace | SeenColours, radial: Tensor) -> Tensor:
+    def _projected(self, V: Tensor, seen: RowSpace, radial: Tensor) -> Tensor:
         """What of V is seen; of the Hessian: the part of V in the seen colours and at right angles to `radial`."""
         n, K = len(self.objective.active), V.shape[1]
-        if isinstance(seen, RowSpace):
+        if self.gauss_newton:
             parts = [V[rows].reshape(n, -1, K) for rows in self.blocks.values()]
             sizes = [part.shape[1] for part in parts]
             kept = seen.project(torch.cat(parts, dim=1)).split(sizes, dim=1)

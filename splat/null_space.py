@@ -44,14 +44,20 @@ class RowSpace:
     rank: Int[Tensor, " n"]
 
     @cached_property
-    def _partial(self) -> tuple[Int[Tensor, " m"], Float[Tensor, "m r d"]]:
-        """The Gaussians that have null components, and their bases: with low SH degrees few have any."""
-        index = torch.nonzero(self.rank < self.basis.shape[2])[:, 0]
-        return index, self.basis[index]
+    def _partial(self) -> Int[Tensor, " m"]:
+        """The Gaussians that have null components: with low SH degrees or many views few have any."""
+        return torch.nonzero(self.rank < self.basis.shape[2])[:, 0]
+
+    @cached_property
+    def _basis(self) -> Float[Tensor, "m r d"]:
+        """Theirs."""
+        return self.basis if len(self._partial) == len(self.basis) else self.basis[self._partial]
 
     def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         """x without its null components."""
-        index, basis = self._partial
+        basis, index = self._basis, self._partial
+        if basis is self.basis:
+            return basis.mT @ (basis @ x)
         return x.index_copy(0, index, basis.mT @ (basis @ x[index]))
 
     def scaled(self, scale: Float[Tensor, "n d"]) -> "RowSpace":
@@ -72,54 +78,6 @@ def _orthonormal(rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSp
     return RowSpace(torch.where(held[:, :, None], directions.to(rows), 0.0), rank)
 
 
-@dataclass(frozen=True, eq=False)
-class SeenColours:
-    """What the Hessian sees of the SH coefficients: of each channel by itself, and at right angles to it over all channels.
-
-    channels: the harmonics, one space a channel (rows of k); slopes: what they add, rows of k x 3, zero-padded.
-    """
-
-    channels: tuple[RowSpace, ...]
-    slopes: RowSpace
-
-    @property
-    def rank(self) -> Int[Tensor, " n"]:
-        """Of every Gaussian."""
-        return sum((space.rank for space in self.channels), self.slopes.rank)
-
-    @property
-    def alone(self) -> "SeenColours":
-        """What the block of SH by itself sees."""
-        return SeenColours(self.channels, RowSpace(self.slopes.basis[:, :0], torch.zeros_like(self.slopes.rank)))
-
-    def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
-        """x without its null components."""
-        return _in_channels(self.channels, x) + self.slopes.basis.mT @ (self.slopes.basis @ x)
-
-    def scaled(self, scale: Float[Tensor, "n d"]) -> "SeenColours":
-        """The space of all D x, D = diag(scale) > 0 and x in this space."""
-        channels = tuple(space.scaled(scale[:, c::3]) for c, space in enumerate(self.channels))
-        return SeenColours(channels, _beyond(channels, self.slopes.basis * scale[:, None], self.slopes.rank))
-
-
-def _in_channels(channels: Sequence[RowSpace], x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
-    """The part of x in the channels' spaces."""
-    n, d, K = x.shape
-    parts = x.view(n, d // 3, 3, K).unbind(dim=2)
-    return torch.stack([space.project(part) for space, part in zip(channels, parts, strict=True)], dim=2).view_as(x)
-
-
-def _across(channels: Sequence[RowSpace], rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n r d"]:
-    """The part of rows at right angles to the channels' spaces."""
-    return rows - _in_channels(channels, rows.mT.contiguous()).mT
-
-
-def _beyond(channels: Sequence[RowSpace], rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSpace:
-    """What these rows, of a rank, add to the channels' spaces; what rounding leaves of those goes in the second go."""
-    once = _orthonormal(_across(channels, rows), rank)
-    return _orthonormal(_across(channels, once.basis), rank)
-
-
 Stacked = Callable[[Tensor], Tensor]
 
 
@@ -128,12 +86,18 @@ def _alone(rows: Tensor) -> Tensor:
 
 
 def seen_colours(
-    views: Iterable[Held], count: int, gaussians: Gaussians, stacked: Stacked = _alone, summed: Stacked = _alone
-) -> SeenColours:
-    """The directions of SH coefficients in which the Hessian can be non-zero; count: of these views.
+    views: Iterable[Held],
+    count: int,
+    gaussians: Gaussians,
+    stacked: Stacked = _alone,
+    summed: Stacked = _alone,
+    *,
+    apart: bool = False,
+) -> RowSpace:
+    """The directions of a Gaussian's SH coefficients in which the Hessian can be non-zero; count: of these views.
 
     stacked, summed: complete the rows of these views, and what is summed over them (up to a factor), to those of all views,
-    where other processes hold some.
+    where other processes hold some.  apart: of the block of SH by itself, without the slopes.
     """
     like, (n, bands) = gaussians.flat, gaussians.sh.shape[:2]
     rows = like.new_zeros(n, count, bands + 3)  # harmonics, and which channels are not clamped
@@ -145,20 +109,39 @@ def seen_colours(
         bent = torch.einsum("ekj,ec->ejkc", slope[:, :bands], bar).flatten(2)
         slopes[index] += bent
         sizes[index] += bent.flatten(1).norm(dim=1)
-    rows, slopes, sizes = (x.split(CHUNK) for x in (stacked(rows), summed(slopes), summed(sizes)))
-    parts = [_colours_of(*some, TOLERANCE[like.dtype]) for some in zip(rows, slopes, sizes, strict=True)]
-    channels = tuple(_joined([part.channels[c] for part in parts], like.dtype) for c in range(3))
-    return SeenColours(channels, _joined([part.slopes for part in parts], like.dtype))
+    rows, slopes, sizes = stacked(rows), summed(slopes)[:, : 0 if apart else 3], summed(sizes)
+
+    def part(start: int) -> RowSpace:
+        some = slice(start, start + CHUNK)
+        return _colours_of(rows[some].double(), slopes[some].double(), sizes[some].double(), TOLERANCE[like.dtype])
+
+    return _joined([part(start) for start in range(0, n, CHUNK)], like.dtype)
 
 
 def _colours_of(
-    rows: Float[Tensor, "n m _"], slopes: Float[Tensor, "n 3 d"], sizes: Float[Tensor, " n"], tolerance: float
-) -> SeenColours:
-    """Of some Gaussians, in double precision."""
-    harmonics, visible = rows[:, :, :-3].double(), rows[:, :, -3:].double()
-    channels = tuple(_row_space(harmonics * visible[:, :, c, None], tolerance) for c in range(3))
-    added = _spanned(_across(channels, slopes.double()), sizes.double(), tolerance)
-    return SeenColours(channels, _beyond(channels, added.basis, added.rank))
+    rows: Float[Tensor, "n m _"], slopes: Float[Tensor, "n s d"], sizes: Float[Tensor, " n"], tolerance: float
+) -> RowSpace:
+    """Of some Gaussians: the harmonics of each channel, and what the slopes add to them."""
+    harmonics, visible = rows[:, :, :-3], rows[:, :, -3:]
+    channels = [_row_space(harmonics * visible[:, :, c, None], tolerance) for c in range(3)]
+    added = _spanned(_across(channels, slopes), sizes, tolerance)
+    for _ in range(2):  # what rounding leaves of the harmonics goes in the second go
+        added = _orthonormal(_across(channels, added.basis), added.rank)
+    bases = [added.basis]
+    for c, space in enumerate(channels):
+        wide = slopes.new_zeros(*space.basis.shape[:2], slopes.shape[2])
+        wide[:, :, c::3] = space.basis
+        bases.append(wide)
+    basis = torch.cat(bases, dim=1)
+    padding = (basis == 0).all(dim=2).int()
+    order, rank = padding.argsort(dim=1, stable=True), basis.shape[1] - padding.sum(dim=1)
+    return RowSpace(basis.gather(1, order[:, : int(rank.max()), None].expand(-1, -1, basis.shape[2])), rank)
+
+
+def _across(channels: Sequence[RowSpace], rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n r d"]:
+    """The part of rows at right angles to the channels' spaces."""
+    kept = [space.project(rows[:, :, c::3].mT).mT for c, space in enumerate(channels)]
+    return rows - torch.stack(kept, dim=3).flatten(2)
 
 
 def seen_parameters(views: Sequence[Held], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
