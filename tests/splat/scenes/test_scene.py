@@ -4,15 +4,15 @@ import shutil
 from math import cos, pi, sin
 from pathlib import Path
 
-import folders
 import pytest
 import torch
-from folders import NAMES
 
-from splat.camera import Camera
-from splat.scenes.capture import forward_facing
+from splat.model.camera import Camera
+from splat.model.capture import forward_facing
 from splat.scenes.scene import Scene, camera_extent, load_scene
 from splat.scenes.view import Frame
+from tests.splat.scenes import folders
+from tests.splat.scenes.folders import NAMES
 
 
 def scene_of(cameras: list[Camera]) -> Scene:
