@@ -86,10 +86,7 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> Non
     if not sure.all():
         hidden: dict[str, Any] = {"fmt": "none", "ecolor": "0.8", "elinewidth": 1.2, "label": "hidden by round-off"}
         axes.errorbar(steps[~sure], values[~sure], bounds[~sure], **hidden)
-    for where, face, label in (
-        (~crossed, BLUE, "finite steps"),
-        (crossed, "white", "finite steps, order changed"),
-    ):
+    for where, face, label in ((~crossed, BLUE, "finite steps"), (crossed, "white", "finite steps, order changed")):
         if (where & sure).any():
             drawn: dict[str, Any] = {"color": BLUE, "markerfacecolor": face, "markersize": 3.5, "elinewidth": 0.8}
             axes.errorbar(*(each[where & sure] for each in (steps, values, bounds)), fmt="o", label=label, **drawn)

@@ -42,7 +42,7 @@ def unit_columns(vectors: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     return vectors / lengths.to(vectors.dtype)
 
 
-def is_dust(length: float, scale: float, dtype: torch.dtype) -> bool:
+def is_roundoff(length: float, scale: float, dtype: torch.dtype) -> bool:
     """Whether a remainder this long is the round-off of orthogonalising vectors of length `scale`."""
     return length <= 10 * torch.finfo(dtype).eps * scale
 

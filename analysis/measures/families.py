@@ -37,7 +37,7 @@ from landscape.results import Progress, finite_or_none
 from landscape.spectrum.families import WHOLE, Lead
 from landscape.traces.trace import total_trace
 from splat.curvature.active_spaces import active_spaces
-from splat.curvature.block_eigenvectors import OwnDirections
+from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
@@ -274,10 +274,10 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnd
     if name == WHOLE and ends is not None:
         return Lead(torch.cat([ends.largest.vectors[:, :1], ends.smallest.vectors[:, :1]], dim=1))
     objective = hessian.objective
-    own, pixelwise = objective.own_blocks
+    own, pixelwise = objective.gaussian_blocks
     if hessian.gauss_newton:
         own = objective.pixelwise_blocks
-    known = OwnDirections(objective, own, pixelwise, None if name == WHOLE else name, scale)
+    known = BlockEigenvectors(objective, own, pixelwise, None if name == WHOLE else name, scale)
     if hessian.gauss_newton or name == "means":
         return Lead(known.steepest(1, 0))
     return Lead(known.leads())

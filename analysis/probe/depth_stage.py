@@ -32,11 +32,7 @@ class DepthFindings:
 
 
 def measure_depth(
-    objective: SceneObjective,
-    traces: TraceSettings,
-    steps: tuple[float, ...],
-    render: float,
-    share: Share,
+    objective: SceneObjective, traces: TraceSettings, steps: tuple[float, ...], render: float, share: Share
 ) -> DepthFindings:
     """render: seconds, of all views.  steps: px, of the rises."""
     end = monotonic() + share.seconds

@@ -61,7 +61,7 @@ from landscape.spectrum.density import ActiveSpace
 from landscape.traces.trace import total_trace
 from splat.backend.cpu.threads import single_threaded, thread_count
 from splat.backend.device import by_triton
-from splat.curvature.block_eigenvectors import OwnDirections
+from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
@@ -185,7 +185,7 @@ def measure(
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
         gradient = _linearised_gradient(objective, report)
-        own = objective.own_blocks
+        own = objective.gaussian_blocks
         value, render = _rendered(objective)
     with stage("checks") as report:
         operator_check = check_operator(operator, split(generator), settings.checked_vectors)
@@ -195,7 +195,7 @@ def measure(
         allowed = replace(settings.traces, max_seconds=share.seconds)
         traces = exact_traces(objective, share.generator, allowed, share.report, samples=settings.trace_samples)
     with budget.stage("eigenvalues") as share:
-        eigen, start = _search(operator, settings, share), OwnDirections(objective, *own).leads()
+        eigen, start = _search(operator, settings, share), BlockEigenvectors(objective, *own).leads()
         timed = CountingOperator(operator)
         ends = extreme_eigenpairs(timed, share.generator, eigen, start, share.report)
     power = density = finite = depth = None

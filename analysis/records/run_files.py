@@ -37,7 +37,7 @@ def read_scores(run: Path) -> dict[str, Any]:
 
 
 def read_seconds(run: Path) -> dict[str, Any]:
-    """`seconds.json` of a run, see `analysis/train/spent.py`."""
+    """`seconds.json` of a run, see `analysis/train/training_time.py`."""
     found = _read(run / SECONDS, _SECONDS, "the seconds of a training", _FORGET)
     return {key: found.get(key) for key in _SECONDS}
 

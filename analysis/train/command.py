@@ -2,7 +2,7 @@
 
 RUN/checkpoint.pt   the latest checkpoint, see `splat/training/checkpoint.py`; written at the start, every so many steps, on
                     Ctrl-C and at the end
-RUN/seconds.json    how long that took, see `analysis/train/spent.py`
+RUN/seconds.json    how long that took, see `analysis/train/training_time.py`
 RUN/history.csv     what the method noted along the way, a row each with its "step"; where there is any
 RUN/trajectory.csv, RUN/start/checkpoint.pt     with --probe-every: the landscape along the way, see
 `analysis/train/trajectory.py`
@@ -37,7 +37,7 @@ from analysis.console.options import TrainOptions
 from analysis.console.overrides import assignments, leaves, overridden
 from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
-from analysis.train.spent import Spent
+from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
 from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
@@ -223,7 +223,7 @@ def _follow(
     console: Console,
 ) -> bool:
     """Train to the end with a progress bar and checkpoints; False where a signal ended it, after a checkpoint."""
-    total, spent = training.config.iterations, Spent.read(path.parent)
+    total, spent = training.config.iterations, TrainingTime.read(path.parent)
     warned = (trajectory.skipped or trajectory.hopeless) if trajectory else ""
     with interruption() as interrupted, _progress(console) as progress:
         bar = progress.add_task("training", total=total, completed=training.step, loss=math.nan, gaussians=0)
@@ -294,7 +294,7 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
         "gaussians": len(training.gaussians),
         "train": _scores(seen),
         "test": _scores(tested) if tested else None,
-        "seconds": asdict(Spent.read(out)),
+        "seconds": asdict(TrainingTime.read(out)),
         "provenance": provenance(config.seed, checkpoint=str(out / CHECKPOINT)),
     }
     write_atomically(out / METRICS, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())

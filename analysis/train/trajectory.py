@@ -60,7 +60,7 @@ from landscape.spectrum.anisotropy import Anisotropy
 from landscape.spectrum.density import ActiveSpace
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import total_trace
-from splat.curvature.block_eigenvectors import OwnDirections
+from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
@@ -201,10 +201,7 @@ class Trajectory:
 
 
 def measure(
-    objective: SceneObjective,
-    generator: torch.Generator,
-    settings: TrajectorySettings,
-    seconds: float = inf,
+    objective: SceneObjective, generator: torch.Generator, settings: TrajectorySettings, seconds: float = inf
 ) -> Found:
     """One record, in about so many seconds, counted from the call."""
     began, streams = perf_counter(), [split(generator) for _ in range(3)]
@@ -216,7 +213,7 @@ def measure(
     operator = CountingOperator(hessian)
     traces = exact_traces(objective, streams[0], replace(settings.traces, max_seconds=max(left() / 2, 0.0)))
     fixed = perf_counter() - began
-    leads = OwnDirections(objective, *objective.own_blocks).leads()
+    leads = BlockEigenvectors(objective, *objective.gaussian_blocks).leads()
     ends = extreme_eigenpairs(operator, streams[1], replace(settings.eigen, max_seconds=max(left(), 0.0)), leads)
     least = fixed + FEWEST_MATVECS * operator.seconds / operator.matvecs
     short = [f"trace of {name}" for name, trace in traces.items() if trace.reason == "time budget"]

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from landscape.eigen.pairs import EigenEnds, Eigenpairs
 from landscape.eigen.ritz import EigenSettings, Goal, Ritz, rayleigh, recombine, turned
-from landscape.linalg import is_dust, norm, orthogonalise, unit_columns
+from landscape.linalg import is_roundoff, norm, orthogonalise, unit_columns
 from landscape.operators.checks import SCALE
 from landscape.operators.operator import SymmetricOperator, product, require_finite
 from landscape.probes import draw_probes
@@ -174,7 +174,7 @@ class Krylov:
             if length < max(before, self.scale) / 10:  # cancellation brought the round-off of earlier passes forward
                 orthogonalise(w[None], self.basis[: self.size + self.width])
                 length = norm(w)
-            if is_dust(length, self.scale, w.dtype):
+            if is_roundoff(length, self.scale, w.dtype):
                 self._exhausted = True
                 w.normal_(generator=self.generator)
                 orthogonalise(w[None], self.basis[: self.size + self.width])

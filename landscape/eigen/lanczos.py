@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.linalg import is_dust, norm, orthogonalise, unit_columns
+from landscape.linalg import is_roundoff, norm, orthogonalise, unit_columns
 from landscape.operators.operator import SymmetricOperator, product, require_finite
 from landscape.results import Progress
 
@@ -71,7 +71,7 @@ def lanczos(
             size = max(scale, length)
             T[i, j, j] = orthogonalise(w, basis[i, : j + 1])[j, 0]
             sizes[i], lengths[i] = j + 1, norm(w)
-            if is_dust(lengths[i], max(size, float(T[i].abs().max())), operator.dtype):
+            if is_roundoff(lengths[i], max(size, float(T[i].abs().max())), operator.dtype):
                 running.remove(i)
                 lengths[i] = 0.0
             remainders[i] = w[0] / (lengths[i] or 1.0)

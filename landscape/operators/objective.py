@@ -35,10 +35,7 @@ class ObjectiveHessian:
     """
 
     def __init__(
-        self,
-        loss: Callable[[Tensor], Tensor],
-        point: Float[Tensor, " n"],
-        blocks: Mapping[str, slice] | None = None,
+        self, loss: Callable[[Tensor], Tensor], point: Float[Tensor, " n"], blocks: Mapping[str, slice] | None = None
     ) -> None:
         if point.ndim != 1 or not point.is_floating_point():
             raise ValueError(

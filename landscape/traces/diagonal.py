@@ -158,11 +158,7 @@ def _pays(samples: Float64[Tensor, "n k"], kept: list[tuple[Tensor, Tensor]]) ->
 
 
 def _sketched(
-    operator: SymmetricOperator,
-    kept: list[tuple[Tensor, Tensor]],
-    batch: int,
-    most: int,
-    progress: Progress | None,
+    operator: SymmetricOperator, kept: list[tuple[Tensor, Tensor]], batch: int, most: int, progress: Progress | None
 ) -> DiagonalEstimate:
     """With the products of the sketch's own directions."""
     Z, Y = (torch.cat(parts, dim=1) for parts in zip(*kept, strict=True))

@@ -106,7 +106,7 @@ class TraceSettings:
         return asked and (high - low) / 2 <= max(self.rtol * abs(value), self.atol)
 
 
-class Looks:
+class StoppingRule:
     """When an adaptive run looks at its error, and whether it may then stop.  next: the number of probes at the next look."""
 
     def __init__(self, first: int, most: int, confirmation: int = CONFIRMATION) -> None:
@@ -152,7 +152,7 @@ class Hutchinson:
         self, done_before: int = 0, most: int = 0, progress: Progress | None = None
     ) -> dict[str, TraceEstimate]:
         """Progress counts matvecs, from done_before to most."""
-        settings, probes, looks = self.settings, 0, Looks(self.first_look, self.settings.max_probes)
+        settings, probes, looks = self.settings, 0, StoppingRule(self.first_look, self.settings.max_probes)
         if self.operator.dim == 0 or self.part is self.operator:
             return self._exact()
         while True:

@@ -47,12 +47,12 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.linalg import column_dots, gram, is_dust, norm
+from landscape.linalg import column_dots, gram, is_roundoff, norm
 from landscape.operators.operator import ProjectedOperator, SymmetricOperator, product
 from landscape.probes import draw_probes
 from landscape.results import StopReason, t_quantile
 from landscape.traces.estimate import TraceEstimate
-from landscape.traces.hutchinson import LEAST, Hutchinson, Looks, TraceSettings
+from landscape.traces.hutchinson import LEAST, Hutchinson, StoppingRule, TraceSettings
 
 EPS = torch.finfo(torch.float64).eps
 GIB = 2**30
@@ -109,7 +109,7 @@ def xtrace(
     count = max(settings.min_probes, settings.least) // 2 if start is None else start[0].shape[1]
     empty = torch.empty(n, 0, dtype=operator.dtype, device=generator.device if start is None else start[0].device)
     Omega, Y, Q, HQ = (empty,) * 4
-    looks = Looks(count, most, CONFIRMATION)
+    looks = StoppingRule(count, most, CONFIRMATION)
     while True:
         Z = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, kind) if start is None else start[0]
         HZ = _products(operator, Z, settings) if start is None else start[1]
@@ -144,7 +144,7 @@ def added_directions(Q: Float[Tensor, "n r"], Y: Float[Tensor, "n s"]) -> Float[
     basis, R = torch.linalg.qr(rest)
     U, sigma, _ = torch.linalg.svd(R.double())
     scale = max(norm(y) for y in Y.T)
-    return basis @ U[:, [not is_dust(float(x), scale, Y.dtype) for x in sigma]].to(basis.dtype)
+    return basis @ U[:, [not is_roundoff(float(x), scale, Y.dtype) for x in sigma]].to(basis.dtype)
 
 
 def _error(samples: Tensor, without: Tensor) -> float:

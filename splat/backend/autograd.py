@@ -28,6 +28,6 @@ def last_derivative(values: tuple[Tensor, ...], *sources: Tensor, refusal: str =
     return _Last.apply(refusal, len(values), *values, *sources)  # pyright: ignore[reportReturnType]
 
 
-def native(tensor: Tensor) -> Any:
+def to_backend(tensor: Tensor) -> Any:
     """A tensor as the kernels where it is take it: as an array on the CPU."""
     return tensor.detach() if by_triton(tensor) else tensor.detach().numpy()

@@ -1,7 +1,7 @@
 """Eigenvectors of the Hessian's blocks of single Gaussians: where the search for the ends of the spectrum begins.
 
 Steep eigenvectors of a scene live on one or two Gaussians, and the block of a Gaussian's own rows, but for its colours, is
-known exactly (`linearize.OwnBlocks`).  Their eigenvectors, at right angles to the quaternions' lengths as in
+known exactly (`linearize.PerGaussianBlocks`).  Their eigenvectors, at right angles to the quaternions' lengths as in
 `curvature.SceneHessian`, are where to begin.
 
 Where the loss couples pixels, its curvature l'' is known pixel by pixel only, which is too much: SSIM does not care for what
@@ -34,7 +34,7 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from splat.backend.cpu.threads import over_batch
-from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, OwnBlocks
+from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, PerGaussianBlocks
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import SIGMA
 from splat.model.camera import Camera
@@ -50,7 +50,7 @@ BOUND_SLACK = 1e-5  # of a norm, for its rounding
 Ends = tuple[Float64[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k w"]]
 
 
-class OwnDirections:
+class BlockEigenvectors:
     """Eigenpairs of the Gaussians' own blocks of the scene's Hessian H; in a metric, of D H D.
 
     own: the blocks of H, or of its Gauss-Newton part; pixelwise: those of that part, where the loss couples pixels.  attribute:
@@ -60,8 +60,8 @@ class OwnDirections:
     def __init__(
         self,
         objective: SceneObjective,
-        own: OwnBlocks,
-        pixelwise: OwnBlocks | None = None,
+        own: PerGaussianBlocks,
+        pixelwise: PerGaussianBlocks | None = None,
         attribute: str | None = None,
         scale: Float[Tensor, " p"] | None = None,
     ):
@@ -145,7 +145,9 @@ def _chosen(values: Float64[Tensor, "m w"], vectors: Float[Tensor, "m w w"], lar
     return values.flatten()[chosen], whose, vectors[whose, :, chosen % width]
 
 
-def _softened(own: OwnBlocks, pixelwise: OwnBlocks, kept: Float[Tensor, " n"]) -> Float[Tensor, "n 11 11"]:
+def _softened(
+    own: PerGaussianBlocks, pixelwise: PerGaussianBlocks, kept: Float[Tensor, " n"]
+) -> Float[Tensor, "n 11 11"]:
     """The blocks with this share of each Gaussian's pixelwise part."""
     return own.geometry - (1 - kept)[:, None, None].to(own.geometry) * pixelwise.geometry
 

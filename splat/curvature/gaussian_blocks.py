@@ -13,7 +13,7 @@ GEOMETRY_COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False)
-class OwnBlocks:
+class PerGaussianBlocks:
     """The diagonal blocks of a Hessian that belong to one Gaussian each.
 
     geometry: over the attributes in GEOMETRY_COLUMNS; sh: the diagonal of the SH block.
@@ -22,8 +22,8 @@ class OwnBlocks:
     geometry: Float[Tensor, "n 11 11"]
     sh: Float[Tensor, "n k 3"]
 
-    def __add__(self, other: "OwnBlocks") -> "OwnBlocks":
-        return OwnBlocks(self.geometry + other.geometry, self.sh + other.sh)
+    def __add__(self, other: "PerGaussianBlocks") -> "PerGaussianBlocks":
+        return PerGaussianBlocks(self.geometry + other.geometry, self.sh + other.sh)
 
     def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
         """Trace of each attribute's block, summed in double precision; without the radial directions of unit quats.

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.operators.operator import require_vectors
-from splat.backend.gpu.graphs import CudaGraphs, Recordings
+from splat.backend.gpu.graphs import CudaGraphCache, CudaGraphs
 from splat.curvature.null_space import RowSpace, seen_colours, seen_parameters
 from splat.curvature.objective import SceneObjective
 
@@ -105,8 +105,8 @@ class SceneHessian:
         return self.project(self.objective.mean(total)).to(home)
 
     @cached_property
-    def _recordings(self) -> Recordings:
-        return Recordings(CudaGraphs(self.objective.active.flat.device))
+    def _recordings(self) -> CudaGraphCache:
+        return CudaGraphCache(CudaGraphs(self.objective.active.flat.device))
 
     def launched(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """The views' products, added up; not recorded."""
@@ -115,7 +115,7 @@ class SceneHessian:
         for view in self.objective.linearized:
             for start in range(0, V.shape[1], at_once):
                 some = V[:, start : start + at_once]
-                if not view.concerns(some):
+                if not view.affects(some):
                     self.spared += some.shape[1]
                     continue
                 total[:, start : start + at_once] += view.ggn(some) if self.gauss_newton else view.hvp(some)

@@ -23,13 +23,13 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from splat.backend.autograd import native
-from splat.curvature.gaussian_blocks import OwnBlocks
+from splat.backend.autograd import to_backend
+from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.projection.dispatch import held_projection
-from splat.projection.formulas import Held, lens_of
+from splat.projection.dispatch import linearize_projection
+from splat.projection.formulas import ProjectionJacobian, lens_of
 from splat.render.forward import rasterize_view, touches
 
 
@@ -52,7 +52,7 @@ class LinearizedView:
         self._loss = loss.linearize(self._raster.planes)
         self._adjoint = self._raster.backward(self._loss.gradient)
         self._index = self._raster.touched
-        self._projection = held_projection(
+        self._projection = linearize_projection(
             gaussians, lens_of(camera, settings), self._raster.splats, self._adjoint.gradient, self._index
         )
 
@@ -90,11 +90,11 @@ class LinearizedView:
         return len(self._index)
 
     @property
-    def held(self) -> Held:
+    def held(self) -> ProjectionJacobian:
         """The projection's derivatives of the Gaussians that have weight in a pixel; takes a pass over the pixels."""
         held = self._projection.held
-        seen = native(touches(self._raster))[held.index]
-        return Held(held.index[seen], held.splats, held.opacity_bar, *(part[seen] for part in held[3:]))
+        seen = to_backend(touches(self._raster))[held.index]
+        return ProjectionJacobian(held.index[seen], held.splats, held.opacity_bar, *(part[seen] for part in held[3:]))
 
     @property
     def bytes(self) -> int:
@@ -105,12 +105,12 @@ class LinearizedView:
         """Bytes that `hvp` of so many vectors takes beside its argument, its result and the loss's few rows a thread."""
         return self._raster.workspace(vectors) + self._loss.workspace(vectors)
 
-    def concerns(self, U: Float[Tensor, "p k"]) -> bool:
+    def affects(self, U: Float[Tensor, "p k"]) -> bool:
         """Whether a vector moves any Gaussian that the view draws: where none does, all products are 0.
 
         On a GPU always True: to look would be to wait for the device.
         """
-        return self._projection.concerns(native(U))
+        return self._projection.affects(to_backend(U))
 
     def jvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "k 4 h w"]:
         """J U: tangents of colour and accumulated alpha."""
@@ -118,31 +118,31 @@ class LinearizedView:
 
     def vjp(self, G: Float[Tensor, "k 4 h w"]) -> Float[Tensor, "p k"]:
         """J^T G for cotangents of colour and accumulated alpha."""
-        return self._pulled([self._raster.backward(self._raster.pad(native(g))).gradient for g in G])
+        return self._pulled([self._raster.backward(self._raster.pad(to_backend(g))).gradient for g in G])
 
     def hvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """H U of the view's loss."""
-        return torch.as_tensor(self._projection.pull(self._curved(U), native(U)))
+        return torch.as_tensor(self._projection.pull(self._curved(U), to_backend(U)))
 
     def ggn(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """G U, the Gauss-Newton part of H U."""
         cotangents = self._loss.hvp(self._tangent(U).planes)
         return self._pulled([self._raster.backward(cotangent).gradient for cotangent in cotangents])
 
-    def block_diagonal(self, *, gauss_newton: bool = False) -> OwnBlocks:
+    def block_diagonal(self, *, gauss_newton: bool = False) -> PerGaussianBlocks:
         """Every Gaussian's own block of the Hessian, or of its Gauss-Newton part, exactly, in one pass over the pixels.
 
         "Exactly" for losses that are sums over pixels; of SSIM's l'' the coupling between pixels is left out.
         """
-        own = self._raster.own_blocks(self._adjoint, self._loss.diagonal, self._index, gauss_newton)
-        return OwnBlocks(*map(torch.as_tensor, self._projection.blocks(own, not gauss_newton)))
+        own = self._raster.gaussian_blocks(self._adjoint, self._loss.diagonal, self._index, gauss_newton)
+        return PerGaussianBlocks(*map(torch.as_tensor, self._projection.blocks(own, not gauss_newton)))
 
     def loss_curvatures(self, U: Float[Tensor, "p k"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
         """(J u)^T l'' (J u) of every column, and the same with l'' replaced by its pixel-diagonal: no backward pass."""
         return self._loss.curvatures(self._tangent(U).planes)
 
     def _tangent(self, U: Tensor) -> Any:
-        return self._raster.jvp(self._projection.jvp(native(U)))
+        return self._raster.jvp(self._projection.jvp(to_backend(U)))
 
     def _curved(self, U: Tensor) -> Any:
         """The tangent of the splats' adjoint, (n, K, 9); all else that it takes is free again before the result is made."""
@@ -152,4 +152,4 @@ class LinearizedView:
     def _pulled(self, bars: Sequence[Any]) -> Tensor:
         """P'^T of adjoints of the splats, (n, 9) each."""
         cotangents = torch.stack([torch.as_tensor(bar) for bar in bars], dim=1)
-        return torch.as_tensor(self._projection.pull(native(cotangents), None))
+        return torch.as_tensor(self._projection.pull(to_backend(cotangents), None))

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from splat.backend.cpu.threads import over_batch
 from splat.model.gaussians import Gaussians
-from splat.projection.formulas import GEOMETRY, Held
+from splat.projection.formulas import GEOMETRY, ProjectionJacobian
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
 CHUNK = 4096  # Gaussians at a time
@@ -86,7 +86,7 @@ def _alone(rows: Tensor) -> Tensor:
 
 
 def seen_colours(
-    views: Iterable[Held],
+    views: Iterable[ProjectionJacobian],
     count: int,
     gaussians: Gaussians,
     stacked: Stacked = _alone,
@@ -144,7 +144,7 @@ def _across(channels: Sequence[RowSpace], rows: Float[Tensor, "n r d"]) -> Float
     return rows - torch.stack(kept, dim=3).flatten(2)
 
 
-def seen_parameters(views: Sequence[Held], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
+def seen_parameters(views: Sequence[ProjectionJacobian], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
     """The directions of a Gaussian's parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
     dtype = _like(views).dtype
     parts = [
@@ -161,12 +161,12 @@ def _joined(parts: Sequence[RowSpace], dtype: torch.dtype) -> RowSpace:
     return RowSpace(torch.cat(padded), torch.cat([part.rank for part in parts]))
 
 
-def _like(views: Sequence[Held]) -> Tensor:
+def _like(views: Sequence[ProjectionJacobian]) -> Tensor:
     """An empty tensor of the views' precision, on their device."""
     return torch.as_tensor(views[0].jacobian[:0])
 
 
-def _jacobian_rows(views: Sequence[Held], start: int, stop: int, bands: int) -> Float[Tensor, "n r d"]:
+def _jacobian_rows(views: Sequence[ProjectionJacobian], start: int, stop: int, bands: int) -> Float[Tensor, "n r d"]:
     """The Jacobians of the splats of Gaussians start..stop in every view, stacked: nine rows a view, zero where unseen."""
     width = GEOMETRY + 1 + 3 * bands
     rows = _like(views).new_zeros(stop - start, 9 * len(views), width, dtype=torch.float64)

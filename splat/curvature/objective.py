@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splat.curvature.gaussian_blocks import OwnBlocks
+from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import LinearizedView
 from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
@@ -142,7 +142,7 @@ class SceneObjective:
         part.views, part._losses = self.views[:count], self._losses[:count]
         part.counts = replace(self.counts, views=count)
         part.memory_plan = replace(self.memory_plan, kept=min(self.memory_plan.kept, count), views=count)
-        for name in ("gradient", "own_blocks", "pixelwise_blocks"):  # those of all views
+        for name in ("gradient", "gaussian_blocks", "pixelwise_blocks"):  # those of all views
             part.__dict__.pop(name, None)
         return part
 
@@ -234,21 +234,21 @@ class SceneObjective:
         """The gradient of L at the active Gaussians."""
         return self.mean(torch.stack([view.gradient for view in self.linearized]).sum(dim=0))
 
-    def block_diagonal(self, *, gauss_newton: bool = False) -> OwnBlocks:
+    def block_diagonal(self, *, gauss_newton: bool = False) -> PerGaussianBlocks:
         """Every Gaussian's own block of the Hessian of L, or of its Gauss-Newton part.
 
         Exact but for the coupling of pixels by SSIM: the loss's curvature l'' enters pixel by pixel.
         """
         parts = (view.block_diagonal(gauss_newton=gauss_newton) for view in self.linearized)
         total = reduce(add, parts)
-        return OwnBlocks(self.mean(total.geometry), self.mean(total.sh))
+        return PerGaussianBlocks(self.mean(total.geometry), self.mean(total.sh))
 
     @cached_property
-    def own_blocks(self) -> tuple[OwnBlocks, OwnBlocks | None]:
+    def gaussian_blocks(self) -> tuple[PerGaussianBlocks, PerGaussianBlocks | None]:
         """Own blocks of the Hessian and, where the loss couples pixels, of what it is pixel by pixel alone."""
         return self.block_diagonal(), self.pixelwise_blocks if self.couples_pixels else None
 
     @cached_property
-    def pixelwise_blocks(self) -> OwnBlocks:
+    def pixelwise_blocks(self) -> PerGaussianBlocks:
         """Own blocks of the Gauss-Newton part as it is pixel by pixel: all of it, where the loss does not couple pixels."""
         return self.block_diagonal(gauss_newton=True)

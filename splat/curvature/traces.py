@@ -27,7 +27,7 @@ from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, t_quantile
 from landscape.traces.control import controlled
 from landscape.traces.estimate import TraceEstimate
-from landscape.traces.hutchinson import CONFIRMATION, WIDENING, Looks, TraceSettings
+from landscape.traces.hutchinson import CONFIRMATION, WIDENING, StoppingRule, TraceSettings
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
 
@@ -62,7 +62,7 @@ def exact_traces(
     if samples is not None and samples < LEAST_SAMPLES:
         raise ValueError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
     quats, units = objective.active.quats, None if scale is None else objective.active.with_flat(scale)
-    whole, coupled = objective.own_blocks
+    whole, coupled = objective.gaussian_blocks
     if gauss_newton:
         whole = objective.pixelwise_blocks
     known = {name: value for name, value in whole.traces(quats, units).items() if name in names}
@@ -113,7 +113,7 @@ class SampledTrace:
         self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
         # a run may end at `first` samples: where the tolerance holds there and held CONFIRMATION earlier
         look = most if first == most else max(first - CONFIRMATION, LEAST_SAMPLES)
-        self.looks, self.open, self.late = Looks(look, most), pixelwise is not None, False
+        self.looks, self.open, self.late = StoppingRule(look, most), pixelwise is not None, False
 
     @property
     def count(self) -> int:

@@ -79,27 +79,27 @@ def seconds_of(found):
 
 
 @formula
-def bent(second, dm, dp, dq):
+def ssim_second_dot(second, dm, dp, dq):
     """S_m', S_p', S_q': the second derivatives applied to m', p', q'."""
     mm, mp, mq, pp, pq, qq = second
     return mm * dm + mp * dp + mq * dq, mp * dm + pp * dp + pq * dq, mq * dm + pq * dp + qq * dq
 
 
 @formula
-def form(second, dm, dp, dq, squared, blurred_sp):
+def ssim_quadratic_form(second, dm, dp, dq, squared, blurred_sp):
     """What a pixel has of the second derivative of sum S along v: (m', p', q') . S'' (m', p', q') + 2 v^2 blur(S_p)."""
-    sm, sp, sq = bent(second, dm, dp, dq)
+    sm, sp, sq = ssim_second_dot(second, dm, dp, dq)
     return sm * dm + sp * dp + sq * dq + 2.0 * squared * blurred_sp
 
 
 @formula
-def spread(residual, aim, bm, bp, bq):
+def ssim_adjoint(residual, aim, bm, bp, bq):
     """blur(S_m) + 2 r blur(S_p) + (y - c) blur(S_q), or the same of other fields; aim: y - c."""
     return bm + 2.0 * residual * bp + aim * bq
 
 
 @formula
-def own_bend(second, blurred_sp, residual, aim):
+def ssim_diag_hessian(second, blurred_sp, residual, aim):
     """The diagonal of the Hessian of sum S, from its second derivatives blurred by the squared window."""
     mm, mp, mq, pp, pq, qq = second
     coupled = mm + 4.0 * residual * (mp + residual * pp + aim * pq) + aim * (2.0 * mq + aim * qq)

@@ -14,7 +14,7 @@ from triton import cdiv, next_power_of_2
 from splat.backend.gpu.compile import launch
 from splat.model.gaussians import Gaussians
 from splat.projection import cuda_kernels as kernels
-from splat.projection.formulas import GEOMETRY, SYMMETRIC, Held, Lens
+from splat.projection.formulas import GEOMETRY, SYMMETRIC, Lens, ProjectionJacobian
 from splat.projection.reference import LARGEST_SPLAT, require_sizes
 
 BLOCK = 128  # Gaussians that a program takes; for a product, times vectors
@@ -90,9 +90,10 @@ class CudaProjection:
         _run(kernels.linearize_colour, programs, *inputs, curvature, *colours, self.n, m, self.bands, FEW)
 
     @property
-    def held(self) -> Held:
+    def held(self) -> ProjectionJacobian:
         """The derivatives, Gaussian by Gaussian: tensors in the places of arrays."""
-        return Held(self._index, self._splats, self._bar[:, 5], *(array.movedim(-1, 0) for array in self._held))  # pyright: ignore
+        rows = (array.movedim(-1, 0) for array in self._held)
+        return ProjectionJacobian(self._index, self._splats, self._bar[:, 5], *rows)  # pyright: ignore
 
     @property
     def bytes(self) -> int:
@@ -105,7 +106,7 @@ class CudaProjection:
         rows = BLOCK // wide
         return (cdiv(self._index.numel(), rows), cdiv(vectors, wide)), rows, wide
 
-    def concerns(self, block: Float[Tensor, "p k"]) -> bool:
+    def affects(self, block: Float[Tensor, "p k"]) -> bool:
         """True: to look whether a vector moves any of the Gaussians that matter would be to wait for the device."""
         return True
 

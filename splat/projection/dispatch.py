@@ -38,7 +38,7 @@ def pulled(gaussians: Gaussians, lens: Lens, splats: Tensor, drawn: Tensor, bar:
     return gradient
 
 
-def held_projection(gaussians: Gaussians, lens: Lens, splats: Any, bar: Any, index: Any) -> Any:
+def linearize_projection(gaussians: Gaussians, lens: Lens, splats: Any, bar: Any, index: Any) -> Any:
     """The projection held still where the Gaussians are: `Projection` in arrays, or `CudaProjection` in tensors."""
     if not by_triton(gaussians.flat):
         return Projection(gaussians, lens, splats, bar, index)

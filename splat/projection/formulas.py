@@ -29,7 +29,7 @@ GEOMETRY = 10  # mean 3, log-scales 3, quaternion 4
 SYMMETRIC = GEOMETRY * (GEOMETRY + 1) // 2
 
 
-class Held(NamedTuple):
+class ProjectionJacobian(NamedTuple):
     """What stands still.  index: (m,) the Gaussians that matter; splats (n, 9); opacity_bar (n,); the rest one row each.
 
     jacobian (5, 10): mean x, y and conic, whitened (`raster/whitening.py`), in mean, log-scales, quaternion; curvature (55,):

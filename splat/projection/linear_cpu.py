@@ -21,8 +21,8 @@ from splat.projection.cpu import attribute_arrays, point, quaternion
 from splat.projection.formulas import (
     GEOMETRY,
     SYMMETRIC,
-    Held,
     Lens,
+    ProjectionJacobian,
     add_symmetric,
     basis,
     colour_adjoint,
@@ -263,7 +263,7 @@ class Projection:
         def empty(*shape: int) -> np.ndarray:
             return np.empty((m, *shape), means.dtype)
 
-        self.held = Held(
+        self.held = ProjectionJacobian(
             index, splats, np.ascontiguousarray(bar[:, 5]), empty(5, GEOMETRY), empty(SYMMETRIC), empty(16), empty(16, 3),
             empty(3), empty(3), empty(3, 3),
         )  # fmt: skip
@@ -274,7 +274,7 @@ class Projection:
         """Memory of what is held per Gaussian in sight."""
         return sum(array.nbytes for array in self.held[3:])
 
-    def concerns(self, block: np.ndarray) -> bool:
+    def affects(self, block: np.ndarray) -> bool:
         """Whether a vector of a block (p, K) moves any of the Gaussians that matter."""
         return any(part[self.held.index].any() for part in self._split(block))
 

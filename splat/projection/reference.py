@@ -22,9 +22,7 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import harmonics
 from splat.model.settings import RenderSettings
-from splat.projection.formulas import (
-    Lens,
-)
+from splat.projection.formulas import Lens
 
 NEEDLE = 100.0  # the condition number from which on a splat is called a needle
 LARGEST_SPLAT = 2.0**60  # px, and world units: 1 / det of a needle is this squared over blur, which float32 still holds

@@ -9,7 +9,7 @@ from splat.model.settings import RenderSettings
 from splat.raster.cpu.raster import Raster
 
 
-def held_raster(
+def rasterize(
     splats: Tensor, depths: Tensor, drawn: Tensor, background: Tensor, width: int, height: int, settings: RenderSettings
 ) -> Any:
     """A view held still where its splats (n, 9) are: `cpu.Raster` in arrays, or `cuda.CudaRaster` in tensors."""

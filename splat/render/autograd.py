@@ -3,7 +3,7 @@
 The backward of each is a function of its own, whose backward runs the tangent kernels: `torch.autograd.grad(...,
 create_graph=True)` followed by another `grad` costs two tangent passes, not a trace through the compositing loop.
 
-`projected`, `pulled`, `held_projection` and `held_raster` alone decide which kernels these are: those where the Gaussians are.
+`projected`, `pulled`, `linearize_projection` and `rasterize` choose the kernels for the device of the Gaussians.
 """
 
 from typing import Any
@@ -12,14 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.backend.autograd import last_derivative, native
+from splat.backend.autograd import last_derivative, to_backend
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.projection.dispatch import held_projection, projected, pulled
+from splat.projection.dispatch import linearize_projection, projected, pulled
 from splat.projection.formulas import Lens, lens_of
 from splat.projection.reference import Splats
-from splat.raster.dispatch import held_raster
+from splat.raster.dispatch import rasterize
 
 PARTS = (2, 3, 1, 3)  # mean, conic, opacity, colour in a splat of nine numbers
 
@@ -38,10 +38,10 @@ def _pushed_and_curved(
     gaussians: Gaussians, lens: Lens, splats: Tensor, drawn: Tensor, bar: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Of one direction in the flat vector, P' u (n, 9) and (bar . P'') u."""
-    index, u = drawn.nonzero()[:, 0], native(direction[:, None])
-    projection = held_projection(gaussians, lens, native(splats), native(bar.double()), native(index))
+    index, u = drawn.nonzero()[:, 0], to_backend(direction[:, None])
+    projection = linearize_projection(gaussians, lens, to_backend(splats), to_backend(bar.double()), to_backend(index))
     tangents = torch.as_tensor(projection.jvp(u))
-    product = torch.as_tensor(projection.pull(native(torch.zeros_like(tangents)), u))
+    product = torch.as_tensor(projection.pull(to_backend(torch.zeros_like(tangents)), u))
     return tangents[:, 0], product[:, 0]
 
 
@@ -95,15 +95,15 @@ class _RasterizeAdjoint(torch.autograd.Function):
     @staticmethod
     def forward(ctx, raster: Any, cotangent: Tensor, *splats: Tensor):
         ctx.raster = raster
-        ctx.adjoint = raster.backward(raster.pad(native(cotangent)))
+        ctx.adjoint = raster.backward(raster.pad(to_backend(cotangent)))
         ctx.save_for_backward(cotangent, *splats)
         return _parts(ctx.adjoint.gradient, cotangent)
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
         raster = ctx.raster
-        tangent = raster.jvp(native(_joined(outputs)[:, None]))
-        product = tangent.curvature(ctx.adjoint, native(torch.zeros_like(torch.as_tensor(tangent.planes))))
+        tangent = raster.jvp(to_backend(_joined(outputs)[:, None]))
+        product = tangent.curvature(ctx.adjoint, to_backend(torch.zeros_like(torch.as_tensor(tangent.planes))))
         values = (torch.as_tensor(raster.crop(tangent.planes[0])).clone(), *_parts(product[:, 0], outputs[0]))
         return None, *last_derivative(values, *ctx.saved_tensors, *outputs)
 
@@ -118,6 +118,6 @@ def rasterize_by_kernel(
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
     """Colour and accumulated alpha of `reference.rasterize_reference`, by the kernels, where the splats are."""
     parts = (splats.means, splats.conics, splats.opacities, splats.colours)
-    raster = held_raster(_joined(parts), splats.depths.detach(), splats.drawn, background, width, height, settings)
+    raster = rasterize(_joined(parts), splats.depths.detach(), splats.drawn, background, width, height, settings)
     planes = _Rasterize.apply(raster, *parts)
     return planes[:3], planes[3]  # pyright: ignore

@@ -39,12 +39,12 @@ def render(
     settings: RenderSettings = RenderSettings(),
     *,
     depth: bool = False,
-    opacity_gain: Float[Tensor, " n"] | None = None,
+    opacity_scale: Float[Tensor, " n"] | None = None,
     backend: Backend = "kernels",
 ) -> Rendering:
     """Colour, accumulated alpha and, if asked for, expected depth of one view; twice differentiable.
 
-    background: RGB, black where None.  opacity_gain: constant factors of the opacities; may exceed 1, and 0 hides a Gaussian.
+    background: RGB, black where None.  opacity_scale: constant factors of the opacities; may exceed 1, and 0 hides a Gaussian.
     backend: "kernels": those for the device of the Gaussians; "reference": plain torch (slow, any number of derivatives).
     Raises ValueError where a parameter is not finite.
     """
@@ -53,10 +53,10 @@ def render(
         background = torch.zeros(3)
     background = background.to(gaussians.flat, non_blocking=True)
     if backend == "reference":
-        splats = _gained(project(gaussians, camera, settings), opacity_gain)
+        splats = _gained(project(gaussians, camera, settings), opacity_scale)
         image, alpha, expected = rasterize_reference(splats, background, camera.width, camera.height, settings)
         return Rendering(image, alpha, expected if depth else None, splats)
-    splats = _gained(project_by_kernel(gaussians, camera, settings), opacity_gain)
+    splats = _gained(project_by_kernel(gaussians, camera, settings), opacity_scale)
     image, alpha = rasterize_by_kernel(splats, background, camera.width, camera.height, settings)
     expected = _layered_depth(splats, gaussians, camera, settings)[0] if depth else None
     return Rendering(image, alpha, expected, splats)
@@ -70,10 +70,10 @@ def render_depth(
     return _layered_depth(project_by_kernel(gaussians, camera, settings), gaussians, camera, settings)
 
 
-def _gained(splats: Splats, opacity_gain: Float[Tensor, " n"] | None) -> Splats:
-    if opacity_gain is None:
+def _gained(splats: Splats, opacity_scale: Float[Tensor, " n"] | None) -> Splats:
+    if opacity_scale is None:
         return splats
-    return replace(splats, opacities=splats.opacities * opacity_gain.to(splats.opacities))
+    return replace(splats, opacities=splats.opacities * opacity_scale.to(splats.opacities))
 
 
 def _layered_depth(

@@ -150,10 +150,7 @@ def training_state(training: Training) -> dict[str, Any]:
             "second": training.adam.second.flat,
             "updates": training.adam.updates,
         },
-        "screen_gradients": {
-            "total": training.screen_gradients.total,
-            "renders": training.screen_gradients.renders,
-        },
+        "screen_gradients": {"total": training.screen_gradients.total, "renders": training.screen_gradients.renders},
         "generator": training.generator.get_state(),
         "order": training.order,
         "regularizer": {

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from splat.losses.autograd import loss_against
 from splat.losses.cpu.loss import ViewLoss
-from splat.render.photometric import photometric
+from splat.render.loss_and_gradient import loss_and_gradient
 from splat.scenes.view import View
 from splat.training.state import Step, Training
 
@@ -71,8 +71,8 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
         training.raise_sh_degree(min(config.sh_degree, (number - 1) // config.sh_degree_every))
         step = _next_step(training, number, views, losses)
         camera, gaussians = step.camera, training.gaussians
-        gain = regularizer.opacity_gain(step)
-        base = photometric(gaussians, camera, step.loss, step.background, config.render, gain)
+        gain = regularizer.opacity_scale(step)
+        base = loss_and_gradient(gaussians, camera, step.loss, step.background, config.render, gain)
         _require_finite("loss", base.loss, step)
         gradient = regularizer.gradient(step, base)
         _require_finite("gradient", float(gradient.sum()), step)  # before the Gaussians and their moments take it over

@@ -2,7 +2,7 @@
 
 The loop asks, in this order, `begin` before the first step and after a resume, and at every step:
 
-    opacity_gain    how the opacities are changed in this step's render (dropout), or None
+    opacity_scale    how the opacities are changed in this step's render (dropout), or None
     gradient        what Adam descends, given the photometric gradient of the sampled view
     follow          ... after density control, or any other change of the Gaussians: which old one each new one comes from
     after           anything else, once the step is whole (unpooling, a second field's own density control)
@@ -26,7 +26,7 @@ from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.render.photometric import Photometric
+from splat.render.loss_and_gradient import LossAndGradient
 from splat.scenes.view import View
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.training.optim.adam import Adam
@@ -75,11 +75,11 @@ class Regularizer:
         """Steps are about to be made on these views; a second call changes nothing.  ValueError where the views lack what the
         method needs."""
 
-    def opacity_gain(self, step: Step) -> Float[Tensor, " n"] | None:
+    def opacity_scale(self, step: Step) -> Float[Tensor, " n"] | None:
         """Factors on the opacities of this step's render, None for 1."""
         return None
 
-    def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
         """What the optimiser descends.  base: the sampled view's loss and gradient, in the parameters of step.gaussians."""
         return base.gradient
 
@@ -279,7 +279,7 @@ class Training:
         position = position_rate(self.config.rates, self.extent, step, self.config.iterations)
         return learning_rates(self.gaussians, self.config.rates, position)
 
-    def control_density(self, step: int, camera: Camera, base: Photometric) -> None:
+    def control_density(self, step: int, camera: Camera, base: LossAndGradient) -> None:
         """Collect the screen-space gradient of a render; clone, split, prune and reset opacities in the steps that do so."""
         schedule, iterations = self.config.densify, self.config.iterations
         if schedule.collects(step, iterations):

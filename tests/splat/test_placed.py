@@ -15,7 +15,7 @@ from analysis.measures.units import scene_units
 from landscape.eigen.lanczos import lanczos
 from landscape.operators.operator import DenseOperator
 from landscape.traces.trace import TraceSettings
-from splat.curvature.block_eigenvectors import OwnDirections
+from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
@@ -103,7 +103,7 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         hessian.apply(V)
         assert not +placed.waits and not +placed.brought  # so that they can be recorded
         _ = objective.gradient, objective.block_diagonal(), objective.loss(flat), scene_units(objective)
-        known = OwnDirections(objective, *objective.own_blocks)
+        known = BlockEigenvectors(objective, *objective.gaussian_blocks)
         known.steepest(1, 1)
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
         split_control(objective.active, [views[0].camera])

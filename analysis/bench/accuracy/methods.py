@@ -35,7 +35,7 @@ from landscape.spectrum.density import spectral_density
 from landscape.traces.diagonal import Method as DiagonalMethod
 from landscape.traces.diagonal import estimate_diagonal
 from landscape.traces.trace import PAPER, TraceSettings, estimate_traces
-from splat.curvature.block_eigenvectors import OwnDirections
+from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.traces import ONE_PERCENT, exact_traces
 
 Origin = Literal["default", "own", "peer"]
@@ -164,10 +164,7 @@ def end_methods() -> Iterator[Method]:
 
 
 def _lanczos(
-    text: str,
-    settings: EigenSettings,
-    origin: Origin = "own",
-    applies: Callable[[Case], bool] = lambda case: True,
+    text: str, settings: EigenSettings, origin: Origin = "own", applies: Callable[[Case], bool] = lambda case: True
 ) -> Method:
     def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
         return end_answers(extreme_eigenpairs(operator, generator(seed), settings))
@@ -179,7 +176,7 @@ def _lanczos(
 def _from_own_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
     """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
     assert case.objective is not None
-    start = OwnDirections(case.objective, case.objective.block_diagonal()).leads()
+    start = BlockEigenvectors(case.objective, case.objective.block_diagonal()).leads()
     operator.charge(PASS)
     return end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
 
@@ -249,14 +246,14 @@ def diagonal_methods() -> Iterator[Method]:
         origin: Origin = "default" if (probes, method) == (32, "auto") else "own"
         yield Method("diagonal", name, f"{probes} probes", run, origin)
 
-    def own_blocks(case: Case, operator: MeteredOperator, _: int) -> list[Answer]:
+    def gaussian_blocks(case: Case, operator: MeteredOperator, _: int) -> list[Answer]:
         assert case.objective is not None
         values = block_diagonal(case)
         operator.charge(PASS)
         known = torch.zeros_like(values) if not case.objective.couples_pixels else torch.full_like(values, inf)
         return [Answer("all", values, known, values - known, values + known)]
 
-    yield Method("diagonal", "own blocks, no coupling", "one pass", own_blocks, applies=_is_scene)
+    yield Method("diagonal", "own blocks, no coupling", "one pass", gaussian_blocks, applies=_is_scene)
 
 
 def block_diagonal(case: Case) -> Float64[Tensor, " n"]:

@@ -33,13 +33,13 @@ from analysis.bench.workloads import Workload
 from analysis.console.timing import Timing, interleaved
 from landscape.probes import draw_probes
 from splat.backend.device import by_triton
-from splat.curvature.gaussian_blocks import OwnBlocks
+from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import LinearizedView
 from splat.losses.autograd import loss_against, view_loss
 from splat.model.settings import Sums
 from splat.projection.dispatch import projected, pulled
 from splat.projection.formulas import lens_of
-from splat.raster.dispatch import held_raster
+from splat.raster.dispatch import rasterize
 from splat.render.render import render
 
 VECTORS = (1, 4, 8)
@@ -77,7 +77,7 @@ class ViewBench:
 
     def _rasterize(self) -> Any:
         camera, settings = self.view.camera, self.workload.settings
-        return held_raster(*self.projected, self.background, camera.width, camera.height, settings)
+        return rasterize(*self.projected, self.background, camera.width, camera.height, settings)
 
     def _linearize(self) -> Any:
         w = self.workload
@@ -90,7 +90,7 @@ class ViewBench:
         """Of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
         splats, depths, drawn = projected(self.workload.gaussians, self.lens)
         camera, settings = self.view.camera, self.workload.settings
-        raster = held_raster(splats, depths, drawn, self.background, camera.width, camera.height, settings)
+        raster = rasterize(splats, depths, drawn, self.background, camera.width, camera.height, settings)
         adjoint = raster.backward(self.loss.linearize(raster.planes).gradient)
         return self._to_parameters(splats, drawn, adjoint)
 
@@ -147,7 +147,7 @@ class ViewBench:
             self.lack = str(error)
         return calls
 
-    def _block_diagonal(self) -> OwnBlocks:
+    def _block_diagonal(self) -> PerGaussianBlocks:
         vars(self.linearized._loss).pop("diagonal", None)  # it keeps the loss's share, which is part of the cost
         return self.linearized.block_diagonal()
 

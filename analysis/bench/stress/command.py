@@ -96,7 +96,7 @@ class Scene:
 
         return cls(objective(WITH_SSIM), objective(PIXELS_ALONE))
 
-    def own_blocks(self) -> dict[str, Tensor]:
+    def gaussian_blocks(self) -> dict[str, Tensor]:
         """The own blocks of every attribute, (n, d, d); of SH the diagonal."""
         blocks = self.pixels.block_diagonal()
         result = {name: blocks.geometry[:, part, part].double() for name, part in GEOMETRY_COLUMNS.items()}
@@ -208,10 +208,10 @@ class Study:
         if self.case.dense and self.case.stand_in is None:
             identity = torch.eye(self.point.flat.numel(), dtype=torch.float64)
             dense = specified(self.case, self.point, PIXELS_ALONE, identity).products
-        truth = self.scenes["float64"].own_blocks() if dense is None else self.dense_blocks(dense)
+        truth = self.scenes["float64"].gaussian_blocks() if dense is None else self.dense_blocks(dense)
         traces = self.traces("float64") if dense is None else self.dense_traces(truth)
         for precision in self.compared if dense is not None else ["float32"]:
-            own, sums = self.scenes[precision].own_blocks(), self.traces(precision)
+            own, sums = self.scenes[precision].gaussian_blocks(), self.traces(precision)
             for i, (name, rows) in enumerate(self.blocks.items()):
                 K = cancels * condition("products", (rows, i + 1))
                 self.judge("own blocks", name, precision, own[name], truth[name], K)

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Column
 
 from analysis.probe.measurement import ProbeSettings
-from analysis.train.spent import Spent
+from analysis.train.training_time import TrainingTime
 from analysis.runs.sweep.sweep_file import Cell, Sweep
 
 Stage = Literal["train", "probe"]
@@ -30,7 +30,7 @@ class SweepProgress:
         self.sweep, self.to_do, self.jobs = sweep, to_do, jobs
         self.active: dict[str, Stage] = {}
         self.probes: list[float] = []
-        self._due: tuple[tuple[list[Spent], int], float | None] = (([], 0), None)
+        self._due: tuple[tuple[list[TrainingTime], int], float | None] = (([], 0), None)
         self._console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("sweep", table_column=Column(no_wrap=True)),
@@ -68,7 +68,7 @@ class SweepProgress:
 
     def update(self) -> None:
         """Look at the folders and redraw the bar."""
-        spent = {cell.name: Spent.read(cell.out) for cell in self.sweep.cells}
+        spent = {cell.name: TrainingTime.read(cell.out) for cell in self.sweep.cells}
         words = [
             f"{name} {spent[name].step}" if stage == "train" else f"{name} probe" for name, stage in self.active.items()
         ]
@@ -77,7 +77,7 @@ class SweepProgress:
 
     def left(self) -> str:
         """The time that is left, counted down between the checkpoints and the ends of stages."""
-        now, spent = monotonic(), [Spent.read(cell.out) for cell in self.sweep.cells]
+        now, spent = monotonic(), [TrainingTime.read(cell.out) for cell in self.sweep.cells]
         state = spent, sum(map(len, self.to_do.values()))
         if state != self._due[0]:
             seconds = self.seconds(spent)
@@ -85,7 +85,7 @@ class SweepProgress:
         due = self._due[1]
         return "--" if due is None else str(timedelta(seconds=round(max(0.0, due - now))))
 
-    def seconds(self, spent: list[Spent]) -> float | None:
+    def seconds(self, spent: list[TrainingTime]) -> float | None:
         """About how many seconds are left; None before the first checkpoint."""
         paces: dict[tuple[str, str], list[float]] = {}
         for cell, each in zip(self.sweep.cells, spent, strict=True):

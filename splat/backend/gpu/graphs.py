@@ -36,7 +36,7 @@ class _Recording:
         return self.result.clone()
 
 
-class Recordings:
+class CudaGraphCache:
     """The recordings of one function of blocks of vectors (p, k): one for every k, made at the third call with that k.
 
     capture: runs a call without arguments and gives its result and a function that repeats its launches.  Where that fails, a

@@ -27,15 +27,15 @@ from splat.losses.cpu.window import (
 from splat.losses.formulas import (
     CENTRE,
     SECONDS,
-    bent,
-    form,
-    own_bend,
     pixel_curvature,
     pixel_slope,
     seconds_of,
     similarity,
     slopes_of,
-    spread,
+    ssim_adjoint,
+    ssim_diag_hessian,
+    ssim_quadratic_form,
+    ssim_second_dot,
 )
 
 PRODUCT_FIELDS = 6  # of rows that a sweep of products keeps for a vector
@@ -197,7 +197,7 @@ def gradient_rows(
                 store(values, BORDER + i, value)
                 if structural != 0:
                     bm, bp, bq = down_three(slopes, 0, row, i, stride, taps)
-                    slope -= structural * spread(residual, load(y, at + i) - CENTRE, bm, bp, bq)
+                    slope -= structural * ssim_adjoint(residual, load(y, at + i) - CENTRE, bm, bp, bq)
                     if blurred_sp.size > 0:
                         store(blurred_sp, at + i, bp)
                 store(gradient, at + i, slope)
@@ -238,7 +238,7 @@ def curve_row(second, ring, field, row, shape, taps, b0, b1, b2, slopes):
     _height, width, _plane_rows, stride = shape
     for i in range(0, stride, lanes(ring)):
         dm, dp, dq = down_three(ring, field, row, i, stride, taps)
-        sm, sp, sq = bent(load_six(second, BORDER + i), dm, 2.0 * dp, dq)
+        sm, sp, sq = ssim_second_dot(load_six(second, BORDER + i), dm, 2.0 * dp, dq)
         store(b0, BORDER + i, sm)
         store(b1, BORDER + i, sp)
         store(b2, BORDER + i, sq)
@@ -284,7 +284,7 @@ def product_rows(start, stop, shape, taps, V, x, y, target, blurred_sp, kind, ep
                     if structural != 0:
                         bm, bp, bq = down_three(slopes, 3 * k, row, i, stride, taps)
                         turned = 2.0 * tangent * load(blurred_sp, at + i)
-                        total -= structural * (spread(residual, aim - CENTRE, bm, bp, bq) + turned)
+                        total -= structural * (ssim_adjoint(residual, aim - CENTRE, bm, bp, bq) + turned)
                     store(product, at + i, total)
                 for i in range(width, stride):
                     product[at + i] = 0
@@ -323,7 +323,9 @@ def form_rows(
                     if structural != 0:
                         dm, dp, dq = down_three(ring, 3 * k, row, i, stride, taps)
                         bends = load_six(second, BORDER + i)
-                        total -= structural * form(bends, dm, 2.0 * dp, dq, squared, load(blurred_sp, at + i))
+                        total -= structural * ssim_quadratic_form(
+                            bends, dm, 2.0 * dp, dq, squared, load(blurred_sp, at + i)
+                        )
                     store(b0, BORDER + i, total)
                     store(b1, BORDER + i, load(diagonal, at + i) * squared)
                 full[k, channel * height + row] = row_sum(b0, width)
@@ -367,7 +369,7 @@ def diagonal_rows(start, stop, shape, taps, squares, x, y, target, blurred_sp, k
                     mq, pp = blur_down(bends, 2, row, i, stride, squares), blur_down(bends, 3, row, i, stride, squares)
                     pq, qq = blur_down(bends, 4, row, i, stride, squares), blur_down(bends, 5, row, i, stride, squares)
                     second = mm, mp, mq, pp, pq, qq
-                    total -= structural * own_bend(second, load(blurred_sp, at + i), residual, aim)
+                    total -= structural * ssim_diag_hessian(second, load(blurred_sp, at + i), residual, aim)
                 store(diagonal, at + i, total)
             for i in range(width, stride):
                 diagonal[at + i] = 0

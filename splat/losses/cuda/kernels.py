@@ -27,10 +27,10 @@ SECONDS = tl.constexpr(losses_formulas.SECONDS)
 
 pixel_slope = traced(losses_formulas.pixel_slope)
 pixel_curvature = traced(losses_formulas.pixel_curvature)
-spread = traced(losses_formulas.spread)
-bent = traced(losses_formulas.bent)
-form = traced(losses_formulas.form)
-own_bend = traced(losses_formulas.own_bend)
+ssim_adjoint = traced(losses_formulas.ssim_adjoint)
+ssim_second_dot = traced(losses_formulas.ssim_second_dot)
+ssim_quadratic_form = traced(losses_formulas.ssim_quadratic_form)
+ssim_diag_hessian = traced(losses_formulas.ssim_diag_hessian)
 pair_slopes = traced(losses_formulas.pair_slopes)
 
 
@@ -207,7 +207,7 @@ def finish_gradient(
             bm = windowed(blurred, at, y, width, height, constants, here)
             bp = windowed(blurred + size, at, y, width, height, constants, here)
             bq = windowed(blurred + 2 * size, at, y, width, height, constants, here)
-            total -= tl.load(constants + STRUCTURAL) * spread(r, aim, bm, bp, bq)
+            total -= tl.load(constants + STRUCTURAL) * ssim_adjoint(r, aim, bm, bp, bq)
             tl.store(blurred_sp + at, bp, here)
         tl.store(gradient + at, total, here)
 
@@ -236,7 +236,7 @@ def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr, FORMU
     size = 3 * height * width
     first = tl.program_id(1).to(tl.int64) * 3 * size
     dm, dp, dq = changes(fed + first, at, y, height, width, constants, here)
-    found = bent(second_derivatives(second, at, size, here), dm, dp, dq)
+    found = ssim_second_dot(second_derivatives(second, at, size, here), dm, dp, dq)
     for j in tl.static_range(3):
         tl.store(out + first + j * size + at, found[j], here)
 
@@ -258,7 +258,7 @@ def finish_product(
         bp = windowed(blurred + size, at, y, width, height, constants, here)
         bq = windowed(blurred + 2 * size, at, y, width, height, constants, here)
         turned = 2.0 * tangent * tl.load(blurred_sp + at, here, other=0.0)
-        total -= tl.load(constants + STRUCTURAL) * (spread(r, aim, bm, bp, bq) + turned)
+        total -= tl.load(constants + STRUCTURAL) * (ssim_adjoint(r, aim, bm, bp, bq) + turned)
     tl.store(out + vector * out_stride + at, total, here)
 
 
@@ -276,7 +276,7 @@ def forms(
     if SSIM:
         dm, dp, dq = changes(fed + vector * 3 * size, at, y, height, width, constants, here)
         bends, blurred = second_derivatives(second, at, size, here), tl.load(blurred_sp + at, here, other=0.0)
-        total -= tl.load(constants + STRUCTURAL) * form(bends, dm, dp, dq, squared, blurred)
+        total -= tl.load(constants + STRUCTURAL) * ssim_quadratic_form(bends, dm, dp, dq, squared, blurred)
     partial_sum(total, here, full + vector * tl.num_programs(0))
     partial_sum(tl.load(diagonal + at, here, other=0.0) * squared, here, pixelwise + vector * tl.num_programs(0))
 
@@ -296,7 +296,7 @@ def finish_diagonal(
         for j in tl.static_range(SECONDS):
             bends = bends + (windowed(along + j * size, at, y, width, height, squared, here),)
         aim = tl.load(target + at, here, other=0.0) - CENTRE
-        own = own_bend(bends, tl.load(blurred_sp + at, here, other=0.0), r, aim)
+        own = ssim_diag_hessian(bends, tl.load(blurred_sp + at, here, other=0.0), r, aim)
         total -= tl.load(constants + STRUCTURAL) * own
     tl.store(out + at, total, here)
 

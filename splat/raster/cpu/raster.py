@@ -109,7 +109,7 @@ class Raster:
         return np.flatnonzero(np.diff(self.slot_start))
 
     def dark_tiles(self, adjoint: "Adjoint", curvature: np.ndarray) -> int:
-        """How many tiles with entries have no slope and no curvature (as in `own_blocks`) in any pixel."""
+        """How many tiles with entries have no slope and no curvature (as in `gaussian_blocks`) in any pixel."""
         rows, lanes = TILE_ROWS, self.plane[1] // self.frame.columns
         planes = np.concatenate([adjoint.cotangent.reshape(4, *self.plane), curvature])
         lit = (planes != 0).reshape(len(planes), -1, rows, self.frame.columns, lanes).any(axis=(0, 2, 4)).reshape(-1)
@@ -132,7 +132,7 @@ class Raster:
         """The gradient in the splats from padded cotangent planes (4, ...)."""
         return Adjoint(self, cotangent)
 
-    def own_blocks(
+    def gaussian_blocks(
         self, adjoint: "Adjoint", curvature: np.ndarray, index: np.ndarray, gauss_newton: bool
     ) -> np.ndarray:
         """Own blocks (m, 9, 9) of the splats at index: of the Hessian or of its Gauss-Newton part.

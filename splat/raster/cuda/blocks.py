@@ -105,7 +105,7 @@ def block_sums(u, v, w, free, D, weight, g, h):
     return total
 
 
-def own_blocks(
+def gaussian_blocks(
     splats: Float[Tensor, "m 9"], total: Float[Tensor, "m 36"], S: Float[Tensor, "m 3"]
 ) -> Float[Tensor, "m 9 9"]:
     """`blocks.splat_block` of every splat, in plain coordinates; S: its moments S, Su, Sv, 0 for the Gauss-Newton part."""

@@ -70,11 +70,7 @@ alpha_row, quadratic, along_row, plus, behind_all = twins(
     formulas.alpha_row, formulas.quadratic, formulas.along_row, formulas.plus, formulas.behind_all
 )
 step_back, step_tangent, step_curvature, row_terms, column_terms = twins(
-    formulas.step_back,
-    formulas.step_tangent,
-    formulas.step_curvature,
-    formulas.row_terms,
-    formulas.column_terms,
+    formulas.step_back, formulas.step_tangent, formulas.step_curvature, formulas.row_terms, formulas.column_terms
 )
 
 

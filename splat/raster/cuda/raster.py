@@ -177,7 +177,7 @@ class CudaRaster:
         """The gradient in the splats from cotangent planes."""
         return CudaAdjoint(self, cotangent)
 
-    def own_blocks(
+    def gaussian_blocks(
         self, adjoint: "CudaAdjoint", curvature: Float[Tensor, "3 h w"], index: Int[Tensor, "m"], gauss_newton: bool
     ) -> Float[Tensor, "m 9 9"]:
         """Own blocks of the splats at index: of the Hessian or of its Gauss-Newton part.
@@ -187,7 +187,7 @@ class CudaRaster:
         gradient = torch.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent
         totals = self.totals(cuda_blocks.block_moments, 1, cuda_blocks.BLOCK_SUMS, gradient, self.pad(curvature))[:, 0]
         moments = torch.zeros_like(adjoint.moments) if gauss_newton else adjoint.moments
-        return cuda_blocks.own_blocks(self.splats[index], totals[index].double(), moments[index].double())
+        return cuda_blocks.gaussian_blocks(self.splats[index], totals[index].double(), moments[index].double())
 
     def jvp(self, directions: Float[Tensor, "n K 9"]) -> "CudaTangent":
         """J u for directions of the splats."""

@@ -37,7 +37,7 @@ from torch import Tensor
 from splat.losses.autograd import consistency_loss
 from splat.model.camera import Camera, slerp
 from splat.model.gaussians import Gaussians
-from splat.render.photometric import Photometric, photometric
+from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.densify import Densified
@@ -91,12 +91,12 @@ class CoRegularizer(Regularizer):
             self.partner = Training.start(training.gaussians, training.extent, config)
         self.partner.move(training.gaussians.flat.device)  # one that was restored is on the CPU
 
-    def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
         """The first field's; the partner makes its whole step here."""
         settings, partner, config = self.settings, self.partner, step.config
         assert partner is not None
         partner.raise_sh_degree(step.gaussians.sh_degree)
-        other = photometric(partner.gaussians, step.camera, step.loss, step.background, config.render)
+        other = loss_and_gradient(partner.gaussians, step.camera, step.loss, step.background, config.render)
         own, theirs = base.gradient, other.gradient
         if settings.weight and step.number > settings.pseudo_start:
             pose = pseudo_view([view.camera for view in step.views], settings.noise, self.generator)

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.model.gaussians import Gaussians
-from splat.render.photometric import Photometric
+from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render_depth
 from splat.scenes.view import View
 from splat.training.methods.depth_prior import DepthKind, prior, require_kind, require_maps
@@ -82,7 +82,7 @@ class DNRegularizer(Regularizer):
     def begin(self, training: Training, views: Sequence[View]) -> None:
         require_maps(views, self.settings.name)
 
-    def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
         settings, total = self.settings, base.gradient
         for start, attribute in ((settings.hard_start, "means"), (settings.soft_start, "opacity_logits")):
             if step.number > start:

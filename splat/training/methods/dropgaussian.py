@@ -39,7 +39,7 @@ class DropRegularizer(Regularizer):
         super().__init__(seed)
         self.settings = settings
 
-    def opacity_gain(self, step: Step) -> Float[Tensor, " n"]:
+    def opacity_scale(self, step: Step) -> Float[Tensor, " n"]:
         p = self.settings.p_max * step.number / step.config.iterations
         return dropout(len(step.gaussians), p, step.gaussians.flat.dtype, self.generator) / (1 - p)
 

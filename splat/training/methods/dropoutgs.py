@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.losses.autograd import consistency_loss
-from splat.render.photometric import Photometric
+from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render
 from splat.training.methods.dropgaussian import dropout
 from splat.training.state import Method, Regularizer, Step
@@ -51,12 +51,12 @@ class DropoutRegularizer(Regularizer):
         super().__init__(seed)
         self.settings = settings
 
-    def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
         flat = step.gaussians.flat.detach().requires_grad_()
         keep = dropout(len(step.gaussians), self.settings.p, flat.dtype, self.generator)
         whole, dropped = (
             render(
-                step.gaussians.with_flat(flat), step.camera, step.background, step.config.render, opacity_gain=gain
+                step.gaussians.with_flat(flat), step.camera, step.background, step.config.render, opacity_scale=gain
             ).image
             for gain in (None, keep)
         )

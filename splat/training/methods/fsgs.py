@@ -32,7 +32,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.model.gaussians import Gaussians
-from splat.render.photometric import Photometric
+from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render_depth
 from splat.scenes.view import View
 from splat.training.densify import Densified
@@ -90,7 +90,7 @@ class FSGSRegularizer(Regularizer):
         if self.settings.depth_weight:
             require_maps(views, self.settings.name)
 
-    def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
         settings = self.settings
         weight = settings.depth_weight and (
             settings.depth_weight if step.number <= settings.depth_until else settings.late_depth_weight

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.render.photometric import Photometric, photometric
+from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
 from splat.training.state import Method, Regularizer, Step
 
 
@@ -50,14 +50,14 @@ class SAMRegularizer(Regularizer):
         super().__init__(seed)
         self.settings = settings
 
-    def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
         if self.settings.metric == "parameters":
             eps = ascent(base.gradient, torch.ones_like(base.gradient), self.settings.rho)
         else:
             rates = step.training.rates(step.number)
             eps = ascent(base.gradient, rates, self.settings.rho * sqrt(rates.numel()))
         worst = step.gaussians.with_flat(step.gaussians.flat + eps)
-        return photometric(worst, step.camera, step.loss, step.background, step.config.render).gradient
+        return loss_and_gradient(worst, step.camera, step.loss, step.background, step.config.render).gradient
 
 
 def ascent(gradient: Float[Tensor, " p"], units: Float[Tensor, " p"], length: float) -> Float[Tensor, " p"]:

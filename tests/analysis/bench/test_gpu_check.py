@@ -27,7 +27,7 @@ from analysis.bench.gpu_check import (
 )
 from analysis.bench.speed.meters import HostMeter
 from analysis.bench.workloads import Workload
-from splat.backend.gpu.graphs import Recordings
+from splat.backend.gpu.graphs import CudaGraphCache
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
@@ -106,7 +106,7 @@ def test_recorded_products_are_held_against_launched_ones(off, monkeypatch):
         return result, lambda: result.copy_(call() + off)
 
     monkeypatch.setattr(SceneObjective, "recordable", lambda self, vectors: vectors == 8)
-    monkeypatch.setattr(SceneHessian, "_recordings", Recordings(capture))
+    monkeypatch.setattr(SceneHessian, "_recordings", CudaGraphCache(capture))
     alone, difference, ratio = recordings(toy(), HostMeter())
     assert alone.value is None and alone.reason == "not recorded here"
     assert difference.name == "H v 8, recorded - launched" and difference.value == pytest.approx(off, rel=1e-4)

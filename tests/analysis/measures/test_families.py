@@ -23,7 +23,7 @@ from analysis.records.records import Record, read_record
 from analysis.records.report import render_report
 from landscape import Bracket, DenseOperator, EigenSettings, FamilySettings, extreme_eigenpairs, families
 from landscape.eigen.pairs import EigenEnds
-from splat.curvature.block_eigenvectors import OwnDirections
+from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -284,14 +284,14 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
     monkeypatch.setattr("analysis.measures.families.families", watched)
     found(objective, checkpoint, metric=metric)
     assert len(seen) == 2 * len(BLOCKS)
-    own, pixelwise = objective.own_blocks
+    own, pixelwise = objective.gaussian_blocks
     for (gauss_newton, block), (operator, lead) in seen.items():
         scale = None if metric == "parameters" else operator.scale[:, 0]
         attribute = None if block == "all" else block
         if block not in ("all", "means", "quats"):
             assert lead.start is None
         else:
-            known = OwnDirections(objective, pixelwise if gauss_newton else own, pixelwise, attribute, scale)
+            known = BlockEigenvectors(objective, pixelwise if gauss_newton else own, pixelwise, attribute, scale)
             upwards = gauss_newton or block == "means"
             assert torch.equal(lead.start, known.steepest(1, 0) if upwards else known.leads())
     eye = torch.eye(objective.active.flat.numel(), dtype=torch.float64)

@@ -14,7 +14,7 @@ from analysis.probe.measurement import ProbeSettings, _density, _within, measure
 from landscape import CountingOperator, EigenSettings, extreme_eigenpairs
 from landscape.operators.operator import DenseOperator
 from landscape.spectrum.density import spectral_density
-from splat.curvature.block_eigenvectors import OwnDirections
+from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
@@ -109,7 +109,7 @@ def test_a_search_for_the_ends_begins_with_several_directions_as_one_alone_takes
     assert case.objective is not None
     seeds, loose, fine = range(3), EigenSettings(rtol=0.1), EigenSettings(rtol=1e-6)
     true = extreme_eigenpairs(case.operator, torch.Generator().manual_seed(9), fine)
-    own = OwnDirections(case.objective, case.objective.block_diagonal())
+    own = BlockEigenvectors(case.objective, case.objective.block_diagonal())
     for start, certain in ((own.steepest(1, 1), False), (own.leads(), True)):
         found = [extreme_eigenpairs(case.operator, torch.Generator().manual_seed(s), loose, start) for s in seeds]
         errors = [

@@ -10,7 +10,7 @@ from analysis.console.options import TrainOptions
 from analysis.records.run_files import read_scores
 from analysis.runs.sweep.sweep_file import Cell
 from analysis.runs.sweep.sweep_results import results
-from analysis.train.spent import Spent
+from analysis.train.training_time import TrainingTime
 
 SCORES = {"psnr": 20.0, "ssim": 0.5, "lpips": None}
 METRICS = {"gaussians": 9, "train": SCORES | {"psnr": "Infinity"}, "test": None}
@@ -66,7 +66,7 @@ def test_damaged_seconds_are_named_with_what_to_do(tmp_path, text, got):
     path = tmp_path / "seconds.json"
     path.write_text(text)
     with pytest.raises(ValueError, match=re.escape(f"expected the seconds of a training in {path}, got {got}")) as e:
-        Spent.read(tmp_path)
+        TrainingTime.read(tmp_path)
     assert str(e.value).endswith("remove it: nothing but the time until its last checkpoint is lost")
     path.write_text(json.dumps(SECONDS | {"later": 1}))
-    assert Spent.read(tmp_path) == Spent(3, 1.5, 2, 2)
+    assert TrainingTime.read(tmp_path) == TrainingTime(3, 1.5, 2, 2)

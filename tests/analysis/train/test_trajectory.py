@@ -11,7 +11,7 @@ from analysis.commands.cli import main
 from analysis.train import command
 from analysis.train.trajectory import COLUMNS, LEAST, Trajectory, TrajectorySettings, measure
 from landscape import extreme_eigenpairs
-from splat.curvature.block_eigenvectors import OwnDirections
+from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import ATTRIBUTES
@@ -96,7 +96,7 @@ def test_the_search_for_the_ends_begins_at_the_directions_of_single_gaussians(at
 
     monkeypatch.setattr("analysis.train.trajectory.extreme_eigenpairs", noted)
     measure(objective, torch.Generator().manual_seed(0), TrajectorySettings(EVERY))
-    assert torch.equal(starts[0], OwnDirections(objective, *objective.own_blocks).leads())
+    assert torch.equal(starts[0], BlockEigenvectors(objective, *objective.gaussian_blocks).leads())
 
 
 def test_a_row_is_the_landscape_within_its_errors(at_the_end, tmp_path):

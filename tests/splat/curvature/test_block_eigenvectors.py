@@ -9,8 +9,8 @@ import torch
 from landscape import ScaledOperator
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from splat.curvature import block_eigenvectors as own_directions
-from splat.curvature.block_eigenvectors import OwnDirections, evened
-from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, OwnBlocks
+from splat.curvature.block_eigenvectors import BlockEigenvectors, evened
+from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, PerGaussianBlocks
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import SIGMA, LossSettings
@@ -35,7 +35,7 @@ def test_the_curvature_along_them_is_the_largest_and_least_of_any_gaussian_alone
         rows = torch.cat([torch.arange(k) + objective.blocks[name].start + i * k for name, k in widths.items()])
         values.append(torch.linalg.eigvalsh(dense[rows][:, rows]))
     values = torch.cat(values).sort().values
-    V = OwnDirections(objective, *objective.own_blocks).steepest(3, 2)
+    V = BlockEigenvectors(objective, *objective.gaussian_blocks).steepest(3, 2)
     assert torch.allclose(V.norm(dim=0), torch.ones(5, dtype=V.dtype))
     assert torch.allclose(H.project(V), V, atol=1e-12)
     found = (V * H.apply(V)).sum(dim=0)
@@ -49,8 +49,8 @@ def test_the_blocks_are_the_hessians_own_with_what_the_window_keeps_of_their_pix
     near = replace(near, camera=replace(near.camera, centre=near.camera.centre + 4 * near.camera.rotation[2]))
     gaussians, loss = random_gaussians(12, 1, logit=1.0), LossSettings(ssim_weight=ssim_weight)
     objective = SceneObjective(gaussians, [far, near], loss, BACKGROUND)
-    own, pixelwise = objective.own_blocks
-    known, n = OwnDirections(objective, own, pixelwise), len(objective.active)
+    own, pixelwise = objective.gaussian_blocks
+    known, n = BlockEigenvectors(objective, own, pixelwise), len(objective.active)
     values, vectors = known.pairs(torch.arange(n))
     found = vectors.double() * values[:, None] @ vectors.double().mT
     single = (4 * pi * SIGMA**2) ** -1  # the square of a Gaussian, added up over the pixels
@@ -86,9 +86,9 @@ def test_near_a_fit_the_steepest_values_are_five_times_nearer_to_the_hessians_th
     made = synthetic_scene(SyntheticSettings(60, 2, 24, 18, sh_degree=0))
     near = made.truth.with_flat(made.truth.flat + 0.02 * random_like(made.truth.flat.shape, 0).to(made.truth.flat))
     objective = SceneObjective(near, made.scene.load())
-    H, (own, pixelwise) = SceneHessian(objective), objective.own_blocks
+    H, (own, pixelwise) = SceneHessian(objective), objective.gaussian_blocks
     errors = []
-    for known in (OwnDirections(objective, own, pixelwise), OwnDirections(objective, own)):
+    for known in (BlockEigenvectors(objective, own, pixelwise), BlockEigenvectors(objective, own)):
         V, values = known.steepest(6, 6), known.pairs(torch.arange(60))[0].flatten().sort().values
         true = (V * H.apply(V)).sum(dim=0)
         found = torch.cat([values[-6:].flip(0), values[:6]])
@@ -108,7 +108,7 @@ def test_in_a_metric_and_of_one_attribute_they_are_those_of_the_scaled_operators
     own = torch.where(owner.flat[:, None] == owner.flat, H.apply(torch.eye(H.dim, dtype=H.dtype)), 0.0)
     rows = slice(0, H.dim) if attribute is None else objective.blocks[attribute]
     own, size = own[rows, rows], float(own[rows, rows].abs().max())
-    known = OwnDirections(objective, *objective.own_blocks, attribute, scale)
+    known = BlockEigenvectors(objective, *objective.gaussian_blocks, attribute, scale)
     of_geometry = owner.flat[rows] < n
     expected = torch.linalg.eigvalsh(own[of_geometry][:, of_geometry])
     assert torch.allclose(known.pairs(torch.arange(n))[0].flatten().sort().values, expected, atol=1e-10 * size)
@@ -123,7 +123,7 @@ def test_a_recurrence_from_the_steepest_finds_the_same_ends(ssim_weight):
     loss = LossSettings(ssim_weight=ssim_weight)
     objective = SceneObjective(random_gaussians(40, 1, logit=1.0), two_views(), loss, BACKGROUND)
     H, settings = SceneHessian(objective), EigenSettings(2, 1, rtol=1e-3)
-    start = OwnDirections(objective, *objective.own_blocks).leads()
+    start = BlockEigenvectors(objective, *objective.gaussian_blocks).leads()
     led = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings, start)
     truth = torch.linalg.eigvalsh(H.apply(torch.eye(H.dim, dtype=H.dtype)).double())
     for pairs, true in ((led.largest, truth[-2:].flip(0)), (led.smallest, truth[:1])):
@@ -143,7 +143,7 @@ def test_blocks_that_curve_up_alone_do_not_lead_along_the_quaternions_lengths(ob
     n, k = len(objective.active), objective.active.sh.shape[1]
     flat = objective.active.flat
     eye = torch.eye(11, dtype=flat.dtype).repeat(n, 1, 1)
-    known = OwnDirections(objective, OwnBlocks(eye, flat.new_ones(n, k, 3)))
+    known = BlockEigenvectors(objective, PerGaussianBlocks(eye, flat.new_ones(n, k, 3)))
     V = known.steepest(2, 3)
     assert torch.allclose(V.norm(dim=0), torch.ones(5, dtype=V.dtype))
     assert torch.allclose(SceneHessian(objective).project(V), V, atol=1e-12)
@@ -158,14 +158,16 @@ def test_few_blocks_are_taken_apart_for_their_ends_and_none_that_has_one_is_left
     values = objective.active.flat.new_full((n, 11), 0.2)
     values[10:20], values[10:20, 6], values[15, 2], values[40, 1] = 2.0, others, 2.5, low
     turns = torch.linalg.qr(random_like((n, 11, 11), 5).to(values)).Q
-    taken, plain = [], OwnDirections.pairs
+    taken, plain = [], BlockEigenvectors.pairs
 
     def counted(self, gaussians):
         taken.append(len(gaussians))
         return plain(self, gaussians)
 
-    monkeypatch.setattr(OwnDirections, "pairs", counted)
-    known = OwnDirections(objective, OwnBlocks(turns @ torch.diag_embed(values) @ turns.mT, values.new_zeros(n, 1, 3)))
+    monkeypatch.setattr(BlockEigenvectors, "pairs", counted)
+    known = BlockEigenvectors(
+        objective, PerGaussianBlocks(turns @ torch.diag_embed(values) @ turns.mT, values.new_zeros(n, 1, 3))
+    )
     found = {}
     for few in (8, n):
         monkeypatch.setattr("splat.curvature.block_eigenvectors.FEW", few)

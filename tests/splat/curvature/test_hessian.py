@@ -171,7 +171,7 @@ def test_the_operator_passes_the_checks_of_any_operator():
 
 def test_the_part_of_some_views_is_their_mean_at_the_same_gaussians():
     scene = objective(random_gaussians(20, 1, logit=1.0))
-    assert scene.gradient.any() and scene.own_blocks[0].sh.any()  # known before
+    assert scene.gradient.any() and scene.gaussian_blocks[0].sh.any()  # known before
     part, (first, _) = scene.of_views(1), scene.linearized
     assert part.active is scene.active and len(scene.views) == 2
     assert (part.counts.views, part.memory_plan.views, part.memory_plan.kept) == (1, 1, 1)
@@ -180,7 +180,7 @@ def test_the_part_of_some_views_is_their_mean_at_the_same_gaussians():
     V = random_like((scene.active.flat.numel(), 2), 3)
     assert torch.equal(SceneHessian(part, keep_null=True).apply(V), first.hvp(V))
     assert torch.equal(part.gradient, first.gradient)
-    assert torch.equal(part.own_blocks[0].geometry, first.block_diagonal().geometry)
+    assert torch.equal(part.gaussian_blocks[0].geometry, first.block_diagonal().geometry)
 
 
 def test_the_signature_changes_where_the_order_does_and_only_there():

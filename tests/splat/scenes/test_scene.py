@@ -21,7 +21,7 @@ def scene_of(cameras: list[Camera]) -> Scene:
 
 
 def camera_turned(degrees: float, centre: tuple[float, float, float] = (0, 0, 0)) -> Camera:
-    """Looks along +z, turned about the vertical axis."""
+    """StoppingRule along +z, turned about the vertical axis."""
     c, s = cos(degrees * pi / 180), sin(degrees * pi / 180)
     rotation = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]], dtype=torch.float64)
     return Camera(rotation, torch.tensor(centre, dtype=torch.float64), 10.0, 10.0, 1.0, 1.0, 2, 2)

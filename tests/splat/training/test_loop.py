@@ -228,7 +228,7 @@ def test_the_background_is_drawn_anew_each_step_where_it_is_random_and_is_the_se
         colours.append(tuple(background.tolist()))
         return render(gaussians, camera, background, settings, **others)
 
-    monkeypatch.setattr("splat.render.photometric.render", recorded)
+    monkeypatch.setattr("splat.render.loss_and_gradient.render", recorded)
     run(TrainConfig(4, random_background=True))
     assert len(set(colours)) == 4
     colours.clear()

@@ -32,7 +32,7 @@ from splat.losses.autograd import consistency_loss
 from splat.model.camera import Camera
 from splat.model.capture import capture_geometry
 from splat.projection.reference import on_screen
-from splat.render.photometric import Photometric, photometric
+from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
 from splat.render.render import render, render_depth
 from splat.scenes.view import View
 from splat.training.methods.stablegs.attribute_probe import (
@@ -106,7 +106,7 @@ class StableRegularizer(Regularizer):
                 "training; take another copy of it, or train anew"
             )
 
-    def gradient(self, step: Step, base: Photometric) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
         settings = self.settings
         since = step.number - settings.warm_up - 1
         if since < 0 or (settings.asp_weight == settings.vsp_weight == 0):
@@ -122,7 +122,7 @@ class StableRegularizer(Regularizer):
             return (1 + settings.asp_weight) * base.gradient
         total = base.gradient.clone()
         if settings.asp_weight:
-            again = photometric(probed.gaussians, step.camera, step.loss, step.background, step.config.render)
+            again = loss_and_gradient(probed.gaussians, step.camera, step.loss, step.background, step.config.render)
             total.add_(probed.pull(again.gradient), alpha=settings.asp_weight)
         for pose in poses:
             if (disagreement := _disagreement(step, probed, pose)) is None:

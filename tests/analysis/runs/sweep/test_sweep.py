@@ -24,7 +24,7 @@ from analysis.runs.sweep.sweep import _Cells, locked, missing, probe_arguments
 from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import results
-from analysis.train.spent import Spent
+from analysis.train.training_time import TrainingTime
 from splat.render.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -96,7 +96,7 @@ def finished(folder) -> Sweep:
         return render(*given, **others)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("splat.render.photometric.render", press)
+        patch.setattr("splat.render.loss_and_gradient.render", press)
         assert main(arguments(sweep.cells[0].training)) == 130
     assert load_checkpoint(sweep.cells[0].out / "checkpoint.pt").training.step == 3
     assert main(["sweep", str(sweep.file), "--jobs", "2"]) == 0
@@ -290,17 +290,17 @@ def test_the_results_are_the_runs_own_metrics(finished, folder):
 def test_the_time_left_follows_the_pace_of_each_method(folder, tmp_path):
     sweep = read_sweep(folder / "sweep.toml", tmp_path)
     progress = SweepProgress(sweep, {cell.name: ["train"] for cell in sweep.cells}, jobs=2)
-    assert progress.seconds([Spent()] * 4) is None
-    known = [Spent(step=12, wall=6.0), Spent(step=4, wall=8.0), Spent(), Spent()]
+    assert progress.seconds([TrainingTime()] * 4) is None
+    known = [TrainingTime(step=12, wall=6.0), TrainingTime(step=4, wall=8.0), TrainingTime(), TrainingTime()]
     assert progress.seconds(known) == pytest.approx((8 * 2 + 12 * 0.5 + 12 * 2) / 2)
-    assert progress.seconds([Spent(step=12, wall=6.0)] + [Spent()] * 3) == pytest.approx(3 * 12 * 0.5 / 2)
+    assert progress.seconds([TrainingTime(step=12, wall=6.0)] + [TrainingTime()] * 3) == pytest.approx(3 * 12 * 0.5 / 2)
 
 
 def test_the_time_left_goes_with_the_last_probe(folder, tmp_path, monkeypatch):
     sweep = read_sweep(folder / "sweep.toml", tmp_path)
     to_do: dict[str, list[Stage]] = {cell.name: ["probe"] for cell in sweep.cells}
     progress = SweepProgress(sweep, to_do, jobs=1)
-    monkeypatch.setattr(Spent, "read", lambda run: Spent(step=12, wall=6.0))
+    monkeypatch.setattr(TrainingTime, "read", lambda run: TrainingTime(step=12, wall=6.0))
     progress.took("probe", 60.0)
     assert progress.left() == "0:04:00"
     for stages in to_do.values():

@@ -22,7 +22,7 @@ from analysis.runs.sweep.sweep_results import (
     unfinished,
     with_ratios,
 )
-from analysis.train.spent import Spent
+from analysis.train.training_time import TrainingTime
 from splat.training.loop import StepResult
 from tests.recorded import synthetic
 
@@ -101,7 +101,7 @@ def test_times_by_the_clock_are_compared_only_at_as_many_threads():
 
 
 def test_a_training_continued_with_other_threads_has_none_of_its_own(monkeypatch):
-    spent = Spent()
+    spent = TrainingTime()
     for threads, said in ((2, 2), (2, 2), (3, None), (3, None)):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         list(spent.timed([StepResult(spent.step + 1, 0.5, 9, "view")]))

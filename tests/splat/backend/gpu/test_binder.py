@@ -54,7 +54,7 @@ def launch_all(n: int, m: int, K: int) -> None:
     from splat.losses.reference import LossSettings
     from splat.model.settings import RenderSettings
     from splat.raster.cuda.raster import CudaRaster
-    from splat.render.photometric import photometric
+    from splat.render.loss_and_gradient import loss_and_gradient
     from splat.training.optim.adam_cuda import update
     from tests.splat.held_scenes import BACKGROUND, two_views
     from tests.splat.random_scenes import random_gaussians
@@ -68,7 +68,7 @@ def launch_all(n: int, m: int, K: int) -> None:
         held = LinearizedView(gaussians, view.camera, loss, BACKGROUND.float(), render)
         held.hvp(flat.new_ones(len(flat), K))
         _ = held.gradient, held.block_diagonal(), held.loss_curvatures(flat.new_ones(len(flat), K))
-    photometric(gaussians, view.camera, loss, BACKGROUND.float(), atomic)
+    loss_and_gradient(gaussians, view.camera, loss, BACKGROUND.float(), atomic)
     loss.value(view.image)
     CudaImageLoss(view.image, settings).consistency(view.image, view.image)
     update(flat, flat, flat, flat.clone(), flat.clone(), 1.0, 1.0, (0.9, 0.999, 1e-15, 1e-28))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splat.backend.gpu import graphs as recording
-from splat.backend.gpu.graphs import CALLS, CudaGraphs, Recordings
+from splat.backend.gpu.graphs import CALLS, CudaGraphCache, CudaGraphs
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
@@ -42,7 +42,7 @@ class Fake:
 
 def test_a_product_is_recorded_once_for_every_number_of_vectors_that_it_is_often_called_with():
     fake = Fake()
-    recordings = Recordings(fake)
+    recordings = CudaGraphCache(fake)
     found = {k: [recordings(triple, torch.full((4, k), float(i))) for i in range(CALLS + 2)] for k in (1, 2)}
     assert (fake.captures, fake.replays) == (2, 2 * 3)
     recordings(triple, torch.ones(4, 3))
@@ -58,7 +58,7 @@ def test_where_recording_fails_it_is_said_once_and_products_are_made_all_the_sam
         tried.append(call())
         raise RuntimeError("operation not permitted")
 
-    recordings = Recordings(fail)
+    recordings = CudaGraphCache(fail)
     with pytest.warns(UserWarning, match=r"kernel by kernel.*\(operation not permitted\)") as caught:
         found = [recordings(triple, torch.full((4, k), float(i))) for k in (1, 2) for i in range(CALLS + 1)]
     assert len(caught) == len(tried) == 1
@@ -137,7 +137,7 @@ def test_recorded_products_of_a_scene_are_those_that_are_not_recorded_to_the_las
 
         tape = Tape(monkeypatch)
         monkeypatch.setattr(SceneObjective, "recordable", lambda self, vectors: True)
-        vars(hessian)["_recordings"] = Recordings(tape.capture)
+        vars(hessian)["_recordings"] = CudaGraphCache(tape.capture)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         for seed in (1, 2):

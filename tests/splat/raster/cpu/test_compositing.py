@@ -163,7 +163,7 @@ def test_tiles_with_a_cotangent_of_zero_are_left_out_and_add_nothing(monkeypatch
     for part in (np.ones_like(lit), lit, 1 - lit):
         adjoint = raster.backward(raster.pad(part * expected.G.numpy()))
         product = tangent.curvature(adjoint, raster.pad(part * expected.dG[:K].numpy()))
-        own = raster.own_blocks(adjoint, raster.pad(part) * curvature, index, False)
+        own = raster.gaussian_blocks(adjoint, raster.pad(part) * curvature, index, False)
         results.append((adjoint.gradient, product, np.tril(own)))
     for whole, one, other in zip(*results, strict=True):
         assert np.abs(one).max() > 0 and relative_error(one + other, whole) < 1e-13

@@ -123,8 +123,8 @@ def test_own_blocks_are_those_of_the_cpu(dtype, device):
     h = torch.rand(3, got.height, got.width, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for gauss_newton in (False, True) if dtype == torch.float64 else (False,):
         adjoint = cpu.backward(cpu.pad(expected.G.numpy()))
-        want = cpu.own_blocks(adjoint, cpu.pad(h.numpy().astype(NUMPY[dtype])), index.numpy(), gauss_newton)
-        blocks = got.own_blocks(got.backward(expected.G.to(device)), h.to(device), index.to(device), gauss_newton)
+        want = cpu.gaussian_blocks(adjoint, cpu.pad(h.numpy().astype(NUMPY[dtype])), index.numpy(), gauss_newton)
+        blocks = got.gaussian_blocks(got.backward(expected.G.to(device)), h.to(device), index.to(device), gauss_newton)
         assert relative_error(blocks, want) < DERIVATIVE[dtype]
 
 

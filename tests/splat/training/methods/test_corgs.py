@@ -10,7 +10,7 @@ from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import photometric_loss
 from splat.model.camera import Camera
 from splat.model.capture import capture_geometry
-from splat.render.photometric import photometric
+from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training.densify import DensifySettings
 from splat.training.loop import train
@@ -90,7 +90,7 @@ def test_each_field_descends_its_loss_and_its_disagreement_with_the_image_of_the
     monkeypatch.setattr(corgs, "pseudo_view", lambda *a: poses.append(posing(*a)) or poses[-1])
     step, partner = a_step(CoRGS(pseudo_start=5, weight=0.7), number)
     monkeypatch.setattr(partner, "descend", lambda gradient, at: descended.append((gradient, at)))
-    base = photometric(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
     own = step.training.regularizer.gradient(step, base)
     assert len(poses) == (weight > 0) and [at for _, at in descended] == [number]
 

@@ -8,7 +8,7 @@ import torch
 
 from splat.losses.cpu.loss import ViewLoss
 from splat.model.gaussians import Gaussians
-from splat.render.photometric import photometric
+from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training.loop import train
 from splat.training.methods import dngaussian
@@ -31,7 +31,7 @@ def a_step(settings: DNGaussian, number: int = 1, scale: float = 1.0, shift: flo
 
 def added(step: Step) -> Gaussians:
     """What the method adds to the photometric gradient."""
-    base = photometric(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
     return step.gaussians.with_flat(step.training.regularizer.gradient(step, base) - base.gradient)
 
 

@@ -17,8 +17,10 @@ from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
 @pytest.fixture
 def gains(monkeypatch) -> list[torch.Tensor]:
     """Every gain that a training draws."""
-    drawn, draw = [], DropRegularizer.opacity_gain
-    monkeypatch.setattr(DropRegularizer, "opacity_gain", lambda self, step: drawn.append(draw(self, step)) or drawn[-1])
+    drawn, draw = [], DropRegularizer.opacity_scale
+    monkeypatch.setattr(
+        DropRegularizer, "opacity_scale", lambda self, step: drawn.append(draw(self, step)) or drawn[-1]
+    )
     return drawn
 
 

@@ -5,7 +5,7 @@ import torch
 
 from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import photometric_loss
-from splat.render.photometric import photometric
+from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training.methods import dropoutgs
 from splat.training.methods.dropoutgs import DropoutGS
@@ -21,7 +21,7 @@ def test_the_gradient_is_that_of_the_loss_and_the_agreement_with_the_gaussians_t
     background = torch.tensor([0.2, 0.4, 0.1], dtype=torch.float64)
     loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
     step = Step(1, training, training.gaussians, views, 1, background, loss)
-    base = photometric(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
     gradient = training.regularizer.gradient(step, base)
 
     stays = masks[0].nonzero()[:, 0]

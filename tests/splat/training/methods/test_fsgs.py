@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splat.losses.cpu.loss import ViewLoss
-from splat.render.photometric import photometric
+from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.loop import train
@@ -111,7 +111,7 @@ def test_disparities_down_to_minus_200_have_no_inverse_and_are_correlated_as_the
 def test_the_gradient_is_that_of_the_loss_and_the_weighted_depth_term(number, weight):
     settings = FSGS(depth_weight=0.3, late_depth_weight=0.02, depth_until=6, depths="depth")
     step = a_step(settings, number)
-    base = photometric(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
     got = step.training.regularizer.gradient(step, base)
 
     flat = step.gaussians.flat.detach().requires_grad_()
@@ -126,7 +126,7 @@ def test_where_nothing_is_seen_depth_adds_nothing_and_is_not_correlated(monkeypa
     monkeypatch.setattr(fsgs, "depth_loss", None)
     step = a_step(FSGS())
     step.gaussians.means[:, 2] = -3.0
-    base = photometric(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
     assert torch.equal(step.training.regularizer.gradient(step, base), base.gradient)
 
 

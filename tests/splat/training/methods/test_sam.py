@@ -7,7 +7,7 @@ import torch
 
 from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import photometric_loss
-from splat.render.photometric import photometric
+from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training.methods import sam
 from splat.training.methods.sam import SAM, ascent
@@ -35,7 +35,7 @@ def units_of(step: Step, metric: str) -> torch.Tensor:
 @pytest.mark.parametrize(("metric", "rho"), [("parameters", 0.02), ("rates", 3.0)])
 def test_the_gradient_is_that_of_the_loss_one_unit_ascent_away_in_the_units_of_the_ball(metric, rho):
     step = a_step(SAM(rho=rho, metric=metric))
-    base = photometric(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
     got = step.training.regularizer.gradient(step, base)
 
     units = units_of(step, metric)
@@ -70,10 +70,10 @@ def test_no_step_of_the_same_length_rises_faster():
 
 def test_one_step_costs_one_more_render_and_where_the_gradient_is_0_nothing_moves(monkeypatch):
     calls = []
-    monkeypatch.setattr(sam, "photometric", lambda *a: calls.append(a[0]) or photometric(*a))
+    monkeypatch.setattr(sam, "loss_and_gradient", lambda *a: calls.append(a[0]) or loss_and_gradient(*a))
     step = a_step(SAM())
     step.gaussians.means[:, 2] = -3.0
-    base = photometric(step.gaussians, step.camera, step.loss, step.background)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
     gradient = step.training.regularizer.gradient(step, base)
     assert len(calls) == 1 and torch.equal(calls[0].flat, step.gaussians.flat)
     assert not gradient.any()

@@ -8,7 +8,7 @@ import torch
 
 from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import photometric_loss
-from splat.render.photometric import photometric
+from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings
@@ -37,7 +37,7 @@ def first_step(settings: StableGS, **others) -> Step:
 
 
 def base_of(step: Step):
-    return photometric(step.gaussians, step.camera, step.loss, step.background)
+    return loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
 
 
 @pytest.mark.parametrize("viewpoints", ["one", "all"])
@@ -84,7 +84,7 @@ def test_a_probe_of_no_attribute_weighs_the_photometric_gradient_alone(monkeypat
     def never(*_, **__):
         raise AssertionError("was worked out for nothing")
 
-    for name in ("photometric", "exact_traces", "render"):
+    for name in ("loss_and_gradient", "exact_traces", "render"):
         monkeypatch.setattr(stablegs, name, never)
     settings = StableGS(warm_up=0, probe=ProbeSettings(attributes=()), viewpoint=ViewpointSettings(edge_rotation=False))
     step = first_step(settings)
@@ -96,7 +96,7 @@ def test_a_probe_of_no_attribute_weighs_the_photometric_gradient_alone(monkeypat
     ("weights", "renders"), [((1.0, 0.0), (1, 0)), ((0.0, 0.5), (0, 6)), ((0.0, 0.0), (0, 0)), ((1.0, 0.5), (1, 6))]
 )
 def test_a_loss_of_weight_0_is_not_rendered(monkeypatch, weights, renders):
-    calls = {"photometric": 0, "render": 0}
+    calls = {"loss_and_gradient": 0, "render": 0}
 
     def counted(name, function):
         def call(*arguments, **settings):

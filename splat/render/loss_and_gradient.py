@@ -16,7 +16,7 @@ from splat.render.render import render
 
 
 @dataclass(frozen=True, eq=False)
-class Photometric:
+class LossAndGradient:
     """gradient: dL / d flat; screen_gradient: dL / d splats.means, per px; all off the autograd graph."""
 
     loss: float
@@ -25,17 +25,17 @@ class Photometric:
     splats: Splats
 
 
-def photometric(
+def loss_and_gradient(
     gaussians: Gaussians,
     camera: Camera,
     loss: ViewLoss,
     background: Float[Tensor, "3"],
     settings: RenderSettings = RenderSettings(),
-    opacity_gain: Float[Tensor, " n"] | None = None,
-) -> Photometric:
-    """Loss and gradient; opacity_gain: see `splat.render.render.render`.  Raises ValueError where a parameter is not finite."""
+    opacity_scale: Float[Tensor, " n"] | None = None,
+) -> LossAndGradient:
+    """Loss and gradient; opacity_scale: see `render`.  Raises ValueError where a parameter is not finite."""
     flat = gaussians.flat.detach().requires_grad_()
-    rendering = render(gaussians.with_flat(flat), camera, background, settings, opacity_gain=opacity_gain)
+    rendering = render(gaussians.with_flat(flat), camera, background, settings, opacity_scale=opacity_scale)
     value = view_loss(rendering.image, loss)
     gradient, screen_gradient = torch.autograd.grad(value, [flat, rendering.splats.means])
-    return Photometric(value.item(), gradient, screen_gradient, rendering.splats.detach())
+    return LossAndGradient(value.item(), gradient, screen_gradient, rendering.splats.detach())

@@ -19,7 +19,7 @@ from splat.training.loop import StepResult
 
 
 @dataclass
-class Spent:
+class TrainingTime:
     """The time until a step."""
 
     step: int = 0
@@ -28,7 +28,7 @@ class Spent:
     threads: int | None = 1
 
     @classmethod
-    def read(cls, run: Path) -> "Spent":
+    def read(cls, run: Path) -> "TrainingTime":
         """That of a run folder; none where it has not been saved yet."""
         return cls(**read_seconds(run)) if (run / SECONDS).is_file() else cls()
 
