@@ -80,7 +80,7 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         scene = checkpoint.load_scene(options.checkpoint, options.scene)
         objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
     with stages:
-        known = _known(options.checkpoint.parent / "probe", unfinished, checkpoint, objective)
+        known = _known(options.checkpoint.parent / "probe", unfinished, objective)
         try:
             found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
         except ValueError:  # it would not end better the next time
@@ -91,7 +91,7 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
                 again = shlex.join(command)
                 console.print(f"what was rendered is kept; to continue: {again}", soft_wrap=True, highlight=False)
             raise
-        data = slice_data(found, objective, checkpoint.training.config.loss)
+        data = slice_data(found, objective)
         data["notes"] = slice_notes(found.slice)
         data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
         with record_folder(out, SLICE) as folder:
@@ -135,12 +135,12 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     return there.flat
 
 
-def _known(probe: Path, unfinished: Path, checkpoint: Checkpoint, objective: SceneObjective) -> list[Tensor]:
+def _known(probe: Path, unfinished: Path, objective: SceneObjective) -> list[Tensor]:
     """Eigenvectors of an interrupted run and of the probe."""
     kept = unfinished / "eigenvectors.npy"
     found = [torch.from_numpy(np.load(kept, allow_pickle=False))] if kept.is_file() else []
     center = objective.active.flat
-    name, precision = loss_name(checkpoint.training.config.loss), torch.finfo(center.dtype).eps
+    name, precision = loss_name(objective.loss_settings), torch.finfo(center.dtype).eps
     found += recorded_eigenvectors(probe, name, objective.loss(center), precision)
     return [vectors.to(center.device) for vectors in found]
 

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.operators.distributed import ALONE, Ranks
 from splat.curvature.objective import SceneObjective
 from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import LossSettings
@@ -204,10 +205,14 @@ class TrainConfig:
     def background_colour(self, dtype: torch.dtype) -> Float[Tensor, "3"]:
         return torch.tensor(self.background, dtype=dtype)
 
-    def objective(self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False) -> SceneObjective:
+    def objective(
+        self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False, ranks: Ranks = ALONE
+    ) -> SceneObjective:
         """This loss, on this background, averaged over views: the objective whose Hessian is studied.  See `SceneObjective`."""
         background = self.background_colour(gaussians.flat.dtype)
-        return SceneObjective(gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen)
+        return SceneObjective(
+            gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen, ranks=ranks
+        )
 
 
 @dataclass(eq=False)

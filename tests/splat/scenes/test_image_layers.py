@@ -158,7 +158,7 @@ def test_depth_maps_that_cannot_be_are_refused(tmp_path: Path, values: np.ndarra
 
 def test_depth_of_8_bits_is_refused(tmp_path: Path) -> None:
     write_mask(tmp_path / "d.png", blob())
-    with pytest.raises(ValueError, match="mode L instead of 16 bits"):
+    with pytest.raises(ValueError, match="depth of 16 bits, got mode L"):
         read_depth(tmp_path / "d.png")
 
 
