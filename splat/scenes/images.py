@@ -26,6 +26,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.scenes.layers import opened_image, read_depth, read_mask
 from splat.scenes.view import Frame, Subset, View
@@ -108,7 +109,7 @@ def image_header(path: Path) -> tuple[tuple[int, int], bool]:
     """((width, height), whether it has an alpha channel), without reading the pixels."""
     with opened_image(path) as file:
         if file.mode.startswith(("I", "F")):
-            raise ValueError(f"expected an image of 8 bits a channel, got mode {file.mode} in {path}; convert it")
+            raise InputError(f"expected an image of 8 bits a channel, got mode {file.mode} in {path}; convert it")
         return file.size, file.has_transparency_data
 
 
@@ -121,7 +122,7 @@ def image_pixels(path: Path) -> UInt8[np.ndarray, "h w c"]:
 def checked_lens(model: str, size: tuple[float, float], params: Sequence[float], name: str) -> pycolmap.Camera:
     """The lens of a photograph of this (width, height).  ValueError where it cannot be one."""
     if not (all(map(isfinite, params)) and all(1 <= side <= LARGEST_SIDE for side in size)):
-        raise ValueError(
+        raise InputError(
             f"the camera of image {name!r} cannot be: expected at least 1 px a side and finite numbers, got "
             f"{size[0]:g} x {size[1]:g} px and {[float(value) for value in params]}"
         )
@@ -135,15 +136,15 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
     pinhole = _pinhole(lens, photo)
     width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
     if downscale > 1 and min(width, height) < SMALLEST:
-        raise ValueError(
+        raise InputError(
             f"expected pictures of at least {SMALLEST} px a side, got {width} x {height} px for {photo.name!r} at downscale "
             f"{downscale:g}; reduce less"
         )
     fx, fy, cx, cy = pinhole.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     try:
         full = Camera(photo.rotation, photo.centre, fx, fy, cx, cy, pinhole.width, pinhole.height)
-    except ValueError as error:
-        raise ValueError(f"the camera of image {photo.name!r} cannot be: {error}") from error
+    except InputError as error:
+        raise InputError(f"the camera of image {photo.name!r} cannot be: {error}") from error
     camera = full.resized(width, height)
     warp = partial(_warp, lens, pinhole, (width, height))
     return Frame(photo.name, camera, partial(_view, photo, camera, warp, background), photo.subset, photo.depth_range)
@@ -155,7 +156,7 @@ def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> py
     if (lens.width, lens.height) == size:
         return lens
     if not _same_shape((lens.width, lens.height), size):
-        raise ValueError(
+        raise InputError(
             f"expected image {photo.name!r} at the {lens.width} x {lens.height} px of its camera or scaled from it, "
             f"got {width} x {height} px in {photo.path}; it was cropped, rotated or stretched: use the images that the "
             "cameras were computed from, or compute the cameras anew"
@@ -180,7 +181,7 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
     if model in PINHOLE_MODELS:
         return lens
     if model not in UNDISTORTED_HERE:
-        raise ValueError(
+        raise InputError(
             f"expected a pinhole lens or radial and tangential distortion ({', '.join(UNDISTORTED_HERE)}), got "
             f"{model} for image {photo.name!r}; make pinhole images first: colmap image_undistorter --image_path "
             f"{photo.path.parent} --input_path MODEL --output_path NEW_SCENE, where MODEL is the folder of cameras.bin"
@@ -188,7 +189,7 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
     if lens.is_undistorted():
         return lens
     if not _displacement(lens) <= LARGEST_DISPLACEMENT:
-        raise ValueError(
+        raise InputError(
             f"the camera of image {photo.name!r} cannot be: expected distortion that moves no corner by more than "
             f"{LARGEST_DISPLACEMENT} half diagonals of the picture, got {model} with {lens.params_to_string()}"
         )
@@ -216,7 +217,7 @@ def _view(photo: Photo, camera: Camera, warp: Warp, background: Float[Tensor, "3
     if photo.mask:
         mask = warp(_at_size(read_mask(photo.mask), size, photo.mask))[0] >= INSIDE
         if not mask.any():
-            raise ValueError(
+            raise InputError(
                 f"expected a mask with whole pixels inside, got none in {photo.mask} at this size; reduce less"
             )
     if photo.depth:
@@ -228,7 +229,7 @@ def _at_size(layers: Float[Tensor, "c h w"], size: tuple[int, int], path: Path) 
     """A mask or depth map at the size of its photograph, whose shape it must have."""
     height, width = layers.shape[1:]
     if not _same_shape((width, height), size):
-        raise ValueError(
+        raise InputError(
             f"expected {path} to have the shape of its photograph, {size[0]} x {size[1]} px at any scale, got "
             f"{width} x {height}; make it from that photograph"
         )

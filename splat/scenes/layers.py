@@ -20,6 +20,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.scenes.view import View
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -39,7 +40,7 @@ def opened_image(path: Path, kind: str = "an image") -> Iterator[Image.Image]:
         with Image.open(path, formats=FORMATS) as file:
             yield file
     except UNREADABLE as error:
-        raise ValueError(f"expected {kind}, cannot read {path}: {error}; replace the file") from error
+        raise InputError(f"expected {kind}, cannot read {path}: {error}; replace the file") from error
 
 
 def dtu_number(name: str) -> int | None:
@@ -69,7 +70,7 @@ def require_depths(views: Sequence[View], folder: Path) -> None:
     """ValueError unless every view has a depth map."""
     without = [view.name for view in views if view.depth is None]
     if without:
-        raise ValueError(
+        raise InputError(
             f"expected a depth map for each of the {len(views)} training views in {folder}, got none for {without[0]}; "
             f"save it as {PurePosixPath(without[0]).stem}.npy"
         )
@@ -81,7 +82,7 @@ def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
         pixels = np.array(file if file.mode in ("1", "L") else file.convert("RGB"))
     lowest = pixels.reshape(*pixels.shape[:2], -1).min(axis=2)
     if not lowest.any():
-        raise ValueError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
+        raise InputError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
     return torch.from_numpy(lowest == lowest.max()).to(torch.float32)[None]
 
 
@@ -91,25 +92,25 @@ def read_depth(path: Path) -> Float[Tensor, "1 h w"]:
         try:
             values = read_array(path)
         except (OSError, ValueError) as error:
-            raise ValueError(f"expected a depth map, cannot read {path}: {error}; write it again") from error
+            raise InputError(f"expected a depth map, cannot read {path}: {error}; write it again") from error
     else:
         with opened_image(path, "a depth map") as file:
             if file.mode not in SIXTEEN_BITS:
-                raise ValueError(
+                raise InputError(
                     f"expected depth of 16 bits, got mode {file.mode}, too few levels, in {path}; write it again"
                 )
             values = np.array(file)
     shape, values = values.shape, values.squeeze()
     if values.ndim != 2 or not values.size:
-        raise ValueError(f"expected a depth map of shape (h, w), got {values.dtype} of shape {shape} in {path}")
+        raise InputError(f"expected a depth map of shape (h, w), got {values.dtype} of shape {shape} in {path}")
     with np.errstate(over="ignore"):  # what becomes infinite is refused
         values = values.astype(np.float32)
     if not np.isfinite(values).all():
-        raise ValueError(
+        raise InputError(
             f"expected finite depths, got {(~np.isfinite(values)).sum()} that are not in {path}; fill them"
         )
     if values.min() == values.max():
-        raise ValueError(f"expected depths that vary, got {values.min()} everywhere in {path}; write it again")
+        raise InputError(f"expected depths that vary, got {values.min()} everywhere in {path}; write it again")
     return torch.from_numpy(values)[None]
 
 
@@ -119,7 +120,7 @@ def read_array(path: Path) -> np.ndarray:
         try:
             values = np.lib.format.read_array(file, allow_pickle=False)
         except Exception as error:  # NumPy has Python read the header, whose errors are of many kinds
-            raise ValueError(f"no array of numbers ({error})") from error
+            raise InputError(f"no array of numbers ({error})") from error
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"an array of {values.dtype}, not of real numbers")
+        raise InputError(f"an array of {values.dtype}, not of real numbers")
     return values
