@@ -14,6 +14,7 @@ places on any step and have their means held still.
 
 from collections.abc import Hashable
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -26,7 +27,6 @@ from splat.curvature.hessian import SceneHessian, ViewSum
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import loss_against, view_loss
 from splat.model.gaussians import Gaussians
-from splat.projection.reference import project
 from splat.render.autograd import rasterize_by_kernel
 
 STEPS = (1e-10, 3e-10, 3e-11)  # per parameter; means in units of their spread
@@ -37,10 +37,12 @@ def check_against_gradient(
 ) -> DerivativeCheck:
     """The relative error of H v for one random v.
 
-    views: how many to take, from the first of this process; all by default.  Both sides are sums over them.
+    views: how many to take, from the first of this process; all by default.  Both sides are sums over them.  For some views,
+    P leaves out the quaternions' lengths alone: what is flat for all views together need not be flat for each.
     """
     objective = hessian.objective
-    operator = ProjectedOperator(DistributedOperator(ViewSum(objective, count=views), objective.ranks), hessian.project)
+    leave_out = hessian.project if views is None else partial(_without_lengths, objective.active)
+    operator = ProjectedOperator(DistributedOperator(ViewSum(objective, count=views), objective.ranks), leave_out)
     double = objective.active.to(torch.float64)
     background, settings = objective.background.double(), objective.settings
     direction = operator.project(_direction(objective, generator)[:, None])[:, 0]
@@ -59,7 +61,7 @@ def check_against_gradient(
         done += 1
         if progress:
             progress(done, 2 * len(STEPS), "gradients in double precision")
-        return _without_lengths(objective.ranks.sum(total), double)
+        return _without_lengths(double, objective.ranks.sum(total)[:, None])[:, 0]
 
     def order(theta: Float[Tensor, " p"]) -> Hashable:
         means = double.with_flat(theta).means.cpu()
@@ -71,11 +73,12 @@ def check_against_gradient(
     return check_gradient(operator, gradient, double.flat, direction, STEPS, order, enough)
 
 
-def _without_lengths(gradient: Float[Tensor, " p"], gaussians: Gaussians) -> Float[Tensor, " p"]:
-    """The gradient, which has no other null directions, without its components along the (unit) quaternions."""
-    turns = gaussians.with_flat(gradient).quats
-    turns -= gaussians.quats * (gaussians.quats * turns).sum(dim=1, keepdim=True)
-    return gradient
+def _without_lengths(gaussians: Gaussians, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+    """V without its components along the (unit) quaternions: the only null directions in which a gradient has any."""
+    V, q = V.clone(), gaussians.quats[:, :, None]
+    quats = V[gaussians.blocks["quats"]].view(len(gaussians), 4, -1)
+    quats -= q * (q * quats).sum(dim=1, keepdim=True)
+    return V
 
 
 def _direction(objective: SceneObjective, generator: torch.Generator) -> Float[Tensor, " p"]:

@@ -33,7 +33,10 @@ class SyntheticSettings:
     """gaussians: about how many (each surface rounds its share).  arc: degrees that the cameras span.
 
     point_share: share of the Gaussians seen by two views that become points; point_noise: their error, in units of the
-    Gaussian's largest scale.
+    Gaussian's largest scale.  InputError where a value is out of its range.
+
+    >>> SyntheticSettings(views=3).width
+    120
     """
 
     gaussians: int = 1600
@@ -72,7 +75,12 @@ class Surface:
 
 
 def synthetic_scene(settings: SyntheticSettings = SyntheticSettings()) -> SyntheticScene:
-    """Build the Gaussians and render every view.  The same settings give the same scene."""
+    """Build the Gaussians and render every view.  The same settings give the same scene.
+
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> len(made.truth), len(made.scene.load()), len(made.scene.points) > 0
+    (50, 2, True)
+    """
     generator = torch.Generator().manual_seed(settings.seed)
     truth = _gaussians(_still_life(settings.gaussians, generator), settings.sh_degree, generator)
     cameras = _arc_of_cameras(settings)

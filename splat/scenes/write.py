@@ -4,6 +4,8 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,24 +22,29 @@ POINTS_FILE = "points.ply"
 COLOURS = ("red", "green", "blue")
 
 
+@contextmanager
+def finished_folder(folder: Path) -> Iterator[Path]:
+    """A new folder that becomes `folder` when the block ends, and is removed if it fails.  FileExistsError if there is one."""
+    if folder.exists():
+        raise FileExistsError(f"expected a folder that does not exist yet, got {folder}; remove it or choose another")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        yield building
+        building.chmod(0o755)  # temporary folders are private
+        os.replace(building, folder)
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+
+
 def write_transforms_scene(scene: Scene, folder: Path) -> None:
     """Write a scene so that `load_scene` finds it again, in a folder that appears when it is complete.
 
     Pictures are rounded to 8 bits and keep their background; an alpha channel is not written.  Cameras keep every
     digit.  FileExistsError if the folder exists already.
     """
-    folder = Path(folder)
-    if folder.exists():
-        raise FileExistsError(f"expected a folder that does not exist yet, got {folder}; remove it or choose another")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
+    with finished_folder(Path(folder)) as building:
         _write_into(scene, building)
-        building.chmod(0o755)  # mkdtemp's own is private
-        os.replace(building, folder)
-    except BaseException:
-        shutil.rmtree(building, ignore_errors=True)
-        raise
 
 
 def _write_into(scene: Scene, folder: Path) -> None:
@@ -58,7 +65,7 @@ def _write_into(scene: Scene, folder: Path) -> None:
 
 
 def _file(frame: Frame) -> str:
-    """images/NAME.png"""
+    """The path of a frame's picture: images/NAME.png."""
     name = frame.name.removeprefix("images/")
     return f"images/{name}" if name.lower().endswith(".png") else f"images/{name}.png"
 
@@ -69,7 +76,7 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def _pose(camera: Camera) -> list[list[float]]:
-    """Camera to world, OpenGL axes."""
+    """Camera to world, with the axes right, up, backwards (OpenGL)."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = camera.rotation.T * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     pose[:3, 3] = camera.centre
@@ -77,7 +84,7 @@ def _pose(camera: Camera) -> list[list[float]]:
 
 
 def _write_points(points: Points, names: tuple[str, ...], path: Path) -> None:
-    """x y z, red green blue, and, where tracks are known, the list `views` of the frames that see the point."""
+    """Write x y z, red green blue and, where tracks are known, the list `views` of the frames that see the point."""
     kinds = [(axis, "f8") for axis in "xyz"] + [(colour, "u1") for colour in COLOURS]
     if points.observations is not None:
         kinds.append(("views", "O"))

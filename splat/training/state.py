@@ -172,6 +172,10 @@ class TrainConfig:
     random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
     method: what is added to 3DGS, with its settings (`splat/training/methods/methods.py`).
     ValueError where a setting is out of its range.
+
+    >>> from splat import METHODS
+    >>> TrainConfig(iterations=300, method=METHODS["stablegs"](warm_up=100)).method.name
+    'stablegs'
     """
 
     iterations: int = 2000
@@ -222,6 +226,10 @@ class Training:
 
     extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.
     order: indices of the epoch's views still to come, last first.
+
+    >>> from splat import Gaussians
+    >>> Training.start(Gaussians(torch.ones(14), sh_degree=0), extent=1.0, config=TrainConfig()).step
+    0
     """
 
     config: TrainConfig

@@ -11,7 +11,6 @@ The scene is a folder with `images` and `sparse/0`, as 3DGS's own tools want it,
 """
 
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from splat.scenes.images import IMAGE_SUFFIXES, image_files, image_header, image
 from splat.scenes.layers import FORMATS
 from splat.scenes.scene import load_scene
 from splat.scenes.sfm.triangulation import SEED, matching, quiet, verification
+from splat.scenes.write import finished_folder
 
 Stage = Literal["features", "matches", "mapping", "images"]
 Progress = Callable[[Stage, int, int], None]  # stage, photographs done, photographs in all
@@ -54,21 +54,11 @@ def scene_from_photos(photos: Path, out: Path, on_progress: Progress = lambda *_
     ValueError where the photographs are too few or make no model; nothing is left behind then.
     """
     files = _photographs(photos)
-    if out.exists():
-        raise FileExistsError(
-            f"expected a folder that does not exist yet, got {out}; remove it or choose another --out"
-        )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    try:
-        with quiet():
-            models = _models(files, building / "work", on_progress)
-            scene = building / "scene"
-            _write_images(models[0], photos, building / "work", scene, on_progress)
+    with finished_folder(out) as scene:
+        with tempfile.TemporaryDirectory(dir=scene.parent, prefix=f".{out.name}-") as work, quiet():
+            models = _models(files, Path(work), on_progress)
+            _write_images(models[0], photos, Path(work), scene, on_progress)
         load_scene(scene)
-        os.replace(scene, out)
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
     placed, *others = ({model.images[i].name for i in model.reg_image_ids()} for model in models)
     return Mapped(
         placed=len(placed),
@@ -101,7 +91,7 @@ def _photographs(folder: Path) -> list[Path]:
 def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[pycolmap.Reconstruction]:
     """The models that the photographs make, the one with the most photographs first."""
     database, photos, models = work / "database.db", work / "photos", work / "models"
-    photos.mkdir(parents=True)
+    photos.mkdir()
     models.mkdir()
     own_names = {f"{i:06d}{path.suffix}": path.name for i, path in enumerate(files)}
     for path, name in zip(files, own_names):  # the list of pairs that COLMAP reads has no names with spaces

@@ -73,7 +73,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> list[Findings]:
     return on_ranks(2, folder, work)
 
 
-def test_loss_gradient_blocks_products_traces_and_ends_are_those_of_one_process(found: list[Findings]) -> None:
+def test_every_quantity_is_that_of_one_process(found: list[Findings]) -> None:
     objective = SceneObjective(gaussians(), tiny_views(torch.float64), LOSS)
     alone = measured(objective, [SceneHessian(objective, gauss_newton=gn) for gn in (False, True)])
     for rank in found:

@@ -70,7 +70,7 @@ def test_own_blocks_are_those_of_the_dense_hessian(loss: LossSettings, gauss_new
         assert abs(traces[name] - float(H.diagonal()[block].sum())) <= 1e-10 * float(H.diagonal()[block].abs().sum())
 
 
-def test_memory_decides_which_views_are_kept_and_changes_no_bit_of_a_product() -> None:
+def test_memory_decides_which_views_are_kept_and_changes_no_bit() -> None:
     gaussians, loss = awkward_gaussians(), LossSettings()
     roomy = objective_of(gaussians, loss, noise=0.3)
     tight = SceneObjective(gaussians, roomy.views, loss, BACKGROUND, memory=0)
@@ -160,7 +160,7 @@ def samples_of(
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.5], ids=["near a fit", "far from a fit"])
-def test_intervals_of_fixed_and_adaptive_budgets_cover_over_two_hundred_runs(noise: float) -> None:
+def test_intervals_of_fixed_and_adaptive_budgets_cover_as_stated(noise: float) -> None:
     """95% intervals: 200 runs of 95% stay within 89.5 to 99% with a probability of 0.9986 (four blocks in a hundred fail)."""
     objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise)
     H, names = dense(SceneHessian(objective)), list(objective.blocks)
@@ -210,7 +210,7 @@ def test_a_number_of_samples_that_is_asked_for_is_the_number_taken() -> None:
         exact_traces(objective, torch.Generator(), samples=3)
 
 
-def test_a_block_whose_error_is_small_enough_is_sampled_no_further_and_the_others_as_if_it_were() -> None:
+def test_a_block_that_stops_early_does_not_change_the_samples_of_others() -> None:
     objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise=0.1)
     settings = TraceSettings(rtol=0.02, min_probes=8, max_probes=40)
     adaptive = exact_traces(objective, torch.Generator().manual_seed(0), settings)
@@ -223,7 +223,7 @@ def test_a_block_whose_error_is_small_enough_is_sampled_no_further_and_the_other
                 assert estimate.value == fixed[name].value and estimate.standard_error == fixed[name].standard_error
 
 
-def test_the_control_variate_leaves_the_mean_unbiased_and_lowers_the_variance() -> None:
+def test_the_control_variate_is_unbiased_and_lowers_the_variance() -> None:
     generator, runs, count = torch.Generator().manual_seed(1), 4000, 12
     y = torch.randn(runs, count, generator=generator, dtype=torch.float64) + 3
     x = 2 * y + 0.1 * torch.randn(runs, count, generator=generator, dtype=torch.float64)

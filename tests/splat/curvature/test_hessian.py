@@ -91,7 +91,7 @@ def test_bands_that_are_not_in_use_are_removed_from_picture_and_operator():
     assert scene.loss(scene.active.flat) == pytest.approx(float(mean_loss(flat, two_views(), LOSS)), rel=1e-12)
 
 
-def test_quaternions_are_brought_to_unit_length_and_the_given_ones_left_alone():
+def test_quaternions_get_unit_length_and_the_given_ones_stay():
     gaussians = random_gaussians(20, logit=1.0)
     before = gaussians.flat.clone()
     scene = objective(gaussians)
@@ -207,7 +207,7 @@ def test_what_cannot_be_an_objective_is_refused():
 
 
 @pytest.mark.parametrize("gauss_newton", [False, True])
-def test_a_view_that_draws_nothing_of_what_the_vectors_move_is_left_out_without_a_difference(gauss_newton):
+def test_a_view_that_draws_no_moved_gaussian_is_left_out_exactly(gauss_newton):
     """Two cameras at one place, back to back, each with Gaussians of its own."""
     gaussians, view = random_gaussians(12, 1, logit=1.0), two_views()[0]
     about_y = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
