@@ -27,6 +27,7 @@ from splat.curvature.hessian import SceneHessian, ViewSum
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import loss_against, view_loss
 from splat.model.gaussians import Gaussians
+from splat.projection.reference import project
 from splat.render.autograd import rasterize_by_kernel
 
 STEPS = (1e-10, 3e-10, 3e-11)  # per parameter; means in units of their spread

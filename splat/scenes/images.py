@@ -60,34 +60,19 @@ class Photo:
 
 
 def image_folder(root: Path, images: str | None = None) -> Path:
-    """The folder of a scene's photographs: `images` if named, else `images`, else `images_K` with the smallest K."""
-    if images is not None:
-        if not (root / images).is_dir():
-            raise FileNotFoundError(f"expected the image folder {root / images}, which does not exist; {_offers(root)}")
-        return root / images
-    if (root / "images").is_dir():
-        return root / "images"
-    reduced = _reduced_folders(root)
-    if not reduced:
+    """The folder of a scene's photographs: the named one, by default `images`, else `images_K` with the smallest K."""
+    reduced = sorted((int(m[1]), path) for path in root.iterdir() if (m := re.fullmatch(r"images_(\d+)", path.name)))
+    found = [path for path in (root / "images", *(path for _, path in reduced)) if path.is_dir()]
+    if images is not None and not (root / images).is_dir():
+        names = ", ".join(path.name for path in found)
+        offers = f"choose from {names}" if found else "the scene has no folder images or images_K either"
+        raise FileNotFoundError(f"expected the image folder {root / images}, which does not exist; {offers}")
+    if images is None and not found:
         raise FileNotFoundError(
             f"expected a folder images or images_K (K = 2, 4, 8 ...) in {root}, found neither; "
             "name the folder of the photographs with images=..."
         )
-    return reduced[0]
-
-
-def _reduced_folders(root: Path) -> list[Path]:
-    found = [
-        (int(m[1]), path)
-        for path in root.iterdir()
-        if path.is_dir() and (m := re.fullmatch(r"images_(\d+)", path.name))
-    ]
-    return [path for _, path in sorted(found)]
-
-
-def _offers(root: Path) -> str:
-    found = [path.name for path in [root / "images", *_reduced_folders(root)] if path.is_dir()]
-    return f"choose from {', '.join(found)}" if found else "the scene has no folder images or images_K either"
+    return found[0] if images is None else root / images
 
 
 def image_files(folder: Path) -> list[Path]:

@@ -6,10 +6,11 @@
     transforms  transforms.json of instant-ngp or nerfstudio                                          `transforms.py`
     DTU         Rectified/scanN beside Calibration                                                    `dtu.py`
 
-in this order: a COLMAP model beside poses_bounds.npy wins, because it has points.  Every image file is looked up and
-its size compared with its camera's here, before any training; the pixels are read when a split asks for them.
+in this order: a COLMAP model beside poses_bounds.npy wins, because it has points.  Every image file is found, and its size
+compared with that of its camera, when the scene is loaded; pixels are read when a view is asked for.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -189,7 +190,6 @@ def _with_layers(root: Path, photos: list[Photo], masks: Path | None, depths: Pa
 
 
 def _require_distinct(photos: Sequence[Photo], root: Path) -> None:
-    names = [photo.name for photo in photos]
-    twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    twice = sorted(name for name, count in Counter(photo.name for photo in photos).items() if count > 1)
     if twice:
         raise InputError(f"expected every image of {root} once, got {twice[0]!r} more than once ({len(twice)} such)")

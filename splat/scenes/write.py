@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -58,9 +59,7 @@ def _write_into(scene: Scene, folder: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         pixels = (frame.view().image * 255).round().to(torch.uint8)
         Image.fromarray(pixels.permute(1, 2, 0).numpy()).save(path)
-    entries = [
-        {"file_path": file, **_intrinsics(f.camera), "transform_matrix": _pose(f.camera)} for file, f in files.items()
-    ]
+    entries = [{"file_path": file, **_camera(frame.camera)} for file, frame in files.items()]
     (folder / SINGLE_FILE).write_text(json.dumps({**content, "frames": entries}, indent=1), encoding="utf-8")
 
 
@@ -70,17 +69,13 @@ def _file(frame: Frame) -> str:
     return f"images/{name}" if name.lower().endswith(".png") else f"images/{name}.png"
 
 
-def _intrinsics(camera: Camera) -> dict[str, float]:
-    pixels = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    return {**pixels, "w": camera.width, "h": camera.height}
-
-
-def _pose(camera: Camera) -> list[list[float]]:
-    """Camera to world, with the axes right, up, backwards (OpenGL)."""
+def _camera(camera: Camera) -> dict[str, Any]:
+    """Intrinsics (px), and the pose: camera to world, with the axes right, up, backwards (OpenGL)."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = camera.rotation.T * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     pose[:3, 3] = camera.centre
-    return pose.tolist()
+    pixels = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return {**pixels, "w": camera.width, "h": camera.height, "transform_matrix": pose.tolist()}
 
 
 def _write_points(points: Points, names: tuple[str, ...], path: Path) -> None:

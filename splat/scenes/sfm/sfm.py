@@ -1,13 +1,13 @@
 """A scene from photographs: structure from motion with pycolmap.
 
     features     SIFT in every photograph
-    cameras      one for photographs of one size and, where the files say it, one make and focal length: SIMPLE_RADIAL, a
-                 focal length and one term of distortion, which few photographs determine
+    cameras      one for all photographs of one size and, where the files say it, one make and focal length: SIMPLE_RADIAL,
+                 a focal length and one term of distortion, which few photographs suffice for
     matches      every pair of photographs
     mapping      incremental; of several models the one with the most photographs is kept
     images       undistorted to PINHOLE
 
-The scene is a folder with `images` and `sparse/0`, as 3DGS's own tools want it, which appears when it is complete.
+The scene is a folder with `images` and `sparse/0`, as the tools of 3DGS expect it, which appears when it is complete.
 """
 
 import os
@@ -35,10 +35,10 @@ CAMERA = "SIMPLE_RADIAL"
 
 @dataclass(frozen=True)
 class Mapped:
-    """What became of the photographs.
+    """The result of structure from motion.
 
-    left_out: names of those that the model could not place; models: how many photographs every model has, the kept one
-    first, then those with photographs that it has not; error: mean reprojection error, px.
+    placed: photographs in the kept model.  left_out: names of the others.  models: numbers of photographs of the kept model
+    and of those with photographs that it lacks.  points: in the kept model.  error: mean reprojection error, px.
     """
 
     placed: int
@@ -70,7 +70,7 @@ def scene_from_photos(photos: Path, out: Path, on_progress: Progress = lambda *_
 
 
 def _photographs(folder: Path) -> list[Path]:
-    """The image files, all of which can be read."""
+    """The image files, each read once to see that it is whole."""
     if not folder.is_dir():
         raise FileNotFoundError(
             f"expected a folder of photographs, {folder} {'is not a folder' if folder.exists() else 'does not exist'}; "
@@ -89,7 +89,7 @@ def _photographs(folder: Path) -> list[Path]:
 
 
 def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[pycolmap.Reconstruction]:
-    """The models that the photographs make, the one with the most photographs first."""
+    """The reconstructed models, the one with the most photographs first."""
     database, photos, models = work / "database.db", work / "photos", work / "models"
     photos.mkdir()
     models.mkdir()
@@ -132,7 +132,7 @@ def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[py
 
 
 def _by_camera(files: Sequence[Path]) -> list[list[int]]:
-    """The places of photographs that may share a camera."""
+    """The indices of photographs that may share a camera, in groups."""
     groups: dict[tuple, list[int]] = {}
     for i, path in enumerate(files):
         with Image.open(path, formats=FORMATS) as file:
@@ -144,7 +144,7 @@ def _by_camera(files: Sequence[Path]) -> list[list[int]]:
 
 
 def _match(database: Path, names: Sequence[str], pairs: Path, on_progress: Progress) -> None:
-    """Every photograph with all before it, one after the other, so that progress shows and Ctrl-C is heard."""
+    """Match every photograph with all before it; one call each, so that progress shows and Ctrl-C is heard."""
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = pairs
     on_progress("matches", 1, len(names))
