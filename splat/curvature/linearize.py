@@ -30,7 +30,7 @@ from splat.model.settings import RenderSettings
 from splat.projection.dispatch import linearize_projection
 from splat.projection.formulas import ProjectionJacobian, lens_of
 from splat.raster.dispatch import Adjoint, Tangent
-from splat.render.forward import rasterize_view
+from splat.render.forward import rasterize_view, touches
 
 
 class LinearizedView:
@@ -91,8 +91,10 @@ class LinearizedView:
 
     @property
     def jacobian(self) -> ProjectionJacobian:
-        """The projection's derivatives, Gaussian by Gaussian."""
-        return self._projection.jacobian
+        """The projection's derivatives of the Gaussians that have weight in a pixel; takes a pass over the pixels."""
+        jacobian = self._projection.jacobian
+        seen = touches(self._raster)[jacobian.index]
+        return ProjectionJacobian(*(part[seen] for part in jacobian))
 
     @property
     def bytes(self) -> int:
