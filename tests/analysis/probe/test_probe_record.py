@@ -144,7 +144,7 @@ def skewed(run):
 
 
 def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_path, no_pictures, monkeypatch, capsys):
-    monkeypatch.setattr("splat.curvature.objective.hessian.SceneHessian.apply", skewed(run))
+    monkeypatch.setattr("splat.curvature.hessian.SceneHessian.apply", skewed(run))
     quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
     assert main([*quick, str(tmp_path / "lenient")]) == 0
     assert main([*quick, str(tmp_path / "strict"), "--strict"]) == 1

@@ -256,8 +256,8 @@ def test_workers_change_no_number(run, tmp_path):
 BLOCKED = """
 import sys, threading, time
 import landscape.slices.grid_evaluations as grid
-from analysis.cli import main
-from splat.curvature import SceneObjective
+from analysis.commands.cli import main
+from splat.curvature.objective import SceneObjective
 grid.SAVE_EVERY, evaluate, calls = 0.0, SceneObjective.evaluate, []
 def blocked(self, flat):
     calls.append(flat)
