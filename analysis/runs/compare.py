@@ -20,7 +20,9 @@ from rich.console import Console
 
 from analysis.runs.compare_table import Run, compare_table, comparison, frame
 from analysis.console.drawing import draw
-from analysis.console.options import CompareOptions, DeviceName, ProbeOptions
+from analysis.console.options import DeviceName
+from analysis.probe.options import ProbeOptions
+from analysis.runs.options import CompareOptions
 from analysis.console.overrides import leaves
 from analysis.records.quantities import quantity
 from analysis.records.records import FILE, read_record

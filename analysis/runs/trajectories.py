@@ -18,7 +18,7 @@ from rich.table import Table
 
 from analysis.console.drawing import draw
 from analysis.records.family_table import bracketed
-from analysis.console.options import TrajectoryOptions
+from analysis.runs.options import TrajectoryOptions
 from analysis.records.quantities import measured, quantity
 from analysis.records.run_files import CHECKPOINT
 from analysis.records.findings import ATTRIBUTES, attribute_name

@@ -71,8 +71,8 @@ from analysis.bench.accuracy.checkpoint import affordable, checkpoint_case
 from analysis.bench.accuracy.methods import BUDGETS, Answer, Method, own_methods
 from analysis.bench.accuracy.peers import peer_methods
 from analysis.bench.accuracy.ratios import points, ratio_table, ratios
+from analysis.bench.options import BenchOptions, Quantity
 from analysis.console.drawing import draw
-from analysis.console.options import BenchOptions, Quantity
 from landscape.errors import InputError
 from landscape.operators.operator import DenseOperator, SymmetricOperator
 from landscape.probes import draw_probes

@@ -35,9 +35,9 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
+from analysis.bench.options import BenchOptions
 from analysis.bench.stress.cases import BACKGROUND, Case, Refusal, cases, refusals
 from analysis.bench.stress.condition import Condition, cancellation, specified
-from analysis.console.options import BenchOptions
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from splat.backend.cpu.simd import EXP2_ERROR
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS

@@ -29,7 +29,7 @@ from rich.console import Console
 
 from analysis.console.drawing import module_environment
 from analysis.console.interruption import interruption
-from analysis.console.options import SweepOptions
+from analysis.runs.options import SweepOptions
 from analysis.records.provenance import usable_cores
 from analysis.records.records import FILE, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS

@@ -31,7 +31,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from analysis.console.options import ProbeOptions, TrainOptions
+from analysis.probe.options import ProbeOptions
+from analysis.train.options import TrainOptions
 from analysis.console.overrides import leaves, read_value
 
 FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")

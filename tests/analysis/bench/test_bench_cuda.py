@@ -13,11 +13,11 @@ from rich.console import Console
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from analysis.bench import command as bench
+from analysis.bench.options import BenchOptions
 from analysis.bench.speed.meters import HostMeter
 from analysis.bench.speed.peak_cuda import BLOCK, UNROLLED, WARPS, multiply_add, multiply_adds
 from analysis.bench.speed.peer import MissingPeer, gsplat_gradient
 from analysis.bench.speed.scene import BYTES, ViewBench
-from analysis.console.options import BenchOptions
 from analysis.console.timing import Timing
 from splat.backend.gpu.compile import launch
 from splat.losses.autograd import loss_against

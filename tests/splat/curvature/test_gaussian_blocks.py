@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from landscape.traces.control import controlled
 from landscape.traces.trace import TraceSettings
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
@@ -219,3 +220,12 @@ def test_a_block_whose_error_is_small_enough_is_sampled_no_further_and_the_other
         for name, estimate in adaptive.items():
             if estimate.probes == count:
                 assert estimate.value == fixed[name].value and estimate.standard_error == fixed[name].standard_error
+
+
+def test_the_control_variate_leaves_the_mean_unbiased_and_lowers_the_variance() -> None:
+    generator, runs, count = torch.Generator().manual_seed(1), 4000, 12
+    y = torch.randn(runs, count, generator=generator, dtype=torch.float64) + 3
+    x = 2 * y + 0.1 * torch.randn(runs, count, generator=generator, dtype=torch.float64)
+    means = torch.stack([controlled(a, b, 3.0).mean() for a, b in zip(x, y, strict=True)])
+    assert abs(float(means.mean()) - 6) < 4 * float(means.std()) / sqrt(runs)
+    assert float(means.std()) < 0.1 * float(x.mean(dim=1).std())

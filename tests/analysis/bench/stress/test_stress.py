@@ -6,10 +6,10 @@ import torch
 
 import analysis.bench.stress.command as stress
 from analysis.bench.command import run_bench
+from analysis.bench.options import BenchOptions
 from analysis.bench.stress.cases import cases, refusals, steady
 from analysis.bench.stress.command import PRECISIONS, Finding, Scene, Study, refused
 from analysis.bench.stress.condition import STEP, roundings
-from analysis.console.options import BenchOptions
 
 CASES = {case.name: case for case in cases(0)}
 FAST = [

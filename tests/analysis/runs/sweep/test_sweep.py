@@ -17,7 +17,7 @@ import torch
 import tyro
 
 from analysis.commands.cli import main
-from analysis.console.options import TrainOptions
+from analysis.train.options import TrainOptions
 from analysis.records.provenance import usable_cores
 from analysis.records.records import record_folder, write_record
 from analysis.runs.sweep.sweep import _Cells, locked, missing, probe_arguments

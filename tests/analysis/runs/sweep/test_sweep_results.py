@@ -10,7 +10,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from analysis.console.options import TrainOptions
+from analysis.train.options import TrainOptions
 from analysis.records.records import record_folder, write_record
 from analysis.runs.sweep.sweep_file import Cell
 from analysis.runs.sweep.sweep_results import (

@@ -1,0 +1,26 @@
+import numpy as np
+import pytest
+import torch
+
+from landscape.traces.control import controlled
+from tests.landscape.spectra import generator
+
+
+@pytest.mark.parametrize("trace", [0.0, 2.0**24, 2.0**30])
+def test_no_sample_has_a_part_in_its_own_slope(trace):
+    x, y = torch.randn(2, 9, dtype=torch.float64, generator=generator())
+    found = controlled(x + trace, y + trace, 0.3 + trace) - trace  # a large trace hides no slope
+    for i in range(9):
+        rest = torch.arange(9) != i
+        slope = np.polyfit(y[rest].numpy(), x[rest].numpy(), 1)[0]
+        assert float(found[i]) == pytest.approx(float(x[i] - slope * (y[i] - 0.3)), abs=1e-12 + 1e-15 * trace)
+
+
+@pytest.mark.parametrize("step", [0.3, 0.7, 1e3 / 3])
+@pytest.mark.parametrize("count", [8, 10, 12, 13, 32])
+def test_a_sample_whose_others_know_no_slope_is_left_as_it_is(count, step):
+    """As random signs give them where the known part is sparse."""
+    y = torch.full((count,), 0.37, dtype=torch.float64)
+    y[2] += step
+    x = torch.randn(count, dtype=torch.float64, generator=generator())
+    assert float(controlled(x, y, 0.4)[2]) == float(x[2])
