@@ -196,7 +196,7 @@ def _lanczos(text: str, settings: EigenSettings, origin: Origin = "own", applies
 
 def _from_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
     """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
-    start = BlockEigenvectors(case.scene, case.scene.block_diagonal()).leads()
+    start = BlockEigenvectors(case.scene, case.scene.block_diagonal()).warm_start()
     operator.charge(PASS)
     return _end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
 
