@@ -16,7 +16,7 @@ def rich_table(table: pd.DataFrame, title: str) -> Table:
     for place, column in enumerate(table):
         numeric = pd.api.types.is_numeric_dtype(table[column]) and not pd.api.types.is_bool_dtype(table[column])
         heading = str(column).replace("_", " ")
-        result.add_column(heading, justify="right" if numeric else "left", no_wrap=place == 0)
+        result.add_column(heading, justify="right" if numeric else "left", no_wrap=place == 0, overflow="fold")
     for row in table.itertuples(index=False):
         result.add_row(*map(_cell, row))
     return result

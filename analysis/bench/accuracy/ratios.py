@@ -178,7 +178,9 @@ def ratio_table(found: pd.DataFrame) -> pd.DataFrame:
             "H v": round(row["needs"]),
             "best rival": row["rival"],
             "its H v": round(row["rival_needs"]),
-            "ratio": f"{row['bound']}{row['ratio']:.2f} ({row['low']:.2f}-{row['high']:.2f})",
+            "ratio": f"{row['bound']}{row['ratio']:.2f}",
+            "from": row["low"],
+            "to": row["high"],
             "asked": row["asked"],
             "holds": f"[{styles[row['holds']]}]{row['holds']}[/]" if row["holds"] else "",
         }
