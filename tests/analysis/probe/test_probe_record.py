@@ -8,9 +8,9 @@ import pytest
 
 from analysis.commands.cli import main
 from analysis.console.budget import SHARES
-from analysis.console.options import ProbeOptions
 from analysis.probe.command import run_probe
 from analysis.probe.measurement import ProbeSettings
+from analysis.probe.options import ProbeOptions
 from analysis.records.records import Record, read_record
 from splat.training.checkpoint import load_checkpoint
 from tests.analysis.probe.probed import unlimited
