@@ -32,6 +32,7 @@ from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
 from splat.model.gaussians import Gaussians
+from splat.model.settings import current_settings
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split
 from splat.training.densify import ScreenGradients
@@ -267,7 +268,7 @@ def restored_training(content: dict[str, Any]) -> Training:
     gaussians.require_finite()
     config = _get(content, "config", dict)
     if isinstance(thresholds := config.get("render"), dict):
-        config = {**config, "render": {"sums": "ordered", **thresholds}}  # a choice that older checkpoints did not have
+        config = {**config, "render": current_settings(thresholds)}
     config = _dataclass(TrainConfig, config, "config")
     regularizer = config.method.regularizer(config.seed)
     _restore(regularizer, _get(content, "regularizer", dict))

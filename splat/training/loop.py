@@ -33,7 +33,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from splat.losses.autograd import loss_against
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.protocols import ViewLoss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.scenes.view import View
 from splat.training.state import Step, Training
