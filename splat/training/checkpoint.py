@@ -11,8 +11,7 @@ Keys (p parameters, n Gaussians):
     adam                {"first": (p,), "second": (p,), "updates": int}
     screen_gradients    {"total": (n,), "renders": (n,)}
     generator, order    state of the random generator, uint8; views still to come in this epoch
-    regularizer         state of the method's regularizer, see `splat/training/state.py`; of a training in it, the
-                        keys from `step` to `config`
+    regularizer         `Method.state`; of a training in it (a second field), the keys from `step` to `config`
     config              `TrainConfig` as nested plain types
     scene               `SceneReference` as plain types
 """
@@ -23,9 +22,9 @@ import sys
 import warnings
 import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
@@ -36,11 +35,13 @@ from splat.scenes.splits import Split
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
 from splat.training.optim.adam import Adam
-from splat.training.plain_types import fits, short
 from splat.training.start import Source
-from splat.training.state import Method, Regularizer, ThreeDGS, TrainConfig, Training
+from splat.training.state import Method, MethodSettings, ThreeDGS, TrainConfig, Training
+from splat.training.typed import Count, leaves, typed
 
 FORMAT, VERSION = "splat-landscape checkpoint", 2
+KIND = "expected a checkpoint written by landscape train"
+REMEDY = "take another copy of the file, or train anew"
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ def training_state(training: Training) -> dict[str, Any]:
         "order": training.order,
         "regularizer": {
             key: training_state(value) if isinstance(value, Training) else value
-            for key, value in training.regularizer.state().items()
+            for key, value in training.method.state().items()
         },
         "config": asdict(training.config),
     }
@@ -203,168 +204,183 @@ def write_atomically(path: Path, content: bytes) -> None:
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint, its tensors on the CPU.
 
-    OSError where there is none or it may not be read; ValueError, which says what is wrong with it, where it is damaged or of
-    another kind.
+    OSError where there is none or the system does not give it, MemoryError where it does not fit; ValueError, of one line, that
+    says what is wrong with it where it is damaged or of another kind.
     """
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
-        raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found {found}")
-    damaged = ValueError(
-        f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
-        f"{' (Gaussians from a PLY file cannot be read)' if path.suffix.lower() == '.ply' else ''}"
-    )
+        raise FileNotFoundError(f"{KIND} at {path}, found {found}")
     with path.open("rb") as file:  # one file throughout: a training may replace it meanwhile
-        try:
-            with zipfile.ZipFile(file) as archive:
-                whole = archive.testzip() is None
-            file.seek(0)
-            with warnings.catch_warnings(
-                action="ignore"
-            ):  # torch warns of pickles of another kind before it refuses them
-                content = torch.load(file, map_location="cpu", weights_only=True)
-        except Exception:  # what torch stumbles over in a file of another kind is of many kinds too
-            raise damaged from None
-    if not whole:
-        raise damaged
+        content = _read(file, path)
     try:
         return _checkpoint(content)
     except ValueError as error:
-        raise ValueError(f"expected a checkpoint written by landscape train, got {path}: {error}") from None
+        raise ValueError(f"{KIND}, got {path}: {error}; {REMEDY}") from error
+
+
+def _read(file: BinaryIO, path: Path) -> Any:
+    """What torch saved, once the checksums are found to be right."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if wrong := archive.testzip():
+                raise zipfile.BadZipFile(f"the checksum of {wrong} is wrong")
+        file.seek(0)
+        with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
+            return torch.load(file, map_location="cpu", weights_only=True)
+    except (OSError, MemoryError):
+        raise  # of the system, not of the file
+    except Exception as error:  # a file of another kind fails in torch in as many ways
+        if "can't allocate memory" in str(error):  # torch's own MemoryError is a RuntimeError
+            raise MemoryError(f"not enough memory to read {path}") from error
+        ply = " (Gaussians from a PLY file cannot be read)" if path.suffix.lower() == ".ply" else ""
+        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
+        raise ValueError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {reason}; {REMEDY}") from error
+
+
+@dataclass(frozen=True)
+class _Moments:
+    first: Tensor
+    second: Tensor
+    updates: Count
+
+
+@dataclass(frozen=True)
+class _ScreenGradients:
+    total: Tensor
+    renders: Tensor
+
+
+@dataclass(frozen=True)
+class _Training:
+    """What `training_state` writes."""
+
+    step: Count
+    extent: float
+    sh_degree: int
+    flat: Tensor
+    adam: _Moments
+    screen_gradients: _ScreenGradients
+    generator: Tensor
+    order: list[Count]
+    regularizer: dict[str, Any]
+    config: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _File:
+    """What a file has beside its training, for every version."""
+
+    format: str
+    version: int
+    torch: str
+    config: dict[str, Any]
+    scene: dict[str, Any]
 
 
 def _checkpoint(content: Any) -> Checkpoint:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"it does not hold the format {FORMAT!r}")
-    version = _get(content, "version", int)
-    if version not in (1, VERSION):
-        raise ValueError(f"its format version is {version!r}, this program reads up to {VERSION}")
-    if version == 1:
-        config = {**_get(content, "config", dict), "method": asdict(ThreeDGS())}
-        content = {**content, "config": config, "regularizer": Regularizer(0).state()}
-    training = restored_training(content)
-    scene = _dataclass(SceneReference, {"start": "scene", "depths": None, **_get(content, "scene", dict)}, "scene")
+    file = typed(_File, content)
+    if file.version not in (1, VERSION):
+        raise ValueError(f"its format version is {file.version}, this program reads up to {VERSION}")
+    if file.version == 1:
+        plain = ThreeDGS()
+        content = {**content, "config": {**file.config, "method": asdict(plain)}, "regularizer": plain.create(0).state()}
+    training, scene = restored_training(content), typed(SceneReference, file.scene, "scene")
     if len(scene.sizes) != len(scene.train):
         raise ValueError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
-    if not all(type(index) is int and 0 <= index < len(scene.train) for index in training.order):
+    if not all(index < len(scene.train) for index in training.order):
         raise ValueError(f"its order does not index its {len(scene.train)} training views")
-    return Checkpoint(training, scene, _get(content, "torch", str))
+    return Checkpoint(training, scene, file.torch)
 
 
 def restored_training(content: dict[str, Any]) -> Training:
     """The training of a state.  ValueError that says what is wrong with it."""
-    flat = _get(content, "flat", Tensor)
-    gaussians = Gaussians(_tensor(content, "flat", (flat.numel(),), flat.dtype), _get(content, "sh_degree", int))
+    saved = typed(_Training, content)
+    adam, screen, shape, dtype = saved.adam, saved.screen_gradients, saved.flat.shape, saved.flat.dtype
+    gaussians = Gaussians(_numbers("flat", saved.flat, (saved.flat.numel(),), dtype), saved.sh_degree)
     if not len(gaussians):
         raise ValueError("it holds no Gaussian")
     gaussians.require_finite()
-    config = _get(content, "config", dict)
-    if isinstance(thresholds := config.get("render"), dict):
-        config = {**config, "render": {"sums": "ordered", **thresholds}}  # a choice that older checkpoints did not have
-    config = _dataclass(TrainConfig, config, "config")
-    regularizer = config.method.regularizer(config.seed)
-    _restore(regularizer, _get(content, "regularizer", dict))
-    adam, screen = _get(content, "adam", dict), _get(content, "screen_gradients", dict)
+    config = _config(saved.config)
+    each = (len(gaussians),)
     training = Training(
         config=config,
-        extent=_get(content, "extent", float),
+        extent=saved.extent,
         gaussians=gaussians,
         adam=Adam(
-            gaussians.with_flat(_finite(adam, "first", flat.shape, flat.dtype, signed=True)),
-            gaussians.with_flat(_finite(adam, "second", flat.shape, flat.dtype)),
-            _get(adam, "updates", int),
+            gaussians.with_flat(_finite("adam.first", adam.first, shape, dtype, signed=True)),
+            gaussians.with_flat(_finite("adam.second", adam.second, shape, dtype)),
+            adam.updates,
         ),
         screen_gradients=ScreenGradients(
-            _finite(screen, "total", (len(gaussians),), flat.dtype),
-            _finite(screen, "renders", (len(gaussians),), flat.dtype),
+            _finite("screen_gradients.total", screen.total, each, dtype),
+            _finite("screen_gradients.renders", screen.renders, each, dtype),
         ),
-        generator=_generator(_get(content, "generator", Tensor)),
-        regularizer=regularizer,
-        order=_get(content, "order", list),
-        step=_get(content, "step", int),
+        generator=_generator(saved.generator),
+        method=_method(config, saved.regularizer),
+        order=saved.order,
+        step=saved.step,
     )
-    if not 0 <= training.step <= config.iterations:
+    if training.step > config.iterations:
         raise ValueError(f"its step {training.step} is not among its {config.iterations} iterations")
     if not 0 < training.extent < float("inf"):
         raise ValueError(f"its extent is {training.extent}")
-    if not 0 <= training.adam.updates <= training.step:
-        raise ValueError(f"its optimiser has made {short(training.adam.updates)} updates in {training.step} steps")
+    if adam.updates > training.step:
+        raise ValueError(f"its optimiser has made {adam.updates} updates in {training.step} steps")
     return training
 
 
-T = TypeVar("T")
+def _config(content: dict[str, Any]) -> TrainConfig:
+    """The settings, each of which has to be there, but for those that older files did not know."""
+    method, render = typed(dict[str, Any], content.get("method"), "config.method"), content.get("render")
+    name = typed(str, method.get("name"), "config.method.name")
+    if name not in METHODS:
+        raise ValueError(f"'config.method' has the unknown name {name[:80]!r}, expected one of {', '.join(METHODS)}")
+    kind: type[MethodSettings] = METHODS[name]
+    content = {**content, "method": {**kind.BEFORE, **method}}
+    if isinstance(render, dict):
+        content["render"] = {"sums": "ordered", **render}
+    settings = typed(kind, content["method"], "config.method")
+    config = replace(typed(TrainConfig, {**content, "method": {}}, "config"), method=settings)
+    if different := leaves({"config": content}).keys() ^ leaves({"config": asdict(config)}).keys():
+        raise ValueError(f"'config' has missing or unknown keys: {', '.join(sorted(map(str, different)))}")
+    return config
 
 
-def _get(content: dict, key: str, kind: type[T]) -> T:
-    if key not in content:
-        raise ValueError(f"{key!r} is missing")
-    value = content[key]
-    if not isinstance(value, kind):
-        raise ValueError(f"{key!r} is {type(value).__name__}, expected {kind.__name__}")
-    return value
-
-
-def _tensor(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    value = _get(content, key, Tensor)
-    kind = f"{value.dtype} of shape {tuple(value.shape)}"
-    if tuple(value.shape) != tuple(shape) or value.dtype != dtype or dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"{key!r} is {kind}, expected {dtype} {tuple(shape)}")
-    if value.device.type != "cpu" or not value.is_contiguous():
-        raise ValueError(f"{key!r} is {kind} that does not hold its numbers one by one")
-    return value
-
-
-def _finite(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype, signed: bool = False) -> Tensor:
-    value = _tensor(content, key, shape, dtype)
-    if not (value.isfinite() & (signed | (value >= 0))).all():
-        raise ValueError(f"{key!r} holds a number that is not finite{'' if signed else ', or a negative one'}")
-    return value
+def _method(config: TrainConfig, state: dict[str, Any]) -> Method:
+    method = config.method.create(config.seed)
+    try:
+        trainings = {key: restored_training(value) for key, value in state.items() if _is_training(value)}
+        method.restore(state | trainings)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"'regularizer' is not the state of the method {config.method.name} ({error})") from error
+    return method
 
 
 def _is_training(value: Any) -> bool:
     return isinstance(value, dict) and "regularizer" in value
 
 
-def _restore(regularizer: Regularizer, state: dict) -> None:
-    try:
-        regularizer.restore(
-            {key: restored_training(value) if _is_training(value) else value for key, value in state.items()}
-        )
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"'regularizer' is not the state of its method ({error}); take another copy of the file, or train anew"
-        ) from None
-
-
 def _generator(state: Tensor) -> torch.Generator:
-    generator = torch.Generator()
     try:
-        return generator.set_state(state)
+        return torch.Generator().set_state(state)
     except (RuntimeError, TypeError) as error:
-        raise ValueError(f"'generator' is not the state of a random generator ({error})") from None
+        raise ValueError(f"'generator' is not the state of a random generator ({error})") from error
 
 
-def _dataclass(kind: type[T], content: dict, where: str) -> T:
-    """A dataclass, and those in it, from what `asdict` made of it; its own checks apply."""
-    hints = get_type_hints(kind)
-    if set(content) != set(hints):
-        different = sorted(map(str, set(content) ^ set(hints)))
-        raise ValueError(f"{where!r} has missing or unknown keys: {', '.join(different)}")
-    values = {}
-    for key, hint in hints.items():
-        value = content[key]
-        if inner := _nested(hint, value, f"{where}.{key}"):
-            value = _dataclass(inner, _get(content, key, dict), f"{where}.{key}")
-        elif not fits(value, hint):
-            raise ValueError(f"'{where}.{key}' is {short(value)}, expected {getattr(hint, '__name__', hint)}")
-        values[key] = value
-    return kind(**values)
+def _numbers(key: str, value: Tensor, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
+    """The tensor, if it holds as many numbers of this type, one by one, in memory."""
+    kind = f"{value.dtype} of shape {tuple(value.shape)}"
+    if tuple(value.shape) != tuple(shape) or value.dtype != dtype or dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"'{key}' is {kind}, expected {dtype} {tuple(shape)}")
+    if value.device.type != "cpu" or not value.is_contiguous():
+        raise ValueError(f"'{key}' is {kind} that does not hold its numbers one by one")
+    return value
 
 
-def _nested(hint: Any, value: Any, where: str) -> type | None:
-    """The dataclass that a value is of, a method's by its name; None where no dataclass is expected."""
-    if hint is not Method:
-        return hint if isinstance(hint, type) and is_dataclass(hint) else None
-    name = value.get("name") if isinstance(value, dict) else value
-    if isinstance(name, str) and name in METHODS:
-        return METHODS[name]
-    raise ValueError(f"'{where}' has the unknown name {short(name)}")
+def _finite(key: str, value: Tensor, shape: Sequence[int], dtype: torch.dtype, signed: bool = False) -> Tensor:
+    value = _numbers(key, value, shape, dtype)
+    if not (value.isfinite() & (signed | (value >= 0))).all():
+        raise ValueError(f"'{key}' holds a number that is not finite{'' if signed else ', or a negative one'}")
+    return value

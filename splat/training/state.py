@@ -1,20 +1,16 @@
-"""What a method of training adds to plain 3DGS: the interface between the loop (`splat/training/loop.py`) and its regularizers.
+"""What a training of 3D Gaussian Splatting consists of: its settings, its state under way, and what a method adds to it.
 
-The loop asks, in this order, `begin` before the first step and after a resume, and at every step:
+TrainConfig, MethodSettings    all that the result depends on beside the start and the views; plain values
+Training, Method               what changes from step to step, the method's part in `Method`
+Step                           what one step is about: its number, its view, its loss
 
-    opacity_scale    how the opacities are changed in this step's render (dropout), or None
-    gradient        what Adam descends, given the photometric gradient of the sampled view
-    follow          ... after density control, or any other change of the Gaussians: which old one each new one comes from
-    after           anything else, once the step is whole (unpooling, a second field's own density control)
-
-A regularizer draws from its own generator, so that the same seed shows every method the same views in the same order and
-splits the same Gaussians alike.  `state` and `restore` carry it through a checkpoint to the same bits.
+The loop (`splat/training/loop.py`) makes the steps; a checkpoint (`splat/training/checkpoint.py`) holds all of it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any, Literal
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -30,16 +26,16 @@ from splat.render.loss_and_gradient import LossAndGradient
 from splat.scenes.view import View
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.training.optim.adam import Adam
-from splat.training.plain_types import fits, short
+from splat.training.typed import Count, typed
 
-Row = dict[str, Any]
+Row = dict[str, Count | float | bool | str]
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
     """One step of a training.  number: from 1; chosen: index in `views` of the sampled view.
 
-    gaussians: before the update.  background, loss: this step's colour, and the loss against the sampled view's image on it.
+    gaussians: before the update.  background: RGB; loss: against the sampled view's image on that background.
     """
 
     number: int
@@ -60,75 +56,86 @@ class Step:
         return self.views[self.chosen].camera
 
 
-class Regularizer:
-    """Plain 3DGS: nothing is added.  The base of the methods' own regularizers, which hold what they need between steps.
+@dataclass(frozen=True)
+class MethodSettings:
+    """Settings of a method, of which `create` makes a `Method`.  name: its key in `methods.METHODS`.
 
-    generator: of whatever the method draws.  history: rows of what is worth a look afterwards, each with its "step";
-    `landscape train` writes them to history.csv.  Both are part of the state.
+    BEFORE: for settings that older checkpoints lack, the values that stand for what the method did then.
     """
 
-    def __init__(self, seed: int):
+    name: str = ""
+    BEFORE: ClassVar[dict[str, Any]] = {}
+
+    def create(self, seed: int) -> "Method":
+        """The method before its first step."""
+        return Method(self, seed)
+
+    def parts(self, config: "TrainConfig") -> dict[str, int]:
+        """How many steps pass before each part of the method begins, by the setting that says so; not of parts switched off."""
+        return {self.name: 0}
+
+    def density_control(self, config: "TrainConfig") -> DensifySettings:
+        """When and how Gaussians are cloned, split and removed."""
+        return config.densify
+
+    def scaled(self, config: "TrainConfig", keep: Collection[str] = ()) -> "TrainConfig":
+        """The training with the method's published schedule scaled to its length.  keep: dotted names that stay as they are."""
+        return config
+
+
+S = TypeVar("S", bound=MethodSettings)
+
+
+class Method(Generic[S]):
+    """What a method adds to 3DGS, and what it holds between steps.  This base adds nothing: it is 3DGS.
+
+    hook            runs                                      arguments          result
+    on_start        before the first step, after a resume     training, views    ValueError where views lack what it needs
+    opacity_scale   before the sampled view is rendered       step               (n,) factors on the opacities, or None
+    gradient        after its backward pass, before Adam      step, base         loss and gradient to go on with
+    on_densify      after each change of the Gaussians        change             which old one each new one comes from
+    after_step      after Adam and density control            step
+
+    Adam descends `gradient` of what the hook of that name returns; density control counts its `screen_gradient`.
+
+    generator: of all that the method draws; its own, so that with the same seed every method sees the same views in the same
+    order and splits the same Gaussians alike.  history: rows to look at afterwards, each with its "step"; `landscape train`
+    writes them to history.csv.  Both are in `state`, and `restore` continues from it to the same bits.
+    """
+
+    def __init__(self, settings: S, seed: int):
+        self.settings = settings
         self.generator = torch.Generator().manual_seed(seed)
         self.history: list[Row] = []
 
-    def begin(self, training: "Training", views: Sequence[View]) -> None:
-        """Steps are about to be made on these views; a second call changes nothing.  ValueError where the views lack what the
-        method needs."""
+    def on_start(self, training: "Training", views: Sequence[View]) -> None:
+        """A second call changes nothing."""
 
     def opacity_scale(self, step: Step) -> Float[Tensor, " n"] | None:
-        """Factors on the opacities of this step's render, None for 1."""
         return None
 
-    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
-        """What the optimiser descends.  base: the sampled view's loss and gradient, in the parameters of step.gaussians."""
-        return base.gradient
+    def gradient(self, step: Step, base: LossAndGradient) -> LossAndGradient:
+        """base: the sampled view's, in the parameters of step.gaussians."""
+        return base
 
-    def follow(self, change: Densified) -> None:
-        """The Gaussians were replaced."""
+    def on_densify(self, change: Densified) -> None: ...
 
-    def after(self, step: Step) -> None:
-        """The step is whole: update and density control are done."""
+    def after_step(self, step: Step) -> None: ...
 
     def state(self) -> dict[str, Any]:
-        """Tensors, plain types and trainings: `restore` makes a new one of the same settings go on from it to the same bits."""
+        """Tensors, plain values and trainings."""
         return {"generator": self.generator.get_state(), "history": self.history}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take over a state.  ValueError, KeyError or RuntimeError where it does not fit."""
+        """Go on from a state.  ValueError, KeyError, TypeError or RuntimeError where it is not one of this method."""
         self.generator.set_state(state["generator"])
-        if type(state["history"]) is not list:
-            raise ValueError(f"expected the history as a list of rows, found {short(state['history'])}")
-        for row in state["history"]:
-            _require_row(row)
-        self.history = list(state["history"])
-
-
-def _require_row(row: Any) -> None:
-    """ValueError unless a row of a history holds plain values, its step and its counts whole numbers of at least 0."""
-    plain = fits(row, dict[str, int | float | bool | str]) and "step" in row
-    if (
-        not plain
-        or any(type(row.get(name, 0)) is not int for name in ("step", "count"))
-        or any(type(value) is int and value < 0 for value in row.values())
-    ):
-        raise ValueError(
-            "expected a row of the history with plain values, its step and its counts whole numbers of at least 0, "
-            f"found {short(row)}"
-        )
+        self.history = typed(list[Row], state["history"], "history")
+        if not all(type(row.get("step")) is int and type(row.get("count", 0)) is int for row in self.history):
+            raise ValueError("'history': expected a step, and counts, that are whole numbers in every row")
 
 
 @dataclass(frozen=True)
-class Method:
-    """Settings of a method, from which `regularizer(seed)` makes a new regularizer.  name: its key in `methods.METHODS`."""
-
-    name: str = ""
-
-    def regularizer(self, seed: int) -> Regularizer:
-        return Regularizer(seed)
-
-
-@dataclass(frozen=True)
-class ThreeDGS(Method):
+class ThreeDGS(MethodSettings):
     """3D Gaussian Splatting as it is (Kerbl et al. 2023)."""
 
     name: Literal["3dgs"] = "3dgs"
@@ -182,7 +189,7 @@ class TrainConfig:
     rates: LearningRates = field(default_factory=LearningRates)
     densify: DensifySettings = field(default_factory=DensifySettings)
     render: RenderSettings = field(default_factory=RenderSettings)
-    method: Method = field(default_factory=ThreeDGS)
+    method: MethodSettings = field(default_factory=ThreeDGS)
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
@@ -224,7 +231,7 @@ class Training:
     adam: Adam
     screen_gradients: ScreenGradients
     generator: torch.Generator
-    regularizer: Regularizer
+    method: Method
     order: list[int] = field(default_factory=list)
     step: int = 0
 
@@ -252,7 +259,7 @@ class Training:
             adam=Adam.zero(gaussians),
             screen_gradients=ScreenGradients.zero(len(gaussians), flat.dtype, flat.device),
             generator=torch.Generator().manual_seed(config.seed),
-            regularizer=config.method.regularizer(config.seed),
+            method=config.method.create(config.seed),
         )
 
     def move(self, device: torch.device) -> None:
@@ -281,25 +288,27 @@ class Training:
 
     def control_density(self, step: int, camera: Camera, base: LossAndGradient) -> None:
         """Collect the screen-space gradient of a render; clone, split, prune and reset opacities in the steps that do so."""
-        schedule, iterations = self.config.densify, self.config.iterations
+        schedule, iterations = self.config.method.density_control(self.config), self.config.iterations
         if schedule.collects(step, iterations):
             self.screen_gradients.add(base.screen_gradient, base.splats, camera)
         if schedule.densifies(step, iterations):
             gradients, large = self.screen_gradients.mean, schedule.prunes_large(step)
-            self.follow(densify(self.gaussians, gradients, self.extent, schedule, self.generator, prune_large=large))
+            self.replace_gaussians(
+                densify(self.gaussians, gradients, self.extent, schedule, self.generator, prune_large=large)
+            )
         if schedule.resets_opacity(step, iterations, white=self.config.is_white):
             reset_opacities(self.gaussians, schedule.reset_opacity)
             self.adam.forget("opacity_logits")
 
-    def follow(self, change: Densified) -> None:
-        """Replace the Gaussians: Adam's moments follow each one that is kept and are 0 for new ones."""
+    def replace_gaussians(self, change: Densified) -> None:
+        """Go on with other Gaussians: Adam's moments follow each one that is kept and are 0 for new ones."""
         if not len(change.gaussians):
             raise ValueError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
         self.gaussians = change.gaussians
         self.adam.select(change.parents, change.fresh)
         flat = change.gaussians.flat
         self.screen_gradients = ScreenGradients.zero(len(change.gaussians), flat.dtype, flat.device)
-        self.regularizer.follow(change)
+        self.method.on_densify(change)
 
     def raise_sh_degree(self, degree: int) -> None:
         """Add bands of zeros up to this degree."""
