@@ -127,12 +127,12 @@ class Checkpoint:
             if scene is None or not folder.is_dir():
                 raise
             name = Path(reference.absolute).name
-            raise ValueError(
+            raise InputError(
                 f"expected the training's scene {name} in {folder}, got another or a part: {error}"
             ) from None
         for frame, size in zip(found.select(reference.train), reference.sizes, strict=True):
             if [frame.camera.width, frame.camera.height] != size:
-                raise ValueError(
+                raise InputError(
                     f"expected view {frame.name!r} of {folder} at {size[0]} x {size[1]} px, as in the training, got "
                     f"{frame.camera.width} x {frame.camera.height}; its images have changed, restore them or train anew"
                 )
@@ -215,7 +215,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     try:
         return _checkpoint(content)
     except ValueError as error:
-        raise ValueError(f"{KIND}, got {path}: {error}; {REMEDY}") from error
+        raise InputError(f"{KIND}, got {path}: {error}; {REMEDY}") from error
 
 
 def _read(file: BinaryIO, path: Path) -> Any:
@@ -234,7 +234,7 @@ def _read(file: BinaryIO, path: Path) -> Any:
             raise MemoryError(f"not enough memory to read {path}") from error
         ply = " (Gaussians from a PLY file cannot be read)" if path.suffix.lower() == ".ply" else ""
         reason = (str(error).splitlines() or [""])[0] or type(error).__name__
-        raise ValueError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {reason}; {REMEDY}") from error
+        raise InputError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {reason}; {REMEDY}") from error
 
 
 @dataclass(frozen=True)
@@ -279,18 +279,18 @@ class _File:
 
 def _checkpoint(content: Any) -> Checkpoint:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"it does not hold the format {FORMAT!r}")
+        raise InputError(f"it does not hold the format {FORMAT!r}")
     file = typed(_File, content)
     if file.version not in (1, VERSION):
-        raise ValueError(f"its format version is {file.version}, this program reads up to {VERSION}")
+        raise InputError(f"its format version is {file.version}, this program reads up to {VERSION}")
     if file.version == 1:
         plain = ThreeDGS()
         content = {**content, "config": {**file.config, "method": asdict(plain)}, "regularizer": plain.create(0).state()}
     training, scene = restored_training(content), typed(SceneReference, file.scene, "scene")
     if len(scene.sizes) != len(scene.train):
-        raise ValueError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
+        raise InputError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
     if not all(index < len(scene.train) for index in training.order):
-        raise ValueError(f"its order does not index its {len(scene.train)} training views")
+        raise InputError(f"its order does not index its {len(scene.train)} training views")
     return Checkpoint(training, scene, file.torch)
 
 
@@ -300,7 +300,7 @@ def restored_training(content: dict[str, Any]) -> Training:
     adam, screen, shape, dtype = saved.adam, saved.screen_gradients, saved.flat.shape, saved.flat.dtype
     gaussians = Gaussians(_numbers("flat", saved.flat, (saved.flat.numel(),), dtype), saved.sh_degree)
     if not len(gaussians):
-        raise ValueError("it holds no Gaussian")
+        raise InputError("it holds no Gaussian")
     gaussians.require_finite()
     config = _config(saved.config)
     each = (len(gaussians),)
@@ -323,11 +323,11 @@ def restored_training(content: dict[str, Any]) -> Training:
         step=saved.step,
     )
     if training.step > config.iterations:
-        raise ValueError(f"its step {training.step} is not among its {config.iterations} iterations")
+        raise InputError(f"its step {training.step} is not among its {config.iterations} iterations")
     if not 0 < training.extent < float("inf"):
-        raise ValueError(f"its extent is {training.extent}")
+        raise InputError(f"its extent is {training.extent}")
     if adam.updates > training.step:
-        raise ValueError(f"its optimiser has made {adam.updates} updates in {training.step} steps")
+        raise InputError(f"its optimiser has made {adam.updates} updates in {training.step} steps")
     return training
 
 
@@ -336,7 +336,7 @@ def _config(content: dict[str, Any]) -> TrainConfig:
     method, render = typed(dict[str, Any], content.get("method"), "config.method"), content.get("render")
     name = typed(str, method.get("name"), "config.method.name")
     if name not in METHODS:
-        raise ValueError(f"'config.method' has the unknown name {name[:80]!r}, expected one of {', '.join(METHODS)}")
+        raise InputError(f"'config.method' has the unknown name {name[:80]!r}, expected one of {', '.join(METHODS)}")
     kind: type[MethodSettings] = METHODS[name]
     content = {**content, "method": {**kind.BEFORE, **method}}
     if isinstance(render, dict):
@@ -344,7 +344,7 @@ def _config(content: dict[str, Any]) -> TrainConfig:
     settings = typed(kind, content["method"], "config.method")
     config = replace(typed(TrainConfig, {**content, "method": {}}, "config"), method=settings)
     if different := leaves({"config": content}).keys() ^ leaves({"config": asdict(config)}).keys():
-        raise ValueError(f"'config' has missing or unknown keys: {', '.join(sorted(map(str, different)))}")
+        raise InputError(f"'config' has missing or unknown keys: {', '.join(sorted(map(str, different)))}")
     return config
 
 
@@ -354,7 +354,7 @@ def _method(config: TrainConfig, state: dict[str, Any]) -> Method:
         trainings = {key: restored_training(value) for key, value in state.items() if _is_training(value)}
         method.restore(state | trainings)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"'regularizer' is not the state of the method {config.method.name} ({error})") from error
+        raise InputError(f"'regularizer' is not the state of the method {config.method.name} ({error})") from error
     return method
 
 
@@ -366,21 +366,21 @@ def _generator(state: Tensor) -> torch.Generator:
     try:
         return torch.Generator().set_state(state)
     except (RuntimeError, TypeError) as error:
-        raise ValueError(f"'generator' is not the state of a random generator ({error})") from error
+        raise InputError(f"'generator' is not the state of a random generator ({error})") from error
 
 
 def _numbers(key: str, value: Tensor, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     """The tensor, if it holds as many numbers of this type, one by one, in memory."""
     kind = f"{value.dtype} of shape {tuple(value.shape)}"
     if tuple(value.shape) != tuple(shape) or value.dtype != dtype or dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"'{key}' is {kind}, expected {dtype} {tuple(shape)}")
+        raise InputError(f"'{key}' is {kind}, expected {dtype} {tuple(shape)}")
     if value.device.type != "cpu" or not value.is_contiguous():
-        raise ValueError(f"'{key}' is {kind} that does not hold its numbers one by one")
+        raise InputError(f"'{key}' is {kind} that does not hold its numbers one by one")
     return value
 
 
 def _finite(key: str, value: Tensor, shape: Sequence[int], dtype: torch.dtype, signed: bool = False) -> Tensor:
     value = _numbers(key, value, shape, dtype)
     if not (value.isfinite() & (signed | (value >= 0))).all():
-        raise ValueError(f"'{key}' holds a number that is not finite{'' if signed else ', or a negative one'}")
+        raise InputError(f"'{key}' holds a number that is not finite{'' if signed else ', or a negative one'}")
     return value

@@ -48,11 +48,11 @@ def prepare(training: Training, views: Sequence[View]) -> None:
     """
     config = training.config
     if not views:
-        raise ValueError("expected at least one view to train on, got none")
+        raise InputError("expected at least one view to train on, got none")
     parts = config.method.parts(config)
     if all(begins >= config.iterations for begins in parts.values()):
         late = ", ".join(f"{name} = {begins}" for name, begins in parts.items()) or "all of it is switched off"
-        raise ValueError(
+        raise InputError(
             f"expected a training in which the method acts, got {config.method.name} which never does in "
             f"{config.iterations} steps ({late}); take more steps, let it begin earlier, or use the method 3dgs"
         )
@@ -106,4 +106,4 @@ def _require_finite(what: str, value: float, step: Step) -> None:
     """ValueError that names the step and its view, unless a loss, or the sum of a gradient, is finite."""
     if not isfinite(value):
         name = step.views[step.chosen].name
-        raise ValueError(f"expected a finite {what}, got {value} at step {step.number} on view {name}; lower the rates")
+        raise InputError(f"expected a finite {what}, got {value} at step {step.number} on view {name}; lower the rates")

@@ -60,7 +60,7 @@ def typed(kind: Any, content: Any, where: str = "") -> Any:
             said += ", got a whole number of more than 64 bits" if large else f", got {reprlib.repr(found)}"
         said = said.replace("Number out of range", "expected float").replace(f"<= {LARGEST}", "that is finite")
         key = f"{where}{path}".lstrip(".")
-        raise ValueError(f"{key and repr(key) + ': '}{said[0].lower()}{said[1:]}") from error
+        raise InputError(f"{key and repr(key) + ': '}{said[0].lower()}{said[1:]}") from error
 
 
 def _at(names: list[str], kind: Any, content: Any) -> tuple[Any, Any]:
