@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.autograd import loss_against
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.scenes.view import View
@@ -33,7 +34,7 @@ from splat.training.state import Step, Training
 
 @dataclass(frozen=True)
 class StepResult:
-    """A step that was made: its number, the view's loss before the update, the number of Gaussians after it, the view's name."""
+    """A step done: its number, the view's loss before the update, the number of Gaussians after it, the view's name."""
 
     step: int
     loss: float
@@ -44,7 +45,7 @@ class StepResult:
 def prepare(training: Training, views: Sequence[View]) -> None:
     """Get ready for steps on these views; a second call changes nothing.
 
-    ValueError where there are no views, they lack what the method needs, or the method would never act.
+    InputError where there are no views, they lack what the method needs, or the method would never act.
     """
     config = training.config
     if not views:
@@ -62,7 +63,7 @@ def prepare(training: Training, views: Sequence[View]) -> None:
 def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
     """Make the steps that are left of config.iterations, one each time the next item is asked for.
 
-    Between two items `training` is complete: it can be saved, evaluated, or left there.  ValueError as of `prepare`, and where
+    Between two items `training` is complete: it can be saved, evaluated, or left there.  InputError as of `prepare`, and where
     a loss or gradient is not finite.
     """
     prepare(training, views)
@@ -103,7 +104,7 @@ def with_background(view: View, old: Float[Tensor, "3"], new: Float[Tensor, "3"]
 
 
 def _require_finite(what: str, value: float, step: Step) -> None:
-    """ValueError that names the step and its view, unless a loss, or the sum of a gradient, is finite."""
+    """InputError that names the step and its view, unless a loss, or the sum of a gradient, is finite."""
     if not isfinite(value):
         name = step.views[step.chosen].name
         raise InputError(f"expected a finite {what}, got {value} at step {step.number} on view {name}; lower the rates")

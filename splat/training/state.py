@@ -9,26 +9,27 @@ The loop (`splat/training/loop.py`) makes the steps; a checkpoint (`splat/traini
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from math import inf
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.curvature.objective import SceneObjective
 from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
+from splat.model.typed import Count, Length, NonNegative, Positive, Settings, Share, typed
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.scenes.view import View
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.training.optim.adam import Adam
-from splat.training.typed import Count, typed
 
-Row = dict[str, Count | float | bool | str]
+Row = dict[str, Count | float | bool | str]  # of a history
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class MethodSettings:
+class MethodSettings(Settings):
     """Settings of a method, of which `create` makes a `Method`.  name: its key in `methods.METHODS`.
 
     BEFORE: for settings that older checkpoints lack, the values that stand for what the method did then.
@@ -90,7 +91,7 @@ class Method(Generic[S]):
     """What a method adds to 3DGS, and what it holds between steps.  This base adds nothing: it is 3DGS.
 
     hook            runs                                      arguments          result
-    on_start        before the first step, after a resume     training, views    ValueError where views lack what it needs
+    on_start        before the first step, after a resume     training, views    InputError where views lack what it needs
     opacity_scale   before the sampled view is rendered       step               (n,) factors on the opacities, or None
     gradient        after its backward pass, before Adam      step, base         loss and gradient to go on with
     on_densify      after each change of the Gaussians        change             which old one each new one comes from
@@ -106,7 +107,7 @@ class Method(Generic[S]):
     def __init__(self, settings: S, seed: int):
         self.settings = settings
         self.generator = torch.Generator().manual_seed(seed)
-        self.history: list[Row] = []
+        self.history: list[dict[str, Any]] = []
 
     def on_start(self, training: "Training", views: Sequence[View]) -> None:
         """A second call changes nothing."""
@@ -142,66 +143,44 @@ class ThreeDGS(MethodSettings):
 
 
 @dataclass(frozen=True)
-class LearningRates:
+class LearningRates(Settings):
     """Adam's rates of 3DGS, about what a step changes a stored parameter by.
 
     position, position_final: per unit of the scene's extent, at the first step and at the last.  sh_constant, sh_higher: of the
     SH band of degree 0 and of those above.
     """
 
-    position: float = 1.6e-4
-    position_final: float = 1.6e-6
-    log_scales: float = 5e-3
-    quats: float = 1e-3
-    opacity_logits: float = 0.05
-    sh_constant: float = 2.5e-3
-    sh_higher: float = 2.5e-3 / 20
-
-    def __post_init__(self) -> None:
-        if not (0 < self.position < inf and 0 < self.position_final < inf):
-            raise InputError(
-                "expected finite position rates above 0 (decay is exponential), got "
-                f"{self.position}, {self.position_final}"
-            )
-        others = self.log_scales, self.quats, self.opacity_logits, self.sh_constant, self.sh_higher
-        if not all(0 <= rate < inf for rate in others):
-            raise InputError(f"expected finite learning rates of at least 0, got {self}")
+    position: Positive = 1.6e-4
+    position_final: Positive = 1.6e-6
+    log_scales: NonNegative = 5e-3
+    quats: NonNegative = 1e-3
+    opacity_logits: NonNegative = 0.05
+    sh_constant: NonNegative = 2.5e-3
+    sh_higher: NonNegative = 2.5e-3 / 20
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Settings):
     """Everything that a training's result depends on beside its start and its views.
 
     sh_degree: the highest SH degree, 0 to 3; one is added every sh_degree_every steps, from 0.
     background: the colour that the views were composited over, RGB in [0, 1], drawn behind the Gaussians.
     random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
     method: what is added to 3DGS, with its settings (`splat/training/methods/methods.py`).
-    ValueError where a setting is out of its range.
+    InputError where a setting is out of its range.
     """
 
-    iterations: int = 2000
-    seed: int = 0
-    sh_degree: int = 3
-    sh_degree_every: int = 1000
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    iterations: Length = 2000
+    seed: Count = 0
+    sh_degree: Annotated[int, Meta(ge=0, le=3)] = 3
+    sh_degree_every: Length = 1000
+    background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
     random_background: bool = False
     loss: LossSettings = field(default_factory=LossSettings)
     rates: LearningRates = field(default_factory=LearningRates)
     densify: DensifySettings = field(default_factory=DensifySettings)
     render: RenderSettings = field(default_factory=RenderSettings)
     method: MethodSettings = field(default_factory=ThreeDGS)
-
-    def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise InputError(f"expected at least 1 iteration, got {self.iterations}")
-        if not 0 <= self.seed < 2**63:
-            raise InputError(f"expected a seed in [0, 2^63), got {self.seed}")
-        if not 0 <= self.sh_degree <= 3:
-            raise InputError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
-        if self.sh_degree_every < 1:
-            raise InputError(f"expected sh_degree_every of at least 1, got {self.sh_degree_every}")
-        if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
-            raise InputError(f"expected a background of three numbers in [0, 1], got {self.background}")
 
     @property
     def is_white(self) -> bool:
@@ -239,7 +218,7 @@ class Training:
     def start(cls, gaussians: Gaussians, extent: float, config: TrainConfig) -> "Training":
         """A training before its first step.  The Gaussians are copied; extent: world units, as of `Scene.extent`.
 
-        ValueError where there are no Gaussians, one is not finite, or their SH degree is above the training's.
+        InputError where there are no Gaussians, one is not finite, or their SH degree is above the training's.
         """
         if len(gaussians) == 0:
             raise InputError("expected at least one Gaussian to start from, got none; use a random start")

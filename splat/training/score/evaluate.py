@@ -79,7 +79,7 @@ def evaluate(
 
 
 def have_masks(views: Sequence[View]) -> bool:
-    """Whether the views have masks.  ValueError where only some do: their scores would have no mean."""
+    """Whether the views have masks.  InputError where only some do: their scores would have no mean."""
     without = [view.name for view in views if view.mask is None]
     if 0 < len(without) < len(views):
         raise InputError(

@@ -9,7 +9,7 @@ import torch
 from splat.losses.reference import photometric_loss
 from splat.render.render import render
 from splat.training.loop import train
-from splat.training.methods.dropgaussian import DropGaussian, DropRegularizer
+from splat.training.methods.dropout.dropgaussian import DropGaussian, DropGaussianMethod
 from splat.training.state import TrainConfig, Training
 from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
 
@@ -17,9 +17,9 @@ from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
 @pytest.fixture
 def gains(monkeypatch) -> list[torch.Tensor]:
     """Every gain that a training draws."""
-    drawn, draw = [], DropRegularizer.opacity_scale
+    drawn, draw = [], DropGaussianMethod.opacity_scale
     monkeypatch.setattr(
-        DropRegularizer, "opacity_scale", lambda self, step: drawn.append(draw(self, step)) or drawn[-1]
+        DropGaussianMethod, "opacity_scale", lambda self, step: drawn.append(draw(self, step)) or drawn[-1]
     )
     return drawn
 
@@ -59,9 +59,3 @@ def test_a_gaussian_is_dropped_irrespective_of_the_others_and_anew_at_each_step(
     first, second = ((gain > 0).double() for gain in gains)
     for one, other in [(first, second), (first[1:], first[:-1])]:
         assert abs(torch.corrcoef(torch.stack([one, other]))[0, 1]) < 4 / sqrt(len(one))
-
-
-@pytest.mark.parametrize("p_max", [0.0, 1.0, float("nan")])
-def test_settings_of_dropgaussian_that_make_no_sense_are_refused(p_max):
-    with pytest.raises(ValueError, match="p_max above 0 and below 1"):
-        DropGaussian(p_max=p_max)

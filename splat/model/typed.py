@@ -16,6 +16,8 @@ from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_
 
 import msgspec
 
+from landscape.errors import InputError
+
 LARGEST = sys.float_info.max
 Positive = Annotated[float, msgspec.Meta(gt=0, le=LARGEST)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0, le=LARGEST)]
@@ -27,7 +29,7 @@ _hints = cache(lambda kind: get_type_hints(kind, include_extras=True))
 
 
 class Settings:
-    """Base of frozen dataclasses of settings.  ValueError that names the field where a value is not what its hint says."""
+    """Base of frozen dataclasses of settings.  InputError that names the field where a value is not what its hint says."""
 
     def __post_init__(self) -> None:
         for name, hint in _hints(type(self)).items():
@@ -39,11 +41,11 @@ class Settings:
 def typed(kind: Any, content: Any, where: str = "") -> Any:
     """content as a value of this type; dataclasses make their own checks too.  where: its name in messages.
 
-    ValueError, of one line, that says at which key what was expected and what was found.
+    InputError, of one line, that says at which key what was expected and what was found.
 
     >>> typed(Share, 2, "p_max")
     Traceback (most recent call last):
-    ValueError: 'p_max': expected float <= 1.0, got 2
+    landscape.errors.InputError: 'p_max': expected float <= 1.0, got 2
     """
     try:
         return msgspec.convert(content, kind, strict=True)

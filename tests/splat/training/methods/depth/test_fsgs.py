@@ -11,8 +11,8 @@ from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.loop import train
-from splat.training.methods import fsgs
-from splat.training.methods.fsgs import FSGS, depth_loss, unpool
+from splat.training.methods.depth import fsgs
+from splat.training.methods.depth.fsgs import FSGS, depth_loss, unpool
 from splat.training.methods.methods import ThreeDGS
 from splat.training.state import Step, TrainConfig, Training
 from tests.splat.tiny import EXTENT, HEIGHT, WIDTH, tiny_config, tiny_gaussians, tiny_views
@@ -74,12 +74,12 @@ def test_unpooling_happens_at_densifications_until_its_last_step():
     config = replace(tiny_config(), method=replace(WIDE, unpool_until=6, depth_weight=0.0))
     training = Training.start(tiny_gaussians(), EXTENT, config)
     counts = [done.gaussians for done in train(training, tiny_views())]
-    steps = [row["step"] for row in training.regularizer.history]
+    steps = [row["step"] for row in training.method.history]
     assert steps == [number for number in range(1, 7) if config.densify.densifies(number, 12)] == [4, 6]
-    assert any(row["grown"] for row in training.regularizer.history)
+    assert any(row["grown"] for row in training.method.history)
     plain = Training.start(tiny_gaussians(), EXTENT, replace(config, method=ThreeDGS()))
     before = [done.gaussians for done in train(plain, tiny_views())]
-    grown = training.regularizer.history[0]["grown"]
+    grown = training.method.history[0]["grown"]
     assert counts[:3] == before[:3] and counts[3] == before[3] + grown
 
 
@@ -112,7 +112,7 @@ def test_the_gradient_is_that_of_the_loss_and_the_weighted_depth_term(number, we
     settings = FSGS(depth_weight=0.3, late_depth_weight=0.02, depth_until=6, depths="depth")
     step = a_step(settings, number)
     base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
-    got = step.training.regularizer.gradient(step, base)
+    got = step.training.method.gradient(step, base).gradient
 
     flat = step.gaussians.flat.detach().requires_grad_()
     shown = render(step.gaussians.with_flat(flat), step.camera, depth=True, backend="reference").depth
@@ -127,7 +127,7 @@ def test_where_nothing_is_seen_depth_adds_nothing_and_is_not_correlated(monkeypa
     step = a_step(FSGS())
     step.gaussians.means[:, 2] = -3.0
     base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
-    assert torch.equal(step.training.regularizer.gradient(step, base), base.gradient)
+    assert torch.equal(step.training.method.gradient(step, base).gradient, base.gradient)
 
 
 def test_without_depth_maps_only_the_unpooling_can_be_trained():
@@ -136,20 +136,3 @@ def test_without_depth_maps_only_the_unpooling_can_be_trained():
     with pytest.raises(ValueError, match=r"depth map of every training view for the method fsgs, got none of 'view2'"):
         next(train(training, views))
     assert training.step == 0
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"neighbours": 0}, "neighbours of at least 1"),
-        ({"unpool_until": -1}, "unpool_until"),
-        ({"threshold": 0.0}, "threshold above 0"),
-        ({"large": float("nan")}, "large of at least 0"),
-        ({"depth_weight": -1.0}, "depth weights"),
-        ({"late_depth_weight": float("inf")}, "depth weights"),
-        ({"depths": "metres"}, "'disparity' .* or 'depth'"),
-    ],
-)
-def test_settings_of_fsgs_that_make_no_sense_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        FSGS(**settings)
