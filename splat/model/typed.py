@@ -15,6 +15,7 @@ from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
+from torch import Tensor
 
 from landscape.errors import InputError
 
@@ -47,6 +48,7 @@ def typed(kind: Any, content: Any, where: str = "") -> Any:
     Traceback (most recent call last):
     landscape.errors.InputError: 'p_max': expected float <= 1.0, got 2
     """
+    _require_no_tensor(kind, content, where)
     try:
         return msgspec.convert(content, kind, strict=True)
     except msgspec.ValidationError as error:
@@ -63,6 +65,18 @@ def typed(kind: Any, content: Any, where: str = "") -> Any:
         said = said.replace("Number out of range", "expected float").replace(f"<= {LARGEST}", "that is finite")
         key = f"{where}{path}".lstrip(".")
         raise InputError(f"{key and repr(key) + ': '}{said[0].lower()}{said[1:]}") from error
+
+
+def _require_no_tensor(kind: Any, content: Any, where: str) -> None:
+    """InputError where a tensor stands for an object, for which msgspec takes it."""
+    if isinstance(content, Tensor) and (is_dataclass(kind) or get_origin(kind) is dict):
+        raise InputError(f"'{where.lstrip('.')}': expected object, got Tensor")
+    if is_dataclass(kind) and isinstance(content, dict):
+        for name, hint in _hints(kind).items():
+            _require_no_tensor(hint, content.get(name), f"{where}.{name}")
+    elif get_origin(kind) in (list, dict) and isinstance(content, list | dict):
+        for value in content.values() if isinstance(content, dict) else content:
+            _require_no_tensor(get_args(kind)[-1], value, f"{where}[...]")
 
 
 def _at(names: list[str], kind: Any, content: Any) -> tuple[Any, Any]:

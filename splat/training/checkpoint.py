@@ -5,6 +5,7 @@ written whole or not at all.  Its checksums are compared, which torch leaves out
 Its keys are the fields of `_File` and of `_Training`, side by side.
 """
 
+import errno
 import io
 import os
 import sys
@@ -186,7 +187,8 @@ def _read(file: BinaryIO, path: Path) -> Any:
         with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
             return torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # a file of another kind fails in torch in as many ways
-        if isinstance(error, OSError) or lacks_memory(error):
+        bad_seek = isinstance(error, OSError) and error.errno == errno.EINVAL  # to where a damaged index points
+        if lacks_memory(error) or (isinstance(error, OSError) and not bad_seek):
             raise
         ply = " (Gaussians from a PLY file cannot be read)" if path.suffix.lower() == ".ply" else ""
         reason = next(iter(str(error).splitlines()), type(error).__name__)

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from landscape.errors import InputError
 from splat.model.settings import RenderSettings
 from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
 from splat.training.loop import train
@@ -107,6 +108,37 @@ def test_a_checkpoint_that_the_system_does_not_open_is_reported_in_its_words(pat
     with pytest.raises(OSError, match=os.strerror(number)) as caught:
         load_checkpoint(path)
     assert caught.value.filename == str(path)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError(
+            "[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory: you tried to allocate"
+        ),
+        OSError(errno.EIO, os.strerror(errno.EIO)),
+        KeyboardInterrupt(),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+@pytest.mark.parametrize("place", ["torch.load", "splat.training.checkpoint.Adam"])
+def test_what_is_not_the_files_fault_is_never_called_damaged(path, monkeypatch, error, place):
+    def fails(*_, **__):
+        raise error
+
+    monkeypatch.setattr(place, fails)
+    with pytest.raises(type(error)) as caught:
+        load_checkpoint(path)
+    assert caught.value is error
+
+
+def test_what_was_wrong_with_a_damaged_file_is_said_and_kept(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(InputError, match="damaged: File is not a zip file; take another copy of the file") as caught:
+        load_checkpoint(path)
+    assert isinstance(caught.value.__cause__, zipfile.BadZipFile)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
@@ -252,11 +284,10 @@ def test_settings_in_a_checkpoint_are_checked_like_any_others(path, key, value, 
     [
         ("densify", "stop", 2**63),
         ("densify", "stop", 10**30),
-        ("densify", "stop", 10**5000),
         ("rates", "position", 10**400),
         ("render", "contour_sigma", 10**400),
     ],
-    ids=["2^63", "10^30", "10^5000", "rate", "sigma"],
+    ids=["2^63", "10^30", "rate", "sigma"],
 )
 def test_whole_numbers_that_no_machine_number_holds_are_refused(path, part, key, number):
     content = torch.load(path, weights_only=True)

@@ -14,8 +14,10 @@ magnitudes and edges, or none.  The history notes it, and counts the probed view
 
 Schedule.  The paper trains for 10,000 steps, 1,000 of them warm-up (Sec. 4, Algorithm 1).  Algorithm 1 densifies only after the
 warm-up (line 18), its text builds on 3DGS, which begins after step 500: `densify_after_warm_up` chooses.  In a training of
-another length T, `StableGS.scaled` multiplies warm-up and density schedule by T / 10,000, so that probing and densification
-overlap as they do in the paper; `landscape train` does so for all of them that are not set by hand.
+another length T, `StableGS.scaled` multiplies the warm-up, the first and last step of density control and the steps between
+resets of the opacities by T / 10,000, so that probing and densification overlap as they do in the paper.  The steps between two
+densifications stay: Gaussians that have had no time to move would be cloned again and again.  `landscape train` does so for all
+that is not set by hand.
 
 Accuracy.  tr H_b has an exact part and one that is sampled (`splat/curvature/traces.py`), with as many samples, from 8 to
 MOST_SAMPLES, as bring the 95% interval of rho within `accuracy` of it; rho takes the root of the trace.  A trace that almost
@@ -102,16 +104,27 @@ class StableGS(MethodSettings):
     def density_control(self, config: TrainConfig) -> DensifySettings:
         if not self.densify_after_warm_up:
             return config.densify
-        return replace(config.densify, start=max(config.densify.start, self.warm_up), start_share=1.0)
+        start = max(config.densify.begins(config.iterations), self.warm_up)
+        return replace(config.densify, start=start, start_share=1.0)
 
     def scaled(self, config: TrainConfig, keep: Collection[str] = ()) -> TrainConfig:
-        def steps(settings: Any, prefix: str, names: tuple[str, ...]) -> dict[str, int]:
-            share = config.iterations / PAPERS_STEPS
-            return {name: max(1, round(share * getattr(settings, name))) for name in names if prefix + name not in keep}
+        def steps(name: str, value: int, least: int = 0) -> int:
+            return value if name in keep else max(round(value * config.iterations / PAPERS_STEPS), least)
 
-        density = steps(config.densify, "densify.", ("start", "stop", "every", "reset_every"))
-        method = replace(self, **steps(self, "", ("warm_up",)))
-        return replace(config, densify=replace(config.densify, **density), method=method)
+        density = replace(
+            config.densify,
+            start=steps("densify.start", config.densify.start),
+            stop=steps("densify.stop", config.densify.stop),
+            reset_every=steps("densify.reset_every", config.densify.reset_every, 1),
+        )
+        return replace(config, densify=density, method=replace(self, warm_up=steps("warm_up", self.warm_up)))
+
+
+class RhoAccuracy(TraceSettings):
+    """Traces as accurate as rho has to be: relative, and no matter how far below 0, where rho is at its cap."""
+
+    def reached(self, value: float, low: float, high: float) -> bool:
+        return high <= 0 or super().reached(value, low, high)
 
 
 class StableGSMethod(Method[StableGS]):
@@ -165,7 +178,7 @@ class StableGSMethod(Method[StableGS]):
         except NothingInSight:
             self.history.append({"step": step.number, "note": "no Gaussian in sight: magnitudes kept"})
             return
-        estimates = self._traces(objective)
+        estimates = self.traces(objective)
         values, active = {name: estimate.value for name, estimate in estimates.items()}, len(objective.active)
         degree, extent = step.gaussians.sh_degree, step.training.extent
         self.magnitudes = magnitudes(values, active, degree, extent, settings.probe)
@@ -176,7 +189,7 @@ class StableGSMethod(Method[StableGS]):
         if settings.vsp_weight and settings.viewpoint.edge_rotation:
             self.normals = [_edge_normal(step, view.camera) for view in step.views]
 
-    def _traces(self, objective: SceneObjective) -> dict[str, TraceEstimate]:
+    def traces(self, objective: SceneObjective) -> dict[str, TraceEstimate]:
         """Of the blocks of the attributes that are probed."""
         settings, names = self.settings, self.settings.probe.on
         if not names:
@@ -185,7 +198,7 @@ class StableGSMethod(Method[StableGS]):
             return estimate_traces(SceneHessian(objective), self.generator, PAPER, names)
         if settings.accuracy == inf:
             return exact_traces(objective, self.generator, names=names, samples=LEAST_SAMPLES)
-        enough = TraceSettings(rtol=2 * settings.accuracy, max_probes=MOST_SAMPLES)
+        enough = RhoAccuracy(rtol=2 * settings.accuracy, max_probes=MOST_SAMPLES)
         return exact_traces(objective, self.generator, enough, names=names)
 
     def _count_unseen(self, step: Step) -> None:

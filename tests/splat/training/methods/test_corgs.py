@@ -21,7 +21,7 @@ from splat.training.state import Step, TrainConfig, Training
 from tests.splat.random_scenes import random_camera
 from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
 
-APART = CoRGS(prune_every=0, weight=0.0)
+APART = CoRGS(prune_every=1000, prune_start=3, weight=0.0)
 TOGETHER = CoRGS(prune_every=4, prune_start=3, distance=0.3, pseudo_start=5)
 
 

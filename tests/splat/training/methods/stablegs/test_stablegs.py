@@ -1,11 +1,14 @@
 """StableGS on the loop: its gradient against one autograd expression, what it leaves out, and resuming."""
 
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 import pytest
 import torch
 
+from landscape.errors import InputError
+from splat.curvature.traces import exact_traces
 from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
@@ -13,6 +16,7 @@ from splat.render.render import render
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings
 from splat.training.loop import train
+from splat.training.methods import agreement
 from splat.training.methods.stablegs import stablegs
 from splat.training.methods.stablegs.attribute_probe import Caps, Constants, ProbeSettings
 from splat.training.methods.stablegs.stablegs import StableGS
@@ -84,8 +88,8 @@ def test_a_probe_of_no_attribute_weighs_the_photometric_gradient_alone(monkeypat
     def never(*_, **__):
         raise AssertionError("was worked out for nothing")
 
-    for name in ("loss_and_gradient", "exact_traces", "render"):
-        monkeypatch.setattr(stablegs, name, never)
+    for module, name in ((stablegs, "loss_and_gradient"), (stablegs, "exact_traces"), (agreement, "render")):
+        monkeypatch.setattr(module, name, never)
     settings = StableGS(warm_up=0, probe=ProbeSettings(attributes=()), viewpoint=ViewpointSettings(edge_rotation=False))
     step = first_step(settings)
     base = base_of(step)
@@ -105,8 +109,8 @@ def test_a_loss_of_weight_0_is_not_rendered(monkeypatch, weights, renders):
 
         return call
 
-    for name in calls:
-        monkeypatch.setattr(stablegs, name, counted(name, getattr(stablegs, name)))
+    for module, name in ((stablegs, "loss_and_gradient"), (agreement, "render")):
+        monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
     asp, vsp = weights
     viewpoint = ViewpointSettings(edge_rotation=False)
     step = first_step(StableGS(warm_up=0, asp_weight=asp, vsp_weight=vsp, probe=PROBE, viewpoint=viewpoint))
@@ -120,7 +124,7 @@ def test_a_viewpoint_that_sees_nothing_adds_nothing(monkeypatch):
     step = first_step(StableGS(warm_up=0, asp_weight=0.0, probe=PROBE))
     away = replace(step.camera, centre=torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64))
     monkeypatch.setattr(stablegs, "composite_pose", lambda *_, **__: away)
-    monkeypatch.setattr(stablegs, "consistency_loss", None)
+    monkeypatch.setattr(agreement, "consistency_loss", None)
     base = base_of(step)
     assert torch.equal(step.training.method.gradient(step, base).gradient, base.gradient)
 
@@ -207,3 +211,93 @@ def test_a_stablegs_run_continues_from_a_checkpoint_to_the_same_bits(tmp_path: P
         pass
     assert torch.equal(resumed.gaussians.flat, whole.gaussians.flat)
     assert resumed.method.history == whole.method.history
+
+
+def rounds(config: TrainConfig) -> list[int]:
+    """The steps that clone, split and prune."""
+    schedule = config.method.density_control(config)
+    return [step for step in range(1, config.iterations + 1) if schedule.densifies(step, config.iterations)]
+
+
+@pytest.mark.parametrize(
+    ("iterations", "met", "made"), [(1000, 7, 8), (2000, 7, 8), (5000, 19, 22), (10_000, 39, 44), (30_000, 119, 134)]
+)
+def test_scaled_to_any_length_probing_meets_densification_as_in_the_paper(iterations, met, made):
+    config = TrainConfig(iterations, method=StableGS())
+    config = config.method.scaled(config)
+    assert isinstance(config.method, StableGS) and config.method.warm_up == iterations // 10
+    assert (sum(step > config.method.warm_up for step in rounds(config)), len(rounds(config))) == (met, made)
+    if iterations == 10_000:
+        assert config == TrainConfig(iterations, method=StableGS())
+
+
+def test_what_is_set_by_hand_is_not_scaled():
+    given = TrainConfig(2000, method=StableGS(warm_up=700), densify=DensifySettings(start=50))
+    scaled = given.method.scaled(given, keep=("warm_up", "densify.start"))
+    assert scaled == replace(given, densify=replace(given.densify, stop=3000, reset_every=600))
+    shortest = TrainConfig(1, method=StableGS())
+    scaled = shortest.method.scaled(shortest)
+    assert scaled.method == StableGS(warm_up=0) and scaled.densify.reset_every == 1
+
+
+def test_densification_can_wait_for_the_end_of_the_warm_up(monkeypatch):
+    config = TrainConfig(10_000, method=StableGS())
+    after = replace(config, method=StableGS(densify_after_warm_up=True))
+    assert rounds(after) == [step for step in rounds(config) if step > 1000]
+    short = replace(tiny_config(), method=StableGS(warm_up=5, every=4, probe=PROBE, densify_after_warm_up=True))
+    training, made = Training.start(tiny_gaussians(), EXTENT, short), []
+    monkeypatch.setattr(training.method, "on_densify", lambda change: made.append(training.step + 1))
+    for _ in train(training, tiny_views()):
+        pass
+    assert made == rounds(short) == [6, 8]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (StableGS(warm_up=12), r"warm_up = 12"),
+        (StableGS(warm_up=0, asp_weight=0.0, vsp_weight=0.0), "all of it is switched off"),
+        (StableGS(warm_up=0, probe=ProbeSettings(attributes=())), "all of it is switched off"),
+    ],
+)
+def test_a_training_in_which_it_never_acts_is_refused(settings, words):
+    training = Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=settings))
+    with pytest.raises(InputError, match=rf"got stablegs which never does in 12 steps \({words}\); take more steps"):
+        next(train(training, tiny_views()))
+    assert training.step == 0
+
+
+def test_rho_is_as_accurate_as_was_asked_for():
+    config = TrainConfig(5, method=StableGS(warm_up=0))
+    objective = config.objective(tiny_gaussians(seed=1), tiny_views())
+    truth = exact_traces(objective, torch.Generator().manual_seed(99), samples=1000)
+    errors = []
+    for seed in range(20):
+        method = config.method.create(seed)
+        assert isinstance(method, stablegs.StableGSMethod)
+        for name, trace in method.traces(objective).items():
+            assert trace.reason == "tolerance" and 8 <= trace.probes <= 64
+            errors.append(abs((truth[name].value / trace.value) ** 0.5 - 1))
+    assert sum(error > 0.05 for error in errors) <= 0.05 * len(errors)
+
+
+def test_a_trace_that_is_surely_negative_needs_no_more_samples():
+    config = TrainConfig(5, method=StableGS(warm_up=0))
+    objective = config.objective(tiny_gaussians(seed=0), tiny_views())
+    method = config.method.create(0)
+    assert isinstance(method, stablegs.StableGSMethod)
+    traces = method.traces(objective)
+    assert traces["quats"].high < 0 and traces["quats"].probes == 8 < traces["log_scales"].probes
+
+
+def test_checkpoints_from_before_accuracy_was_a_setting_keep_their_four_samples(tmp_path):
+    path, method = tmp_path / "checkpoint.pt", StableGS(warm_up=0)
+    save_checkpoint(path, Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=method)), REFERENCE)
+    content = torch.load(path, weights_only=True)
+    del content["config"]["method"]["accuracy"], content["config"]["method"]["densify_after_warm_up"]
+    torch.save(content, path)
+    training = load_checkpoint(path).training
+    assert training.config.method == StableGS(warm_up=0, accuracy=inf)
+    assert isinstance(training.method, stablegs.StableGSMethod)
+    objective = training.config.objective(training.gaussians, tiny_views())
+    assert {trace.probes for trace in training.method.traces(objective).values()} == {4}
