@@ -65,6 +65,12 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
 
     Between two items `training` is complete: it can be saved, evaluated, or left there.  InputError as of `prepare`, and where
     a loss or gradient is not finite.
+
+    >>> from splat import SyntheticSettings, TrainConfig, synthetic_scene
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> training = Training.start(made.truth, made.scene.extent(), TrainConfig(iterations=2))
+    >>> [done.step for done in train(training, made.scene.load())]
+    [1, 2]
     """
     prepare(training, views)
     config, method, dtype = training.config, training.method, training.gaussians.flat.dtype

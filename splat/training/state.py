@@ -17,6 +17,7 @@ from msgspec import Meta
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.operators.distributed import ALONE, Ranks
 from splat.curvature.objective import SceneObjective
 from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import LossSettings
@@ -168,6 +169,10 @@ class TrainConfig(Settings):
     random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
     method: what is added to 3DGS, with its settings (`splat/training/methods/methods.py`).
     InputError where a setting is out of its range.
+
+    >>> from splat import METHODS
+    >>> TrainConfig(iterations=300, method=METHODS["stablegs"](warm_up=100)).method.name
+    'stablegs'
     """
 
     iterations: Length = 2000
@@ -190,10 +195,14 @@ class TrainConfig(Settings):
     def background_colour(self, dtype: torch.dtype) -> Float[Tensor, "3"]:
         return torch.tensor(self.background, dtype=dtype)
 
-    def objective(self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False) -> SceneObjective:
+    def objective(
+        self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False, ranks: Ranks = ALONE
+    ) -> SceneObjective:
         """This loss, on this background, averaged over views: the objective whose Hessian is studied.  See `SceneObjective`."""
         background = self.background_colour(gaussians.flat.dtype)
-        return SceneObjective(gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen)
+        return SceneObjective(
+            gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen, ranks=ranks
+        )
 
 
 @dataclass(eq=False)
@@ -219,6 +228,10 @@ class Training:
         """A training before its first step.  The Gaussians are copied; extent: world units, as of `Scene.extent`.
 
         InputError where there are no Gaussians, one is not finite, or their SH degree is above the training's.
+
+        >>> from splat import Gaussians
+        >>> Training.start(Gaussians(torch.ones(14), sh_degree=0), extent=1.0, config=TrainConfig()).step
+        0
         """
         if len(gaussians) == 0:
             raise InputError("expected at least one Gaussian to start from, got none; use a random start")

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from splat.curvature.hessian import SceneHessian
-from splat.curvature.null_space import CHUNK, RowSpace, _row_space, seen_parameters
+from splat.curvature.null_space import CHUNK, TOLERANCE, RowSpace, _row_space, seen_parameters
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.view import View
@@ -92,11 +92,11 @@ def test_a_gpu_takes_no_large_matrices_apart(
     generator = torch.Generator().manual_seed(0)
     A = torch.randn(CHUNK + 3, rows, 5, generator=generator, dtype=torch.float64)
     A = A @ torch.randn(CHUNK + 3, 5, columns, generator=generator, dtype=torch.float64)  # of rank 5
-    plain, sizes, brought, svd, cpu = _row_space(A, A.dtype), [], [], torch.linalg.svd, torch.Tensor.cpu
+    plain, sizes, brought, svd, cpu = _row_space(A, TOLERANCE[A.dtype]), [], [], torch.linalg.svd, torch.Tensor.cpu
     monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda tensor: not brought))
     monkeypatch.setattr(torch.Tensor, "cpu", lambda tensor: brought.append(tensor.shape) or cpu(tensor))
     monkeypatch.setattr(torch.linalg, "svd", lambda A, **options: sizes.append(A.shape) or svd(A, **options))
-    found = _row_space(A, A.dtype)
+    found = _row_space(A, TOLERANCE[A.dtype])
     assert len(brought) == copies and max(size[0] for size in sizes) <= CHUNK
     assert copies or all(size[1] <= 16 for size in sizes)
     assert torch.equal(found.rank, plain.rank) and int(found.rank.max()) == int(found.rank.min()) == 5
