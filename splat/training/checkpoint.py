@@ -100,17 +100,14 @@ class _File:
 
 def training_state(training: Training) -> dict[str, Any]:
     """All that a training depends on, as tensors and plain types: the fields of `_Training`."""
+    adam, screen = training.adam, training.screen_gradients
     return {
         "step": training.step,
         "extent": training.extent,
         "sh_degree": training.gaussians.sh_degree,
         "flat": training.gaussians.flat,
-        "adam": {
-            "first": training.adam.first.flat,
-            "second": training.adam.second.flat,
-            "updates": training.adam.updates,
-        },
-        "screen_gradients": {"total": training.screen_gradients.total, "renders": training.screen_gradients.renders},
+        "adam": {"first": adam.first.flat, "second": adam.second.flat, "updates": adam.updates},
+        "screen_gradients": {"total": screen.total, "renders": screen.renders},
         "generator": training.generator.get_state(),
         "order": training.order,
         "regularizer": {

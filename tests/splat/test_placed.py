@@ -8,8 +8,6 @@ import torch
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
-from splat.training.methods.fsgs import FSGS, unpool
-
 from analysis.measures.depth import depth_rises, depth_split
 from analysis.measures.localization import conditions, localize
 from analysis.measures.split_control import split_control
@@ -23,6 +21,7 @@ from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.training.loop import train
 from splat.training.methods.corgs import _pruned, confirmed
+from splat.training.methods.depth.fsgs import FSGS, unpool
 from splat.training.state import Training
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.placed import Placed

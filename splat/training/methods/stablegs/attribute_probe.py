@@ -33,7 +33,7 @@ from landscape.errors import InputError
 from splat.curvature.traces import Dimension, curvature_scale
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
-from splat.model.typed import NonNegative, Positive, Settings, Share
+from splat.model.typed import LARGEST, NonNegative, Positive, Settings, Share
 from splat.projection.reference import NEEDLE, Splats, condition, on_screen
 
 Attribute = Literal["means", "log_scales", "quats", "opacity_logits", "sh"]
@@ -96,17 +96,13 @@ class ProbeSettings(Settings):
 
 
 @dataclass(frozen=True)
-class Magnitude:
+class Magnitude(Settings):
     """How far an attribute is probed and why: its trace as given, tau, rho of Eq. (5) uncapped, and rho under its cap."""
 
-    trace: float
-    tau: float
-    uncapped: float
-    rho: float
-
-    def __post_init__(self) -> None:
-        if not (isfinite(self.trace) and all(0 <= value < inf for value in (self.tau, self.uncapped, self.rho))):
-            raise InputError(f"expected a finite trace, and finite tau and rho of at least 0, got {self}")
+    trace: Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+    tau: NonNegative
+    uncapped: NonNegative
+    rho: NonNegative
 
     @property
     def capped(self) -> bool:
