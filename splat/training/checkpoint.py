@@ -87,7 +87,7 @@ class _Training:
 
 @dataclass(frozen=True)
 class _File:
-    """What is beside the training.  version: 1 knew no methods, so that there is no `regularizer`: it is 3DGS.
+    """The keys beside those of the training.  version: 1 knew no methods, so that there is no `regularizer`: it is 3DGS.
 
     torch: the version that wrote the file; scene: `SceneReference` as plain types.
     """
@@ -127,7 +127,7 @@ def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> No
         **training_state(training),
         "scene": asdict(scene),
     }
-    buffer = io.BytesIO()  # a file's own name would be among the bytes
+    buffer = io.BytesIO()  # torch writes the name of a file into it
     torch.save(_interned(content), buffer)
     write_atomically(path, buffer.getvalue())
 
@@ -180,7 +180,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 
 def _read(file: BinaryIO, path: Path) -> Any:
-    """What torch saved, once the checksums are found to be right."""
+    """The content that torch saved, after its checksums were found to be right."""
     try:
         with zipfile.ZipFile(file) as archive:
             if wrong := archive.testzip():

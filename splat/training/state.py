@@ -1,8 +1,8 @@
-"""What a training of 3D Gaussian Splatting consists of: its settings, its state under way, and what a method adds to it.
+"""Settings and state of a training of 3D Gaussian Splatting, and the interface of the methods that add to it.
 
-TrainConfig, MethodSettings    all that the result depends on beside the start and the views; plain values
-Training, Method               what changes from step to step, the method's part in `Method`
-Step                           what one step is about: its number, its view, its loss
+TrainConfig, MethodSettings    plain values: all that the result depends on beside the start and the views
+Training, Method               the state that changes from step to step; `Method` holds the method's part
+Step                           one step: its number, its view, its loss
 
 The loop (`splat/training/loop.py`) makes the steps; a checkpoint (`splat/training/checkpoint.py`) holds all of it.
 """
@@ -60,9 +60,9 @@ class Step:
 
 @dataclass(frozen=True)
 class MethodSettings(Settings):
-    """Settings of a method, of which `create` makes a `Method`.  name: its key in `methods.METHODS`.
+    """Settings of a method; `create` makes a `Method` from them.  name: its key in `methods.METHODS`.
 
-    BEFORE: for settings that older checkpoints lack, the values that stand for what the method did then.
+    BEFORE: values for settings that older checkpoints lack, with which the method does the same as it did then.
     """
 
     name: str = ""
@@ -73,7 +73,7 @@ class MethodSettings(Settings):
         return Method(self, seed)
 
     def parts(self, config: "TrainConfig") -> dict[str, int]:
-        """How many steps pass before each part of the method begins, by the setting that says so; not of parts switched off."""
+        """Steps before each part of the method begins, by the name of the setting; parts that are switched off are left out."""
         return {self.name: 0}
 
     def density_control(self, config: "TrainConfig") -> DensifySettings:
@@ -89,7 +89,7 @@ S = TypeVar("S", bound=MethodSettings)
 
 
 class Method(Generic[S]):
-    """What a method adds to 3DGS, and what it holds between steps.  This base adds nothing: it is 3DGS.
+    """Additions of a method to 3DGS, and its state between steps.  This base adds nothing: it is 3DGS.
 
     hook            runs                                      arguments          result
     on_start        before the first step, after a resume     training, views    InputError where views lack what it needs
@@ -98,11 +98,12 @@ class Method(Generic[S]):
     on_densify      after each change of the Gaussians        change             which old one each new one comes from
     after_step      after Adam and density control            step
 
-    Adam descends `gradient` of what the hook of that name returns; density control counts its `screen_gradient`.
+    The hook `gradient` returns a loss with two gradients: Adam descends its `gradient`, density control counts its
+    `screen_gradient`.
 
-    generator: of all that the method draws; its own, so that with the same seed every method sees the same views in the same
-    order and splits the same Gaussians alike.  history: rows to look at afterwards, each with its "step"; `landscape train`
-    writes them to history.csv.  Both are in `state`, and `restore` continues from it to the same bits.
+    generator: for everything that the method draws.  It is not the training's, so that with the same seed every method sees
+    the same views in the same order and splits the same Gaussians alike.  history: rows to look at afterwards, each with its
+    "step"; `landscape train` writes them to history.csv.  Both are in `state`; `restore` continues from it to the same bits.
     """
 
     def __init__(self, settings: S, seed: int):
@@ -211,6 +212,10 @@ class Training:
 
     extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.
     order: indices of the epoch's views still to come, last first.
+
+    >>> from splat import Gaussians
+    >>> Training.start(Gaussians(torch.ones(14), sh_degree=0), extent=1.0, config=TrainConfig()).step
+    0
     """
 
     config: TrainConfig
@@ -228,10 +233,6 @@ class Training:
         """A training before its first step.  The Gaussians are copied; extent: world units, as of `Scene.extent`.
 
         InputError where there are no Gaussians, one is not finite, or their SH degree is above the training's.
-
-        >>> from splat import Gaussians
-        >>> Training.start(Gaussians(torch.ones(14), sh_degree=0), extent=1.0, config=TrainConfig()).step
-        0
         """
         if len(gaussians) == 0:
             raise InputError("expected at least one Gaussian to start from, got none; use a random start")

@@ -1,7 +1,7 @@
-"""CoR-GS (Zhang et al., ECCV 2024): two fields on the same views, each kept to what the other confirms.
+"""CoR-GS (Zhang et al., ECCV 2024): two fields on the same views; each keeps the Gaussians that the other confirms.
 
-Both start from the same Gaussians and see the same view at every step; they drift apart because each draws its own splits.
-The training's Gaussians are one field, which is also the result.  The other, the partner, is a second training with its own
+Both start from the same Gaussians and see the same view at every step; they drift apart because each draws other splits.
+The training's Gaussians are one field, which is also the result.  The other, the partner, is a second training, with
 optimiser, density control and generator, which the method holds.
 
 co-pruning      every `prune_every` steps after `prune_start`, after density control: a Gaussian of either field stays only if

@@ -95,7 +95,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path, content):
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO])
-def test_a_checkpoint_that_the_system_does_not_open_is_reported_in_its_words(path, monkeypatch, number):
+def test_a_file_that_the_system_does_not_open_is_reported_in_its_words(path, monkeypatch, number):
     opened = io.open
 
     def refuse(file, *arguments, **settings):
@@ -161,7 +161,7 @@ def test_a_bit_that_flipped_anywhere_among_the_numbers_is_noticed(path, training
     load_checkpoint(path)
 
 
-def test_what_is_loaded_is_what_was_checked_though_a_training_replaces_it_meanwhile(path, training, monkeypatch):
+def test_what_is_loaded_is_what_was_checked_though_the_file_is_replaced(path, training, monkeypatch):
     checked = zipfile.ZipFile.testzip
 
     def replaced(archive):
@@ -235,7 +235,7 @@ def test_every_key_is_checked(path, key):
     ("part", "key", "number"),
     [("adam", "first", math.nan), ("adam", "second", -1e-9), ("screen_gradients", "total", math.inf)],
 )
-def test_what_a_training_goes_on_from_is_finite_and_what_was_squared_not_negative(path, part, key, number):
+def test_saved_moments_and_sums_are_finite_and_squares_not_negative(path, part, key, number):
     content = torch.load(path, weights_only=True)
     content[part][key][1] = number
     torch.save(content, path)
@@ -331,7 +331,7 @@ def test_parameters_that_are_not_finite_are_refused_by_name(path):
         ({"flat": torch.zeros(23, device="meta")}, "does not hold its numbers one by one"),
     ],
 )
-def test_parameters_that_are_no_plain_numbers_are_refused_before_they_are_looked_at(path, change, message):
+def test_parameters_that_are_no_plain_numbers_are_refused_unread(path, change, message):
     torch.save({**torch.load(path, weights_only=True), **change}, path)
     refused(path, message)
 
@@ -349,7 +349,7 @@ def test_a_checkpoint_of_float64_comes_back_in_float64(tmp_path):
     assert load_checkpoint(tmp_path / "checkpoint.pt").training.gaussians.flat.dtype == torch.float64
 
 
-def test_the_scene_is_found_from_the_checkpoint_else_where_it_was_else_not_at_all(tmp_path):
+def test_the_scene_is_found_from_the_checkpoint_else_where_it_was(tmp_path):
     there, run, moved = tmp_path / "scene", tmp_path / "run", tmp_path / "elsewhere"
     for folder in (there, run):
         folder.mkdir()

@@ -7,7 +7,7 @@
     E           mean of (N(D) - N(prior))^2 over the pixels where |N(D) - N(prior)| > tolerance, N either of
     N_local     (D - mean_P) / (std_P + 0.01 std)           mean_P, std_P over the patch of a pixel, std over the image
     N_global    (D - mean_P) / std
-    P           square patches side by side from the top left corner, what is left over at the edges not counted; their
+    P           square patches side by side from the top left corner; pixels left over at the edges do not count; their
                 side is drawn anew for each E, uniform in [smallest_patch, largest_patch], at most the image's
 
 std over the image is a constant to the derivative.  D and prior: see `prior.py`.  Weights, starts, sides and tolerance

@@ -7,7 +7,8 @@ Proximity-guided unpooling, at every densification up to `unpool_until`:
     grown       one on each edge from a source to one of its neighbours (the destination): the mean half way, scales and
                 opacity of the destination, no rotation (1, 0, 0, 0), SH 0; edges of both directions count
 
-The paper's threshold is 10 in the units of the scene; here it is as in the published code, relative to the scene.
+The paper's threshold is 10 in the units of the scene; here it is relative to the scene, as in the published code
+(VITA-Group/FSGS, scene/gaussian_model.py).
 
 Depth supervision, at every step:
 
@@ -124,7 +125,7 @@ def pearson(x: Tensor, y: Tensor) -> Float[Tensor, ""]:
 
 @torch.no_grad()
 def unpool(gaussians: Gaussians, extent: float, settings: FSGS) -> Densified:
-    """The Gaussians with new ones on the edges of the sources.  What is there stays, first and in its order."""
+    """The Gaussians, which stay first and in their order, with new ones on the edges of the sources."""
     n, device = len(gaussians), gaussians.flat.device
     k = min(settings.neighbours, n - 1)
     everyone = torch.arange(n, device=device)

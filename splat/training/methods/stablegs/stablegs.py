@@ -202,7 +202,7 @@ class StableGSMethod(Method[StableGS]):
         return exact_traces(objective, self.generator, enough, names=names)
 
     def _count_unseen(self, step: Step) -> None:
-        """One more probed viewpoint that sees nothing, in a row of its own after the last diagnosis."""
+        """One more probed viewpoint that sees nothing, in a separate row after the last diagnosis."""
         if not self.history or "count" not in self.history[-1]:
             note = "probed viewpoints without a Gaussian in sight, until the next diagnosis"
             self.history.append({"step": step.number, "note": note, "count": 0})

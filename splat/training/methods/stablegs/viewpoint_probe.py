@@ -8,7 +8,7 @@ parallax        c += delta p,   delta ~ N(0, (parallax_sigma r)^2), r the camera
                 p = R_m^T (cos phi, sin phi, 0), phi ~ U(0, 2 pi): perpendicular to the viewing direction R_m^T e_z
                 (the paper's `R e_z` reads R as camera to world)
 in a 360 capture the parallax is a spherical shell instead: c = target + orbit u, u ~ Uniform(S^2), R looks at the target,
-                held level.  It replaces the interpolated pose, so that interpolation does nothing beside it.  The paper's
+                level.  It replaces the interpolated pose, so that interpolation does nothing beside it.  The paper's
                 sphere is whole: about an object that is seen from above only, more than half of it lies below all cameras
 edge rotation   R <- exp(theta R R_m^T n) R,   theta ~ N(0, theta_sigma^2), n = (n_x, n_y, 0) the axis in view m's camera
                 frame, from its occlusion edges.  The same as R exp(theta R_m^T n): the paper's line, with n in the world

@@ -84,7 +84,7 @@ def test_the_fields_are_the_same_until_each_draws_its_own_splits():
 
 
 @pytest.mark.parametrize(("number", "weight"), [(5, 0.0), (6, 0.7)])
-def test_each_field_descends_its_loss_and_its_disagreement_with_the_image_of_the_other(monkeypatch, number, weight):
+def test_each_field_descends_its_loss_and_its_disagreement_with_the_other(monkeypatch, number, weight):
     poses, descended = [], []
     posing = corgs.pseudo_view
     monkeypatch.setattr(corgs, "pseudo_view", lambda *a: poses.append(posing(*a)) or poses[-1])
@@ -109,7 +109,7 @@ def test_each_field_descends_its_loss_and_its_disagreement_with_the_image_of_the
         assert (got - expected).norm() < 1e-10 * expected.norm()
 
 
-def test_a_gaussian_is_confirmed_where_the_nearest_of_the_other_field_is_within_the_distance():
+def test_a_gaussian_is_confirmed_by_the_nearest_one_of_the_other_field():
     one, other = tiny_gaussians(60, seed=1, dtype=torch.float64), tiny_gaussians(40, seed=2, dtype=torch.float64)
     nearest = torch.cdist(one.means, other.means).amin(dim=1)
     distance = nearest.median().item()
@@ -117,7 +117,7 @@ def test_a_gaussian_is_confirmed_where_the_nearest_of_the_other_field_is_within_
     assert 0 < confirmed(one, other, distance).sum() < 60
 
 
-def test_both_fields_lose_what_the_other_had_not_confirmed_before_either_changed():
+def test_both_fields_lose_what_the_other_did_not_confirm_before_the_change():
     step, partner = a_step(replace(TOGETHER, distance=0.35), number=8)
     one, other = step.training.gaussians, partner.gaussians
     apart = torch.cdist(one.means, other.means)
@@ -143,7 +143,7 @@ def test_fields_that_confirm_nothing_of_each_other_are_an_error():
         step.training.method.after_step(step)
 
 
-def test_a_pseudo_view_is_turned_half_way_to_the_nearest_camera_and_jittered_about_its_own_place():
+def test_a_pseudo_view_is_half_turned_to_the_nearest_camera_and_jittered():
     cameras = [random_camera(seed=seed) for seed in range(4)]
     centres = torch.stack([camera.centre for camera in cameras])
     nearest = torch.cdist(centres, centres).fill_diagonal_(torch.inf).argmin(dim=1).tolist()

@@ -50,7 +50,7 @@ def test_every_method_is_known_by_its_name():
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_training_by_any_method_continues_from_a_checkpoint_to_the_same_bits(tmp_path, name):
+def test_any_method_continues_from_a_checkpoint_to_the_same_bits(tmp_path, name):
     path, config = tmp_path / "checkpoint.pt", replace(tiny_config(), method=SHORT[name])
     whole = Training.start(tiny_gaussians(), EXTENT, config)
     kept = {}

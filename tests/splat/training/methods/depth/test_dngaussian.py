@@ -38,7 +38,7 @@ def added(step: Step) -> Gaussians:
 
 @pytest.mark.parametrize("side", [3, 5, 14])
 @pytest.mark.parametrize("local", [True, False])
-def test_depth_is_normalised_in_patches_from_the_corner_and_what_is_left_over_is_not_counted(side, local):
+def test_depth_is_normalised_in_whole_patches_from_the_corner(side, local):
     depth = np.random.default_rng(0).normal(size=(14, 20))
     depth[:side, :side] = 2.0  # a patch without variation
     rows = []
@@ -66,7 +66,7 @@ def loss_by_hand(rendered: torch.Tensor, target: torch.Tensor, sides: list[int],
     return total
 
 
-def test_the_hard_loss_moves_only_means_and_the_soft_loss_only_opacities_by_their_gradients():
+def test_the_hard_loss_moves_means_alone_and_the_soft_loss_opacities():
     settings = replace(SMALL, tolerance=0.1, soft_start=0, depths="depth")
     step = a_step(settings)
     got = added(step)
@@ -95,7 +95,7 @@ def test_the_hard_and_the_soft_loss_begin_after_their_starts():
         assert parts["opacity_logits"].any().item() == (number > 4)
 
 
-def test_the_scale_and_the_shift_of_a_map_do_not_matter_and_disparity_is_depth_upside_down():
+def test_scale_and_shift_of_a_map_do_not_matter_and_disparity_is_negated():
     settings = replace(SMALL, soft_start=0, depths="depth")
     plain = added(a_step(settings)).flat
     assert (added(a_step(settings, scale=40.0, shift=7.0)).flat - plain).norm() < 1e-10 * plain.norm()
@@ -124,7 +124,7 @@ def test_where_nothing_is_seen_depth_adds_nothing_and_is_not_normalised(monkeypa
     assert not added(step).flat.any()
 
 
-def test_in_an_image_smaller_than_a_patch_the_patch_is_as_large_as_the_image():
+def test_in_a_small_image_a_patch_is_as_large_as_the_image():
     wide = added(a_step(DNGaussian(soft_start=0, smallest_patch=16, largest_patch=17))).flat
     assert wide.any() and wide.isfinite().all()
 

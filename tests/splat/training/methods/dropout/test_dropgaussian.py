@@ -24,7 +24,7 @@ def gains(monkeypatch) -> list[torch.Tensor]:
     return drawn
 
 
-def test_the_loss_is_that_of_the_remaining_gaussians_with_their_opacities_raised(gains):
+def test_the_loss_is_of_the_remaining_gaussians_with_raised_opacities(gains):
     start, views = tiny_gaussians(dtype=torch.float64), tiny_views(torch.float64)
     start.opacity_logits.clamp_max_(-0.1)  # raised by 1 / (1 - 0.4) they stay below 1
     training = Training.start(start, EXTENT, TrainConfig(1, seed=1, method=DropGaussian(p_max=0.4)))
@@ -51,7 +51,7 @@ def test_the_share_grows_in_proportion_to_the_step_up_to_p_max_at_the_last(gains
         assert abs(dropped - p) < 4 * sqrt(p * (1 - p) / len(gain))
 
 
-def test_a_gaussian_is_dropped_irrespective_of_the_others_and_anew_at_each_step(gains):
+def test_a_gaussian_is_dropped_independently_and_anew_at_each_step(gains):
     n = 4000
     config = TrainConfig(2, method=DropGaussian(p_max=0.5))
     for _ in train(Training.start(tiny_gaussians(n), EXTENT, config), tiny_views()):

@@ -12,7 +12,7 @@ from splat.training.state import Step, TrainConfig, Training
 from tests.splat.tiny import EXTENT, tiny_gaussians, tiny_views
 
 
-def test_the_gradient_is_that_of_the_loss_and_the_agreement_with_the_gaussians_that_stay(monkeypatch):
+def test_the_gradient_is_that_of_the_loss_and_of_the_agreement(monkeypatch):
     masks, draw = [], dropoutgs.dropout
     monkeypatch.setattr(dropoutgs, "dropout", lambda *a: masks.append(draw(*a)) or masks[-1])
     views, config = tiny_views(torch.float64), TrainConfig(10, method=DropoutGS(p=0.5, weight=0.3))

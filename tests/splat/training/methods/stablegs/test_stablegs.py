@@ -45,7 +45,7 @@ def base_of(step: Step):
 
 
 @pytest.mark.parametrize("viewpoints", ["one", "all"])
-def test_the_gradient_is_that_of_the_total_loss_with_the_probes_held_constant(monkeypatch, viewpoints):
+def test_the_gradient_is_that_of_the_total_loss_with_constant_probes(monkeypatch, viewpoints):
     settings = StableGS(warm_up=0, asp_weight=0.7, vsp_weight=0.3, viewpoints=viewpoints, probe=PROBE)
     step, probes, poses = first_step(settings, background=(0.2, 0.4, 0.1)), [], []
     probing, posing = stablegs.probe_attributes, stablegs.composite_pose
@@ -129,7 +129,7 @@ def test_a_viewpoint_that_sees_nothing_adds_nothing(monkeypatch):
     assert torch.equal(step.training.method.gradient(step, base).gradient, base.gradient)
 
 
-def test_a_viewpoint_that_sees_nothing_is_counted_in_the_history_until_the_next_diagnosis(monkeypatch):
+def test_viewpoints_that_see_nothing_are_counted_for_each_diagnosis(monkeypatch):
     config = replace(tiny_config(), method=StableGS(warm_up=3, every=4, probe=PROBE))
     posing = stablegs.composite_pose
 
@@ -152,7 +152,7 @@ def looking_away(gaussians):
     gaussians.means[:, 2] *= -1
 
 
-def test_a_diagnosis_without_a_gaussian_in_sight_keeps_the_magnitudes_and_says_so():
+def test_without_a_gaussian_in_sight_a_diagnosis_keeps_the_magnitudes():
     method = StableGS(warm_up=2, every=2, probe=PROBE)
     config = replace(tiny_config(iterations=8), method=method, densify=DensifySettings(enabled=False))
     training = Training.start(tiny_gaussians(), EXTENT, config)
@@ -290,7 +290,7 @@ def test_a_trace_that_is_surely_negative_needs_no_more_samples():
     assert traces["quats"].high < 0 and traces["quats"].probes == 8 < traces["log_scales"].probes
 
 
-def test_checkpoints_from_before_accuracy_was_a_setting_keep_their_four_samples(tmp_path):
+def test_checkpoints_from_before_accuracy_keep_their_four_samples(tmp_path):
     path, method = tmp_path / "checkpoint.pt", StableGS(warm_up=0)
     save_checkpoint(path, Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=method)), REFERENCE)
     content = torch.load(path, weights_only=True)
