@@ -15,11 +15,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from analysis.records.family_table import INDICES, OPERATOR_NAMES, Cell, bracketed
-from analysis.records.quantities import PLACES, SCORES, measured, quantity
 from analysis.records.findings import attribute_name
+from analysis.records.quantities import PLACES, SCORES, measured, quantity
+from splat.model.typed import leaves
 from splat.training.checkpoint import Checkpoint
 from splat.training.state import MethodSettings
-from splat.model.typed import leaves
 
 FAMILIES = "families"  # a section that only the page and the file show
 DEPTH = "depth over lateral"

@@ -42,7 +42,8 @@ def test_projectors_have_their_ranks_and_leave_nothing_out_that_is_curved(
         assert float((P @ block - block).norm()) <= 1e-10 * float(block.norm())
     n = len(objective.active)
     assert [spaces[name].rank for name in ("means", "log_scales", "quats", "opacity_logits")] == [3 * n] * 3 + [n]
-    assert spaces["sh"].rank < 27 * n  # three views see 9 of 27 coefficients a channel and Gaussian at most
+    colours = torch.linalg.eigvalsh(H[hessian.blocks["sh"], hessian.blocks["sh"]]).abs()
+    assert spaces["sh"].rank == int((colours > 1e-15 * colours.max()).sum())
 
 
 @pytest.mark.parametrize("gauss_newton", [False, True])
