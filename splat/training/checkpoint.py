@@ -21,6 +21,7 @@ from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
 from splat.model.gaussians import Gaussians
+from splat.model.settings import current_settings
 from splat.model.typed import Count, leaves, typed
 from splat.scenes.scene import Scene
 from splat.training.densify import ScreenGradients
@@ -251,7 +252,7 @@ def _config(content: dict[str, Any]) -> TrainConfig:
     name = typed(str, method.get("name"), "config.method.name")
     if name not in METHODS:
         raise InputError(f"'config.method' has the unknown name {name[:80]!r}, expected one of {', '.join(METHODS)}")
-    method, render = {**METHODS[name].BEFORE, **method}, {"sums": "ordered", **render}
+    method, render = {**METHODS[name].BEFORE, **method}, current_settings(render)
     content = {**content, "render": render, "method": {}}
     config = replace(typed(TrainConfig, content, "config"), method=typed(METHODS[name], method, "config.method"))
     if different := leaves({**content, "method": method}).keys() ^ leaves(asdict(config)).keys():

@@ -19,7 +19,7 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
 from splat.curvature.objective import SceneObjective
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.protocols import ViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians

@@ -13,7 +13,7 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.kept_views import VECTORS
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, SampledTrace, _signs, coupling_samples, exact_traces
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
@@ -97,7 +97,7 @@ def test_traces_leave_the_radial_directions_of_the_quaternions_out() -> None:
 def test_the_pixel_diagonal_of_the_loss_is_that_of_its_dense_hessian(kind) -> None:
     target, generator = torch.rand(3, 9, 13, dtype=torch.float64), torch.Generator().manual_seed(0)
     image = target + 0.1 * torch.randn(3, 9, 13, generator=generator, dtype=torch.float64)
-    loss = ViewLoss.of(target, LossSettings(kind), torch.float64)
+    loss = CpuViewLoss(target, LossSettings(kind), torch.float64)
     linear = loss.linearize(loss.padded(image))
     units = torch.eye(image.numel(), dtype=torch.float64).view(-1, 3, 9, 13)
     columns = [loss.cropped(linear.hvp(loss.padded(unit)[None])[0]).reshape(-1) for unit in units]

@@ -9,7 +9,7 @@ import torch
 
 from landscape.errors import InputError
 from splat.curvature.traces import exact_traces
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
@@ -36,7 +36,7 @@ def first_step(settings: StableGS, **others) -> Step:
     training = Training.start(gaussians, EXTENT, config)
     training.method.on_start(training, views)
     background = config.background_colour(torch.float64)
-    loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
+    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
     return Step(settings.warm_up + 1, training, training.gaussians, views, 1, background, loss)
 
 
