@@ -116,8 +116,8 @@ def run_bench(options: BenchOptions) -> int:
 def _about(device: torch.device) -> str:
     about = machine(lanes_of(np.float32))
     if device.type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, beside {about['cpu']}"
-    return f"{about['cpu']}, {thread_count()} threads, {about['lanes']} lanes of float32"
+        return f"{torch.cuda.get_device_name(device)}, beside {about.cpu}"
+    return f"{about.cpu}, {thread_count()} threads, {about.lanes} lanes of float32"
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------

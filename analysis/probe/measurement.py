@@ -30,9 +30,10 @@ from torch import Tensor
 
 from analysis.console.budget import Budget, Share, Stage
 from analysis.measures.depth import STEPS as DEPTH_STEPS
+from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import check_against_gradient
 from analysis.measures.memory import basis_within, vectors_within
-from analysis.probe.depth_stage import DepthFindings, measure_depth
+from analysis.records.schema import Depth
 from landscape import (
     CountingOperator,
     DerivativeCheck,
@@ -89,7 +90,6 @@ class ProbeSettings:
     probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
         noise of a render.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
-    timings: how often each product is timed that tells what a skip saves; 0: that is not told.
     seconds: for all estimators together.  memory: GiB for the vectors of a basis.
     """
 
@@ -109,7 +109,6 @@ class ProbeSettings:
     depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=64))
     depth_steps: tuple[float, ...] = DEPTH_STEPS
     noise_points: int = NOISE_POINTS
-    timings: int = 3
     seconds: float = 45.0
     memory: float = 2.0
 
@@ -138,7 +137,6 @@ class ProbeSettings:
             slice_holdout=FEWEST_HELD_OUT,
             probe_steps=(),
             depth=None,
-            timings=0,
             seconds=12.0,
         )
 
@@ -153,7 +151,7 @@ class PlaneSlice:
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
+class Measured:
     """What was measured; density, finite, depth and plane are None where a note says why, power where it was not asked for.
 
     matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
@@ -169,7 +167,7 @@ class Findings:
     power: EigenEnds | None
     density: SpectralDensity | None
     finite: FiniteProbe | None
-    depth: DepthFindings | None
+    depth: Depth | None
     plane: PlaneSlice | None
     matvecs: int
     spared: int
@@ -179,7 +177,7 @@ class Findings:
 
 def measure(
     objective: SceneObjective, loss: LossSettings, settings: ProbeSettings, generator: torch.Generator, stage: Stage
-) -> Findings:
+) -> Measured:
     """Run every stage.  loss: the objective's; stage(name): see `analysis.console.stages`."""
     with stage("linearise") as report:
         hessian = SceneHessian(objective)
@@ -216,7 +214,7 @@ def measure(
     if settings.depth is not None:
         with budget.stage("depth") as share:
             depth = measure_depth(objective, settings.depth, settings.depth_steps, render, share)
-    return Findings(
+    return Measured(
         value=value,
         gradient_norm=float(gradient.double().norm()),
         operator_check=operator_check,

@@ -9,21 +9,21 @@
     curvature unit  sqrt(2 rise L / |d.H d|): the step within which the curvature alone changes the loss by rise L
 
 Of two kinds in one plane the second (then e₁⊥, say) is its part at a right angle to the first, drawn out to its old length.
-Eigenvectors that are known already are taken where H itself confirms them: |H v - lambda v| within the tolerance.
+Eigenvectors that are known already are taken where H itself confirms them: |H v - lambda v| within the tolerance, lambda
+falling.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isclose, nan
+from math import isclose
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from analysis.console.options import Along
-from analysis.records.records import read_record
+from analysis.records.records import ProbeRecord, read_record
 from landscape import (
     EigenSettings,
     curvature_reach,
@@ -183,7 +183,8 @@ def largest_eigenvectors(
         product, exact = operator.apply(vectors).double(), vectors.double()
         values = (exact * product).sum(dim=0)
         residuals = (product - values * exact).norm(dim=0)
-        if (residuals <= RTOL * values.abs()).all() and ((exact.norm(dim=0) - 1).abs() <= RTOL).all():
+        ordered = bool((values.diff() <= RTOL * values.abs().max()).all())  # the steepest first
+        if ordered and (residuals <= RTOL * values.abs()).all() and ((exact.norm(dim=0) - 1).abs() <= RTOL).all():
             report(1, 1, "known already")
             return vectors, residuals.tolist()
         start = vectors
@@ -192,15 +193,23 @@ def largest_eigenvectors(
     return pairs.vectors, pairs.residuals.tolist()
 
 
-def recorded_eigenvectors(folder: Path, loss: str, value: float, precision: float) -> list[Float[Tensor, "n k"]]:
-    """Those of the probe recorded in a folder, if any, where its objective is the Hessian of this loss with this value."""
+def recorded_eigenvectors(
+    folder: Path, loss: str, value: float, precision: float, notes: list[str]
+) -> list[Float[Tensor, "n k"]]:
+    """Those of the probe recorded in a folder, if any, where its objective is the Hessian of this loss with this value.
+
+    notes: is told where there is a record that cannot be read.
+    """
+    if not (folder / ProbeRecord.FILE).is_file():
+        return []
     try:
-        record = read_record(folder)
-    except (FileNotFoundError, ValueError):
+        record = read_record(folder, ProbeRecord)
+    except (FileNotFoundError, ValueError) as error:
+        notes.append(f"eigenvectors were not taken from the probe: {error}")
         return []
-    about = record.data.get("objective", {})
-    same = (about.get("loss"), about.get("operator")) == (loss, "hessian")
-    if not same or not isclose(about.get("value", nan), value, rel_tol=SAME_LOSS * precision):
+    about = record.data.objective
+    same = (about.loss, about.operator) == (loss, "hessian") and about.value is not None
+    if not same or not isclose(about.value or 0.0, value, rel_tol=SAME_LOSS * precision):
         return []
-    vectors: np.ndarray | None = record.arrays.get("eigenvectors", {}).get("largest")
+    vectors = record.arrays.get("eigenvectors", {}).get("largest")
     return [] if vectors is None else [torch.from_numpy(vectors)]

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from analysis.records.family_table import Cell, family_lines, family_table
 from rich.console import Console
 from scipy.stats import binom
 
@@ -18,7 +19,6 @@ from analysis.commands.cli import main
 from analysis.measures.families import FamilyFindings, FamilyOptions, _seconds_a_product, measure_families, quotient
 from analysis.measures.split_control import split_in_two
 from analysis.probe.command import scene_objective
-from analysis.records.family_table import Cell, family_lines, family_table
 from analysis.records.records import Record, read_record
 from analysis.records.report import render_report
 from landscape import Bracket, DenseOperator, EigenSettings, FamilySettings, extreme_eigenpairs, families
@@ -196,15 +196,15 @@ def test_the_metrics_have_the_units_that_they_name(objective, checkpoint, split)
 
 
 def test_the_record_and_the_page_hold_every_family_and_what_the_split_does(record, split):
-    rows = record.data["families"]
-    assert len(rows) == 24 and {row["metric"] for row in rows} == {"optimiser"} and rows[0]["unit"] == split.unit
-    assert [row["block"] for row in rows[:6]] == BLOCKS and sum(row["split"] for row in rows) == 12
-    control = record.data["split_control"]
-    assert control["psnr"] == pytest.approx(split.control.psnr) and len(control["effects"]) == 60
+    rows = record.data.families
+    assert len(rows) == 24 and {row.metric for row in rows} == {"optimiser"} and rows[0].unit == split.unit
+    assert [row.block for row in rows[:6]] == BLOCKS and sum(row.split for row in rows) == 12
+    control = record.data.split_control
+    assert control.psnr == pytest.approx(split.control.psnr) and len(control.effects) == 60
     starts, nodes = record.arrays["families"][
         "split.gauss-newton.sh.nodes"
     ].shape  # eigenvalues that are known are nodes, too
-    assert starts == rows[-1]["starts"] and nodes >= rows[-1]["steps"]
+    assert starts == rows[-1].starts and nodes >= rows[-1].steps
     page = Tables((record.folder / "report.html").read_text(encoding="utf-8"))
     lines = page.rows("families")
     assert len(lines) == 1 + 3 * 12 and all(len(line) == len(lines[0]) == 12 for line in lines)
@@ -225,24 +225,24 @@ def test_a_family_whose_small_end_is_not_resolved_is_given_by_its_bound(record):
 
 
 def test_an_end_that_was_not_reached_says_so_with_its_bound(record):
-    row = copy.deepcopy(record.data["families"][0])
-    row["lambda_min"] |= {"value": 1e-5, "residual": 2.4e-4, "reason": "matvec budget"}
+    row = copy.deepcopy(record.data.families[0])
+    row.lambda_min |= {"value": 1e-5, "residual": 2.4e-4, "reason": "matvec budget"}
     for beyond, bracket in ((0.03, "−0.0302 … 2.50 × 10⁻⁴"), (None, "≤ 2.50 × 10⁻⁴")):
         (line,) = family_lines({"families": [row | {"beyond": beyond}]})
         assert line.ends[1] == Cell("not reached", bracket, "matvec budget")
-    row["lambda_max"] |= {"value": 2.0, "residual": 0.1, "reason": "time budget"}
+    row.lambda_max |= {"value": 2.0, "residual": 0.1, "reason": "time budget"}
     (line,) = family_lines({"families": [row | {"beyond": 0.5}]})
     assert line.ends[0] == Cell("not reached", "1.90 … 2.60", "time budget")
-    row["lambda_min"] |= {"reason": "tolerance"}
+    row.lambda_min |= {"reason": "tolerance"}
     assert family_lines({"families": [row]})[0].ends[1].value == "(0.1 ± 2.4) × 10⁻⁴"
-    assert "beyond" in record.data["families"][0]
+    assert "beyond" in record.data.families[0]
 
 
 def test_at_80_columns_every_number_and_label_of_the_terminals_table_is_whole(record):
     data = copy.deepcopy(record.data)
     wide = {"value": -1.234e-4, "low": -1.235e-4, "high": -1.233e-4, "note": ""}
     bracket = {"value": 2.5e-4, "low": 7.45e-4, "high": 1.02e4, "note": ""}
-    for entry in [row["indices"] for row in data["families"]]:
+    for entry in [row.indices for row in data["families"]]:
         entry |= {"literal": wide, "share": bracket, "mass_quantile": bracket}
     for effect in data["split_control"]["effects"]:
         effect |= wide if effect["index"] == "literal" else bracket
