@@ -76,6 +76,10 @@ class Trace(TraceOf, kw_only=True):
 
     tau: Number
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_error("tau", self.tau)
+
 
 class LivesOn(Struct, kw_only=True):
     """Where an eigenvector lives (`analysis.measures.localization`).
