@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MOST_ROOMS = 9
 ORDER = {
     "": "landscape splat analysis figures",
-    "landscape": "linalg probes results operators traces eigen spectrum slices",
+    "landscape": "errors linalg probes results operators traces eigen spectrum slices",
     "splat": "model backend projection losses raster render scenes curvature training",
     "analysis": "records console measures train probe slice runs bench commands",
 }

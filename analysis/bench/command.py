@@ -40,6 +40,7 @@ from analysis.console.drawing import draw
 from analysis.console.options import BenchOptions
 from analysis.console.timing import Timing, interleaved
 from analysis.records.provenance import machine
+from landscape.errors import InputError
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import thread_count
 from splat.backend.device import by_triton, device_named
@@ -73,29 +74,29 @@ SCALING_SHARE = 3  # scaling is timed with this fraction of the repetitions
 def run_bench(options: BenchOptions) -> int:
     """Measure, print tables, write them; returns the exit code."""
     if options.repetitions < 1:
-        raise ValueError(f"expected at least 1 repetition, got {options.repetitions}")
+        raise InputError(f"expected at least 1 repetition, got {options.repetitions}")
     if options.prototype is not None and options.subject != "kernels":
-        raise ValueError(
+        raise InputError(
             "expected --prototype with the kernels it is compared with: landscape bench kernels --prototype ..."
         )
     if options.checkpoint is not None and options.subject != "accuracy":
-        raise ValueError(
+        raise InputError(
             f"expected one subject, got a second one, {options.checkpoint}; only accuracy takes a checkpoint"
         )
     if (options.quantity or options.case or options.scenes != 1) and options.subject != "accuracy":
-        raise ValueError(
+        raise InputError(
             "expected --quantity, --case and --scenes with what they confine: landscape bench accuracy ..."
         )
     if options.device == "cuda" and options.subject in ("kernels", "stress", "accuracy"):
-        raise ValueError(
+        raise InputError(
             f"expected a scene, a checkpoint or --sizes for the device cuda, got {options.subject}, which measures the CPU's "
             "kernels; leave out --device"
         )
     folder = options.subject is not None and Path(options.subject).is_dir()
     if (options.images is not None or options.downscale != 1) and not folder and options.checkpoint is None:
-        raise ValueError("expected --images and --downscale with a scene's folder, whose images they choose, got none")
+        raise InputError("expected --images and --downscale with a scene's folder, whose images they choose, got none")
     if options.images is not None and not folder:
-        raise ValueError("expected --images with a scene's folder; a checkpoint's images are those of its training")
+        raise InputError("expected --images with a scene's folder; a checkpoint's images are those of its training")
     if options.subject == "stress":
         return run_stress(options)
     if options.subject == "accuracy":

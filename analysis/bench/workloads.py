@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -40,7 +41,7 @@ class Size:
         match = re.fullmatch(r"(\d+)(k?)@(\d+)x(\d+)", text)
         size = cls(int(match[1]) * (1000 if match[2] else 1), int(match[3]), int(match[4])) if match else None
         if size is None or min(size.count, size.width, size.height) < 1:
-            raise ValueError(f"expected a size as GAUSSIANS@WIDTHxHEIGHT, e.g. 10k@504x378, got {text!r}")
+            raise InputError(f"expected a size as GAUSSIANS@WIDTHxHEIGHT, e.g. 10k@504x378, got {text!r}")
         return size
 
     def __str__(self) -> str:
@@ -156,7 +157,7 @@ def workload_of(path: Path, images: str | None = None, downscale: float = 1.0) -
         return Workload(name, checkpoint.training.gaussians, views, scene.background, config.loss, config.render)
     scene = load_scene(path, images, downscale)
     if scene.points is None:
-        raise ValueError(f"expected a scene with points, got {path} without any; train it and give the checkpoint")
+        raise InputError(f"expected a scene with points, got {path} without any; train it and give the checkpoint")
     views = tuple(scene.load(split_scene(scene, 3).train))
     gaussians = gaussians_from_points(scene.points, scene.frames, sh_degree=3)
     return Workload(f"{scene.name}, start", gaussians, views, scene.background)

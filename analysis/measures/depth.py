@@ -32,6 +32,7 @@ from torch import Tensor
 
 from analysis.console.budget import Share
 from analysis.records.schema import Depth, Rise
+from landscape.errors import InputError
 from landscape.probes import draw_probes
 from landscape.results import Bracket, Progress, finite_or_none
 from landscape.traces.estimate import TraceEstimate
@@ -173,7 +174,7 @@ def depth_rises(
 ) -> DepthRises:
     """What steps along and across the rays do to the loss.  steps: px; draws: of all directions and signs, 2 or more."""
     if draws < 2:
-        raise ValueError(f"expected at least 2 draws, got {draws}")
+        raise InputError(f"expected at least 2 draws, got {draws}")
     seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
     rises, crossed = torch.zeros(2, len(steps), len(KINDS), draws, dtype=torch.float64)
     for index, number in enumerate(objective.view_numbers):

@@ -33,6 +33,7 @@ from analysis.records import schema
 from analysis.records.records import ProbeRecord
 from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
 from landscape.eigen.pairs import EigenEnds
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, finished
 from landscape.probes import split
 from landscape.results import Progress, finite_or_none
@@ -68,7 +69,7 @@ class FamilyOptions:
 
     def __post_init__(self) -> None:
         if not (self.seconds > 0 and self.memory > 0):
-            raise ValueError(
+            raise InputError(
                 f"expected seconds and memory above 0 for the families, got {self.seconds} and {self.memory}"
             )
 
@@ -211,7 +212,7 @@ def _metric(
         return f"positions in units of the scene's size, {size:.4g} world units", lambda scene: scene_units(scene, size)
     rates, extent = training.config.rates, training.extent
     if not (optimiser_units(objective, rates, extent) > 0).all():
-        raise ValueError(f"expected learning rates above 0 for the optimiser's metric, got {rates}")
+        raise InputError(f"expected learning rates above 0 for the optimiser's metric, got {rates}")
     words = (
         f"steps of the training's first learning rates: position {rates.position * extent:.3g} (extent {extent:.4g}), "
         f"log scale {rates.log_scales:.3g}, rotation {rates.quats:.3g}, opacity {rates.opacity_logits:.3g}, "

@@ -24,6 +24,7 @@ from analysis.records.findings import findings
 from analysis.records.provenance import require_seed
 from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
+from landscape.errors import InputError
 from landscape.operators.distributed import Ranks, torchrun_ranks
 from landscape.probes import split
 from splat.backend.device import device_named
@@ -56,7 +57,7 @@ def _run(
     out = options.out or options.checkpoint.parent / "probe"
     settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
     if ranks is not None and family_options is not None:
-        raise ValueError(
+        raise InputError(
             "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
         )
     writes = ranks is None or ranks.rank == 0
@@ -131,7 +132,7 @@ def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:
     seconds = settings.seconds if options.seconds is None else options.seconds
     if shared:
         if options.seconds is not None and isfinite(options.seconds):
-            raise ValueError(f"expected --seconds inf under torchrun, as without --seconds, got {options.seconds:g}")
+            raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {options.seconds:g}")
         seconds = inf
     return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=seconds)
 

@@ -53,6 +53,7 @@ from landscape import (
     spectral_density,
     symmetric_axis,
 )
+from landscape.errors import InputError
 from landscape.probes import split
 from landscape.results import Progress
 from landscape.slices.finite_probe import NOISE_POINTS, STEPS, FiniteProbe, finite_probe
@@ -114,13 +115,13 @@ class ProbeSettings:
 
     def __post_init__(self) -> None:
         if self.slice_points < FEWEST_POINTS or self.slice_points % 2 == 0:
-            raise ValueError(
+            raise InputError(
                 f"expected an odd number of at least {FEWEST_POINTS} slice points, got {self.slice_points}"
             )
         if not (self.slice_radius > 0 and self.slice_rise > 0):
-            raise ValueError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
+            raise InputError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
         if not (self.seconds > 0 and self.memory > 0):
-            raise ValueError(f"expected seconds and memory > 0, got {self.seconds} and {self.memory}")
+            raise InputError(f"expected seconds and memory > 0, got {self.seconds} and {self.memory}")
 
     @classmethod
     def quick(cls) -> "ProbeSettings":

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from landscape.errors import InputError
+
 T = TypeVar("T")
 NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 STEP = re.compile(r"\.(\w+)|\[(\d+)\]|(\[\.\.\.\])")  # of a path of msgspec, which leaves out the keys of mappings
@@ -32,7 +34,7 @@ def plain_json(path: Path, what: str, remedy: str) -> Any:
     try:
         return decoded(msgspec.json.decode(path.read_bytes()))
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(
+        raise InputError(
             f"expected {what} in {path}, got a file that is damaged or truncated ({error}); {remedy}"
         ) from None
 
@@ -42,7 +44,7 @@ def fitted(data: Any, kind: type[T], where: str, remedy: str) -> T:
     try:
         return msgspec.convert(data, kind, strict=True)
     except msgspec.ValidationError as error:
-        raise ValueError(f"{where}: {_said(data, kind, str(error))}; {remedy}") from None
+        raise InputError(f"{where}: {_said(data, kind, str(error))}; {remedy}") from None
 
 
 def _said(data: Any, kind: type, message: str) -> str:

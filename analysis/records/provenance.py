@@ -10,6 +10,7 @@ from typing import Any
 from msgspec import UNSET, Struct
 
 from analysis.records.schema import Maybe
+from landscape.errors import InputError
 
 PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib", "pyvista", "plotly")
 
@@ -49,7 +50,7 @@ class Provenance(Struct, kw_only=True):
 def require_seed(seed: int) -> None:
     """ValueError where it is out of range."""
     if not 0 <= seed < 2**63:
-        raise ValueError(f"expected a seed in [0, 2^63), got {seed}")
+        raise InputError(f"expected a seed in [0, 2^63), got {seed}")
 
 
 def provenance(seed: int, *, lanes: int | None = None, **more: Any) -> Provenance:

@@ -37,6 +37,7 @@ from analysis.records.schema import (
     SplitControl,
     Trace,
 )
+from landscape.errors import InputError
 
 ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
@@ -217,7 +218,7 @@ def write_record(folder: str | Path, data: ProbeRecord | SliceRecord, arrays: Ma
     for group, names in arrays.items():
         numeric: dict[str, Any] = {name: np.asarray(array) for name, array in names.items()}
         if objects := [name for name, array in numeric.items() if array.dtype.hasobject]:
-            raise ValueError(f"expected numbers in the array {group}.{objects[0]}, got objects")
+            raise InputError(f"expected numbers in the array {group}.{objects[0]}, got objects")
         # not compressed: eigenvectors, by far the largest, would take a tenth of a second for 2% less
         np.savez(Path(folder) / f"{group}.npz", **numeric)
     return path
@@ -251,16 +252,16 @@ def read_record(folder: str | Path, kind: type[Data] | None = None) -> Record[Da
         case {"format": {"name": found.FORMAT.name, "version": int(version)}}:
             pass
         case _:
-            raise ValueError(f'expected {what} in {path}, got JSON without "format": {plain(found.FORMAT)}; {again}')
+            raise InputError(f'expected {what} in {path}, got JSON without "format": {plain(found.FORMAT)}; {again}')
     if version > found.FORMAT.version:
-        raise ValueError(
+        raise InputError(
             f"expected a record of format version {found.FORMAT.version} or older in {path}, got version {version}; "
             f"update splat-landscape, or {again}"
         )
     data = fitted(raw, found, str(path), again)
     arrays = {group: _read_arrays(folder, group, data.arrays[group], again) for group in ARRAYS if group in data.arrays}
     if data.slice and "slice" in arrays and arrays["slice"]["loss"].ndim != len(data.slice.directions):
-        raise ValueError(
+        raise InputError(
             f"{path}: expected a direction for each axis of the slice, got {len(data.slice.directions)}; {again}"
         )
     return Record(folder, data, arrays)
@@ -281,7 +282,7 @@ def _read_arrays(folder: Path, group: str, shapes: Mapping[str, list[int]], agai
     try:
         _require_arrays(group, arrays, shapes)
     except ValueError as error:
-        raise ValueError(f"expected the arrays of the record in {path}, got {error}; {again}") from None
+        raise InputError(f"expected the arrays of the record in {path}, got {error}; {again}") from None
     return arrays
 
 
@@ -293,7 +294,7 @@ def refusing_damage(what: str, path: Path, remedy: str) -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:
-        raise ValueError(f"expected {what} in {path}, got a damaged or truncated file ({error}); {remedy}") from None
+        raise InputError(f"expected {what} in {path}, got a damaged or truncated file ({error}); {remedy}") from None
 
 
 def _require_arrays(group: str, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, list[int]]) -> None:
@@ -333,11 +334,11 @@ def _why_not_found(folder: Path, command: str, file: str) -> str:
 def require_replaceable(folder: Path, kind: type[ProbeRecord | SliceRecord] = ProbeRecord) -> None:
     """Replacing deletes: raise ValueError unless folder is absent, empty or an older record of this kind."""
     if folder.is_dir() and any(folder.iterdir()) and not (folder / kind.FILE).is_file():
-        raise ValueError(
+        raise InputError(
             f"expected an empty folder or an older record to replace, got {folder} without {kind.FILE}; move it away"
         )
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"expected a folder to write a record to, got the file {folder}; move it away")
+        raise InputError(f"expected a folder to write a record to, got the file {folder}; move it away")
 
 
 def _clean_up_after_kills(folder: Path, previous: Path) -> None:

@@ -16,6 +16,7 @@ from msgspec import Struct
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.json_files import read_json
 from analysis.records.schema import INDICES, Count, Number
+from landscape.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -96,10 +97,10 @@ def read_trajectory(path: Path) -> "pd.DataFrame":
     try:
         table = pd.read_csv(path)
     except (ValueError, OverflowError) as error:  # pandas names no file
-        raise ValueError(f"expected {_TRAJECTORY} in {path}, got {error}") from None
+        raise InputError(f"expected {_TRAJECTORY} in {path}, got {error}") from None
     for name in ("state", "step", "gaussians", *NUMBERS):
         if name not in table:
-            raise ValueError(f"expected {_TRAJECTORY} in {path}, got no column {name}")
+            raise InputError(f"expected {_TRAJECTORY} in {path}, got no column {name}")
         column = pd.Series(table[name])
         if name == "state":
             wrong, what = ~column.isin(STATES), " or ".join(STATES)
@@ -109,5 +110,5 @@ def read_trajectory(path: Path) -> "pd.DataFrame":
             table[name] = numbers
         if wrong.any():
             row = int(wrong.to_numpy().argmax())
-            raise ValueError(f"expected {what} as {name} in {path}, got {column.iloc[row]!r} in row {row + 1}")
+            raise InputError(f"expected {what} as {name} in {path}, got {column.iloc[row]!r} in row {row + 1}")
     return table

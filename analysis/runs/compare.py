@@ -27,6 +27,7 @@ from analysis.records.report import pictures_in, template_environment
 from analysis.records.run_files import CHECKPOINT, COMPARISON, METRICS, Comparison, Scores, read_scores
 from analysis.runs.compare_table import Run, compare_table, comparison, frame
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
+from landscape.errors import InputError
 
 PAGE, TABLE, PROBE = "compare.html", "compare.csv", "probe"
 PICTURES = {
@@ -49,7 +50,7 @@ def run_compare(options: CompareOptions) -> int:
     missing = [path for path, checkpoint in zip(options.runs, checkpoints) if not probed(path, checkpoint)]
     if missing and not options.probe:
         again = "; ".join(f"landscape probe {path / CHECKPOINT}" for path in missing)
-        raise ValueError(
+        raise InputError(
             f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
         )
     for path in missing:
@@ -66,7 +67,7 @@ def run_compare(options: CompareOptions) -> int:
 def _folders(runs: Sequence[Path]) -> list[Path]:
     folders = [run.resolve() for run in runs]
     if len(set(folders)) < 2 or len(set(folders)) < len(folders):
-        raise ValueError(f"expected at least two runs, each once, got {', '.join(map(str, runs)) or 'none'}")
+        raise InputError(f"expected at least two runs, each once, got {', '.join(map(str, runs)) or 'none'}")
     return folders
 
 
@@ -82,7 +83,7 @@ def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> No
         first = of(checkpoints[0])
         for label, checkpoint in zip(labels, checkpoints, strict=True):
             if of(checkpoint) != first:
-                raise ValueError(
+                raise InputError(
                     f"expected runs with the same {what}, as their curvatures are not comparable else, got {first} in "
                     f"{labels[0]} and {of(checkpoint)} in {label}; compare them apart"
                 )

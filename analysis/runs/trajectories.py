@@ -22,6 +22,7 @@ from analysis.records.quantities import measured, quantity
 from analysis.records.run_files import CHECKPOINT, ENDS, NO_TIME, RECORDS, TRAJECTORY_INDICES, read_trajectory
 from analysis.records.schema import Index
 from analysis.records.tables import bracketed
+from landscape.errors import InputError
 
 TABLE, PICTURE = "trajectories.csv", "trajectories.png"
 VALUES = {f"trace_{name}": f"trace of {attribute_name(name)}" for name in ATTRIBUTES} | ENDS
@@ -63,9 +64,9 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
     """The rows of all runs.  FileNotFoundError or ValueError where a run has none, or is named twice."""
     folders = [run.resolve() for run in runs]
     if not folders:
-        raise ValueError("expected at least one run, got none; name the folders that landscape train wrote")
+        raise InputError("expected at least one run, got none; name the folders that landscape train wrote")
     if len(set(folders)) < len(folders):
-        raise ValueError(f"expected every run once, got {', '.join(str(run) for run in runs)}")
+        raise InputError(f"expected every run once, got {', '.join(str(run) for run in runs)}")
     common = Path(os.path.commonpath(folders))
     tables = []
     for run, folder in zip(runs, folders, strict=True):
@@ -85,7 +86,7 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
     if set(together["state"]) == {"skipped"}:
         note = str(together["note"].iloc[-1]) if "note" in together else "why is not said"
         remedy = "; train with a larger --probe-share" if note.startswith(NO_TIME) else ""
-        raise ValueError(
+        raise InputError(
             f"expected at least one record that was not skipped, got {len(together)} skipped ({note}){remedy}"
         )
     return together

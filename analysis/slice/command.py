@@ -19,6 +19,7 @@ from functools import partial
 from math import ceil, inf
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,6 +50,7 @@ from analysis.slice.directions import (
 )
 from analysis.slice.record import Found, slice_arrays, slice_record
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
+from landscape.errors import InputError
 from landscape.probes import split
 from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
 from splat.backend.device import device_named
@@ -58,6 +60,7 @@ from splat.model.gaussians import Gaussians
 from splat.training.checkpoint import Checkpoint, load_checkpoint
 
 COARSE = {1: 9, 2: 21}  # points that an adaptive slice begins with, by its dimension
+SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
 
@@ -83,14 +86,9 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         known = _known(options.checkpoint.parent / "probe", unfinished, checkpoint, objective, notes)
         try:
             found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
-        except BaseException as error:
+        except BaseException:
             if unfinished.is_dir():
-                again = (
-                    f"; to continue: {shlex.join(command)}"
-                    if isinstance(error, KeyboardInterrupt)
-                    else f" in {unfinished}"
-                )
-                console.print(f"what was rendered is kept{again}", soft_wrap=True, highlight=False, markup=False)
+                console.print(f"what was rendered is kept; to continue: {shlex.join(command)}", **SAID)
             raise
         made = provenance_of(options, command, settings, checkpoint, scene)
         made.other = None if options.other is None else str(options.other)
@@ -109,11 +107,11 @@ def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> Slic
     holdout = min(SliceSettings.holdout, ceil(options.points**shape.dimension / 8))
     if options.all_points:
         if options.max_renders is not None:
-            raise ValueError("expected --all-points or --max-renders, got both; leave one out")
+            raise InputError("expected --all-points or --max-renders, got both; leave one out")
         return SliceSettings(tolerance=None, workers=workers)
     least = COARSE[shape.dimension] + holdout + 1
     if options.max_renders is not None and options.max_renders < least:
-        raise ValueError(
+        raise InputError(
             f"expected --max-renders of at least {least}, with which a slice of dimension {shape.dimension} can begin and be "
             f"judged, got {options.max_renders}"
         )
@@ -125,7 +123,7 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     """The other checkpoint's parameters, quaternions as unit ones on the near side."""
     here, there = checkpoint.training.gaussians, load_checkpoint(path).training.gaussians
     if (len(here), here.sh_degree) != (len(there), there.sh_degree):
-        raise ValueError(
+        raise InputError(
             f"expected a checkpoint of {len(here):,} Gaussians with SH degree {here.sh_degree} at the other end of the line, "
             f"got {len(there):,} with {there.sh_degree} in {path}; take two of one training after densification has ended"
         )
@@ -145,7 +143,7 @@ def _known(
         try:
             with kept.open("rb") as stream, refusing_damage("eigenvectors", kept, "they were computed again"):
                 found.append(torch.from_numpy(np.load(stream, allow_pickle=False)))
-        except ValueError as error:
+        except InputError as error:
             notes.append(str(error))
     name, precision = loss_name(checkpoint.training.config.loss), torch.finfo(center.dtype).eps
     found += recorded_eigenvectors(probe, name, objective.loss(center), precision, notes)
@@ -217,15 +215,15 @@ def _evaluation(objective: SceneObjective, workers: int) -> Loss:
     def evaluate(flat: Tensor) -> Evaluation:
         try:
             return inner(flat)
-        except ValueError as error:
-            raise ValueError(f"expected steps to where there is an image, got one that is too long ({error})") from None
+        except InputError as error:
+            raise InputError(f"expected steps to where there is an image, got one that is too long ({error})") from None
 
     return evaluate
 
 
 def _conclude(data: SliceRecord, out: Path) -> None:
     """The curvatures, how well the slice is known, and the files to open."""
-    say = partial(Console().print, soft_wrap=True, highlight=False)
+    say = partial(Console().print, **SAID)
     for direction in data.slice.directions:
         curvature = measured(direction.curvature, direction.residual or 0.0)
         text = f"{direction.name}: curvature {curvature}, slope {quantity(direction.slope or 0.0)}"

@@ -55,6 +55,7 @@ from landscape import (
     spectral_density,
 )
 from landscape.eigen.pairs import EigenEnds
+from landscape.errors import InputError
 from landscape.probes import split
 from landscape.spectrum.anisotropy import Anisotropy
 from landscape.spectrum.density import ActiveSpace
@@ -94,9 +95,9 @@ class TrajectorySettings:
 
     def __post_init__(self) -> None:
         if self.every < 1:
-            raise ValueError(f"expected probe_every of at least 1 step, got {self.every}")
+            raise InputError(f"expected probe_every of at least 1 step, got {self.every}")
         if not self.share > 0:
-            raise ValueError(f"expected probe_share above 0 (0.1: a tenth of the time of the steps), got {self.share}")
+            raise InputError(f"expected probe_share above 0 (0.1: a tenth of the time of the steps), got {self.share}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +140,7 @@ class Trajectory:
             start = perf_counter()
             try:
                 row |= self._recorded(allowed)
-            except ValueError as error:  # nothing in sight, say: the training may still find its way
+            except InputError as error:  # such as no Gaussian in sight: the training may still find its way
                 row["note"] = str(error)
             row["seconds"] = perf_counter() - start
         row["time_share"] = (spent + row["seconds"]) / trained

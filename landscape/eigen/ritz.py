@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.linalg import norm
 from landscape.operators.operator import SymmetricOperator, product
 
@@ -49,19 +50,19 @@ class EigenSettings:
 
     def __post_init__(self) -> None:
         if min(self.largest, self.smallest) < 0 or self.wanted < 1 or self.block < 1:
-            raise ValueError(
+            raise InputError(
                 f"expected largest, smallest >= 0 (not both 0) and block >= 1, "
                 f"got {self.largest}, {self.smallest} and {self.block}"
             )
         if not (self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and 0 < self.noise < inf):
-            raise ValueError(
+            raise InputError(
                 f"expected rtol, atol, max_seconds >= 0 and a finite noise > 0, got {self.rtol}, {self.atol}, "
                 f"{self.max_seconds} and {self.noise}"
             )
         if self.basis < self.wanted + 3 * self.block:
-            raise ValueError(f"expected a basis of at least {self.wanted + 3 * self.block} vectors, got {self.basis}")
+            raise InputError(f"expected a basis of at least {self.wanted + 3 * self.block} vectors, got {self.basis}")
         if self.max_matvecs < 2 * self.wanted + self.block + 2:
-            raise ValueError(f"expected max_matvecs >= {2 * self.wanted + self.block + 2}, got {self.max_matvecs}")
+            raise InputError(f"expected max_matvecs >= {2 * self.wanted + self.block + 2}, got {self.max_matvecs}")
 
     @property
     def wanted(self) -> int:

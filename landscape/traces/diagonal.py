@@ -27,6 +27,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.linalg import gram, group_sums
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.probes import draw_probes
@@ -115,9 +116,9 @@ def estimate_diagonal(
     tensor([ 1., -2.], dtype=torch.float64)
     """
     if probes < 3:
-        raise ValueError(f"expected at least 3 probes, got {probes}")
+        raise InputError(f"expected at least 3 probes, got {probes}")
     if method not in ("auto", "signs"):
-        raise ValueError(f"expected the method 'auto' or 'signs', got {method!r}")
+        raise InputError(f"expected the method 'auto' or 'signs', got {method!r}")
     if isinstance(operator, PartlyKnown) and operator.known is operator:
         exact = operator.known_diagonal().double()
         return DiagonalEstimate(

@@ -16,6 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.linalg import column_dots
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.probes import Distribution, draw_probes
@@ -61,21 +62,21 @@ class TraceSettings:
 
     def __post_init__(self) -> None:
         if self.distribution not in ("rademacher", "gaussian"):
-            raise ValueError(f"expected the distribution 'rademacher' or 'gaussian', got {self.distribution!r}")
+            raise InputError(f"expected the distribution 'rademacher' or 'gaussian', got {self.distribution!r}")
         if self.reading not in ("block", "full"):
-            raise ValueError(f"expected the reading 'block' or 'full', got {self.reading!r}")
+            raise InputError(f"expected the reading 'block' or 'full', got {self.reading!r}")
         if self.method not in ("auto", "hutchinson", "hutch++", "xtrace"):
-            raise ValueError(f"expected the method 'auto', 'hutchinson', 'hutch++' or 'xtrace', got {self.method!r}")
+            raise InputError(f"expected the method 'auto', 'hutchinson', 'hutch++' or 'xtrace', got {self.method!r}")
         if self.method in ("hutch++", "xtrace") and self.reading == "full":
-            raise ValueError(f"expected the reading 'block' with the method {self.method!r}, got 'full'")
+            raise InputError(f"expected the reading 'block' with the method {self.method!r}, got 'full'")
         if not LEAST <= self.min_probes <= self.max_probes or self.max_probes < self.least:
-            raise ValueError(
+            raise InputError(
                 f"expected {LEAST} <= min_probes <= max_probes and max_probes >= {self.least} with the method {self.method!r}, "
                 f"got {self.min_probes} and {self.max_probes}"
             )
         positive = self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and self.batch >= 1 and self.memory > 0
         if not (positive and 0 < self.confidence < 1):
-            raise ValueError(
+            raise InputError(
                 f"expected rtol, atol >= 0, confidence in (0, 1), max_seconds >= 0, batch >= 1 and memory > 0, "
                 f"got {self.rtol}, {self.atol}, {self.confidence}, {self.max_seconds}, {self.batch} and {self.memory}"
             )

@@ -26,6 +26,7 @@ from time import monotonic
 
 import torch
 
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
 from landscape.probes import split
 from landscape.results import Progress
@@ -69,7 +70,7 @@ def estimate_traces(
     names = list(operator.blocks) if blocks is None else list(blocks)
     unknown = [name for name in names if name not in operator.blocks]
     if unknown:
-        raise ValueError(f"expected blocks out of {', '.join(operator.blocks)}, got {unknown[0]!r}")
+        raise InputError(f"expected blocks out of {', '.join(operator.blocks)}, got {unknown[0]!r}")
     deadline = monotonic() + settings.max_seconds
     if settings.reading == "full":
         rows = {name: operator.blocks[name] for name in names}

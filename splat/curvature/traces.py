@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, t_quantile
 from landscape.traces.control import controlled
@@ -60,7 +61,7 @@ def exact_traces(
     samples: exactly so many, at least LEAST_SAMPLES, whatever the settings say: for rough values, as a training needs them.
     """
     if samples is not None and samples < LEAST_SAMPLES:
-        raise ValueError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
+        raise InputError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
     quats, units = objective.active.quats, None if scale is None else objective.active.with_flat(scale)
     whole, coupled = objective.gaussian_blocks
     if gauss_newton:

@@ -18,6 +18,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
+
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
 PixelLoss = Literal["l1", "charbonnier", "l2"]
@@ -37,9 +39,9 @@ class LossSettings:
 
     def __post_init__(self) -> None:
         if self.pixel not in ("l1", "charbonnier", "l2"):
-            raise ValueError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
+            raise InputError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
         if not (0 <= self.ssim_weight <= 1 and self.eps > 0):
-            raise ValueError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
+            raise InputError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
 
     @property
     def pixel_weight(self) -> float:

@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -29,16 +31,16 @@ class Camera:
     def __post_init__(self) -> None:
         error = (self.rotation @ self.rotation.T - torch.eye(3, dtype=self.rotation.dtype)).abs().max().item()
         if not error < 1e-4 or torch.linalg.det(self.rotation) < 0:
-            raise ValueError(
+            raise InputError(
                 f"expected a rotation matrix, got one with |R R^T - 1| = {error:.1e}: {self.rotation.tolist()}"
             )
         if not (self.fx > 0 and self.fy > 0 and self.width > 0 and self.height > 0):
-            raise ValueError(
+            raise InputError(
                 f"expected positive focal lengths and image size, got {self.fx}, {self.fy}, {self.width}, {self.height}"
             )
         numbers = (*self.centre.tolist(), self.fx, self.fy, self.cx, self.cy)
         if not all(map(isfinite, numbers)):
-            raise ValueError(f"expected a finite centre, focal lengths and principal point, got {numbers}")
+            raise InputError(f"expected a finite centre, focal lengths and principal point, got {numbers}")
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera with its image resampled to width x height pixels."""
@@ -61,7 +63,7 @@ def look_at(centre: Float[Tensor, "3"], target: Float[Tensor, "3"], down: Float[
     forward = (target - centre) / (target - centre).norm()
     right = torch.linalg.cross(down, forward)
     if not right.norm() > 1e-9 * down.norm():
-        raise ValueError(
+        raise InputError(
             f"expected a target away from the centre, not along {down.tolist()} from it, got {target.tolist()}"
         )
     right = right / right.norm()

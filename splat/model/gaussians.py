@@ -18,6 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
+
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
 
@@ -46,10 +48,10 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
+            raise InputError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
         each = parameters_per_gaussian(self.sh_degree)
         if self.flat.ndim != 1 or self.flat.numel() % each:
-            raise ValueError(
+            raise InputError(
                 f"expected a vector of n x {each} parameters at SH degree {self.sh_degree}, got {tuple(self.flat.shape)}"
             )
 
@@ -149,7 +151,7 @@ class Gaussians:
 
     def _refuse(self, good: Tensor, name: str, quality: str, meaning: str) -> None:
         first = int((~good).nonzero()[0])
-        raise ValueError(
+        raise InputError(
             f"expected {quality} {name}{meaning}, got {self.attributes[name][first].tolist()} at Gaussian {first} "
             f"({int((~good).sum())} of {len(self)} are not {quality}); remove them from the checkpoint, or lower its rates"
         )

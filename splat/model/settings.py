@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Literal, get_args
 
+from landscape.errors import InputError
+
 Sums = Literal["ordered", "atomic"]
 
 
@@ -40,21 +42,21 @@ class RenderSettings:
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha_max < 1:
-            raise ValueError(
+            raise InputError(
                 f"expected 0 < alpha_max < 1, got {self.alpha_max}: at 1 a Gaussian would hide all behind it exactly, "
                 "and the backward pass divides by 1 - alpha; use e.g. 0.999"
             )
         if not 0 <= self.alpha_min < self.alpha_max:
-            raise ValueError(f"expected 0 <= alpha_min < alpha_max = {self.alpha_max}, got {self.alpha_min}")
+            raise InputError(f"expected 0 <= alpha_min < alpha_max = {self.alpha_max}, got {self.alpha_min}")
         if not 0 <= self.transmittance_min < 1:
-            raise ValueError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
+            raise InputError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
         finite = 0 <= self.blur < inf and 0 < self.near < inf and 0 < self.fov_clamp < inf
         if not finite:  # nan fails every comparison
-            raise ValueError(f"expected blur >= 0, near > 0, fov_clamp > 0, all finite, got {self}")
+            raise InputError(f"expected blur >= 0, near > 0, fov_clamp > 0, all finite, got {self}")
         if self.contour_sigma is not None and not self.contour_sigma > 0:
-            raise ValueError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
+            raise InputError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
         if self.sums not in get_args(Sums):
-            raise ValueError(f"expected sums 'ordered' or 'atomic', got {self.sums!r}")
+            raise InputError(f"expected sums 'ordered' or 'atomic', got {self.sums!r}")
 
 
 SMOOTH = replace(RenderSettings(), alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)

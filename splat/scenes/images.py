@@ -28,6 +28,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.scenes.layers import FORMATS, UNREADABLE, read_depth, read_mask
 from splat.scenes.view import Frame, Picture, Subset
@@ -112,9 +113,9 @@ def image_header(path: Path) -> tuple[tuple[int, int], bool]:
         with Image.open(path, formats=FORMATS) as file:
             mode, size, has_alpha = file.mode, file.size, _has_alpha(file)
     except UNREADABLE as error:
-        raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
+        raise InputError(f"expected an image, cannot read {path}: {error}; replace the file") from error
     if mode.startswith(("I", "F")):
-        raise ValueError(f"expected an image of 8 bits a channel, got mode {mode} in {path}; convert it")
+        raise InputError(f"expected an image of 8 bits a channel, got mode {mode} in {path}; convert it")
     return size, has_alpha
 
 
@@ -124,7 +125,7 @@ def image_pixels(path: Path) -> UInt8[np.ndarray, "h w c"]:
         with Image.open(path, formats=FORMATS) as file:
             return np.array(file.convert("RGBA" if _has_alpha(file) else "RGB"))
     except UNREADABLE as error:
-        raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
+        raise InputError(f"expected an image, cannot read {path}: {error}; replace the file") from error
 
 
 def _has_alpha(file: Image.Image) -> bool:
@@ -134,7 +135,7 @@ def _has_alpha(file: Image.Image) -> bool:
 def checked_lens(model: str, size: tuple[float, float], params: Sequence[float], name: str) -> pycolmap.Camera:
     """The lens of a photograph of this (width, height).  ValueError where it cannot be one."""
     if not (all(map(isfinite, params)) and all(1 <= side <= LARGEST_SIDE for side in size)):
-        raise ValueError(
+        raise InputError(
             f"the camera of image {name!r} cannot be: expected at least 1 px a side and finite numbers, got "
             f"{size[0]:g} x {size[1]:g} px and {[float(value) for value in params]}"
         )
@@ -148,15 +149,15 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
     pinhole = _pinhole(lens, photo)
     width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
     if downscale > 1 and min(width, height) < SMALLEST:
-        raise ValueError(
+        raise InputError(
             f"expected pictures of at least {SMALLEST} px a side, got {width} x {height} px for {photo.name!r} at downscale "
             f"{downscale:g}; reduce less"
         )
     fx, fy, cx, cy = pinhole.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     try:
         full = Camera(photo.rotation, photo.centre, fx, fy, cx, cy, pinhole.width, pinhole.height)
-    except ValueError as error:
-        raise ValueError(f"the camera of image {photo.name!r} cannot be: {error}") from error
+    except InputError as error:
+        raise InputError(f"the camera of image {photo.name!r} cannot be: {error}") from error
     camera = full.resized(width, height)
     warp = partial(_warp, lens, pinhole, (width, height))
     return Frame(
@@ -176,7 +177,7 @@ def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> py
     if (lens.width, lens.height) == size:
         return lens
     if not _same_shape((lens.width, lens.height), size):
-        raise ValueError(
+        raise InputError(
             f"expected image {photo.name!r} at the {lens.width} x {lens.height} px of its camera or scaled from it, "
             f"got {width} x {height} px in {photo.path}; it was cropped, rotated or stretched: use the images that the "
             "cameras were computed from, or compute the cameras anew"
@@ -201,7 +202,7 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
     if model in PINHOLE_MODELS:
         return lens
     if model not in UNDISTORTED_HERE:
-        raise ValueError(
+        raise InputError(
             f"expected a pinhole lens or radial and tangential distortion ({', '.join(UNDISTORTED_HERE)}), got "
             f"{model} for image {photo.name!r}; make pinhole images first: colmap image_undistorter --image_path "
             f"{photo.path.parent} --input_path MODEL --output_path NEW_SCENE, where MODEL is the folder of cameras.bin"
@@ -209,7 +210,7 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
     if lens.is_undistorted():
         return lens
     if not _displacement(lens) <= LARGEST_DISPLACEMENT:
-        raise ValueError(
+        raise InputError(
             f"the camera of image {photo.name!r} cannot be: expected distortion that moves no corner by more than "
             f"{LARGEST_DISPLACEMENT} half diagonals of the picture, got {model} with {lens.params_to_string()}"
         )
@@ -239,7 +240,7 @@ def _read(path: Path, warp: Warp, background: Float[Tensor, "3"]) -> Picture:
 def _read_mask(path: Path, size: tuple[int, int], warp: Warp) -> Bool[Tensor, "h w"]:
     inside = warp(_at_size(read_mask(path), size, path))[0] >= INSIDE
     if not inside.any():
-        raise ValueError(f"expected a mask with whole pixels inside, got none in {path} at this size; reduce less")
+        raise InputError(f"expected a mask with whole pixels inside, got none in {path} at this size; reduce less")
     return inside
 
 
@@ -251,7 +252,7 @@ def _at_size(layers: Float[Tensor, "c h w"], size: tuple[int, int], path: Path) 
     """A mask or depth map at the size of its photograph, whose shape it must have."""
     height, width = layers.shape[1:]
     if not _same_shape((width, height), size):
-        raise ValueError(
+        raise InputError(
             f"expected {path} to have the shape of its photograph, {size[0]} x {size[1]} px at any scale, got "
             f"{width} x {height}; make it from that photograph"
         )

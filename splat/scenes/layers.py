@@ -19,6 +19,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.scenes.view import View
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -63,7 +64,7 @@ def require_depths(views: Sequence[View], folder: Path) -> None:
     """ValueError unless every view has a depth map."""
     without = [view.name for view in views if view.depth is None]
     if without:
-        raise ValueError(
+        raise InputError(
             f"expected a depth map for each of the {len(views)} training views in {folder}, got none for {without[0]}; "
             f"save it as {PurePosixPath(without[0]).stem}.npy"
         )
@@ -75,10 +76,10 @@ def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
         with Image.open(path, formats=FORMATS) as file:
             pixels = np.array(file if file.mode in ("1", "L") else file.convert("RGB"))
     except UNREADABLE as error:
-        raise ValueError(f"expected a mask, cannot read {path}: {error}; replace the file") from error
+        raise InputError(f"expected a mask, cannot read {path}: {error}; replace the file") from error
     lowest = pixels.reshape(*pixels.shape[:2], -1).min(axis=2)
     if not lowest.any():
-        raise ValueError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
+        raise InputError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
     return torch.from_numpy(lowest == lowest.max()).to(torch.float32)[None]
 
 
@@ -87,18 +88,18 @@ def read_depth(path: Path) -> Float[Tensor, "1 h w"]:
     try:
         values = read_array(path) if path.suffix == ".npy" else _read_png(path)
     except (*UNREADABLE, ValueError) as error:
-        raise ValueError(f"expected a depth map, cannot read {path}: {error}; write it again") from error
+        raise InputError(f"expected a depth map, cannot read {path}: {error}; write it again") from error
     shape, values = values.shape, values.squeeze()
     if values.ndim != 2 or not values.size:
-        raise ValueError(f"expected a depth map of shape (h, w), got {values.dtype} of shape {shape} in {path}")
+        raise InputError(f"expected a depth map of shape (h, w), got {values.dtype} of shape {shape} in {path}")
     with np.errstate(over="ignore"):  # what becomes infinite is refused
         values = values.astype(np.float32)
     if not np.isfinite(values).all():
-        raise ValueError(
+        raise InputError(
             f"expected finite depths, got {(~np.isfinite(values)).sum()} that are not in {path}; fill them"
         )
     if values.min() == values.max():
-        raise ValueError(f"expected depths that vary, got {values.min()} everywhere in {path}; write it again")
+        raise InputError(f"expected depths that vary, got {values.min()} everywhere in {path}; write it again")
     return torch.from_numpy(values)[None]
 
 
@@ -108,14 +109,14 @@ def read_array(path: Path) -> np.ndarray:
         try:
             values = np.lib.format.read_array(file, allow_pickle=False)
         except Exception as error:  # NumPy has Python read the header, whose errors are of many kinds
-            raise ValueError(f"no array of numbers ({error})") from error
+            raise InputError(f"no array of numbers ({error})") from error
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"an array of {values.dtype}, not of real numbers")
+        raise InputError(f"an array of {values.dtype}, not of real numbers")
     return values
 
 
 def _read_png(path: Path) -> np.ndarray:
     with Image.open(path, formats=FORMATS) as file:
         if file.mode not in SIXTEEN_BITS:
-            raise ValueError(f"mode {file.mode} instead of 16 bits, too few levels for depth")
+            raise InputError(f"mode {file.mode} instead of 16 bits, too few levels for depth")
         return np.array(file)

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.scenes.formats.colmap import MODEL_FOLDERS, find_model, read_colmap
 from splat.scenes.formats.dtu import is_dtu, mask_folder, read_dtu
@@ -53,7 +54,7 @@ class Scene:
         by_name = {frame.name: frame for frame in self.frames}
         unknown = [name for name in names if name not in by_name]
         if unknown:
-            raise ValueError(
+            raise InputError(
                 f"expected names of images of {self.root}, got {unknown[0]!r} ({len(unknown)} unknown); the scene has "
                 f"{len(self.frames)} images from {self.names[0]!r} to {self.names[-1]!r}"
             )
@@ -76,7 +77,7 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
     centres = torch.stack([camera.centre for camera in cameras])
     extent = 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
     if not extent > 0:
-        raise ValueError(
+        raise InputError(
             f"expected cameras at different places, got {len(cameras)} at the same one: the scene has no scale; "
             "choose at least two views from different places"
         )
@@ -110,7 +111,7 @@ def load_scene(
             f"expected a scene folder, {root} {'is not a folder' if root.exists() else 'does not exist'}"
         )
     if not 1 <= downscale < float("inf"):
-        raise ValueError(f"expected downscale of at least 1, got {downscale}")
+        raise InputError(f"expected downscale of at least 1, got {downscale}")
     kind, photos, found, own_background = _read(root, images, points)
     photos = _with_layers(root, photos, masks, depths)
     require_files([photo.path for photo in photos] + [photo.mask for photo in photos if photo.mask])
@@ -127,7 +128,7 @@ def load_scene(
 def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
     three = isinstance(values, list | tuple) and len(values) == 3
     if not (three and all(isinstance(v, (int, float)) and 0 <= v <= 1 for v in values)):
-        raise ValueError(f"expected a background of three numbers in [0, 1], got {values!r}")
+        raise InputError(f"expected a background of three numbers in [0, 1], got {values!r}")
     return torch.tensor(values, dtype=torch.float32)
 
 
@@ -139,7 +140,7 @@ def _read(root: Path, images: str | None, points: bool) -> tuple[Kind, list[Phot
         return "llff", read_llff(root, images), None, None
     if all((root / name).is_file() for _, name in BLENDER_FILES):
         if images is not None:
-            raise ValueError(f"expected no image folder for {root}, whose transforms files name theirs, got {images!r}")
+            raise InputError(f"expected no image folder for {root}, whose transforms files name theirs, got {images!r}")
         return "blender", read_blender(root), None, None
     for name in (SINGLE_FILE, BLENDER_FILES[0][1]):
         if (root / name).is_file():
@@ -182,4 +183,4 @@ def _require_distinct(photos: Sequence[Photo], root: Path) -> None:
     names = [photo.name for photo in photos]
     twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
     if twice:
-        raise ValueError(f"expected every image of {root} once, got {twice[0]!r} more than once ({len(twice)} such)")
+        raise InputError(f"expected every image of {root} once, got {twice[0]!r} more than once ({len(twice)} such)")

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera, look_at
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
@@ -47,9 +48,9 @@ class SyntheticSettings:
 
     def __post_init__(self) -> None:
         if self.gaussians < 50 or self.views < 2 or min(self.width, self.height) < 8:
-            raise ValueError(f"expected at least 50 Gaussians, 2 views and 8 x 8 pixels, got {self}")
+            raise InputError(f"expected at least 50 Gaussians, 2 views and 8 x 8 pixels, got {self}")
         if not (0 < self.arc < 150 and 0 < self.point_share <= 1 and self.point_noise >= 0):
-            raise ValueError(f"expected 0 < arc < 150, 0 < point_share <= 1 and point_noise >= 0, got {self}")
+            raise InputError(f"expected 0 < arc < 150, 0 < point_share <= 1 and point_noise >= 0, got {self}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 
 Subset = Literal["train", "test"]
@@ -90,11 +91,11 @@ class Points:
                 f"expected xyz and rgb of shape (n, 3), got {tuple(self.xyz.shape)} and {tuple(self.rgb.shape)}"
             )
         if not bool(torch.isfinite(self.xyz).all()):
-            raise ValueError("expected finite points, got some that are not; remove them from the scene's point file")
+            raise InputError("expected finite points, got some that are not; remove them from the scene's point file")
         if self.observations is not None and self.observations.numel():
             point, image = self.observations.amax(dim=0).tolist()
             if point >= len(self.xyz) or image >= len(self.names) or int(self.observations.min()) < 0:
-                raise ValueError(
+                raise InputError(
                     f"expected observations of {len(self.xyz)} points in {len(self.names)} images, "
                     f"got point {point} in image {image}"
                 )

@@ -31,6 +31,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.autograd import loss_against
 from splat.losses.cpu.loss import ViewLoss
 from splat.render.loss_and_gradient import loss_and_gradient
@@ -87,7 +88,7 @@ def _require_finite(what: str, value: float, step: Step) -> None:
     """ValueError that names the step and its view, unless a loss, or the sum of a gradient, is finite."""
     if not isfinite(value):
         name = step.views[step.chosen].name
-        raise ValueError(f"expected a finite {what}, got {value} at step {step.number} on view {name}; lower the rates")
+        raise InputError(f"expected a finite {what}, got {value} at step {step.number} on view {name}; lower the rates")
 
 
 def _next_step(training: Training, number: int, views: Sequence[View], losses: Sequence[ViewLoss]) -> Step:

@@ -73,6 +73,7 @@ from analysis.bench.accuracy.peers import peer_methods
 from analysis.bench.accuracy.ratios import points, ratio_table, ratios
 from analysis.console.drawing import draw
 from analysis.console.options import BenchOptions, Quantity
+from landscape.errors import InputError
 from landscape.operators.operator import DenseOperator, SymmetricOperator
 from landscape.probes import draw_probes
 from splat.training.checkpoint import write_atomically
@@ -239,15 +240,15 @@ def run_accuracy(options: BenchOptions) -> int:
 
 def _cases(options: BenchOptions) -> list[Case]:
     if options.scenes < 1:
-        raise ValueError(f"expected at least 1 scene of each kind, got --scenes {options.scenes}")
+        raise InputError(f"expected at least 1 scene of each kind, got --scenes {options.scenes}")
     if options.checkpoint is not None:
         if options.case or options.scenes > 1:
-            raise ValueError("expected neither --case nor --scenes beside a checkpoint, which is the only case")
+            raise InputError("expected neither --case nor --scenes beside a checkpoint, which is the only case")
         return [checkpoint_case(options.checkpoint, options.out, options.downscale)]
     matrices, scenes = {case.name: case for case in matrix_cases(SEED)}, splat_cases(SEED, options.scenes)
     if strange := set(options.case) - {*matrices, *scenes}:
         names = ", ".join(map(repr, (*scenes, *matrices)))
-        raise ValueError(f"expected --case to be one of {names}, got {', '.join(map(repr, sorted(strange)))}")
+        raise InputError(f"expected --case to be one of {names}, got {', '.join(map(repr, sorted(strange)))}")
     chosen = options.case or (*scenes, *matrices)
     return [scenes[name]() if name in scenes else matrices[name] for name in chosen]
 

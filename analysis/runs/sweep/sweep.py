@@ -10,6 +10,7 @@ What is there already is not done again: the next start continues where the last
 number of threads, only the seconds do.
 """
 
+from landscape.errors import InputError
 import fcntl
 import os
 import shlex
@@ -46,7 +47,7 @@ POLL = 0.5  # seconds
 def run_sweep(options: SweepOptions) -> int:
     """Run what is missing; returns the exit code."""
     if options.jobs < 1:
-        raise ValueError(f"expected at least 1 job, got {options.jobs}")
+        raise InputError(f"expected at least 1 job, got {options.jobs}")
     sweep = read_sweep(options.file, options.out, options.probe)
     to_do = {cell.name: missing(cell, sweep) for cell in sweep.cells}
     sweep.out.mkdir(parents=True, exist_ok=True)
@@ -65,7 +66,7 @@ def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
             return wanted
         remedy = f"remove {cell.out}, or choose another out"
         training = resumed(cell.out / CHECKPOINT, config, reference, remedy)
-    except (ValueError, FileNotFoundError) as error:
+    except (InputError, FileNotFoundError) as error:
         raise type(error)(f"{sweep.file}, {cell.name}: {error}") from None
     if training.step < config.iterations or not (cell.out / METRICS).is_file():
         return wanted
@@ -87,7 +88,7 @@ def locked(out: Path) -> Iterator[int]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(
+            raise InputError(
                 f"expected no other sweep at work in {out}, got one, or a command that it left behind; wait until it ends"
             ) from None
         yield file.fileno()

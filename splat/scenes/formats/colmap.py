@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 import torch
 
+from landscape.errors import InputError, lacks_memory
 from splat.scenes.images import Photo, image_files, image_folder
 from splat.scenes.view import Points
 
@@ -38,12 +39,14 @@ def read_colmap(
         reconstruction = pycolmap.Reconstruction(model)
         registered = (reconstruction.images[i] for i in reconstruction.reg_image_ids())
         posed = sorted(registered, key=lambda image: image.name)  # which may be no text
-    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        raise ValueError(
+    except (ValueError, RuntimeError, IndexError) as error:
+        if lacks_memory(error):
+            raise
+        raise InputError(
             f"expected a COLMAP model, cannot read the one in {model}: {error}; export it again"
         ) from error
     if not posed:
-        raise ValueError(
+        raise InputError(
             f"expected images with poses in the COLMAP model {model}, got none among {len(reconstruction.images)}; "
             "run `colmap mapper` to compute them"
         )
@@ -63,7 +66,7 @@ def _require_plausible_counts(model: Path) -> None:
         content = path.read_bytes() if path.is_file() else bytes(8)
         count = int.from_bytes(content[:8], "little")
         if len(content) < 8 + count * record or (name in LISTS and not _lists_fit(content, count, name)):
-            raise ValueError(
+            raise InputError(
                 f"expected a COLMAP model, {path} promises {count} {name} with more in them than its {len(content)} bytes; "
                 "it is cut short or no COLMAP file: export the model again"
             )

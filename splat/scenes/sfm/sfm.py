@@ -21,6 +21,7 @@ from typing import Literal
 import pycolmap
 from PIL import ExifTags, Image
 
+from landscape.errors import InputError
 from splat.scenes.images import IMAGE_SUFFIXES, image_files, image_header, image_pixels
 from splat.scenes.layers import FORMATS
 from splat.scenes.scene import load_scene
@@ -87,7 +88,7 @@ def _photographs(folder: Path) -> list[Path]:
         )
     files = image_files(folder)
     if len(files) < FEWEST:
-        raise ValueError(
+        raise InputError(
             f"expected at least {FEWEST} photographs ({', '.join(IMAGE_SUFFIXES)}) in {folder}, got {len(files)}; "
             "take more, or name the folder that holds them"
         )
@@ -133,7 +134,7 @@ def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[py
         next_image_callback=lambda: on_progress("mapping", next(placed, len(names)), len(names)),
     )
     if not found:
-        raise ValueError(_why_there_is_no_model(database, len(names)))
+        raise InputError(_why_there_is_no_model(database, len(names)))
     for model in found.values():
         for image in model.images.values():
             image.name = own_names[image.name]

@@ -19,6 +19,7 @@ import pycolmap
 import torch
 from PIL import Image
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.scenes.formats.colmap import points_of
 from splat.scenes.view import Points, View
@@ -29,7 +30,7 @@ SEED = 0  # of RANSAC: the same views give the same points
 def triangulated_points(views: Sequence[View]) -> Points:
     """The points that at least two of these views show.  ValueError where there are fewer than two views, or no point."""
     if len(views) < 2:
-        raise ValueError(f"expected at least 2 views to triangulate from, got {len(views)}; start from random points")
+        raise InputError(f"expected at least 2 views to triangulate from, got {len(views)}; start from random points")
     with tempfile.TemporaryDirectory() as folder, quiet():
         database, pictures, output = (Path(folder) / name for name in ("database.db", "images", "output"))
         pictures.mkdir()
@@ -51,7 +52,7 @@ def triangulated_points(views: Sequence[View]) -> Points:
         model = pycolmap.triangulate_points(posed, database, pictures, output, options=options)
     points = points_of(model, _in_order(model))
     if points is None:
-        raise ValueError(
+        raise InputError(
             f"expected places that two of the {len(views)} training views show, found none that match; "
             "choose views that overlap more, or start from random points"
         )

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.reference import psnr, ssim
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -81,7 +82,7 @@ def have_masks(views: Sequence[View]) -> bool:
     """Whether the views have masks.  ValueError where only some do: their scores would have no mean."""
     without = [view.name for view in views if view.mask is None]
     if 0 < len(without) < len(views):
-        raise ValueError(
+        raise InputError(
             f"expected a mask for each of {len(views)} views that are scored together or for none, got "
             f"{len(views) - len(without)}, and none for {without[0]}; add those that are missing"
         )

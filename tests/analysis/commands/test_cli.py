@@ -301,7 +301,7 @@ def test_what_the_system_refuses_is_said_with_the_path(original, tmp_path, capsy
 
 
 def test_the_process_of_a_command_says_all_that_it_printed_and_ends_with_its_exit_code():
-    program = "from analysis import cli\ncli.main = lambda: print('the last words') or 3\ncli.command()"
+    program = "from analysis.commands import cli\ncli.main = lambda: print('the last words') or 3\ncli.command()"
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     result = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, env=buffered, capture_output=True, text=True, timeout=60
