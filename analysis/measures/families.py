@@ -150,10 +150,8 @@ def measure_families(
 ) -> FamilyFindings:
     """Every family of the scene and, if asked for, of the split scene.
 
-
-    training: that of the checkpoint; stage: see `analysis.console.stages`; ends: of the objective's Hessian in the
-    stored parameters,
-    where they have been looked for.
+    training: that of the checkpoint; stage: see `analysis.console.stages`; ends: of the objective's Hessian in the stored
+    parameters, where they have been looked for.
     """
     scenes: dict[SceneName, SceneObjective] = {"trained": objective}
     control, notes = None, []

@@ -1,22 +1,19 @@
 """What `landscape probe` measures at one point of a scene's loss, stage by stage.
 
-    linearise           every view held still, every Gaussian's own block of H, a first render
+    linearise           every view's derivatives, each Gaussian's own block of H, a first render
     checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
     traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
-    eigenvalues         the two largest and the smallest, led by the blocks of single Gaussians
-    (`splat.curvature.block_eigenvectors`)
-    power iteration     both ends as the paper takes them; not in a quick probe, whose few products do not take it there
-    density             stochastic Lanczos quadrature, for sums and quantiles of |lambda|; not in a quick probe, whose few
-                        products would leave them known to a factor of 1000
-    finite probe        the second difference of the loss along the first eigenvector, over a range of steps; not in a quick
-                        probe
+    eigenvalues         the two largest and the smallest; the search begins at `splat.curvature.block_eigenvectors`
+    power iteration *   both ends as the paper takes them
+    density *           stochastic Lanczos quadrature, for sums and quantiles of |lambda|
+    finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
     slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
-    depth               the positions' gradient and curvature along the rays and across them, and what finite steps there do to
-                        the loss; not in a quick probe
+    depth *             the positions' gradient and curvature along the rays and across them, and what finite steps there do
 
-Every kernel has worked once when the checks are done: what follows compiles nothing.  The estimators stop at their
-tolerance, at their budget of products, or when their share of the time is spent; each result says which.  Time that a stage
-leaves goes to the later ones.  The numbers depend on the seed alone unless time ran out.
+* not in a quick probe, which has too few products for them.  Every kernel has worked once when the checks are done: what
+follows compiles nothing.  The estimators stop at their tolerance, at their budget of products, or when their share of the time
+is spent; each result says which.  Time that a stage leaves goes to the later ones.  The numbers depend on the seed alone unless
+time ran out.
 """
 
 from collections.abc import Callable, Hashable
@@ -183,9 +180,8 @@ def measure(
     with stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
-        gradient = _linearised_gradient(objective, report)
-        own = objective.gaussian_blocks
-        value, render = _rendered(objective)
+        gradient, value, render = _linearised(objective, report)
+        blocks = objective.gaussian_blocks
     with stage("checks") as report:
         operator_check = check_operator(operator, split(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(hessian, loss, split(generator), report, settings.checked_views)
@@ -194,7 +190,7 @@ def measure(
         allowed = replace(settings.traces, max_seconds=share.seconds)
         traces = exact_traces(objective, share.generator, allowed, share.report, samples=settings.trace_samples)
     with budget.stage("eigenvalues") as share:
-        eigen, start = _search(operator, settings, share), BlockEigenvectors(objective, *own).leads()
+        eigen, start = _search(operator, settings, share), BlockEigenvectors(objective, *blocks).leads()
         timed = CountingOperator(operator)
         ends = extreme_eigenpairs(timed, share.generator, eigen, start, share.report)
     power = density = finite = depth = None
@@ -244,11 +240,14 @@ def _unasked(settings: ProbeSettings) -> list[str]:
     return [name for name, wanted in optional.items() if not wanted]
 
 
-def _linearised_gradient(objective: SceneObjective, report: Progress) -> Tensor:
+def _linearised(objective: SceneObjective, report: Progress) -> tuple[Tensor, float, float]:
+    """The gradient, the loss, and the seconds that rendering it takes; for the first render the kernels may compile."""
     report(0, 1, f"{len(objective.views)} views")
-    gradient = objective.gradient
+    gradient, center = objective.gradient, objective.active.flat
     report(1, 1, f"{len(objective.views)} views")
-    return gradient
+    objective.loss(center)
+    start = monotonic()
+    return gradient, objective.loss(center), monotonic() - start
 
 
 def _search(operator: CountingOperator, settings: ProbeSettings, share: Share) -> EigenSettings:
@@ -280,13 +279,6 @@ def _density(
     if matvecs < settings.density_matvecs:
         share.notes.append(f"the spectral density took {matvecs} products instead of {settings.density_matvecs}")
     return run(share.generator, progress=share.report, matvecs=matvecs, starts=starts, longest=longest, batch=batch)
-
-
-def _rendered(objective: SceneObjective) -> tuple[float, float]:
-    """The loss at the centre, and the seconds that rendering it takes; for the first render the kernels may compile."""
-    objective.loss(objective.active.flat)
-    start = monotonic()
-    return objective.loss(objective.active.flat), monotonic() - start
 
 
 def _finite(

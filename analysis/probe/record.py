@@ -13,20 +13,9 @@ from msgspec import convert
 from analysis.console.options import ProbeOptions, SliceOptions
 from analysis.measures.localization import conditions, localize, mass_shares
 from analysis.probe.measurement import Measured, PlaneSlice
+from analysis.records import schema
 from analysis.records.provenance import Provenance, provenance
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
-from analysis.records.schema import (
-    INDICES,
-    Anisotropy,
-    Direction,
-    Eigenvalue,
-    Eigenvalues,
-    FiniteProbe,
-    Index,
-    Objective,
-    Slice,
-    Trace,
-)
 from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, anisotropy, literal
 from landscape.operators.checks import ROUND_OFFS
@@ -58,7 +47,7 @@ def probe_record(
         else {f"{share:g}": index_of(quantile(density, share)) for share in QUANTILES},
         finite_probe=None
         if found.finite is None
-        else convert({**found.finite.record(), "direction": NAMES[0]}, FiniteProbe),
+        else convert({**found.finite.record(), "direction": NAMES[0]}, schema.FiniteProbe),
         depth=found.depth,
         slice=None if found.plane is None else _slice(found.plane, found.ends.largest),
         counts=_counts(found, objective),
@@ -125,8 +114,8 @@ def loss_name(loss: LossSettings) -> str:
     return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM)"
 
 
-def objective_of(objective: SceneObjective, loss: LossSettings, value: float, gradient_norm: float) -> Objective:
-    return Objective(
+def objective_of(objective: SceneObjective, loss: LossSettings, value: float, gradient_norm: float) -> schema.Objective:
+    return schema.Objective(
         loss=loss_name(loss),
         sizes=[(view.camera.width, view.camera.height) for view in objective.views],
         background=tuple(objective.background.tolist()),
@@ -136,48 +125,48 @@ def objective_of(objective: SceneObjective, loss: LossSettings, value: float, gr
     )
 
 
-def index_of(bracket: Bracket) -> Index:
-    return convert(bracket.record(), Index)
+def index_of(bracket: Bracket) -> schema.Index:
+    return convert(bracket.record(), schema.Index)
 
 
-def _trace(numbers: Mapping[str, Any]) -> Trace:
+def _trace(numbers: Mapping[str, Any]) -> schema.Trace:
     method = "exact, the coupling of pixels sampled with random signs" if numbers["probes"] else "exact"
     tau = sqrt(max(numbers["value"] or 0.0, 0.0) / numbers["dim"]) if numbers["dim"] else 0.0
-    return convert({**numbers, "tau": tau, "method": method}, Trace)
+    return convert({**numbers, "tau": tau, "method": method}, schema.Trace)
 
 
-def _eigenvalues(found: Measured, objective: SceneObjective) -> Eigenvalues:
+def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalues:
     ends, power, gaussians = found.ends, found.power, objective.active
     needles = conditions(gaussians, [view.camera for view in objective.views], objective.settings)
 
-    def eigenvalue(of: EigenEnds, pairs: Eigenpairs, index: int = 0) -> Eigenvalue:
+    def eigenvalue(of: EigenEnds, pairs: Eigenpairs, index: int = 0) -> schema.Eigenvalue:
         shares = mass_shares(pairs.vectors[:, index], gaussians.blocks)
-        return Eigenvalue(**pairs.record(index), matvecs=of.matvecs, method=of.method, shares=shares)  # pyright: ignore[reportArgumentType]
+        return schema.Eigenvalue(**pairs.record(index), matvecs=of.matvecs, method=of.method, shares=shares)  # pyright: ignore[reportArgumentType]
 
-    def exact(pairs: Eigenpairs, index: int) -> Eigenvalue:
+    def exact(pairs: Eigenpairs, index: int) -> schema.Eigenvalue:
         found_end = eigenvalue(ends, pairs, index)
         found_end.lives_on = localize(pairs.vectors[:, index], gaussians, needles)
         return found_end
 
     largest, smallest = ends.largest, ends.smallest
-    rows = Eigenvalues(max=exact(largest, 0), second=exact(largest, 1), min=exact(smallest, 0))
+    rows = schema.Eigenvalues(max=exact(largest, 0), second=exact(largest, 1), min=exact(smallest, 0))
     if power is not None:
         rows.power_max, rows.power_min = eigenvalue(power, power.largest), eigenvalue(power, power.smallest)
     return rows
 
 
-def _anisotropy(found: Measured) -> Anisotropy:
+def _anisotropy(found: Measured) -> schema.Anisotropy:
     """All indices; those that need the density are undetermined without it."""
     family = anisotropy(found.ends, found.density)
-    left_out = Index(value=None, low=None, high=None, note=NEEDS_DENSITY)
-    known = {name: getattr(family, name) for name in INDICES}
-    indices = Anisotropy(**{name: index_of(bracket) if bracket else left_out for name, bracket in known.items()})
+    left_out = schema.Index(value=None, low=None, high=None, note=NEEDS_DENSITY)
+    known = {name: getattr(family, name) for name in schema.INDICES}
+    indices = schema.Anisotropy(**{name: index_of(bracket) if bracket else left_out for name, bracket in known.items()})
     if found.power is not None:
         indices.literal = literal_index(found.ends, found.power)
     return indices
 
 
-def literal_index(ends: EigenEnds, power: EigenEnds) -> Index:
+def literal_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
     """The paper's index from its power iteration, where that arrived within the certain bracket; else that of the ends.
 
     Everything lies within a bracket without bound: there it has arrived where it stopped by itself.
@@ -193,13 +182,14 @@ def literal_index(ends: EigenEnds, power: EigenEnds) -> Index:
     return index_of(replace(certain, value=value, note=note))
 
 
-def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> Slice:
+def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
     x, y = (float(axis.abs().max()) for axis in plane.slice.coordinates)
     units = [reach / unit for reach, unit in zip((x, y), plane.units, strict=True)]
     numbers = zip(NAMES, pairs.values.tolist(), pairs.residuals.tolist(), plane.units, strict=False)
-    return Slice(
+    return schema.Slice(
         directions=[
-            Direction(name=name, curvature=value, residual=error, unit=unit) for name, value, error, unit in numbers
+            schema.Direction(name=name, curvature=value, residual=error, unit=unit)
+            for name, value, error, unit in numbers
         ],
         loss_scale=plane.loss_scale,
         **plane.slice.record(),  # pyright: ignore[reportArgumentType]

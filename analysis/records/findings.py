@@ -8,20 +8,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from analysis.records import schema
 from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
-from analysis.records.schema import (
-    Anisotropy,
-    Depth,
-    Eigenvalues,
-    FiniteProbe,
-    Index,
-    LivesOn,
-    Maybe,
-    Number,
-    Slice,
-    Trace,
-)
 
 ATTRIBUTES = {
     "means": "position",
@@ -81,7 +70,7 @@ def _of_checks(checks: Mapping[str, Check]) -> list[Line]:
     return lines
 
 
-def _of_traces(traces: Mapping[str, Trace]) -> list[Line]:
+def _of_traces(traces: Mapping[str, schema.Trace]) -> list[Line]:
     values = {
         name: trace.value for name, trace in traces.items() if trace.value is not None and math.isfinite(trace.value)
     }
@@ -101,7 +90,7 @@ def _of_traces(traces: Mapping[str, Trace]) -> list[Line]:
     return lines
 
 
-def _of_largest_trace(traces: Mapping[str, Trace], values: Mapping[str, float]) -> Line:
+def _of_largest_trace(traces: Mapping[str, schema.Trace], values: Mapping[str, float]) -> Line:
     """values: of the traces that are numbers, not all 0."""
     first, *others = sorted(values, key=lambda name: -abs(values[name]))
     share = abs(values[first]) / sum(map(abs, values.values()))
@@ -123,7 +112,7 @@ def _of_largest_trace(traces: Mapping[str, Trace], values: Mapping[str, float]) 
     return Line(text)
 
 
-def _of_ends(ends: Eigenvalues) -> list[Line]:
+def _of_ends(ends: schema.Eigenvalues) -> list[Line]:
     numbers = [number for end in (ends.max, ends.min) for number in (end.value, end.residual) if _is_finite(number)]
     if len(numbers) < 4:
         return [Line("The ends of the spectrum were not determined.", "failure")]
@@ -153,7 +142,7 @@ def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
     ]
 
 
-def _of_anisotropy(family: Anisotropy) -> list[Line]:
+def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
     lines, saddle, share = [], family.saddle, family.share
     steepest = "The steepest direction up is"
     if saddle and _is_finite(saddle.value):
@@ -171,7 +160,7 @@ def _of_anisotropy(family: Anisotropy) -> list[Line]:
     return lines
 
 
-def _of_needles(where: Maybe[LivesOn], counts: Counts) -> list[Line]:
+def _of_needles(where: schema.Maybe[schema.LivesOn], counts: Counts) -> list[Line]:
     """The paper's claim that Gaussians with an ill-conditioned projection dominate the steepest directions."""
     if not where:
         return []
@@ -186,7 +175,7 @@ def _of_needles(where: Maybe[LivesOn], counts: Counts) -> list[Line]:
     return [Line(f"{text}, which is spread over about {spread} Gaussians.")]
 
 
-def _of_finite_probe(probe: FiniteProbe | None) -> list[Line]:
+def _of_finite_probe(probe: schema.FiniteProbe | None) -> list[Line]:
     if probe is None:
         return []
     along, here = probe.direction or "the direction", quantity(probe.infinitesimal)
@@ -197,7 +186,7 @@ def _of_finite_probe(probe: FiniteProbe | None) -> list[Line]:
     return [Line(f"{text}{quantity(probe.curvatures[-1])} at ±{quantity(probe.steps[-1])}.")]
 
 
-def resolved(probe: FiniteProbe) -> list[bool]:
+def resolved(probe: schema.FiniteProbe) -> list[bool]:
     """At which finite steps round-off does not hide the curvature."""
     here = abs(probe.infinitesimal or 0.0)
     pairs = zip(probe.curvatures, probe.round_off, strict=True)
@@ -207,7 +196,7 @@ def resolved(probe: FiniteProbe) -> list[bool]:
     ]
 
 
-def _of_depth(depth: Depth | None) -> list[Line]:
+def _of_depth(depth: schema.Depth | None) -> list[Line]:
     """The paper's statement that the positions' gradient is typically 100 times as large along the rays as across them."""
     if depth is None:
         return []
@@ -250,7 +239,7 @@ def _of_counts(counts: Counts) -> list[Line]:
     return [*lines, Line(f"The operator acts on {used}, over {counts.views} views.")]
 
 
-def of_slice(plane: Slice | None) -> list[Line]:
+def of_slice(plane: schema.Slice | None) -> list[Line]:
     """The sentences of a slice alone."""
     if plane is None:
         return [Line("No slice of the loss was recorded.", "caution")]
@@ -270,16 +259,16 @@ def _sentence(note: str) -> str:
     return f"{note[:1].upper()}{note[1:]}" + ("" if note.endswith((".", "!", "?")) else ".")
 
 
-def _is_finite(number: Number) -> bool:
+def _is_finite(number: schema.Number) -> bool:
     return number is not None and math.isfinite(number)
 
 
-def _bracket(index: Index, written: Callable[[float], str] | None = None) -> str:
+def _bracket(index: schema.Index, written: Callable[[float], str] | None = None) -> str:
     """Between which numbers it lies.  written: how one of them is, where not as `limits` has them."""
     ends = index.low, index.high
     texts = limits(*ends) if written is None else [UNDETERMINED if end is None else written(end) for end in ends]
     return "" if ends == (None, None) else f" (between {texts[0]} and {texts[1]})"
 
 
-def _in_brackets(note: Maybe[str]) -> str:
+def _in_brackets(note: schema.Maybe[str]) -> str:
     return f" ({note})" if note else ""

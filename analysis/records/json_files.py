@@ -34,9 +34,7 @@ def plain_json(path: Path, what: str, remedy: str) -> Any:
     try:
         return decoded(msgspec.json.decode(path.read_bytes()))
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(
-            f"expected {what} in {path}, got a file that is damaged or truncated ({error}); {remedy}"
-        ) from None
+        raise InputError(f"expected {what} in {path}, got a damaged file ({error}); {remedy}") from None
 
 
 def fitted(data: Any, kind: type[T], where: str, remedy: str) -> T:

@@ -20,23 +20,10 @@ from typing import Any, ClassVar, Generic, TypeVar, cast
 import numpy as np
 from msgspec import UNSET, Struct, field
 
+from analysis.records import schema
 from analysis.records.json_files import decoded, encoded, fitted, json_text, plain, plain_json
 from analysis.records.provenance import Provenance
-from analysis.records.schema import (
-    Anisotropy,
-    Count,
-    Depth,
-    Eigenvalues,
-    Family,
-    FiniteProbe,
-    Index,
-    Maybe,
-    Number,
-    Objective,
-    Slice,
-    SplitControl,
-    Trace,
-)
+from analysis.records.schema import Count, Maybe, Number
 from landscape.errors import InputError
 
 ARRAYS = {
@@ -123,21 +110,21 @@ class ProbeRecord(Struct, kw_only=True):
     FORMAT: ClassVar[Format] = Format("landscape probe", 1)
 
     format: Format = FORMAT
-    objective: Objective = field(default_factory=Objective)
-    traces: dict[str, Trace]
-    eigenvalues: Eigenvalues
-    anisotropy: Anisotropy
-    quantiles: dict[str, Index] | None = None
-    finite_probe: FiniteProbe | None = None
-    depth: Depth | None = None
-    slice: Slice | None = None
+    objective: schema.Objective = field(default_factory=schema.Objective)
+    traces: dict[str, schema.Trace]
+    eigenvalues: schema.Eigenvalues
+    anisotropy: schema.Anisotropy
+    quantiles: dict[str, schema.Index] | None = None
+    finite_probe: schema.FiniteProbe | None = None
+    depth: schema.Depth | None = None
+    slice: schema.Slice | None = None
     counts: Counts
     checks: dict[str, Check]
     notes: list[str] = []
     skipped: dict[str, Skip] = {}
     provenance: Provenance
-    families: Maybe[list[Family]] = UNSET
-    split_control: Maybe[SplitControl] = UNSET
+    families: Maybe[list[schema.Family]] = UNSET
+    split_control: Maybe[schema.SplitControl] = UNSET
     timing: dict[str, float]
     arrays: Shapes = {}
 
@@ -154,9 +141,9 @@ class SliceRecord(Struct, kw_only=True):
     FORMAT: ClassVar[Format] = Format("landscape slice", 1)
 
     format: Format = FORMAT
-    objective: Objective
-    slice: Slice
-    finite_probe: FiniteProbe | None = None
+    objective: schema.Objective
+    slice: schema.Slice
+    finite_probe: schema.FiniteProbe | None = None
     counts: Counts
     notes: list[str] = []
     provenance: Provenance
@@ -294,7 +281,7 @@ def refusing_damage(what: str, path: Path, remedy: str) -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:
-        raise InputError(f"expected {what} in {path}, got a damaged or truncated file ({error}); {remedy}") from None
+        raise InputError(f"expected {what} in {path}, got a damaged file ({error}); {remedy}") from None
 
 
 def _require_arrays(group: str, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, list[int]]) -> None:

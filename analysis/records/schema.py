@@ -12,7 +12,7 @@ lack; keys of a file that are no fields are ignored.
 """
 
 from collections.abc import Iterator
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Generic, Literal, TypeVar
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
@@ -28,6 +28,14 @@ IndexName = Literal["literal", "saddle", "share", "effective_rank", "mass_quanti
 def _require_error(name: str, value: Number) -> None:
     if value is not None and value < 0:
         raise ValueError(f"Expected `{name}` of at least 0, got {value}")
+
+
+class Named(Struct, Generic[T]):
+    """Entries of one kind under names, of which some may be absent."""
+
+    def items(self) -> Iterator[tuple[str, T]]:
+        """Those that there are, by name."""
+        return ((name, getattr(self, name)) for name in self.__struct_fields__ if getattr(self, name))
 
 
 class Objective(Struct, kw_only=True):
@@ -124,7 +132,7 @@ class Eigenvalue(End, kw_only=True):
     lives_on: Maybe[LivesOn] = UNSET
 
 
-class Eigenvalues(Struct, kw_only=True):
+class Eigenvalues(Named[Eigenvalue], kw_only=True):
     """The two largest and the smallest, and both ends by the paper's power iteration."""
 
     max: Eigenvalue
@@ -132,10 +140,6 @@ class Eigenvalues(Struct, kw_only=True):
     min: Eigenvalue
     power_max: Maybe[Eigenvalue] = UNSET
     power_min: Maybe[Eigenvalue] = UNSET
-
-    def items(self) -> Iterator[tuple[str, Eigenvalue]]:
-        """Those that there are, by name."""
-        return ((name, getattr(self, name)) for name in self.__struct_fields__ if getattr(self, name))
 
 
 class Index(Struct, kw_only=True):
@@ -147,7 +151,7 @@ class Index(Struct, kw_only=True):
     note: str
 
 
-class Anisotropy(Struct, kw_only=True):
+class Anisotropy(Named[Index], kw_only=True):
     """The indices of `landscape.spectrum.anisotropy`."""
 
     literal: Maybe[Index] = UNSET
@@ -155,10 +159,6 @@ class Anisotropy(Struct, kw_only=True):
     share: Maybe[Index] = UNSET
     effective_rank: Maybe[Index] = UNSET
     mass_quantile: Maybe[Index] = UNSET
-
-    def items(self) -> Iterator[tuple[str, Index]]:
-        """Those that there are, by name."""
-        return ((name, getattr(self, name)) for name in INDICES if getattr(self, name))
 
 
 INDICES = Anisotropy.__struct_fields__

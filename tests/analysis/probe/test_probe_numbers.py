@@ -40,7 +40,7 @@ def test_eigenvalues_are_those_of_the_dense_hessian_within_their_residuals(recor
     _, H, _, _ = dense
     true = torch.linalg.eigvalsh((H + H.T) / 2)
     for name, index in (("max", -1), ("second", -2), ("min", 0)):
-        end = record.data.eigenvalues[name]
+        end = getattr(record.data.eigenvalues, name)
         assert abs(end.value - float(true[index])) <= end.residual + rounding(H), name
         assert end.residual <= 1e-3 * abs(end.value) and end.reason == "tolerance"
         assert sum(end.shares.values()) == pytest.approx(1) and list(end.shares) == ATTRIBUTES
@@ -81,7 +81,7 @@ def test_within_a_bracket_without_bound_a_power_iteration_that_ran_out_has_not_a
     )
     index = literal_index(ends, late)
     assert index.high is None and index.note.startswith("by Lanczos: the paper's power iteration did not arrive")
-    assert literal_index(ends, arrived)["note"].startswith("by power iteration")
+    assert literal_index(ends, arrived).note.startswith("by power iteration")
 
 
 def test_the_slice_is_made_of_true_losses_along_the_two_steepest_directions(record, dense):
@@ -94,7 +94,7 @@ def test_the_slice_is_made_of_true_losses_along_the_two_steepest_directions(reco
     values, vectors = torch.linalg.eigh((H + H.T) / 2)
     for axis, (name, index) in enumerate((("x", -1), ("y", -2))):
         unit = math.sqrt(2 * about.loss_scale / float(values[index]))
-        assert about.directions[axis]["unit"] == pytest.approx(unit, rel=1e-4)
+        assert about.directions[axis].unit == pytest.approx(unit, rel=1e-4)
         assert arrays[name] == pytest.approx(np.linspace(-3, 3, 5) * unit, rel=1e-4)
     assert about.loss_scale == pytest.approx(1e-3 * value)
     # a vector is known up to its sign and its error: the losses on the axis are those along the dense one
@@ -110,7 +110,7 @@ def test_the_eigenvectors_are_said_to_live_where_the_dense_ones_do(record, dense
     objective, H, _, _ = dense
     vectors = torch.linalg.eigh((H + H.T) / 2).eigenvectors
     for name, index in (("max", -1), ("min", 0)):
-        where = record.data.eigenvalues[name]["lives_on"]
+        where = getattr(record.data.eigenvalues, name).lives_on
         v = objective.active.with_flat(vectors[:, index])
         mass = torch.stack([part.reshape(len(v), -1).square().sum(dim=1) for part in v.attributes.values()]).sum(dim=0)
         assert where.participation == pytest.approx(float(1 / mass.square().sum()), rel=1e-2)
@@ -136,13 +136,13 @@ def test_positions_are_split_along_and_across_the_rays(record, dense):
     depth, lateral = found.curvature.depth, found.curvature.lateral
     whole = record.data.traces["means"]
     error = math.hypot(*(trace.standard_error for trace in (depth, lateral, whole)))
-    assert abs(depth["value"] + lateral["value"] - whole.value) < 5 * error
-    assert found.curvature_ratio.value == pytest.approx(2 * depth["value"] / lateral["value"], rel=1e-12)
-    assert [row["pixels"] for row in found.rises] == list(STEPS)
+    assert abs(depth.value + lateral.value - whole.value) < 5 * error
+    assert found.curvature_ratio.value == pytest.approx(2 * depth.value / lateral.value, rel=1e-12)
+    assert [row.pixels for row in found.rises] == list(STEPS)
     for row in found.rises:
-        assert row["ratio"] == pytest.approx(row["depth"] / row["lateral"], rel=1e-12)
-        assert min(row[f"{kind}_error"] for kind in ("depth", "lateral", "ratio")) > 0
-        assert 0 <= row["depth_crossed"] <= 1
+        assert row.ratio == pytest.approx(row.depth / row.lateral, rel=1e-12)
+        assert min(row.depth_error, row.lateral_error, row.ratio_error) > 0
+        assert 0 <= row.depth_crossed <= 1
     console = Console(width=140, record=True, file=StringIO())
     console.print(probe_table(record.data))
     table = console.export_text()
@@ -155,12 +155,12 @@ def test_quantiles_ascend_and_hold_those_of_the_dense_spectrum(record, dense):
     found, null = record.data.quantiles, len(H) - record.data.counts.rank
     true = torch.linalg.eigvalsh((H + H.T) / 2)
     true = true[true.abs().argsort()][null:].sort().values  # the exact null space left out
-    values = [found[share]["value"] for share in found]
+    values = [found[share].value for share in found]
     assert values == sorted(values) and len(values) == 7
     held = 0
     for share, entry in found.items():
         at = float(true[min(int(float(share) * len(true)), len(true) - 1)])
-        low = -math.inf if entry["low"] is None else entry["low"]
-        high = math.inf if entry["high"] is None else entry["high"]
+        low = -math.inf if entry.low is None else entry.low
+        high = math.inf if entry.high is None else entry.high
         held += low - rounding(H) <= at <= high + rounding(H)
     assert held == 7

@@ -239,8 +239,7 @@ def test_families_that_only_one_run_has_are_in_no_other_units(runs, capsys, no_p
     data, arrays = synthetic()
     data["provenance"] |= {"iteration": ITERATIONS}
     for changes, said in (({"families": []}, False), ({"families": [other_units(runs[0])]}, True)):
-        with record_folder(folder) as partial:
-            write_record(partial, data | changes, arrays)
+        written(folder, data | changes, arrays)
         assert main(["compare", *runs]) == 0
         assert (words in capsys.readouterr().out) == said
 

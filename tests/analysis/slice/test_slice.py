@@ -12,11 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from msgspec import convert
 
 from analysis.commands.cli import main
 from analysis.probe.command import scene_objective
 from analysis.probe.record import loss_name
 from analysis.records.records import Record, read_record
+from analysis.records.schema import FiniteProbe
 from analysis.slice.command import _finite_curvature
 from figures.make_all import recorded_figures
 from splat.curvature.hessian import SceneHessian
@@ -145,17 +147,34 @@ def test_eigenvectors_of_the_probe_beside_the_checkpoint_are_taken_where_they_ar
     shutil.copy(run / "double.pt", path)
     loss = load_checkpoint(path).training.config.loss
     vectors, value = eigen.arrays["directions"]["vectors"], eigen.data.slice.center_loss
-    probed(path.parent, value, vectors[:, ::-1].copy(), loss)  # told apart from those that Lanczos finds
+    probed(path.parent, value, -vectors, loss)  # told apart from those that Lanczos finds
     taken = sliced(tmp_path / "taken", path, *scene, *POINTS)
-    assert np.array_equal(taken.arrays["directions"]["vectors"], vectors[:, ::-1])
+    assert np.array_equal(taken.arrays["directions"]["vectors"], -vectors)
     assert taken.data.counts.products == 6  # of two vectors: to confirm them, for their curvatures, for the model
     turned = vectors @ np.array([[0.8, -0.6], [0.6, 0.8]])
-    for number, (recorded, of) in enumerate([(vectors, 1.001 * value), (turned, value), (vectors[:-1], value)]):
+    swapped = np.ascontiguousarray(vectors[:, ::-1])  # true eigenvectors, but the first is not the steepest
+    cases = [(vectors, 1.001 * value), (turned, value), (vectors[:-1], value), (swapped, value)]
+    for number, (recorded, of) in enumerate(cases):
         probed(path.parent, of, recorded, loss)
         computed = sliced(tmp_path / str(number), path, *scene, *POINTS)
+        assert computed.data.notes == []
         assert computed.data.counts.products > 6
         for found, exact in zip(computed.data.slice.directions, eigen.data.slice.directions, strict=True):
             assert abs(found.curvature - exact.curvature) <= found.residual + exact.residual
+
+
+def test_a_probe_and_eigenvectors_that_cannot_be_read_are_named(run, tmp_path, capsys):
+    path, out = tmp_path / "run" / "double.pt", tmp_path / "run" / "slice-eigenvectors-1d"
+    (path.parent / "probe").mkdir(parents=True)
+    shutil.copy(run / "double.pt", path)
+    (path.parent / "probe" / "probe.json").write_text("{")
+    unfinished = out.with_name(f".{out.name}.unfinished")
+    unfinished.mkdir()
+    (unfinished / "eigenvectors.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', ")
+    record = sliced(out, path, "--scene", str(run.parent / "still"), "--dimension", "1", *POINTS)
+    said = " ".join(capsys.readouterr().out.split())
+    for note, file in zip(record.data.notes, ("eigenvectors.npy", "probe.json"), strict=True):
+        assert file in note and "damaged" in note and note in said
 
 
 def test_random_directions_are_as_long_as_each_attribute_of_each_gaussian(run, objective, tmp_path):
@@ -192,11 +211,14 @@ def test_along_the_gradient_the_slope_is_its_length_and_finite_steps_are_second_
 
 def test_what_finite_steps_see_is_said_as_the_range_over_those_that_round_off_does_not_hide():
     probe = synthetic_line()[0]["finite_probe"]
-    said = _finite_curvature(probe)
+    said = _finite_curvature(convert(probe, FiniteProbe))
     assert "from 41.0 to 70.0, at the 3 of 4 steps that round-off does not hide (±1.00 × 10⁻⁵ to ±0.00100)" in said
     assert said.endswith(", 2 of them with another order of splats")
     hidden = probe | {"curvatures": [None] * 4, "round_off": [None] * 4, "crossed": None}
-    assert _finite_curvature(hidden) == "at finite steps: round-off hides the curvature at all 4 steps"
+    assert (
+        _finite_curvature(convert(hidden, FiniteProbe))
+        == "at finite steps: round-off hides the curvature at all 4 steps"
+    )
 
 
 def test_a_line_leads_to_the_other_checkpoint_and_what_is_in_sight_there_alone(run, tmp_path):
@@ -239,7 +261,7 @@ def test_an_adaptive_slice_says_what_it_rendered_and_stays_below_the_most(run, o
     about = record.data.slice
     assert about.evaluations <= 80 and about.points == 41 * 41 and about.reason == "evaluation budget"
     said = capsys.readouterr()
-    assert "evaluation budget" in said.out and f"{about['evaluated_points']} are renders" in said.out
+    assert "evaluation budget" in said.out and f"{about.evaluated_points} are renders" in said.out
     assert str(tmp_path / "slice") in said.out and "slice.json" in said.out
 
 
@@ -255,8 +277,8 @@ def test_workers_change_no_number(run, tmp_path):
 BLOCKED = """
 import sys, threading, time
 import landscape.slices.grid_evaluations as grid
-from analysis.cli import main
-from splat.curvature import SceneObjective
+from analysis.commands.cli import main
+from splat.curvature.objective import SceneObjective
 grid.SAVE_EVERY, evaluate, calls = 0.0, SceneObjective.evaluate, []
 def blocked(self, flat):
     calls.append(flat)
@@ -392,7 +414,8 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys, o
     assert message.startswith("landscape: ") and "Traceback" not in said.err and said.out == ""
     for part in words:
         assert part in message, message
-    assert not out.parent.exists() or list(out.parent.iterdir()) == []
+    kept = [] if "100" not in options else [".slice.unfinished"]  # no error deletes what was rendered
+    assert [path.name for path in out.parent.glob("*")] + [path.name for path in out.parent.glob(".*")] == kept
 
 
 def test_a_folder_of_something_else_is_not_replaced(run, tmp_path, capsys):
