@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
@@ -154,7 +155,8 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path, key, value):
 def test_a_changed_array_is_refused_by_file_and_name(tmp_path, array, words):
     folder, arrays = written(tmp_path / "probe"), synthetic()[1]["slice"]
     arrays |= {"loss": array}
-    np.savez(folder / "slice.npz", **{name: values for name, values in arrays.items() if values is not None})
+    known: dict[str, Any] = {name: values for name, values in arrays.items() if values is not None}
+    np.savez(folder / "slice.npz", **known)
     with pytest.raises(ValueError, match=rf"slice\.npz, got {words}.*; probe again"):
         read_record(folder)
 
