@@ -15,20 +15,19 @@ import torch
 from rich.console import Console
 
 from analysis.console.drawing import Draw
-from analysis.console.options import ProbeOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.measurement import ProbeSettings, measure
+from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.records.findings import findings
 from analysis.records.provenance import require_seed
 from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
 from landscape.errors import InputError
-from landscape.operators.distributed import Ranks, torchrun_ranks
+from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import split
 from splat.backend.device import device_named
-from splat.curvature.distributed import DistributedObjective
 from splat.curvature.objective import SceneObjective
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint, load_checkpoint
@@ -71,10 +70,10 @@ def _run(
         objective = scene_objective(checkpoint, scene, ranks)
     console.print(_introduction(scene, checkpoint, objective), highlight=False)
     with stages:
-        loss, generator = checkpoint.training.config.loss, torch.Generator(device).manual_seed(options.seed)
-        found = measure(objective, loss, settings, generator, stages.stage)
-        made = provenance_of(options, command, settings, checkpoint, scene)
-        data, arrays = probe_record(found, objective, loss, made, stages.timing), probe_arrays(found)
+        generator = torch.Generator(device).manual_seed(options.seed)
+        found = measure(objective, settings, generator, stages.stage)
+        made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
+        data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         if family_options is not None:
             from analysis.measures.families import measure_families
 
@@ -116,13 +115,9 @@ def scene_objective(
     checkpoint: Checkpoint, scene: Scene, ranks: Ranks | None = None, *, keep_unseen: bool = False
 ) -> SceneObjective:
     """The training's loss over its views, at the checkpoint; ranks: share them.  keep_unseen: see `SceneObjective`."""
-    training, names = checkpoint.training, checkpoint.scene.train
-    config, gaussians = training.config, training.gaussians
-    if ranks is None:
-        return config.objective(gaussians, scene.load(names), keep_unseen=keep_unseen)
-    background = config.background_colour(gaussians.flat.dtype)
-    views = scene.load(ranks.share(names, "training view"))
-    return DistributedObjective(gaussians, views, ranks, config.loss, background, config.render)
+    ranks = ranks or ALONE
+    training, views = checkpoint.training, scene.load(ranks.share(checkpoint.scene.train, "training view"))
+    return training.config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
 
 def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:

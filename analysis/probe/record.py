@@ -4,13 +4,13 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from math import isfinite, isnan, nan, sqrt
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from msgspec import convert
 
-from analysis.console.options import ProbeOptions, SliceOptions
 from analysis.measures.localization import conditions, localize, mass_shares
 from analysis.probe.measurement import Measured, PlaneSlice
 from analysis.records import schema
@@ -33,12 +33,12 @@ QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
 def probe_record(
-    found: Measured, objective: SceneObjective, loss: LossSettings, made: Provenance, timing: Mapping[str, float]
+    found: Measured, objective: SceneObjective, made: Provenance, timing: Mapping[str, float]
 ) -> ProbeRecord:
     """All numbers that are no arrays, without the families.  timing: seconds of the stages so far."""
     density = found.density
     return ProbeRecord(
-        objective=objective_of(objective, loss, found.value, found.gradient_norm),
+        objective=objective_of(objective, found.value, found.gradient_norm),
         traces={name: _trace(trace.record()) for name, trace in found.traces.items()},
         eigenvalues=_eigenvalues(found, objective),
         anisotropy=_anisotropy(found),
@@ -83,13 +83,13 @@ def grid_arrays(grid: Grid) -> dict[str, np.ndarray]:
 
 
 def provenance_of(
-    options: ProbeOptions | SliceOptions, command: Sequence[str], settings: Any, checkpoint: Checkpoint, scene: Scene
+    seed: int, path: Path, command: Sequence[str], settings: Any, checkpoint: Checkpoint, scene: Scene
 ) -> Provenance:
-    """Where the numbers of a probe or a slice come from.  command: as typed; settings: a dataclass."""
+    """Where the numbers of a probe or a slice come from.  path: of the checkpoint; settings: a dataclass; command: as typed."""
     return provenance(
-        options.seed,
+        seed,
         lanes=lanes_of(np.float32),
-        checkpoint=str(options.checkpoint),
+        checkpoint=str(path),
         scene=scene.name,
         scene_folder=str(scene.root),
         views=list(checkpoint.scene.train),
@@ -114,9 +114,9 @@ def loss_name(loss: LossSettings) -> str:
     return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM)"
 
 
-def objective_of(objective: SceneObjective, loss: LossSettings, value: float, gradient_norm: float) -> schema.Objective:
+def objective_of(objective: SceneObjective, value: float, gradient_norm: float) -> schema.Objective:
     return schema.Objective(
-        loss=loss_name(loss),
+        loss=loss_name(objective.loss_settings),
         sizes=[(view.camera.width, view.camera.height) for view in objective.views],
         background=tuple(objective.background.tolist()),
         operator="hessian",
@@ -215,7 +215,7 @@ def counts_of(active: ActiveCounts, **work: int) -> Counts:
 
 def _counts(found: Measured, objective: SceneObjective) -> Counts:
     renders = 0 if found.plane is None else found.plane.slice.evaluations * objective.counts.views
-    kept = objective.memory_plan.kept
+    kept = objective.linearized.kept
     return counts_of(
         objective.counts, rank=found.rank, views_kept_linearised=kept, products=found.matvecs, renders=renders
     )
@@ -228,12 +228,17 @@ def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, fl
     their vectors move nothing, which is not counted.
     """
     counts, probes = objective.counts, [trace.probes for trace in found.traces.values()]
+
+    def total(count: int) -> int:
+        """Over the views of all processes."""
+        return int(objective.ranks.sum(torch.tensor(count)))
+
     products = {
         "gaussians_out_of_sight": counts.gaussians - counts.active_gaussians,
         "sh_bands_not_in_use": (counts.sh_degree + 1) ** 2 - (counts.active_sh_degree + 1) ** 2,
-        "entries_behind_opaque_fronts": objective.total(sum(view.entries_behind for view in objective.linearized)),
-        "tiles_of_zero_cotangent": objective.total(sum(view.dark_tiles for view in objective.linearized)),
-        "products_of_views_not_concerned": objective.total(found.spared),
+        "entries_behind_opaque_fronts": total(sum(view.intersections_behind for view in objective.linearized)),
+        "tiles_of_zero_cotangent": total(sum(view.dark_tiles for view in objective.linearized)),
+        "products_of_views_not_concerned": total(found.spared),
     }
 
     def undone(count: int, made: int, seconds: float) -> Skip:
@@ -251,9 +256,8 @@ def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, fl
 
 def _checks(found: Measured) -> dict[str, Check]:
     operator, derivative = found.operator_check, found.gradient_check
-    close = max(
-        operator.tolerance, ROUND_OFFS * torch.finfo(torch.float32).eps
-    )  # differences are not much better in float64
+    # differences are not much better in float64
+    close = max(operator.tolerance, ROUND_OFFS * torch.finfo(torch.float32).eps)
     steps = len(derivative.steps) + derivative.skipped
     skipped = f"the order of the splats changed on {derivative.skipped} of {steps} steps"
     if isnan(derivative.error):

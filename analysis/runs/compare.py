@@ -17,8 +17,9 @@ from typing import Any
 from rich.console import Console
 
 from analysis.console.drawing import draw
-from analysis.console.options import CompareOptions, DeviceName, ProbeOptions
+from analysis.console.options import DeviceName
 from analysis.console.overrides import leaves
+from analysis.probe.options import ProbeOptions
 from analysis.records.findings import of_budgets
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import quantity
@@ -26,8 +27,9 @@ from analysis.records.records import ProbeRecord, read_record
 from analysis.records.report import pictures_in, template_environment
 from analysis.records.run_files import CHECKPOINT, COMPARISON, METRICS, Comparison, Scores, read_scores
 from analysis.runs.compare_table import Run, compare_table, comparison, frame
-from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
+from analysis.runs.options import CompareOptions
 from landscape.errors import InputError
+from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
 PAGE, TABLE, PROBE = "compare.html", "compare.csv", "probe"
 PICTURES = {
@@ -152,7 +154,9 @@ def split_controls(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         if control := run.data.split_control:
             seen = next((row.gaussians for row in run.data.families or () if row.split), control.gaussians)
-            lost = f", and {control.gaussians - seen:,} of the halves touch no pixel." if seen < control.gaussians else "."
+            lost = (
+                f", and {control.gaussians - seen:,} of the halves touch no pixel." if seen < control.gaussians else "."
+            )
             lines.append(
                 f"{run.label}: the split into {control.gaussians:,} halves changes the images by {quantity(control.rms)} "
                 f"(root mean square; {quantity(control.psnr)} dB){lost}"

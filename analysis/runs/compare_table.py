@@ -112,7 +112,9 @@ def _depth(runs: Sequence[Run]) -> Iterable[Row]:
 
 def _families(runs: Sequence[Run]) -> Iterable[Row]:
     """Of every operator and block that a run has families of."""
-    of_runs: list[dict[tuple[Operator, str], Anisotropy]] = [{(row.operator, row.block): row.indices for row in run.data.families or () if not row.split} for run in runs]
+    of_runs: list[dict[tuple[Operator, str], Anisotropy]] = [
+        {(row.operator, row.block): row.indices for row in run.data.families or () if not row.split} for run in runs
+    ]
     for operator, block in dict.fromkeys(key for rows in of_runs for key in rows):
         for name in INDICES:
             words = f"{OPERATOR_NAMES[operator]}, {attribute_name(block)}: {name.replace('_', ' ')}"

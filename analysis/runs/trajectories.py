@@ -16,12 +16,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from analysis.console.drawing import draw
-from analysis.console.options import TrajectoryOptions
 from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.quantities import measured, quantity
 from analysis.records.run_files import CHECKPOINT, ENDS, NO_TIME, RECORDS, TRAJECTORY_INDICES, read_trajectory
 from analysis.records.schema import Index
 from analysis.records.tables import bracketed
+from analysis.runs.options import TrajectoryOptions
 from landscape.errors import InputError
 
 TABLE, PICTURE = "trajectories.csv", "trajectories.png"

@@ -27,7 +27,6 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
-from analysis.console.options import SliceOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.command import scene_objective
@@ -48,6 +47,7 @@ from analysis.slice.directions import (
     find_directions,
     recorded_eigenvectors,
 )
+from analysis.slice.options import SliceOptions
 from analysis.slice.record import Found, slice_arrays, slice_record
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
 from landscape.errors import InputError
@@ -83,16 +83,16 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
     with stages:
         notes: list[str] = []
-        known = _known(options.checkpoint.parent / "probe", unfinished, checkpoint, objective, notes)
+        known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:
             found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
         except BaseException:
             if unfinished.is_dir():
                 console.print(f"what was rendered is kept; to continue: {shlex.join(command)}", **SAID)
             raise
-        made = provenance_of(options, command, settings, checkpoint, scene)
+        made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         made.other = None if options.other is None else str(options.other)
-        data = slice_record(found, objective, checkpoint.training.config.loss, notes + slice_notes(found.slice), made)
+        data = slice_record(found, objective, notes + slice_notes(found.slice), made)
         with record_folder(out, SliceRecord) as folder:
             write_with_pictures(folder, data, slice_arrays(found), stages, start)
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -134,9 +134,7 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     return there.flat
 
 
-def _known(
-    probe: Path, unfinished: Path, checkpoint: Checkpoint, objective: SceneObjective, notes: list[str]
-) -> list[Tensor]:
+def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list[str]) -> list[Tensor]:
     """Eigenvectors of an interrupted run and of the probe.  notes: is told which of them cannot be read."""
     kept, found, center = unfinished / "eigenvectors.npy", [], objective.active.flat
     if kept.is_file():
@@ -145,7 +143,7 @@ def _known(
                 found.append(torch.from_numpy(np.load(stream, allow_pickle=False)))
         except InputError as error:
             notes.append(str(error))
-    name, precision = loss_name(checkpoint.training.config.loss), torch.finfo(center.dtype).eps
+    name, precision = loss_name(objective.loss_settings), torch.finfo(center.dtype).eps
     found += recorded_eigenvectors(probe, name, objective.loss(center), precision, notes)
     return [vectors.to(center.device) for vectors in found]
 

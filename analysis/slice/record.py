@@ -16,7 +16,6 @@ from analysis.records.records import SliceRecord
 from analysis.slice.directions import Direction
 from landscape import FiniteProbe, Slice
 from splat.curvature.objective import SceneObjective
-from splat.losses.reference import LossSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +31,7 @@ class Found:
     matvecs: int
 
 
-def slice_record(
-    found: Found, objective: SceneObjective, loss: LossSettings, notes: list[str], made: Provenance
-) -> SliceRecord:
+def slice_record(found: Found, objective: SceneObjective, notes: list[str], made: Provenance) -> SliceRecord:
     """All numbers that are no arrays, without timing."""
     grid, probe = found.slice, found.probe
     assert grid.slope is not None and grid.curvature is not None
@@ -56,7 +53,7 @@ def slice_record(
     about = {"directions": directions, "loss_scale": found.loss_scale, "cosine": found.cosine, **grid.record()}
     evaluations = grid.evaluations + (0 if probe is None else probe.evaluations)
     return SliceRecord(
-        objective=objective_of(objective, loss, grid.center_loss, float(objective.gradient.double().norm())),
+        objective=objective_of(objective, grid.center_loss, float(objective.gradient.double().norm())),
         slice=convert(about, schema.Slice),
         finite_probe=None if probe is None else convert(probe.record(), schema.FiniteProbe),
         counts=counts_of(objective.counts, products=found.matvecs, renders=evaluations * objective.counts.views),

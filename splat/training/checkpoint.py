@@ -32,6 +32,7 @@ from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
 from splat.model.gaussians import Gaussians
+from splat.model.settings import current_settings
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split
 from splat.training.densify import ScreenGradients
@@ -206,6 +207,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
     OSError where there is none or it may not be read; ValueError, which says what is wrong with it, where it is damaged or of
     another kind.
+
+    >>> load_checkpoint(Path("nowhere/checkpoint.pt"))
+    Traceback (most recent call last):
+        ...
+    FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file
     """
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
@@ -262,7 +268,7 @@ def restored_training(content: dict[str, Any]) -> Training:
     gaussians.require_finite()
     config = _get(content, "config", dict)
     if isinstance(thresholds := config.get("render"), dict):
-        config = {**config, "render": {"sums": "ordered", **thresholds}}  # a choice that older checkpoints did not have
+        config = {**config, "render": current_settings(thresholds)}
     config = _dataclass(TrainConfig, config, "config")
     regularizer = config.method.regularizer(config.seed)
     _restore(regularizer, _get(content, "regularizer", dict))

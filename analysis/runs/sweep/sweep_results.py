@@ -96,7 +96,11 @@ def _metrics(run: Path) -> dict[str, float]:
     for part, prefix in ((found.test, ""), (found.train, "train_")):
         row |= {f"{prefix}{key}": _number(value) for key, value in structs.asdict(part or ViewScores()).items()}
     clock = found.seconds or Clock()
-    seconds = {"wall_seconds": _number(clock.wall), "cpu_seconds": _number(clock.cpu), "threads": clock.threads or math.nan}
+    seconds = {
+        "wall_seconds": _number(clock.wall),
+        "cpu_seconds": _number(clock.cpu),
+        "threads": clock.threads or math.nan,
+    }
     return row | {"gaussians": found.gaussians} | seconds
 
 

@@ -67,7 +67,7 @@ def test_a_power_iteration_that_did_not_arrive_gives_no_index(steps, says):
     power = power_ends(operator, generator.manual_seed(0), PowerSettings(rtol=1e-9, max_matvecs=steps))
     index = literal_index(extreme_eigenpairs(operator, generator), power)
     assert index.value == pytest.approx(-3, rel=1e-2) and index.note.startswith(says)
-    assert index.low is not None and index.high is not None and index.low <= index.value <= index.high
+    assert None not in (index.low, index.value, index.high) and index.low <= index.value <= index.high  # pyright: ignore[reportOptionalOperand, reportOperatorIssue]
 
 
 def test_within_a_bracket_without_bound_a_power_iteration_that_ran_out_has_not_arrived():

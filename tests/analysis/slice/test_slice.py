@@ -402,7 +402,7 @@ def few(run: Path, tmp_path: Path) -> str:
         (["NOWHERE"], ["nowhere.pt", "no such file"]),
     ],
 )
-def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys, options, words):
+def test_bad_input_gets_one_sentence_and_leaves_no_record(run, tmp_path, capsys, options, words):
     named = {"OTHER": str(run / "turned.pt"), "SAME": str(run / "double.pt"), "NOWHERE": str(tmp_path / "nowhere.pt")}
     if "FEW" in options:
         named["FEW"] = few(run, tmp_path)

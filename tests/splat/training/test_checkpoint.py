@@ -216,11 +216,14 @@ def test_a_ply_file_is_refused_by_its_name(tmp_path):
     refused(path, r"damaged \(Gaussians from a PLY file cannot be read\)")
 
 
-def test_a_checkpoint_from_before_sums_had_a_name_has_ordered_ones(path):
+@pytest.mark.parametrize("older", [{}, {"sums": "ordered"}, {"sums": "atomic"}])
+def test_a_checkpoint_with_older_words_for_accumulation_is_read(path, older):
     content = torch.load(path, weights_only=True)
-    del content["config"]["render"]["sums"]
+    del content["config"]["render"]["accumulation"]
+    content["config"]["render"] |= older
     torch.save(content, path)
-    assert load_checkpoint(path).training.config.render == RenderSettings()
+    accumulation = "atomic" if older == {"sums": "atomic"} else "deterministic"
+    assert load_checkpoint(path).training.config.render == RenderSettings(accumulation=accumulation)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
 from splat.model.camera import Camera
 from splat.model.capture import capture_geometry
@@ -42,7 +42,7 @@ def a_step(settings: CoRGS, number: int) -> tuple[Step, Training]:
     partner = regularizer.partner
     assert partner is not None
     partner.gaussians = tiny_gaussians(sh_degree=1, seed=3, dtype=torch.float64)
-    loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
+    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
     background = torch.tensor(config.background, dtype=torch.float64)
     return Step(number, training, training.gaussians, views, 1, background, loss), partner
 

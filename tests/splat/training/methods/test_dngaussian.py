@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.model.gaussians import Gaussians
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
@@ -25,7 +25,7 @@ def a_step(settings: DNGaussian, number: int = 1, scale: float = 1.0, shift: flo
     views = [replace(view, depth=values) for view, values in zip(tiny_views(torch.float64), maps, strict=True)]
     config = TrainConfig(10, method=settings)
     training = Training.start(tiny_gaussians(sh_degree=1, dtype=torch.float64), EXTENT, config)
-    loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
+    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
     return Step(number, training, training.gaussians, views, 1, torch.zeros(3, dtype=torch.float64), loss)
 
 

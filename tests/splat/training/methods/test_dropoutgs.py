@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
@@ -19,7 +19,7 @@ def test_the_gradient_is_that_of_the_loss_and_the_agreement_with_the_gaussians_t
     views, config = tiny_views(torch.float64), TrainConfig(10, method=DropoutGS(p=0.5, weight=0.3))
     training = Training.start(tiny_gaussians(sh_degree=1, dtype=torch.float64), EXTENT, config)
     background = torch.tensor([0.2, 0.4, 0.1], dtype=torch.float64)
-    loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
+    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
     step = Step(1, training, training.gaussians, views, 1, background, loss)
     base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
     gradient = training.regularizer.gradient(step, base)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.scenes.view import View
@@ -28,7 +28,7 @@ def with_depths(views: list[View]) -> list[View]:
 def a_step(settings: FSGS, number: int = 1) -> Step:
     views, config = with_depths(tiny_views(torch.float64)), TrainConfig(10, method=settings)
     training = Training.start(tiny_gaussians(sh_degree=1, dtype=torch.float64), EXTENT, config)
-    loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
+    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
     return Step(number, training, training.gaussians, views, 1, torch.zeros(3, dtype=torch.float64), loss)
 
 

@@ -5,7 +5,7 @@ from math import sqrt
 import pytest
 import torch
 
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
@@ -20,7 +20,7 @@ def a_step(settings: SAM) -> Step:
     config = TrainConfig(10, background=(0.2, 0.4, 0.1), method=settings)
     training = Training.start(gaussians, EXTENT, config)
     views = tiny_views(torch.float64)
-    loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
+    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
     background = torch.tensor(config.background, dtype=torch.float64)
     return Step(3, training, training.gaussians, views, 1, background, loss)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
@@ -32,7 +32,7 @@ def first_step(settings: StableGS, **others) -> Step:
     training = Training.start(gaussians, EXTENT, config)
     training.regularizer.begin(training, views)
     background = config.background_colour(torch.float64)
-    loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
+    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
     return Step(settings.warm_up + 1, training, training.gaussians, views, 1, background, loss)
 
 
