@@ -130,13 +130,15 @@ def recordings(workload: Workload, meter: Meter) -> list[Check]:
     objective = SceneObjective(w.gaussians, w.views, w.loss, w.background, w.settings)
     hessian, generator = SceneHessian(objective, keep_null=True), torch.Generator(meter.device).manual_seed(0)
     for vectors in (1, 8):
-        if not objective.recordable(vectors):
+        if not hessian.recordable(vectors):
             checks.append(Check(f"H v {vectors}, recorded", None, 0.0, "not recorded here"))
             continue
         blocks = [draw_probes(hessian.dim, vectors, generator, hessian.dtype) for _ in range(CALLS + 1)]
-        differences = [(hessian.apply(V) - objective.mean(hessian.launched(V))).abs().max() for V in blocks]
+        differences = [
+            (hessian.apply(V) - objective.mean_over_views(hessian.views.apply(V))).abs().max() for V in blocks
+        ]
         V = blocks[-1]
-        calls = {"recorded": lambda V=V: hessian.apply(V), "launched": lambda V=V: hessian.launched(V)}
+        calls = {"recorded": lambda V=V: hessian.apply(V), "launched": lambda V=V: hessian.views.apply(V)}
         times = interleaved(calls, REPETITIONS, clock=meter.seconds)
         ratio = times["recorded"].minimum / times["launched"].minimum
         checks.append(Check(f"H v {vectors}, recorded - launched", float(max(differences)), 0.0))

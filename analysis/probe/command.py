@@ -29,11 +29,10 @@ from analysis.records.findings import verdict
 from analysis.records.provenance import provenance, require_seed
 from analysis.records.records import FILE, PROBE, Record, record_folder, require_replaceable
 from landscape.errors import InputError
-from landscape.operators.distributed import Ranks, torchrun_ranks
+from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import split
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.device import device_named
-from splat.curvature.distributed import DistributedObjective
 from splat.curvature.objective import SceneObjective
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint, load_checkpoint
@@ -76,10 +75,9 @@ def _run(
         objective = scene_objective(checkpoint, scene, ranks)
     console.print(_introduction(scene, checkpoint, objective), highlight=False)
     with stages:
-        loss = checkpoint.training.config.loss
         generator = torch.Generator(device).manual_seed(options.seed)
-        findings = measure(objective, loss, settings, generator, stages.stage)
-        data = probe_data(findings, objective, loss)
+        findings = measure(objective, settings, generator, stages.stage)
+        data = probe_data(findings, objective)
         with stages.stage("skips"):
             gaussians, made = checkpoint.training.gaussians, (findings.matvecs, findings.spared)
             skips = product_skips(objective, gaussians, *made, repetitions=settings.timings)
@@ -116,13 +114,9 @@ def scene_objective(
     checkpoint: Checkpoint, scene: Scene, ranks: Ranks | None = None, *, keep_unseen: bool = False
 ) -> SceneObjective:
     """The training's loss over its views, at the checkpoint; ranks: share them.  keep_unseen: see `SceneObjective`."""
-    training, names = checkpoint.training, checkpoint.scene.train
-    config, gaussians = training.config, training.gaussians
-    if ranks is None:
-        return config.objective(gaussians, scene.load(names), keep_unseen=keep_unseen)
-    background = config.background_colour(gaussians.flat.dtype)
-    views = scene.load(ranks.share(names, "training view"))
-    return DistributedObjective(gaussians, views, ranks, config.loss, background, config.render)
+    ranks = ranks or ALONE
+    training, views = checkpoint.training, scene.load(ranks.share(checkpoint.scene.train, "training view"))
+    return training.config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
 
 def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:

@@ -82,14 +82,14 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         scene = checkpoint.load_scene(options.checkpoint, options.scene)
         objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
     with stages:
-        known = _known(options.checkpoint.parent / "probe", unfinished, checkpoint, objective, console)
+        known = _known(options.checkpoint.parent / "probe", unfinished, objective, console)
         try:
             found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
         except BaseException:
             if unfinished.is_dir():
                 console.print(f"what was rendered is kept; to continue: {shlex.join(command)}", **SAID)
             raise
-        data = slice_data(found, objective, checkpoint.training.config.loss)
+        data = slice_data(found, objective)
         data["notes"] = slice_notes(found.slice)
         data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
         with record_folder(out, SLICE) as folder:
@@ -133,14 +133,12 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     return there.flat
 
 
-def _known(
-    probe: Path, unfinished: Path, checkpoint: Checkpoint, objective: SceneObjective, console: Console
-) -> list[Tensor]:
+def _known(probe: Path, unfinished: Path, objective: SceneObjective, console: Console) -> list[Tensor]:
     """Eigenvectors of an interrupted run and of the probe, where its record can be read."""
     kept = unfinished / "eigenvectors.npy"
     found = [torch.from_numpy(np.load(kept, allow_pickle=False))] if kept.is_file() else []
     center = objective.active.flat
-    name, precision = loss_name(checkpoint.training.config.loss), torch.finfo(center.dtype).eps
+    name, precision = loss_name(objective.loss_settings), torch.finfo(center.dtype).eps
     try:
         found += recorded_eigenvectors(probe, name, objective.loss(center), precision)
     except (InputError, FileNotFoundError) as error:

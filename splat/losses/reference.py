@@ -30,6 +30,9 @@ class LossSettings:
     """Which loss a view contributes: the pixel loss, and ssim_weight = lambda in [0, 1], of 1 - SSIM.
 
     eps: Charbonnier's, in units of intensity.  literal: the pixel loss has the weight 1 instead of 1 - lambda.
+
+    >>> LossSettings("l2", ssim_weight=0.2).pixel_weight
+    0.8
     """
 
     pixel: PixelLoss = "l1"

@@ -17,7 +17,13 @@ from landscape.errors import InputError
 
 @dataclass(frozen=True)
 class Camera:
-    """rotation: world to camera, float64; centre: camera centre in world units, float64; the rest in pixels."""
+    """rotation: world to camera, float64; centre: camera centre in world units, float64; the rest in pixels.
+
+    InputError where the rotation is none, or a number is not finite or, but for centre and principal point, not positive.
+
+    >>> Camera(torch.eye(3), torch.zeros(3), fx=50.0, fy=50.0, cx=16.0, cy=12.0, width=32, height=24).resized(16, 12).fx
+    25.0
+    """
 
     rotation: Float[Tensor, "3 3"]
     centre: Float[Tensor, "3"]
@@ -56,9 +62,9 @@ class Camera:
 
 
 def look_at(centre: Float[Tensor, "3"], target: Float[Tensor, "3"], down: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """World-to-camera rotation at a centre that looks at a target, held level: +x is perpendicular to `down`.
+    """World-to-camera rotation of a level camera at a centre that looks at a target: +x is perpendicular to `down`.
 
-    Raises ValueError where the target is the centre, or straight above or below it.
+    Raises InputError where the target is the centre, or straight above or below it.
     """
     forward = (target - centre) / (target - centre).norm()
     right = torch.linalg.cross(down, forward)
@@ -71,14 +77,14 @@ def look_at(centre: Float[Tensor, "3"], target: Float[Tensor, "3"], down: Float[
 
 
 def rotation_about(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The rotation by |vector| radians about it."""
+    """The rotation by |vector| radians about a vector."""
     return torch.from_numpy(scipy.spatial.transform.Rotation.from_rotvec(vector.numpy()).as_matrix()).to(vector.dtype)
 
 
 def slerp(first: Float[Tensor, "3 3"], second: Float[Tensor, "3 3"], t: float) -> Float[Tensor, "3 3"]:
     """first (first^T second)^t: the shorter geodesic on SO(3), first at 0, second at 1, any real t.
 
-    Half a turn apart both ways are equally short; which one is taken is SciPy's choice, always the same.
+    For rotations half a turn apart, both ways are equally short; SciPy always takes the same.
     """
     vector = scipy.spatial.transform.Rotation.from_matrix((first.T @ second).numpy()).as_rotvec()
     return first @ rotation_about(t * torch.from_numpy(vector))

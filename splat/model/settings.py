@@ -1,8 +1,8 @@
-"""The thresholds of the renderer, and how a GPU adds up, in one frozen object.
+"""The thresholds of the renderer, and the order of a GPU's sums, in one frozen object.
 
-Every threshold makes the image a discontinuous or merely piecewise smooth function of the parameters.  The values are
-those of the original 3DGS rasterizer (Kerbl et al. 2023); `SMOOTH` switches off what can be switched off, so that a study
-can measure what the thresholds do to the landscape.
+Every threshold makes the image a discontinuous or merely piecewise smooth function of the parameters.  The default values are
+those of the original 3DGS rasterizer (Kerbl et al. 2023).  `SMOOTH` switches off the thresholds that can be switched off, so
+that a study can measure their effect on the landscape.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,11 @@ class RenderSettings:
     contour_sigma: an additional cut at this Mahalanobis distance (the original cuts at 3); None keeps alpha_min's contour.
     gradient_through_cap: pass derivatives in ln alpha through the cap, instead of the true 0; the original CUDA code passes
         those in alpha through, which is the same within 1%.
-    sums: how a GPU adds up gradients.  ordered: the same bits every time, as on the CPU; atomic: as they come, which is faster.
+    sums: the order in which a GPU adds up gradients.  ordered: always the same, and so the bits; atomic: any, which is faster.
+    InputError where a value is out of its range.
+
+    >>> RenderSettings(alpha_min=0.0).near
+    0.2
     """
 
     blur: float = 0.3

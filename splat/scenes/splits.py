@@ -1,10 +1,10 @@
-"""Which views train and which test: the sparse-view protocols of the field.
+"""Training and test views of a scene, by the sparse-view protocols of the field.
 
 LLFF       3, 6 or 9 views.  Names sorted; every 8th, from the first, is a test view; n training views at the rounded,
            evenly spaced places of the rest, np.linspace(0, m - 1, n): RegNeRF, FreeNeRF, FSGS and their followers.
            Images of images_8, 504 x 378
-Mip-NeRF   360: 12 or 24 views by the same rule, images of images_8 (FSGS, CoR-GS, DropGaussian).  So is every scene
-           without a protocol of its own
+Mip-NeRF   360: 12 or 24 views by the same rule, images of images_8 (FSGS, CoR-GS, DropGaussian).  The same rule holds for
+           every scene that no other protocol is for
 DTU        3, 6 or 9 views, the first of 25, 22, 28, 40, 44, 48, 0, 8, 13 (views counted from 0); the 25 test views are the
            other ones of the first 49 but 3-7, 16-21 and 36-39, which are badly exposed: pixelNeRF, RegNeRF (`dtu_split_type`
            pixelnerf), DNGaussian, CoR-GS.  Images reduced by 4; metrics inside the objects' masks.  A scene is DTU's by the
@@ -43,7 +43,7 @@ class Split:
 
 
 def usual_views(scene: Scene) -> int:
-    """How many training views the scene has where nobody says: all 8 of Blender's protocol, else the fewest of the field."""
+    """The default number of training views: all 8 of Blender's protocol, else the fewest of the field."""
     return len(BLENDER_TRAINING) if scene.kind == "blender" else FEWEST
 
 
@@ -53,7 +53,15 @@ def split_scene(
     train: Sequence[str | int] | None = None,
     test: Sequence[str | int] | None = None,
 ) -> Split:
-    """The protocol of the scene's kind with that many training views (all by default), or the explicit lists."""
+    """The protocol of the scene's kind with that many training views (all by default), or the explicit lists.
+
+    InputError where the scene lacks views.
+
+    >>> from splat import SyntheticSettings, synthetic_scene
+    >>> scene = synthetic_scene(SyntheticSettings(gaussians=50, views=10, width=16, height=12)).scene
+    >>> split_scene(scene, 2).train
+    ('images/view_001.png', 'images/view_009.png')
+    """
     if train is not None:
         if views is not None:
             raise InputError(

@@ -21,7 +21,7 @@ from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.render.render import Rendering, render
 from splat.scenes.scene import Scene
-from splat.scenes.view import Frame, Picture, Points, inside_image, pixel_coordinates
+from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
 
 GOLDEN = (1 + sqrt(5)) / 2
 FLOOR, WALL = 1.0, 3.0
@@ -33,7 +33,10 @@ class SyntheticSettings:
     """gaussians: about how many (each surface rounds its share).  arc: degrees that the cameras span.
 
     point_share: share of the Gaussians seen by two views that become points; point_noise: their error, in units of the
-    Gaussian's largest scale.
+    Gaussian's largest scale.  InputError where a value is out of its range.
+
+    >>> SyntheticSettings(views=3).width
+    120
     """
 
     gaussians: int = 1600
@@ -72,23 +75,24 @@ class Surface:
 
 
 def synthetic_scene(settings: SyntheticSettings = SyntheticSettings()) -> SyntheticScene:
-    """Build the Gaussians and render every view.  The same settings give the same scene."""
+    """Build the Gaussians and render every view.  The same settings give the same scene.
+
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> len(made.truth), len(made.scene.load()), len(made.scene.points) > 0
+    (50, 2, True)
+    """
     generator = torch.Generator().manual_seed(settings.seed)
     truth = _gaussians(_still_life(settings.gaussians, generator), settings.sh_degree, generator)
     cameras = _arc_of_cameras(settings)
     with torch.no_grad():
         renderings = [render(truth, camera, depth=True) for camera in cameras]
-    frames = tuple(
-        Frame(f"images/view_{i:03d}.png", camera, partial(_picture, rendering.image.clamp(0, 1)))
-        for i, (camera, rendering) in enumerate(zip(cameras, renderings))
-    )
+    frames = []
+    for i, (camera, rendering) in enumerate(zip(cameras, renderings)):
+        name = f"images/view_{i:03d}.png"
+        frames.append(Frame(name, camera, partial(View, name, camera, rendering.image.clamp(0, 1))))
     points = _points(truth, frames, renderings, settings, generator)
-    scene = Scene("synthetic", Path("synthetic"), "synthetic", frames, points, torch.zeros(3))
+    scene = Scene("synthetic", Path("synthetic"), "synthetic", tuple(frames), points, torch.zeros(3))
     return SyntheticScene(scene, truth)
-
-
-def _picture(image: Float[Tensor, "3 h w"]) -> Picture:
-    return image, None
 
 
 def _still_life(n: int, generator: torch.Generator) -> list[Surface]:
@@ -214,7 +218,7 @@ def _arc_of_cameras(settings: SyntheticSettings) -> list[Camera]:
 
 def _points(
     truth: Gaussians,
-    frames: tuple[Frame, ...],
+    frames: list[Frame],
     renderings: list[Rendering],
     settings: SyntheticSettings,
     generator: torch.Generator,

@@ -206,6 +206,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
     OSError where there is none or it may not be read; ValueError, which says what is wrong with it, where it is damaged or of
     another kind.
+
+    >>> load_checkpoint(Path("nowhere/checkpoint.pt"))
+    Traceback (most recent call last):
+        ...
+    FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file
     """
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"

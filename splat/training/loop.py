@@ -61,6 +61,12 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
 
     Between two items `training` is whole, so that it can be saved, evaluated or left there.  ValueError where there are no
     views, they lack what the method needs, or a loss or gradient is not finite.
+
+    >>> from splat import SyntheticSettings, TrainConfig, synthetic_scene
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> training = Training.start(made.truth, made.scene.extent(), TrainConfig(iterations=2))
+    >>> [done.step for done in train(training, made.scene.load())]
+    [1, 2]
     """
     config, regularizer = training.config, training.regularizer
     if not views:

@@ -51,7 +51,13 @@ def initial_gaussians(
     random_points: int = 10_000,
     source: Source = "scene",
 ) -> Gaussians:
-    """From the points of the source.  Same generator state, same Gaussians."""
+    """Gaussians from the points of the source.  The same state of the generator gives the same Gaussians.
+
+    >>> from splat import SyntheticSettings, synthetic_scene
+    >>> scene = synthetic_scene(SyntheticSettings(gaussians=50, views=3, width=16, height=12)).scene
+    >>> initial_gaussians(scene, scene.load(), sh_degree=1, generator=torch.Generator().manual_seed(0)).sh_degree
+    1
+    """
     if source == "points" and scene.points is None:
         raise InputError(f"expected a scene with points, {scene.root} has none; start from triangulated or random ones")
     if source == "triangulated":

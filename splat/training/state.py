@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.operators.distributed import ALONE, Ranks
 from splat.curvature.objective import SceneObjective
 from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import LossSettings
@@ -171,6 +172,10 @@ class TrainConfig:
     random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
     method: what is added to 3DGS, with its settings (`splat/training/methods/methods.py`).
     ValueError where a setting is out of its range.
+
+    >>> from splat import METHODS
+    >>> TrainConfig(iterations=300, method=METHODS["stablegs"](warm_up=100)).method.name
+    'stablegs'
     """
 
     iterations: int = 2000
@@ -205,10 +210,14 @@ class TrainConfig:
     def background_colour(self, dtype: torch.dtype) -> Float[Tensor, "3"]:
         return torch.tensor(self.background, dtype=dtype)
 
-    def objective(self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False) -> SceneObjective:
+    def objective(
+        self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False, ranks: Ranks = ALONE
+    ) -> SceneObjective:
         """This loss, on this background, averaged over views: the objective whose Hessian is studied.  See `SceneObjective`."""
         background = self.background_colour(gaussians.flat.dtype)
-        return SceneObjective(gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen)
+        return SceneObjective(
+            gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen, ranks=ranks
+        )
 
 
 @dataclass(eq=False)
@@ -217,6 +226,10 @@ class Training:
 
     extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.
     order: indices of the epoch's views still to come, last first.
+
+    >>> from splat import Gaussians
+    >>> Training.start(Gaussians(torch.ones(14), sh_degree=0), extent=1.0, config=TrainConfig()).step
+    0
     """
 
     config: TrainConfig

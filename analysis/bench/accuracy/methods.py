@@ -176,7 +176,7 @@ def _lanczos(
 def _from_own_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
     """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
     assert case.objective is not None
-    start = BlockEigenvectors(case.objective, case.objective.block_diagonal()).leads()
+    start = BlockEigenvectors(case.objective, case.objective.block_diagonal()).warm_start()
     operator.charge(PASS)
     return end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
 

@@ -1,4 +1,4 @@
-"""Scenes of DTU (Jensen et al. 2014), and how its files number the views.
+"""Scenes of DTU (Jensen et al. 2014).
 
     Rectified/scanN/rect_III_L_rX.png       III the view from 001, L the light (0 to 6, or max), X 5000, or 7000 from view 50
     Calibration/cal18/pos_III.txt           the 3 x 4 matrix P = K [R | -R c] of view III, px and mm, for all scans

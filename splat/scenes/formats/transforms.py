@@ -16,7 +16,9 @@ files, because the sparse-view protocols count them.  Frames of a single file ar
 """
 
 import json
+import re
 from collections.abc import Mapping
+from io import BytesIO
 from math import isfinite, pi, tan
 from pathlib import Path
 from typing import Any
@@ -168,7 +170,10 @@ def _focal(values: Mapping[str, Any], width: int, name: str, path: Path) -> floa
 def read_points(path: Path, names: tuple[str, ...]) -> Points:
     """Points of a PLY file: x y z, red green blue (0 to 255; grey where there are none), and `views` if it is there."""
     try:
-        vertex = PlyData.read(path)["vertex"]
+        promised = re.search(rb"^element vertex (\d+)", content := path.read_bytes(), re.M)
+        if promised and int(promised[1]) > len(content):  # memory for so many would be asked for
+            raise ValueError(f"it promises {int(promised[1])} points in {len(content)} bytes")
+        vertex = PlyData.read(BytesIO(content))["vertex"]
         present = {prop.name for prop in vertex.properties}
         xyz = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=1)
         rgb = np.full(xyz.shape, 0.5, dtype=np.float32)

@@ -29,7 +29,6 @@ from analysis.bench.speed.meters import HostMeter
 from analysis.bench.workloads import Workload
 from splat.backend.gpu.graphs import CudaGraphCache
 from splat.curvature.hessian import SceneHessian
-from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.synthetic import SyntheticSettings
 from tests.splat.held_scenes import two_views
@@ -105,7 +104,7 @@ def test_recorded_products_are_held_against_launched_ones(off, monkeypatch):
         result = call()
         return result, lambda: result.copy_(call() + off)
 
-    monkeypatch.setattr(SceneObjective, "recordable", lambda self, vectors: vectors == 8)
+    monkeypatch.setattr(SceneHessian, "recordable", lambda self, vectors: vectors == 8)
     monkeypatch.setattr(SceneHessian, "_recordings", CudaGraphCache(capture))
     alone, difference, ratio = recordings(toy(), HostMeter())
     assert alone.value is None and alone.reason == "not recorded here"
