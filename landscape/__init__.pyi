@@ -9,7 +9,6 @@ from .eigen.power import PowerSettings as PowerSettings
 from .eigen.power import power_ends as power_ends
 from .eigen.power import power_iteration as power_iteration
 from .errors import InputError as InputError
-from .operators.block_size import fastest_block as fastest_block
 from .operators.checks import DerivativeCheck as DerivativeCheck
 from .operators.checks import OperatorCheck as OperatorCheck
 from .operators.checks import check_gradient as check_gradient
@@ -58,7 +57,6 @@ from .spectrum.families import family as family
 from .spectrum.quantiles import absolute_quantile as absolute_quantile
 from .spectrum.quantiles import quantile as quantile
 from .spectrum.rules import SpectralDensity as SpectralDensity
-from .traces.control import PartlyKnown as PartlyKnown
 from .traces.diagonal import DiagonalEstimate as DiagonalEstimate
 from .traces.diagonal import GroupSums as GroupSums
 from .traces.diagonal import estimate_diagonal as estimate_diagonal

@@ -11,18 +11,13 @@ from typing import Annotated, NoReturn
 
 import tyro
 
+from analysis.bench.options import BenchOptions
+from analysis.commands.options import DemoOptions, SfmOptions
 from analysis.console.failures import report
-from analysis.console.options import (
-    BenchOptions,
-    CompareOptions,
-    DemoOptions,
-    ProbeOptions,
-    SfmOptions,
-    SliceOptions,
-    SweepOptions,
-    TrainOptions,
-    TrajectoryOptions,
-)
+from analysis.probe.options import ProbeOptions
+from analysis.runs.options import CompareOptions, SweepOptions, TrajectoryOptions
+from analysis.slice.options import SliceOptions
+from analysis.train.options import TrainOptions
 
 DEBUG = "--debug"
 Options = (

@@ -1,7 +1,7 @@
 """What a command says of an error, and its exit code.
 
     0    done
-    1    a self-check failed under --strict, a bound of bench was exceeded, or a cell of a sweep failed
+    1    a self-check failed under --strict, a bound of `bench stress` was exceeded, or a cell of a sweep failed
     2    bad input: one sentence that says what was expected, what came and what to do
     70   a fault of the program: its traceback, and how to report it
     71   memory ran out

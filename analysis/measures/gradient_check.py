@@ -20,10 +20,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from landscape import DerivativeCheck, DistributedOperator, ProjectedOperator, check_gradient
+from landscape import DerivativeCheck, ProjectedOperator, check_gradient
 from landscape.operators.checks import ROUND_OFFS
 from landscape.results import Progress
-from splat.curvature.hessian import SceneHessian, ViewSum
+from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import loss_against, view_loss
 from splat.model.gaussians import Gaussians
@@ -38,12 +38,12 @@ def check_against_gradient(
 ) -> DerivativeCheck:
     """The relative error of H v for one random v.
 
-    views: how many to take, from the first of this process; all by default.  Both sides are sums over them.  For some views,
-    P leaves out the quaternions' lengths alone: what is flat for all views together need not be flat for each.
+    views: how many to take, from the first of this process; all by default.  For some views, P leaves out the quaternions'
+    lengths alone: what is flat for all views together need not be flat for each.
     """
     objective = hessian.objective
     leave_out = hessian.project if views is None else partial(_without_lengths, objective.active)
-    operator = ProjectedOperator(DistributedOperator(ViewSum(objective, count=views), objective.ranks), leave_out)
+    operator = ProjectedOperator(SceneHessian(objective, keep_null=True, count=views), leave_out)
     double = objective.active.to(torch.float64)
     background, settings = objective.background.double(), objective.settings
     direction = operator.project(_direction(objective, generator)[:, None])[:, 0]
@@ -62,7 +62,7 @@ def check_against_gradient(
         done += 1
         if progress:
             progress(done, 2 * len(STEPS), "gradients in double precision")
-        return _without_lengths(double, objective.ranks.sum(total)[:, None])[:, 0]
+        return _without_lengths(double, objective.mean_over_views(total)[:, None])[:, 0]
 
     def order(theta: Float[Tensor, " p"]) -> Hashable:
         means = double.with_flat(theta).means.cpu()

@@ -17,10 +17,10 @@ import torch
 from rich.console import Console
 
 from analysis.console.drawing import Draw
-from analysis.console.options import ProbeOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.measurement import ProbeSettings, measure
+from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_data
 from analysis.probe.skips import estimator_skips, product_skips
 from analysis.probe.table import probe_table

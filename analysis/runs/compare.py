@@ -9,7 +9,6 @@ What must be the same for curvatures to be comparable at all is demanded: the lo
 must be kept in mind beside that is said: other starts, steps, budgets, checks that failed, numbers of Gaussians.
 """
 
-from landscape.errors import InputError
 import json
 import os
 from collections.abc import Callable, Sequence
@@ -18,15 +17,18 @@ from typing import Any
 
 from rich.console import Console
 
-from analysis.runs.compare_table import Run, compare_table, comparison, frame
 from analysis.console.drawing import draw
-from analysis.console.options import CompareOptions, DeviceName, ProbeOptions
+from analysis.console.options import DeviceName
 from analysis.console.overrides import leaves
+from analysis.probe.options import ProbeOptions
+from analysis.records.findings import of_budgets
 from analysis.records.quantities import quantity
 from analysis.records.records import FILE, read_record
 from analysis.records.report import pictures_in, template_environment
 from analysis.records.run_files import CHECKPOINT, METRICS, read_scores
-from analysis.records.findings import of_budgets
+from analysis.runs.compare_table import Run, compare_table, comparison, frame
+from analysis.runs.options import CompareOptions
+from landscape.errors import InputError
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
 PAGE, TABLE, INDEX, PROBE = "compare.html", "compare.csv", "compare.json", "probe"

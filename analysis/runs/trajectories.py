@@ -4,7 +4,6 @@ OUT/trajectories.csv    the rows of all runs, each with its "run": the run's fol
 OUT/trajectories.png    drawn by `figures/trajectory.py`, which also draws PDF
 """
 
-from landscape.errors import InputError
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,11 +17,11 @@ from rich.table import Table
 
 from analysis.console.drawing import draw
 from analysis.records.family_table import bracketed
-from analysis.console.options import TrajectoryOptions
-from analysis.records.quantities import measured, quantity
-from analysis.records.run_files import CHECKPOINT
 from analysis.records.findings import ATTRIBUTES, attribute_name
-from analysis.records.run_files import NO_TIME, RECORDS
+from analysis.records.quantities import measured, quantity
+from analysis.records.run_files import CHECKPOINT, NO_TIME, RECORDS
+from analysis.runs.options import TrajectoryOptions
+from landscape.errors import InputError
 
 TABLE, PICTURE = "trajectories.csv", "trajectories.png"
 VALUES = {

@@ -27,7 +27,6 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
-from analysis.console.options import SliceOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.command import scene_objective
@@ -47,6 +46,7 @@ from analysis.slice.directions import (
     find_directions,
     recorded_eigenvectors,
 )
+from analysis.slice.options import SliceOptions
 from analysis.slice.record import Found, slice_arrays, slice_data
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
 from landscape.errors import InputError

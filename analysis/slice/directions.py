@@ -22,8 +22,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from analysis.console.options import Along
 from analysis.records.records import read_record
+from analysis.slice.options import Along
 from landscape import (
     EigenSettings,
     curvature_reach,

@@ -33,10 +33,10 @@ from rich.text import Text
 from torch import Tensor
 
 from analysis.console.interruption import interruption
-from analysis.console.options import TrainOptions
 from analysis.console.overrides import assignments, leaves, overridden
 from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
+from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
 from landscape.errors import InputError

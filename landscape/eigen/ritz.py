@@ -29,7 +29,7 @@ class EigenSettings:
     rtol, atol: a pair is good enough when its residual |H v - lambda v| is max(rtol |lambda|, atol) or less.
     basis: vectors kept at a time, `block` more in work (the memory budget): at least largest + smallest + 3 block.
     block: vectors per application of the operator; more than one helps with multiple eigenvalues and where the operator is
-        cheaper per vector in blocks (`fastest_block` measures that).
+        cheaper per vector in blocks.
     noise: length of a random vector added to a given start of unit length, so that an end that the start misses is still
         found.  The shorter, the fewer products from a good start, and the likelier to take the neighbour of an end for it,
         where they are about rtol apart: with rtol = 1% and two lowest eigenvalues 1.5% apart in 40% of the runs at 1, in 85%

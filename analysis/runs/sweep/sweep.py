@@ -10,7 +10,6 @@ What is there already is not done again: the next start continues where the last
 number of threads, only the seconds do.
 """
 
-from landscape.errors import InputError
 import fcntl
 import os
 import shlex
@@ -29,14 +28,15 @@ from rich.console import Console
 
 from analysis.console.drawing import module_environment
 from analysis.console.interruption import interruption
-from analysis.console.options import SweepOptions
 from analysis.records.provenance import usable_cores
 from analysis.records.records import FILE, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS
+from analysis.runs.options import SweepOptions
 from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import PROBE, of_other_threads, summarize, tables, unfinished, write_results
 from analysis.train.command import planned, resumed
+from landscape.errors import InputError
 
 CELL_FAILED = 1
 LOCK = ".lock"

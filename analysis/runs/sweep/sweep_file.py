@@ -23,7 +23,6 @@ one run of `landscape train` in OUT/SCENE/METHOD/SEED; all of the first seed com
 that is stopped has compared like with like.
 """
 
-from landscape.errors import InputError
 import re
 import tomllib
 from collections.abc import Mapping
@@ -31,8 +30,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from analysis.console.options import ProbeOptions, TrainOptions
 from analysis.console.overrides import leaves, read_value
+from analysis.probe.options import ProbeOptions
+from analysis.train.options import TrainOptions
+from landscape.errors import InputError
 
 FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
