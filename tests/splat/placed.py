@@ -25,7 +25,13 @@ GPU, EITHER, HOST = "gpu", "either", "host"
 READS = {"_local_scalar_dense", "nonzero", "unique_dim", "_unique2", "masked_select", "equal"}
 INDEXED = {"index", "index_put", "index_put_"}
 ACROSS = {"copy_", "_to_copy", *INDEXED}
-KERNELS = ("raster.cuda_binning", "raster.cuda", "projection_cuda", "losses_cuda", "adam_cuda")
+KERNELS = (
+    "raster.cuda.binning",
+    "raster.cuda.raster",
+    "projection.cuda",
+    "losses.cuda.loss",
+    "training.optim.adam_cuda",
+)
 
 
 def waits_for_values(func: Any, args: Any) -> bool:

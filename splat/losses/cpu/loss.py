@@ -27,7 +27,7 @@ RINGS = 5 << 18  # bytes of the rows that a sweep keeps: with more of them, a ve
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 
-class ImageLoss:
+class CpuImageLoss:
     """A loss of images of one size: their planes, and what its kernels are told."""
 
     def __init__(self, shape: Sequence[int], settings: LossSettings, dtype: type | np.dtype):
@@ -43,16 +43,16 @@ class ImageLoss:
         """Uninitialised plane sets, (sets, 3, padded height, padded width)."""
         return aligned((sets, 3, self.shape[2], self.shape[3]), self.dtype)
 
-    def padded(self, image: Tensor | np.ndarray) -> np.ndarray:
+    def padded(self, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 H W"]:
         """Padded planes of an image, 0 outside it."""
         planes = self.planes(1)[0]
         planes[:] = 0
-        planes[:, : self.shape[0], : self.shape[1]] = image.detach().numpy() if isinstance(image, Tensor) else image
-        return planes
+        planes[:, : self.shape[0], : self.shape[1]] = image.detach().numpy()
+        return torch.from_numpy(planes)
 
-    def cropped(self, planes: np.ndarray) -> Tensor:
-        """The first three planes without their padding, as a tensor."""
-        return torch.from_numpy(np.ascontiguousarray(planes[:3, : self.shape[0], : self.shape[1]]))
+    def cropped(self, planes: Float[Tensor, "k H W"]) -> Float[Tensor, "3 h w"]:
+        """The first three planes without their padding."""
+        return planes[:3, : self.shape[0], : self.shape[1]].contiguous()
 
     def _pointwise(self) -> tuple:
         scalar = self.dtype.type
@@ -62,28 +62,25 @@ class ImageLoss:
     def _value(self, pixels: np.ndarray, distances: np.ndarray) -> float:
         return float(self.pixel * pixels.sum() + self.structural * distances.sum())
 
-    def consistency(self, x: np.ndarray, y: np.ndarray) -> tuple[Tensor, np.ndarray]:
-        """The loss between two padded images, and its gradients in both (2, 3, ...)."""
+    def consistency(
+        self, x: Float[Tensor, "3 H W"], y: Float[Tensor, "3 H W"]
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "2 3 H W"]]:
+        """The loss between two padded images, and its gradients in both."""
         gradients, (pixels, distances) = self.planes(2), np.zeros((2, 3 * self.shape[0]))
         over_range(
-            len(pixels), consistency_rows, self.shape, self.taps, x.reshape(-1), y.reshape(-1), *self._pointwise(),
-            *gradients.reshape(2, -1), pixels, distances,
+            len(pixels), consistency_rows, self.shape, self.taps, x.numpy().reshape(-1), y.numpy().reshape(-1),
+            *self._pointwise(), *gradients.reshape(2, -1), pixels, distances,
         )  # fmt: skip
-        return torch.tensor(self._value(pixels, distances), dtype=torch.from_numpy(gradients).dtype), gradients
+        return x.new_tensor(self._value(pixels, distances)), torch.from_numpy(gradients)
 
 
-class ViewLoss(ImageLoss):
+class CpuViewLoss(CpuImageLoss):
     """The loss of images against one target; what depends on the target alone is computed once."""
 
-    def __init__(self, target: Float[np.ndarray, "3 h w"], settings: LossSettings, dtype: type | np.dtype):
-        super().__init__(target.shape, settings, dtype)
-        self.target = self.padded(target)
+    def __init__(self, target: Float[Tensor, "3 h w"], settings: LossSettings, dtype: torch.dtype):
+        super().__init__(target.shape, settings, NUMPY[dtype])
+        self.target = self.padded(target).numpy()
         self._target_moments = self._moments_of_target() if settings.ssim_weight else np.empty(0, self.dtype)
-
-    @classmethod
-    def of(cls, target: Float[Tensor, "3 h w"], settings: LossSettings, dtype: torch.dtype) -> "ViewLoss":
-        """The loss against a tensor, for images of dtype."""
-        return cls(target.numpy(), settings, NUMPY[dtype])
 
     def _moments_of_target(self) -> np.ndarray:
         """mu and var."""
@@ -92,12 +89,12 @@ class ViewLoss(ImageLoss):
         over_range(3 * self.shape[0], moments_rows, self.shape, self.taps, *flat)
         return moments
 
-    def _against(self, image: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _against(self, image: Float[Tensor, "k H W"]) -> tuple[np.ndarray, ...]:
         """The image's three planes, the target's, and the latter's moments, flat."""
-        x = np.ascontiguousarray(image[:3], self.dtype)
+        x = np.ascontiguousarray(image[:3].numpy(), self.dtype)
         return x.reshape(-1), self.target.reshape(-1), self._target_moments.reshape(-1)
 
-    def value(self, image: np.ndarray) -> float:
+    def value(self, image: Float[Tensor, "k H W"]) -> float:
         """The loss at padded planes: two blurs instead of the gradient's four."""
         kind, eps, _, structural = self._pointwise()
         pixels, distances = np.zeros((2, 3 * self.shape[0]))
@@ -106,7 +103,7 @@ class ViewLoss(ImageLoss):
         )  # fmt: skip
         return self._value(pixels, distances)
 
-    def linearize(self, image: np.ndarray, second_order: bool = True) -> "LinearLoss":
+    def linearize(self, image: Float[Tensor, "k H W"], second_order: bool = True) -> "CpuLinearLoss":
         """Value, gradient and Hessian's products at padded planes (at least three), which must not change.
 
         second_order: what the products need is held, too.
@@ -120,13 +117,13 @@ class ViewLoss(ImageLoss):
             len(pixels), gradient_rows, self.shape, self.taps, *self._against(image), *self._pointwise(),
             gradient.reshape(-1), blurred, pixels, distances,
         )  # fmt: skip
-        return LinearLoss(self, self._value(pixels, distances), gradient, image, blurred)
+        return CpuLinearLoss(self, self._value(pixels, distances), torch.from_numpy(gradient), image, blurred)
 
 
-class LinearLoss:
+class CpuLinearLoss:
     """A loss held still at an image: value, gradient (4, padded planes; that of alpha is 0) and Hessian-vector products."""
 
-    def __init__(self, loss: ViewLoss, value: float, gradient: np.ndarray, image: np.ndarray, blurred: np.ndarray):
+    def __init__(self, loss: CpuViewLoss, value: float, gradient: Tensor, image: Tensor, blurred: np.ndarray):
         self.loss, self.value, self.gradient, self._image, self._blurred = loss, value, gradient, image, blurred
 
     def scalar(self, like: Tensor) -> Float[Tensor, ""]:
@@ -136,13 +133,13 @@ class LinearLoss:
     def _held(self) -> tuple:
         return *self.loss._against(self._image), self._blurred, *self.loss._pointwise()
 
-    def hvp(self, tangents: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """l'' v for K padded tangents (K, 4, ...), to out (which may be the tangents themselves)."""
-        loss, height = self.loss, self.loss.shape[0]
-        products = aligned((len(tangents), 4, *loss.shape[2:]), loss.dtype) if out is None else out
+    def hvp(self, tangents: Float[Tensor, "k 4 H W"], out: Tensor | None = None) -> Float[Tensor, "k 4 H W"]:
+        """l'' v for K padded tangents, to out (which may be the tangents themselves)."""
+        loss, height, vectors = self.loss, self.loss.shape[0], tangents.numpy()
+        products = aligned((len(vectors), 4, *loss.shape[2:]), loss.dtype) if out is None else out.numpy()
         found = loss.planes(min(self._together, len(tangents)))
         for first in range(0, len(tangents), self._together):
-            some, results = (each[first : first + self._together] for each in (tangents, products))
+            some, results = (each[first : first + self._together] for each in (vectors, products))
             V = np.ascontiguousarray(some, loss.dtype).reshape(-1)
             over_range(
                 3 * height, product_rows, loss.shape, loss.taps, V, *self._held(), found.reshape(len(found), -1)[: len(some)]
@@ -150,7 +147,7 @@ class LinearLoss:
             results[:, :3, :height] = found[: len(some), :, :height]
             results[:, :, height:] = 0
             results[:, 3] = 0
-        return products
+        return torch.from_numpy(products)
 
     @property
     def _together(self) -> int:
@@ -158,12 +155,12 @@ class LinearLoss:
         rows = PRODUCT_FIELDS * RING * self.loss.shape[3] * self.loss.dtype.itemsize
         return max(1, RINGS // rows)
 
-    def curvatures(self, tangents: np.ndarray) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-        """v . l'' v for K padded tangents (K, 3 or more, ...), and v . D v with the diagonal D of l''."""
+    def curvatures(self, tangents: Float[Tensor, "k p H W"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
+        """v . l'' v for K padded tangents (at least three planes each), and v . D v with the diagonal D of l''."""
         loss, sums = self.loss, np.empty((2, len(tangents), 3 * self.loss.shape[0]))
-        V = np.ascontiguousarray(tangents, loss.dtype).reshape(-1)
+        V = np.ascontiguousarray(tangents.numpy(), loss.dtype).reshape(-1)
         over_range(
-            sums.shape[2], form_rows, loss.shape, loss.taps, V, *self._held(), self.diagonal.reshape(-1), *sums
+            sums.shape[2], form_rows, loss.shape, loss.taps, V, *self._held(), self.diagonal.numpy().reshape(-1), *sums
         )  # fmt: skip
         full, pixelwise = torch.from_numpy(sums.sum(axis=2))
         return full, pixelwise
@@ -179,12 +176,12 @@ class LinearLoss:
         return min(vectors, self._together) * self.gradient[:3].nbytes
 
     @cached_property
-    def diagonal(self) -> np.ndarray:
-        """The pixel-diagonal of l'', padded planes (3, ...): that of SSIM is one blur with the squared window."""
+    def diagonal(self) -> Float[Tensor, "3 H W"]:
+        """The pixel-diagonal of l'': that of SSIM is one blur with the squared window."""
         loss = self.loss
         diagonal = loss.planes(1)[0]
         diagonal[:, loss.shape[0] :] = 0
         over_range(
             3 * loss.shape[0], diagonal_rows, loss.shape, loss.taps, loss.taps**2, *self._held(), diagonal.reshape(-1)
         )  # fmt: skip
-        return diagonal
+        return torch.from_numpy(diagonal)
