@@ -15,8 +15,8 @@ import triton.language as tl
 from splat.backend.gpu.compile import jit, sized
 from splat.backend.gpu.traced import digest, tangent_of, traced, variable
 from splat.projection.formulas import (
+    GEOMETRY,
     Lens,
-    add_symmetric,
     basis,
     colour_adjoint,
     direction_of,
@@ -86,9 +86,14 @@ def in_other_coordinates(way, splat, numbers):
 
 @traced
 def curved(packed, u, h):
-    """h + C u: `add_symmetric`."""
-    total = list(h)
-    add_symmetric(packed, u, total)
+    """h + C u, C symmetric with its lower triangle packed row by row."""
+    total, place = list(h), 0
+    for j in range(GEOMETRY):
+        for k in range(j):
+            total[j] = total[j] + packed[place + k] * u[k]
+            total[k] = total[k] + packed[place + k] * u[j]
+        total[j] = total[j] + packed[place + j] * u[j]
+        place += j + 1
     return total
 
 
