@@ -114,7 +114,7 @@ def pixel_slope(residual, kind, eps):
     if kind == L2:
         return residual * residual, 2.0 * residual
     length = sqrt(residual * residual + eps * eps)
-    return length, residual / length
+    return length, residual * (1.0 / length)
 
 
 @formula

@@ -24,7 +24,7 @@ CHUNK = 1 << 16  # Gaussians whose blocks are chained at a time
 
 
 def _run(kernel: Any, programs: tuple[int, ...], *arguments) -> None:
-    launch(kernel, programs, *arguments, kernels.FORMULAS)
+    launch(kernel, programs, *arguments)
 
 
 def _lens_numbers(lens: Lens, device: torch.device) -> Float64[Tensor, " 20"]:

@@ -1,8 +1,8 @@
 """Projection and SH on the GPU: kernels over blocks of Gaussians.
 
-The formulas are those of `projection_formulas.py` and `raster/whitening.py`, run by `traced.py`.  What is held per Gaussian in
-sight is as in `projection_linear.Held`, with the Gaussians along the last axis, so that neighbouring threads read neighbouring
-numbers.  A block of vectors (p, K) is laid out like the flat vector; `start_of` says where an attribute begins there.
+The formulas are those of `formulas.py` and `whitening.py` beside this file, compiled by `triton_formula`.  What is held per
+Gaussian in sight is as in `ProjectionJacobian`, with the Gaussians along the last axis, so that neighbouring threads read
+neighbouring numbers.  A block of vectors (p, K) is laid out like the flat vector; `start_of` says where an attribute begins.
 
 Values and the tangents of the linearisation are in double precision, products with vectors in that of the parameters.
 """
@@ -13,7 +13,7 @@ Values and the tangents of the linearisation are in double precision, products w
 import triton.language as tl
 
 from splat.backend.gpu.compile import jit, sized
-from splat.backend.gpu.traced import digest, tangent_of, traced, variable
+from splat.backend.gpu.formula import tangent_of, triton_formula, variable
 from splat.projection.formulas import (
     Lens,
     add_symmetric,
@@ -34,20 +34,20 @@ def lens_from(numbers):
     return Lens(numbers[:9], numbers[9:12], *numbers[12:])
 
 
-@traced
+@triton_formula
 def depth_of(lens, mean):
     camera = lens_from(lens)
     return to_camera(camera, offset_from(camera, mean))[2]
 
 
-@traced
+@triton_formula
 def splat_of(lens, mean, log_scales, quat):
     """Mean x, y and conic, and the sixteen harmonics at the view direction."""
     camera = lens_from(lens)
     return geometry(camera, mean, log_scales, quat), basis(direction_of(camera, mean)[0])
 
 
-@traced
+@triton_formula
 def adjoint_of(lens, mean, log_scales, quat, bar, weight, bands):
     """The adjoints of mean, log-scales and quaternion: of the five numbers in bar, and of weight . harmonics in the mean."""
     camera = lens_from(lens)
@@ -56,7 +56,7 @@ def adjoint_of(lens, mean, log_scales, quat, bar, weight, bands):
     return (m[0] + along[0], m[1] + along[1], m[2] + along[2], *s, *q)
 
 
-@traced
+@triton_formula
 def linearized_geometry(lens, mean, log_scales, quat, splat, bar, lane):
     """The whitened Jacobian (5 rows) and the Hessian of bar . geometry (10 rows), one direction at each place of `lane`."""
     camera = lens_from(lens)
@@ -68,7 +68,7 @@ def linearized_geometry(lens, mean, log_scales, quat, splat, bar, lane):
     return jacobian, [tangent_of(row) for row in (*m, *t, *r)]
 
 
-@traced
+@triton_formula
 def linearized_colour(lens, mean, weight, bands, lane):
     """The harmonics at the view direction, their slopes in the mean, and the Hessian of weight . harmonics (3 rows)."""
     camera = lens_from(lens)
@@ -78,25 +78,22 @@ def linearized_colour(lens, mean, weight, bands, lane):
     return basis(direction_of(camera, mean)[0]), slopes, along
 
 
-@traced
+@triton_formula
 def plain_tangent(splat, five):
     return plain(whitening(splat), five)
 
 
-@traced
+@triton_formula
 def whitened_bar(splat, five):
     return whitened_adjoint(whitening(splat), five)
 
 
-@traced
+@triton_formula
 def curved(packed, u, h):
     """h + C u: `add_symmetric`."""
     total = list(h)
     add_symmetric(packed, u, total)
     return total
-
-
-FORMULAS = digest()
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -153,7 +150,7 @@ def sigmoid(x):
 
 @sized("n")
 def project_splats(
-    flat, lens, splats, depths, drawn, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+    flat, lens, splats, depths, drawn, n, BANDS: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
     """Splats (n, 9), depths and drawn; a Gaussian behind the near plane gets zeros."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -206,7 +203,7 @@ def harmonic_weights(flat, colour_bar, i, n, BANDS: tl.constexpr, mask):
 
 @sized("n")
 def project_adjoint(
-    flat, lens, splats, drawn, bar, gradient, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+    flat, lens, splats, drawn, bar, gradient, n, BANDS: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
     """The gradient in the flat vector, given the adjoint of the splats, bar (n, 9)."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -242,7 +239,7 @@ def project_adjoint(
 
 @sized("n", "m")
 def linearize_geometry(
-    flat, lens, splats, bar, index, jacobian, curvature, n, m, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+    flat, lens, splats, bar, index, jacobian, curvature, n, m, BLOCK: tl.constexpr
 ):  # fmt: skip
     """What is held of the geometry of the Gaussians at index (m,), one direction a lane."""
     e, lane = places(BLOCK, 16)
@@ -261,7 +258,7 @@ def linearize_geometry(
 @sized("n", "m")
 def linearize_colour(
     flat, lens, splats, bar, index, curvature, harmonic, slope, colour_bar, visible, colour_slope, n, m,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """What is held of the colours, one direction a lane; what they add to the curvature is added."""
     e, lane = places(BLOCK, 16)
@@ -287,7 +284,7 @@ def linearize_colour(
 
 
 @sized("start", "count", "m")
-def plain_jacobian(splats, index, jacobian, out, start, count, m, BLOCK: tl.constexpr, FORMULAS: tl.constexpr):
+def plain_jacobian(splats, index, jacobian, out, start, count, m, BLOCK: tl.constexpr):
     """The geometry's Jacobian in plain coordinates: five rows of out (count, 9, 11), of the Gaussians at places from start."""
     e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = e < count
@@ -320,7 +317,7 @@ def tangents_at(block, i, k, K, n, here):
 @sized("n", "m", "K")
 def push_forward(
     block, splats, index, jacobian, harmonic, visible, colour_slope, out, n, m, K,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr, FORMULAS: tl.constexpr,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr,
 ):  # fmt: skip
     """P' u: rows of out (n, K, 9)."""
     e, k = places(BLOCK, VECTORS)
@@ -355,7 +352,7 @@ def push_forward(
 def pull_back(
     cotangents, block, splats, opacity_bar, index, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope,
     out, n, m, K, SECOND_ORDER: tl.constexpr,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr, FORMULAS: tl.constexpr,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr,
 ):  # fmt: skip
     """P'^T of cotangents (n, K, 9), plus (a . P'') u where SECOND_ORDER: rows of out (p, K)."""
     e, k = places(BLOCK, VECTORS)

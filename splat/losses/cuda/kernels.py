@@ -15,7 +15,7 @@ place along the grid's second axis.
 import triton.language as tl
 
 from splat.backend.gpu.compile import jit
-from splat.backend.gpu.traced import digest, traced
+from splat.backend.gpu.formula import triton_formula
 from splat.losses import formulas as losses_formulas
 from splat.losses.formulas import seconds_of, similarity, slopes_of
 from splat.losses.reference import WINDOW
@@ -25,27 +25,24 @@ REACH = tl.constexpr(WINDOW // 2)
 CENTRE = tl.constexpr(losses_formulas.CENTRE)
 SECONDS = tl.constexpr(losses_formulas.SECONDS)
 
-pixel_slope = traced(losses_formulas.pixel_slope)
-pixel_curvature = traced(losses_formulas.pixel_curvature)
-ssim_adjoint = traced(losses_formulas.ssim_adjoint)
-ssim_second_dot = traced(losses_formulas.ssim_second_dot)
-ssim_quadratic_form = traced(losses_formulas.ssim_quadratic_form)
-ssim_diag_hessian = traced(losses_formulas.ssim_diag_hessian)
-pair_slopes = traced(losses_formulas.pair_slopes)
+pixel_slope = triton_formula(losses_formulas.pixel_slope)
+pixel_curvature = triton_formula(losses_formulas.pixel_curvature)
+ssim_adjoint = triton_formula(losses_formulas.ssim_adjoint)
+ssim_second_dot = triton_formula(losses_formulas.ssim_second_dot)
+ssim_quadratic_form = triton_formula(losses_formulas.ssim_quadratic_form)
+ssim_diag_hessian = triton_formula(losses_formulas.ssim_diag_hessian)
+pair_slopes = triton_formula(losses_formulas.pair_slopes)
 
 
-@traced
+@triton_formula
 def slopes(m, p, q, mu, var):
     """1 - S, and S_m, S_p, S_q."""
     return slopes_of(similarity(m, p, q, mu, var))
 
 
-@traced
+@triton_formula
 def seconds(m, p, q, mu, var):
     return seconds_of(similarity(m, p, q, mu, var))
-
-
-FORMULAS = digest()
 
 
 # --- the window -------------------------------------------------------------------------------------------------------
@@ -168,7 +165,7 @@ def moments_down(along, out, constants, height, width, BLOCK: tl.constexpr):
 @jit
 def differentiate(
     fed, target_moments, out, second, distances, constants, height, width,
-    SLOPES: tl.constexpr, SECOND: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    SLOPES: tl.constexpr, SECOND: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums of 1 - S; with SLOPES also S_m, S_p, S_q, with SECOND the second derivatives of S."""
     at, _x, y, here = pixels(height, width, BLOCK)
@@ -192,7 +189,7 @@ def differentiate(
 @jit
 def finish_gradient(
     blurred, residual, target, gradient, blurred_sp, losses, constants, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums of the pixel loss; with SLOPES the gradient, and blur(S_p)."""
     at, _x, y, here = pixels(height, width, BLOCK)
@@ -230,7 +227,7 @@ def second_derivatives(second, at, size, here):
 
 
 @jit
-def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr, FORMULAS: tl.constexpr):
+def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr):
     """S_m', S_p', S_q' of every vector."""
     at, _x, y, here = pixels(height, width, BLOCK)
     size = 3 * height * width
@@ -244,7 +241,7 @@ def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr, FORMU
 @jit
 def finish_product(
     v, v_stride, blurred, residual, target, blurred_sp, out, out_stride, constants, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The Hessian of the loss times every vector; out may be v."""
     at, _x, y, here = pixels(height, width, BLOCK)
@@ -265,7 +262,7 @@ def finish_product(
 @jit
 def forms(
     v, v_stride, fed, second, residual, blurred_sp, diagonal, full, pixelwise, constants, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums of v . l'' v and of v . D v, D the diagonal of l'', of every vector: one a program."""
     at, _x, y, here = pixels(height, width, BLOCK)
@@ -284,7 +281,7 @@ def forms(
 @jit
 def finish_diagonal(
     along, residual, target, blurred_sp, out, constants, squared, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The diagonal of the loss's Hessian.  along: the second derivatives blurred along the rows by the window squared."""
     at, _x, y, here = pixels(height, width, BLOCK)
@@ -322,7 +319,7 @@ def feed_pair(x, y, out, constants, height, width, BLOCK: tl.constexpr):
 
 @jit
 def differentiate_pair(
-    fed, along, out, distances, constants, height, width, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+    fed, along, out, distances, constants, height, width, BLOCK: tl.constexpr
 ):  # fmt: skip
     """Sums of 1 - S, and its slopes: four fields."""
     at, _x, y, here = pixels(height, width, BLOCK)
@@ -339,7 +336,7 @@ def differentiate_pair(
 @jit
 def finish_pair(
     blurred, x, y, in_x, in_y, losses, constants, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums of the pixel loss, and the gradients of the loss in x and in y."""
     at, _column, row, here = pixels(height, width, BLOCK)

@@ -17,7 +17,6 @@ from splat.losses.reference import LossSettings, window
 
 KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
 BLOCK = 256
-FORMULAS = kernels.FORMULAS
 
 
 class CudaImageLoss:
@@ -80,12 +79,11 @@ class CudaImageLoss:
             fed, slopes = self.fields(2), self.fields(4)
             self.run(kernels.feed_pair, x, y, fed, self.constants)
             along = self.moments_along(x, y)
-            self.run(kernels.differentiate_pair, fed, along, slopes, sums[1], self.constants, FORMULAS=FORMULAS)
+            self.run(kernels.differentiate_pair, fed, along, slopes, sums[1], self.constants)
             slopes = self.blurred(slopes, self.constants)
         in_x, in_y = self.fields(), self.fields()
         self.run(
             kernels.finish_pair, slopes, x, y, in_x, in_y, sums[0], self.constants, KIND=self.kind, SSIM=self.ssim,
-            FORMULAS=FORMULAS,
         )  # fmt: skip
         return self.total(sums).to(self.like.dtype), (in_x, in_y)
 
@@ -110,7 +108,7 @@ class CudaViewLoss(CudaImageLoss):
             self.run(kernels.feed, residual, 0, residual, self.target, fed, self.constants)
             self.run(
                 kernels.differentiate, fed, self.moments, first, bends, sums[1], self.constants, SLOPES=slopes,
-                SECOND=second, FORMULAS=FORMULAS,
+                SECOND=second,
             )  # fmt: skip
         return residual, sums, first, bends
 
@@ -118,7 +116,7 @@ class CudaViewLoss(CudaImageLoss):
         """The sums of the pixel loss and, where there is a place for it, the gradient."""
         self.run(
             kernels.finish_gradient, blurred, residual, self.target, gradient, sp, sums[0], self.constants, KIND=self.kind,
-            SSIM=self.ssim, SLOPES=gradient.numel() > 0, FORMULAS=FORMULAS,
+            SSIM=self.ssim, SLOPES=gradient.numel() > 0,
         )  # fmt: skip
 
     def value(self, image: Tensor) -> float:
@@ -160,12 +158,12 @@ class CudaLinearLoss:
         tangents, blurred = tangents.contiguous(), loss.like
         if loss.ssim:
             fed, bends = self._fed(tangents), loss.fields(K, 3)
-            loss.run(kernels.curve, fed, self._second, bends, loss.constants, vectors=K, FORMULAS=FORMULAS)
+            loss.run(kernels.curve, fed, self._second, bends, loss.constants, vectors=K)
             blurred = loss.blurred(bends.flatten(0, 1), loss.constants)
         products = self.gradient.new_empty(K, *self.gradient.shape) if out is None else out
         loss.run(
             kernels.finish_product, tangents, tangents.stride(0), blurred, self._residual, loss.target, self._blurred,
-            products, products.stride(0), loss.constants, vectors=K, KIND=loss.kind, SSIM=loss.ssim, FORMULAS=FORMULAS,
+            products, products.stride(0), loss.constants, vectors=K, KIND=loss.kind, SSIM=loss.ssim,
         )  # fmt: skip
         products[:, 3] = 0
         return products
@@ -184,7 +182,7 @@ class CudaLinearLoss:
         fed, sums = self._fed(tangents) if loss.ssim else loss.like, loss.sums(K)
         loss.run(
             kernels.forms, tangents, tangents.stride(0), fed, self._second, self._residual, self._blurred, self.diagonal,
-            *sums, loss.constants, vectors=K, KIND=loss.kind, SSIM=loss.ssim, FORMULAS=FORMULAS,
+            *sums, loss.constants, vectors=K, KIND=loss.kind, SSIM=loss.ssim,
         )  # fmt: skip
         full, pixelwise = sums.sum(dim=2)
         return full, pixelwise
@@ -206,6 +204,6 @@ class CudaLinearLoss:
         along = loss.blurred(self._second, loss.squared) if loss.ssim else loss.like
         loss.run(
             kernels.finish_diagonal, along, self._residual, loss.target, self._blurred, diagonal, loss.constants,
-            loss.squared, KIND=loss.kind, SSIM=loss.ssim, FORMULAS=FORMULAS,
+            loss.squared, KIND=loss.kind, SSIM=loss.ssim,
         )  # fmt: skip
         return diagonal

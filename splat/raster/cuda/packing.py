@@ -13,7 +13,8 @@ whole number, exact in single precision, so the kernels need no double precision
 
 import triton.language as tl
 
-from splat.backend.gpu.compile import jit, sized, twin, twins
+from splat.backend.gpu.compile import jit, sized
+from splat.backend.gpu.formula import triton_formula
 from splat.projection import whitening
 from splat.raster import formulas
 from splat.raster.cuda.binning import load_splat
@@ -29,10 +30,9 @@ BACKGROUND = tl.constexpr(6)
 FRAME = 9
 HALF_LOG2_E = tl.constexpr(whitening.LOG2_E / 2)
 
-whiten = twin(whitening.whitening)
-exponent_tangent, first_order, second_order = twins(
-    formulas.exponent_tangent, formulas.first_order, formulas.second_order
-)
+whiten = triton_formula(whitening.whitening)
+exponent_tangent = triton_formula(formulas.exponent_tangent)
+first_order, second_order = triton_formula(formulas.first_order), triton_formula(formulas.second_order)
 
 
 @jit

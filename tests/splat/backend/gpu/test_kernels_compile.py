@@ -48,11 +48,7 @@ def kernels() -> list[tuple]:
         (adam._step, ("numbers",), {"BLOCK": 1024, "BETA1": 0.9, "BETA2": 0.999, "EPS": 1e-15, "GRID": 1e-28}),
         (peak.multiply_add, (), {"BLOCK": peak.BLOCK, "UNROLLED": peak.UNROLLED}),
     ]
-    return [(kernel, double, constants | _formulas(kernel)) for kernel, double, constants in found]
-
-
-def _formulas(kernel) -> dict[str, str]:
-    return {"FORMULAS": "x"} if "FORMULAS" in kernel.arg_names else {}
+    return found
 
 
 def test_every_kernel_of_projection_and_losses_compiles():
