@@ -17,12 +17,11 @@ from splat.backend.cpu.planes import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
 from splat.losses.cpu.consistency import consistency_rows
-from splat.losses.cpu.sweeps import PRODUCT_FIELDS, diagonal_rows, form_rows, gradient_rows, product_rows, value_rows
+from splat.losses.cpu.sweeps import PRODUCT_FIELDS, diagonal_rows, form_rows, gradient_rows, product_rows
 from splat.losses.cpu.window import RING, moments_rows
-from splat.losses.formulas import CHARBONNIER, L1, L2
+from splat.losses.formulas import KINDS
 from splat.losses.reference import LossSettings, window
 
-KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
 RINGS = 5 << 18  # bytes of the rows that a sweep keeps: with more of them, a vector more costs more than it shares
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
@@ -99,12 +98,7 @@ class ViewLoss(ImageLoss):
 
     def value(self, image: np.ndarray) -> float:
         """The loss at padded planes: two blurs instead of the gradient's four."""
-        kind, eps, _, structural = self._pointwise()
-        pixels, distances = np.zeros((2, 3 * self.shape[0]))
-        over_range(
-            len(pixels), value_rows, self.shape, self.taps, *self._against(image), kind, eps, structural, pixels, distances
-        )  # fmt: skip
-        return self._value(pixels, distances)
+        return self._sweep(image, None, np.empty(0, self.dtype))
 
     def linearize(self, image: np.ndarray, second_order: bool = True) -> "LinearLoss":
         """Value, gradient and Hessian's products at padded planes (at least three), which must not change.
@@ -115,12 +109,16 @@ class ViewLoss(ImageLoss):
         blurred = self.planes(1).reshape(-1) if second_order and self.structural else np.empty(0, self.dtype)
         gradient[:, self.shape[0] :] = 0
         gradient[3] = 0
+        return LinearLoss(self, self._sweep(image, gradient.reshape(-1), blurred), gradient, image, blurred)
+
+    def _sweep(self, image: np.ndarray, gradient: np.ndarray | None, blurred: np.ndarray) -> float:
+        """The loss; the gradient and blur(S_p) go to where there is a place for them."""
         pixels, distances = np.zeros((2, 3 * self.shape[0]))
         over_range(
             len(pixels), gradient_rows, self.shape, self.taps, *self._against(image), *self._pointwise(),
-            gradient.reshape(-1), blurred, pixels, distances,
+            gradient, blurred, pixels, distances,
         )  # fmt: skip
-        return LinearLoss(self, self._value(pixels, distances), gradient, image, blurred)
+        return self._value(pixels, distances)
 
 
 class LinearLoss:
