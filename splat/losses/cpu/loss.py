@@ -16,7 +16,6 @@ from torch import Tensor
 from splat.backend.cpu.planes import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
-from splat.losses.cpu.consistency import consistency_rows
 from splat.losses.cpu.sweeps import PRODUCT_FIELDS, diagonal_rows, form_rows, gradient_rows, product_rows
 from splat.losses.cpu.window import RING, moments_rows
 from splat.losses.formulas import KINDS
@@ -58,17 +57,20 @@ class ImageLoss:
         eps, pixel, structural = scalar(self.settings.eps), scalar(self.pixel), scalar(self.structural)
         return KINDS[self.settings.pixel], eps, pixel, structural
 
-    def _value(self, pixels: np.ndarray, distances: np.ndarray) -> float:
+    def _sweep(self, *images: np.ndarray | None) -> float:
+        """The loss by `gradient_rows`.  images: x, y and target, and where the two results go."""
+        pixels, distances = np.zeros((2, 3 * self.shape[0]))
+        inputs, results = images[:3], images[3:]
+        over_range(
+            len(pixels), gradient_rows, self.shape, self.taps, *inputs, *self._pointwise(), *results, pixels, distances
+        )
         return float(self.pixel * pixels.sum() + self.structural * distances.sum())
 
     def consistency(self, x: np.ndarray, y: np.ndarray) -> tuple[Tensor, np.ndarray]:
         """The loss between two padded images, and its gradients in both (2, 3, ...)."""
-        gradients, (pixels, distances) = self.planes(2), np.zeros((2, 3 * self.shape[0]))
-        over_range(
-            len(pixels), consistency_rows, self.shape, self.taps, x.reshape(-1), y.reshape(-1), *self._pointwise(),
-            *gradients.reshape(2, -1), pixels, distances,
-        )  # fmt: skip
-        return torch.tensor(self._value(pixels, distances), dtype=torch.from_numpy(gradients).dtype), gradients
+        gradients = self.planes(2)
+        value = self._sweep(x.reshape(-1), y.reshape(-1), None, *gradients.reshape(2, -1))
+        return torch.tensor(value, dtype=torch.from_numpy(gradients).dtype), gradients
 
 
 class ViewLoss(ImageLoss):
@@ -98,7 +100,7 @@ class ViewLoss(ImageLoss):
 
     def value(self, image: np.ndarray) -> float:
         """The loss at padded planes: two blurs instead of the gradient's four."""
-        return self._sweep(image, None, np.empty(0, self.dtype))
+        return self._sweep(*self._against(image), None, np.empty(0, self.dtype))
 
     def linearize(self, image: np.ndarray, second_order: bool = True) -> "LinearLoss":
         """Value, gradient and Hessian's products at padded planes (at least three), which must not change.
@@ -109,16 +111,8 @@ class ViewLoss(ImageLoss):
         blurred = self.planes(1).reshape(-1) if second_order and self.structural else np.empty(0, self.dtype)
         gradient[:, self.shape[0] :] = 0
         gradient[3] = 0
-        return LinearLoss(self, self._sweep(image, gradient.reshape(-1), blurred), gradient, image, blurred)
-
-    def _sweep(self, image: np.ndarray, gradient: np.ndarray | None, blurred: np.ndarray) -> float:
-        """The loss; the gradient and blur(S_p) go to where there is a place for them."""
-        pixels, distances = np.zeros((2, 3 * self.shape[0]))
-        over_range(
-            len(pixels), gradient_rows, self.shape, self.taps, *self._against(image), *self._pointwise(),
-            gradient, blurred, pixels, distances,
-        )  # fmt: skip
-        return self._value(pixels, distances)
+        value = self._sweep(*self._against(image), gradient.reshape(-1), blurred)
+        return LinearLoss(self, value, gradient, image, blurred)
 
 
 class LinearLoss:

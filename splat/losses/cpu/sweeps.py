@@ -1,4 +1,4 @@
-"""The sweeps of a loss against a target: value, gradient, Hessian-vector product, quadratic form and diagonal.
+"""The sweeps of the losses: value, gradient, Hessian-vector product, quadratic form and diagonal.
 
 A sweep is one pass down the rows with up to three stages, each REACH rows behind the one before:
 
@@ -8,10 +8,11 @@ A sweep is one pass down the rows with up to three stages, each REACH rows behin
 
 So the only arrays of the size of the image that a sweep writes are its results.  Products need blur(S_p), which the gradient's
 sweep leaves, and the two images; S's second derivatives are worked out again, once for all vectors of a sweep.  A quadratic
-form has no third stage, as the window is its own adjoint.
+form has no third stage, as the window is its own adjoint.  Two images that both depend on the parameters (a pair) take four
+blurs in and four out, where a loss against each as the other's target takes sixteen.
 
-The kernels' arguments: x, y image and target; target: mu and var (2 plane sets); kind, eps, pixel, structural: pixel loss, its
-parameter, and the weights of pixel loss and 1 - S over the number of values; without structural there is no SSIM.
+The kernels' arguments: x, y image and target, or a pair; target: mu and var of y (2 plane sets); kind, eps, pixel, structural:
+pixel loss, its parameter, and the weights of pixel loss and 1 - S over the number of values; if structural is 0, no SSIM.
 """
 
 from splat.backend.cpu.jit import formula, kernel
@@ -20,10 +21,13 @@ from splat.losses.cpu.window import (
     BORDER,
     REACH,
     blur_along,
+    blur_down,
     blur_down_three,
     bordered_rows,
     channel_part,
     clear,
+    moments_along,
+    moments_down,
     put,
     ring_buffer,
     row_sum,
@@ -31,6 +35,8 @@ from splat.losses.cpu.window import (
 from splat.losses.formulas import (
     CENTRE,
     SECONDS,
+    pair_adjoint,
+    pair_slopes,
     pixel_curvature,
     pixel_slope,
     ssim_adjoint,
@@ -42,6 +48,7 @@ from splat.losses.formulas import (
 )
 
 PRODUCT_FIELDS = 6  # rings of rows that a sweep of products keeps for a vector
+PAIR_FIELDS = 4  # m, p, M, V; after differentiation what is blurred for the gradients in r (2) and in a (2)
 
 
 @formula
@@ -124,14 +131,70 @@ def finish_gradient(x, y, at, row, shape, taps, slopes, kind, eps, pixel, struct
     return row_sum(values, width)
 
 
+@formula
+def feed_pair(x, y, top, row, shape, taps, rows, ring):
+    """Stage one of a pair: r, r^2 and the moments of a."""
+    height, width, _plane_rows, stride = shape
+    if row < 0 or row >= height:
+        clear(ring, 0, PAIR_FIELDS, row, stride)
+        return
+    at = top + row * stride
+    for i in range(0, stride, lanes(x)):
+        one, other = load(x, at + i), load(y, at + i)
+        r = one - other
+        put(rows, i, stride, (r, r * r, 0.5 * (one + other)))
+    blur_along(rows, 2, width, stride, taps, ring, 0, row)
+    moments_along(rows, 2, width, stride, taps, ring, 2, row)
+
+
+@formula
+def differentiate_pair(ring, row, shape, taps, rows, values, slopes):
+    """Stage two of a pair: the fields of `pair_slopes`, blurred along the row; the sum of 1 - S."""
+    height, width, _plane_rows, stride = shape
+    if row < 0 or row >= height:
+        clear(slopes, 0, PAIR_FIELDS, row, stride)
+        return 0.0
+    for i in range(0, stride, lanes(ring)):
+        m, p = blur_down(ring, 0, row, i, stride, taps), blur_down(ring, 1, row, i, stride, taps)
+        mean, variance = moments_down(ring, 2, row, i, stride, taps)
+        distance, in_m, in_p, in_mean, in_variance = pair_slopes(m, p, mean, variance)
+        store(values, BORDER + i, distance)
+        put(rows, i, stride, (in_m, in_p, in_mean, in_variance))
+    blur_along(rows, PAIR_FIELDS, width, stride, taps, slopes, 0, row)
+    return row_sum(values, width)
+
+
+@formula
+def finish_pair(x, y, at, row, shape, taps, slopes, kind, eps, pixel, structural, in_x, in_y, values):
+    """Stage three of a pair, if any; the sum of the pixel loss over the row at `at`."""
+    _height, width, _plane_rows, stride = shape
+    for i in range(0, stride, lanes(x)):
+        one, other = load(x, at + i), load(y, at + i)
+        value, slope = pixel_slope(one - other, kind, eps)
+        store(values, BORDER + i, value)
+        if in_x is not None:
+            one_bar, other_bar = slope * pixel, -(slope * pixel)
+            if structural != 0:
+                bm, bp, ba = blur_down_three(slopes, 0, row, i, stride, taps)
+                bv = blur_down(slopes, 3, row, i, stride, taps)
+                one_bar, other_bar = pair_adjoint(one, other, slope * pixel, structural, bm, bp, ba, bv)
+            store(in_x, at + i, one_bar)
+            store(in_y, at + i, other_bar)
+    return row_sum(values, width)
+
+
 @kernel
 def gradient_rows(
-    start, stop, shape, taps, x, y, target, kind, eps, pixel, structural, gradient, blurred_sp, pixels, distances
+    start, stop, shape, taps, x, y, target, kind, eps, pixel, structural, gradient, other, pixels, distances
 ):  # fmt: skip
-    """The gradient, unless None; sums over each row of the pixel loss and of 1 - S; blur(S_p), unless its array is empty."""
+    """The gradient in x, unless None, of a loss against a target; or, where target is None, the gradients in both of a pair.
+
+    other: where the gradient in y goes or, against a target, blur(S_p), unless empty.  pixels, distances: sums over each row
+    of the pixel loss and of 1 - S.
+    """
     height, _width, plane_rows, stride = shape
-    rows, values, own = bordered_rows(x, 3, stride), bordered_rows(x, 1, stride), ring_buffer(x, 3, stride)
-    slopes = ring_buffer(x, 3, stride)
+    rows, values = bordered_rows(x, PAIR_FIELDS, stride), bordered_rows(x, 1, stride)
+    ring, slopes = ring_buffer(x, PAIR_FIELDS, stride), ring_buffer(x, PAIR_FIELDS, stride)
     reach = 0 if gradient is None else REACH  # rows beyond the range that are differentiated
     lead = reach + REACH if structural != 0 else 0
     for channel in range(3):
@@ -141,31 +204,31 @@ def gradient_rows(
         top = channel * plane_rows * stride
         for ahead in range(first - lead, last + lead):
             if structural != 0:
-                feed(None, 0, x, y, top, ahead, shape, taps, rows, own, 0)
+                if target is None:
+                    feed_pair(x, y, top, ahead, shape, taps, rows, ring)
+                else:
+                    feed(None, 0, x, y, top, ahead, shape, taps, rows, ring, 0)
                 row = ahead - REACH
                 if first - reach <= row < last + reach:
-                    distance = differentiate(own, row, top, shape, taps, target, rows, values, slopes, gradient)
+                    if target is None:
+                        distance = differentiate_pair(ring, row, shape, taps, rows, values, slopes)
+                    else:
+                        distance = differentiate(ring, row, top, shape, taps, target, rows, values, slopes, gradient)
                     if first <= row < last:
                         distances[channel * height + row] = distance
             row = ahead - lead
             if row < first:
                 continue
-            pixels[channel * height + row] = finish_gradient(
-                x,
-                y,
-                top + row * stride,
-                row,
-                shape,
-                taps,
-                slopes,
-                kind,
-                eps,
-                pixel,
-                structural,
-                gradient,
-                blurred_sp,
-                values,
-            )
+            at = top + row * stride
+            if target is None:
+                found = finish_pair(
+                    x, y, at, row, shape, taps, slopes, kind, eps, pixel, structural, gradient, other, values
+                )
+            else:
+                found = finish_gradient(
+                    x, y, at, row, shape, taps, slopes, kind, eps, pixel, structural, gradient, other, values
+                )
+            pixels[channel * height + row] = found
 
 
 @formula

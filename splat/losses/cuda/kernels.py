@@ -200,19 +200,12 @@ def finish_gradient(
 
 
 @jit
-def changes(fed, at, y, height, width, constants, here):
-    """m', p' and q' of a vector."""
-    dm, dp, dq = windowed_down(fed, at, y, height, width, constants, here, 3)
-    return dm, 2.0 * dp, dq
-
-
-@jit
 def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr):
     """S_m', S_p', S_q' of every vector."""
     at, _x, y, here, size = pixels(height, width, BLOCK)
     first = tl.program_id(1).to(tl.int64) * 3 * size
-    dm, dp, dq = changes(fed + first, at, y, height, width, constants, here)
-    found = ssim_second_dot(load_all(second, at, size, here, SECONDS), dm, dp, dq)
+    dm, dp, dq = windowed_down(fed + first, at, y, height, width, constants, here, 3)
+    found = ssim_second_dot(load_all(second, at, size, here, SECONDS), dm, 2.0 * dp, dq)
     store_all(out + first, at, size, found, here, 3)
 
 
@@ -246,9 +239,9 @@ def forms(
     squared = tangent * tangent
     total = pixel_curvature(r, KIND, tl.load(constants + EPS), tl.load(constants + PIXEL)) * squared
     if SSIM:
-        dm, dp, dq = changes(fed + vector * 3 * size, at, y, height, width, constants, here)
+        dm, dp, dq = windowed_down(fed + vector * 3 * size, at, y, height, width, constants, here, 3)
         bends, bp = load_all(second, at, size, here, SECONDS), tl.load(blurred_sp + at, here, other=0.0)
-        total -= tl.load(constants + STRUCTURAL) * ssim_quadratic_form(bends, dm, dp, dq, squared, bp)
+        total -= tl.load(constants + STRUCTURAL) * ssim_quadratic_form(bends, dm, 2.0 * dp, dq, squared, bp)
     partial_sum(total, here, full + vector * tl.num_programs(0))
     partial_sum(tl.load(diagonal + at, here, other=0.0) * squared, here, pixelwise + vector * tl.num_programs(0))
 

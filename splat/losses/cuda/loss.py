@@ -104,40 +104,29 @@ class CudaViewLoss(CudaImageLoss):
             along, self.moments = self.moments_along(self.target), self.fields(2)
             self.run(kernels.moments_down, along, self.moments, self.constants)
 
-    def _start(self, image: Tensor, slopes: bool, second: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The residual, sums with those of 1 - S, and, empty unless asked for, S_m, S_p, S_q and the second derivatives."""
+    def _evaluate(self, image: Tensor, slopes: bool, second: bool) -> tuple[Tensor, ...]:
+        """The loss, the gradient, the residual, S's second derivatives and blur(S_p); empty what is not asked for."""
         residual, sums = image[:3] - self.target, self.sums()
-        first = self.fields(3) if self.ssim and slopes else self.like
-        bends = self.fields(SECONDS) if self.ssim and second else self.like
+        gradient = self.like.new_zeros(4, *self.shape) if slopes else self.like
+        first = bends = sp = self.like
         if self.ssim:
+            first, sp = (self.fields(3), self.fields()) if slopes else (first, sp)
+            bends = self.fields(SECONDS) if second else bends
             fed = self.fed(residual[None], residual, self.target, 3)
-            self.run(
-                kernels.differentiate, fed, self.moments, first, bends, sums[1], self.constants, SLOPES=slopes,
-                SECOND=second,
-            )  # fmt: skip
-        return residual, sums, first, bends
-
-    def _finish(self, residual: Tensor, sums: Tensor, blurred: Tensor, gradient: Tensor, sp: Tensor) -> None:
-        """Fill in the sums of the pixel loss and, unless it is empty, the gradient."""
-        self.run(
-            kernels.finish_gradient, blurred, residual, self.target, gradient, sp, sums[0], self.constants, **self.which,
-            SLOPES=gradient.numel() > 0,
-        )  # fmt: skip
+            outputs = first, bends, sums[1]
+            self.run(kernels.differentiate, fed, self.moments, *outputs, self.constants, SLOPES=slopes, SECOND=second)
+            first = self.blurred(first, self.constants) if slopes else first
+        inputs, outputs = (first, residual, self.target), (gradient, sp, sums[0])
+        self.run(kernels.finish_gradient, *inputs, *outputs, self.constants, **self.which, SLOPES=slopes)
+        return self.total(sums), gradient, residual, bends, sp
 
     def value(self, image: Tensor) -> float:
         """The loss at an image."""
-        residual, sums, first, _ = self._start(image, slopes=False, second=False)
-        self._finish(residual, sums, first, self.like, self.like)
-        return float(self.total(sums))
+        return float(self._evaluate(image, slopes=False, second=False)[0])
 
     def linearize(self, image: Tensor, second_order: bool = True) -> "CudaLinearLoss":
         """Value and gradient at an image (at least three planes), and what the Hessian's product needs if second_order."""
-        residual, sums, first, second = self._start(image, slopes=True, second=second_order)
-        gradient = self.like.new_zeros(4, *self.shape)
-        sp = self.fields() if self.ssim else self.like
-        blurred = self.blurred(first, self.constants) if self.ssim else self.like
-        self._finish(residual, sums, blurred, gradient, sp)
-        return CudaLinearLoss(self, self.total(sums), gradient, residual, second, sp)
+        return CudaLinearLoss(self, *self._evaluate(image, slopes=True, second=second_order))
 
 
 class CudaLinearLoss:
