@@ -5,7 +5,7 @@ Planes are padded as in `raster/cpu.py`; only the first three are read, and the 
 `losses_formulas.py` and `consistency_kernels.py`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -16,8 +16,8 @@ from torch import Tensor
 from splat.backend.cpu.planes import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
-from splat.losses.cpu.sweeps import PRODUCT_FIELDS, diagonal_rows, form_rows, gradient_rows, product_rows
-from splat.losses.cpu.window import RING, moments_rows
+from splat.losses.cpu.sweeps import PRODUCT_FIELDS, Loss, diagonal_rows, gradient_rows, product_rows
+from splat.losses.cpu.window import RING, Frame, moments_rows
 from splat.losses.formulas import KINDS
 from splat.losses.reference import LossSettings, window
 
@@ -32,38 +32,34 @@ class ImageLoss:
         _, height, width = shape
         stride = -(-width // lanes_of(dtype)) * lanes_of(dtype)
         plane_rows = -(-height // TILE_ROWS) * TILE_ROWS
-        self.shape, self.settings, self.dtype = (height, width, plane_rows, stride), settings, np.dtype(dtype)
-        self.taps = window(torch.float64).numpy().astype(self.dtype)
-        count = 3 * height * width
+        self.dtype = np.dtype(dtype)
+        self.frame = Frame(height, width, plane_rows, stride, window(torch.float64).numpy().astype(dtype))
+        count, scalar = 3 * height * width, self.dtype.type
         self.pixel, self.structural = settings.pixel_weight / count, settings.ssim_weight / count
+        numbers = map(scalar, (settings.eps, self.pixel, self.structural))
+        self.loss = Loss(KINDS[settings.pixel], *numbers)
 
     def planes(self, sets: int) -> np.ndarray:
         """Uninitialised plane sets, (sets, 3, padded height, padded width)."""
-        return aligned((sets, 3, self.shape[2], self.shape[3]), self.dtype)
+        return aligned((sets, 3, self.frame.plane_rows, self.frame.stride), self.dtype)
 
     def padded(self, image: Tensor | np.ndarray) -> np.ndarray:
         """Padded planes of an image, 0 outside it."""
         planes = self.planes(1)[0]
         planes[:] = 0
-        planes[:, : self.shape[0], : self.shape[1]] = image.detach().numpy() if isinstance(image, Tensor) else image
+        planes[:, : self.frame.height, : self.frame.width] = (
+            image.detach().numpy() if isinstance(image, Tensor) else image
+        )
         return planes
 
     def cropped(self, planes: np.ndarray) -> Tensor:
         """The first three planes without their padding, as a tensor."""
-        return torch.from_numpy(np.ascontiguousarray(planes[:3, : self.shape[0], : self.shape[1]]))
-
-    def _pointwise(self) -> tuple:
-        scalar = self.dtype.type
-        eps, pixel, structural = scalar(self.settings.eps), scalar(self.pixel), scalar(self.structural)
-        return KINDS[self.settings.pixel], eps, pixel, structural
+        return torch.from_numpy(np.ascontiguousarray(planes[:3, : self.frame.height, : self.frame.width]))
 
     def _sweep(self, *images: np.ndarray | None) -> float:
         """The loss by `gradient_rows`.  images: x, y and target, and where the two results go."""
-        pixels, distances = np.zeros((2, 3 * self.shape[0]))
-        inputs, results = images[:3], images[3:]
-        over_range(
-            len(pixels), gradient_rows, self.shape, self.taps, *inputs, *self._pointwise(), *results, pixels, distances
-        )
+        pixels, distances = np.zeros((2, 3 * self.frame.height))
+        over_range(len(pixels), gradient_rows, self.frame, self.loss, *images, pixels, distances)
         return float(self.pixel * pixels.sum() + self.structural * distances.sum())
 
     def consistency(self, x: np.ndarray, y: np.ndarray) -> tuple[Tensor, np.ndarray]:
@@ -90,7 +86,7 @@ class ViewLoss(ImageLoss):
         """mu and var."""
         moments = self.planes(2)
         flat = self.target.reshape(-1), moments.reshape(-1)
-        over_range(3 * self.shape[0], moments_rows, self.shape, self.taps, *flat)
+        over_range(3 * self.frame.height, moments_rows, self.frame, *flat)
         return moments
 
     def _against(self, image: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -107,9 +103,9 @@ class ViewLoss(ImageLoss):
 
         second_order: what the products need is held, too.
         """
-        gradient = aligned((4, *self.shape[2:]), self.dtype)
+        gradient = aligned((4, self.frame.plane_rows, self.frame.stride), self.dtype)
         blurred = self.planes(1).reshape(-1) if second_order and self.structural else np.empty(0, self.dtype)
-        gradient[:, self.shape[0] :] = 0
+        gradient[:, self.frame.height :] = 0
         gradient[3] = 0
         value = self._sweep(*self._against(image), gradient.reshape(-1), blurred)
         return LinearLoss(self, value, gradient, image, blurred)
@@ -125,20 +121,14 @@ class LinearLoss:
         """The value as a tensor like another."""
         return like.new_tensor(self.value)
 
-    def _held(self) -> tuple:
-        return *self.loss._against(self._image), self._blurred, *self.loss._pointwise()
-
     def hvp(self, tangents: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """l'' v for K padded tangents (K, 4, ...), to out (which may be the tangents themselves)."""
-        loss, height = self.loss, self.loss.shape[0]
-        products = aligned((len(tangents), 4, *loss.shape[2:]), loss.dtype) if out is None else out
+        loss, height = self.loss, self.loss.frame.height
+        products = aligned((len(tangents), *self.gradient.shape), loss.dtype) if out is None else out
         found = loss.planes(min(self._together, len(tangents)))
         for first in range(0, len(tangents), self._together):
             some, results = (each[first : first + self._together] for each in (tangents, products))
-            V = np.ascontiguousarray(some, loss.dtype).reshape(-1)
-            over_range(
-                3 * height, product_rows, loss.shape, loss.taps, V, *self._held(), found.reshape(len(found), -1)[: len(some)]
-            )  # fmt: skip
+            self._products(some, found.reshape(len(found), -1)[: len(some)], None, None)
             results[:, :3, :height] = found[: len(some), :, :height]
             results[:, :, height:] = 0
             results[:, 3] = 0
@@ -147,18 +137,25 @@ class LinearLoss:
     @property
     def _together(self) -> int:
         """Vectors in a sweep."""
-        rows = PRODUCT_FIELDS * RING * self.loss.shape[3] * self.loss.dtype.itemsize
+        rows = PRODUCT_FIELDS * RING * self.loss.frame.stride * self.loss.dtype.itemsize
         return max(1, RINGS // rows)
 
     def curvatures(self, tangents: np.ndarray) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
         """v . l'' v for K padded tangents (K, 3 or more, ...), and v . D v with the diagonal D of l''."""
-        loss, sums = self.loss, np.empty((2, len(tangents), 3 * self.loss.shape[0]))
-        V = np.ascontiguousarray(tangents, loss.dtype).reshape(-1)
-        over_range(
-            sums.shape[2], form_rows, loss.shape, loss.taps, V, *self._held(), self.diagonal.reshape(-1), *sums
-        )  # fmt: skip
-        full, pixelwise = torch.from_numpy(sums.sum(axis=2))
+        forms = np.empty((2, len(tangents), 3 * self.loss.frame.height))
+        self._products(tangents, None, self.diagonal.reshape(-1), forms)
+        full, pixelwise = torch.from_numpy(forms.sum(axis=2))
         return full, pixelwise
+
+    def _products(self, tangents: np.ndarray, *results: np.ndarray | None) -> None:
+        """`product_rows`.  results: products, diagonal and forms."""
+        V = np.ascontiguousarray(tangents, self.loss.dtype).reshape(len(tangents), -1)
+        self._sweep(product_rows, V, *results)
+
+    def _sweep(self, kernel: Callable, *arguments: np.ndarray | tuple | None) -> None:
+        loss = self.loss
+        kept = *loss._against(self._image), self._blurred
+        over_range(3 * loss.frame.height, kernel, loss.frame, loss.loss, *kept, *arguments)
 
     @property
     def bytes(self) -> int:
@@ -173,10 +170,7 @@ class LinearLoss:
     @cached_property
     def diagonal(self) -> np.ndarray:
         """The pixel-diagonal of l'', padded planes (3, ...): that of SSIM is one blur with the squared window."""
-        loss = self.loss
-        diagonal = loss.planes(1)[0]
-        diagonal[:, loss.shape[0] :] = 0
-        over_range(
-            3 * loss.shape[0], diagonal_rows, loss.shape, loss.taps, loss.taps**2, *self._held(), diagonal.reshape(-1)
-        )  # fmt: skip
+        frame, diagonal = self.loss.frame, self.loss.planes(1)[0]
+        diagonal[:, frame.height :] = 0
+        self._sweep(diagonal_rows, frame._replace(taps=frame.taps**2), diagonal.reshape(-1))
         return diagonal
