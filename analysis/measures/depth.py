@@ -28,6 +28,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.probes import draw_probes
 from landscape.results import Bracket, Progress
 from landscape.traces.estimate import TraceEstimate
@@ -78,14 +79,14 @@ class DepthSplit:
 class DepthRises:
     """Rises of the loss by steps along and across the rays (columns: KINDS), rows by length.
 
-    steps: px.  errors: standard errors of the means over draws.  crossed: in which share of the renders the order of the splats
-    or the set of visible ones was another.
+    steps: px.  errors: standard errors of the means over draws.  discontinuous: the share of renders in which the order of the
+    splats, or the set of visible ones, differs from that at the start.
     """
 
     steps: tuple[float, ...]
     values: Float64[Tensor, "s 2"]
     errors: Float64[Tensor, "s 2"]
-    crossed: Float64[Tensor, "s 2"]
+    discontinuous: Float64[Tensor, "s 2"]
 
     @property
     def ratios(self) -> tuple[Float64[Tensor, " s"], Float64[Tensor, " s"]]:
@@ -108,13 +109,13 @@ def depth_split(
         components.append(along_and_across(view.gradient[objective.blocks["means"]].view(-1, 3), ray))
         for part, gauss_newton in enumerate(parts):
             own[:, part] += _split_traces(view.block_diagonal(gauss_newton=gauss_newton).geometry[:, :3, :3], ray).cpu()
-    pairs = objective.stacked(torch.stack(components, dim=1)).flatten(0, 1)
+    pairs = objective.gather_rows(torch.stack(components, dim=1)).flatten(0, 1)
     dims = (len(objective.active), LATERAL_DIRECTIONS * len(objective.active))
     traces = [
         SampledTrace(
             kind, dim, known, pixelwise[0] if pixelwise else None, settings, settings.min_probes, settings.max_probes
         )
-        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean(own).tolist(), strict=True)
+        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean_over_views(own).tolist(), strict=True)
     ]
     found = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
     return DepthSplit(pairs[pairs.any(dim=1)], **found)
@@ -129,9 +130,9 @@ def depth_rises(
 ) -> DepthRises:
     """What steps along and across the rays do to the loss.  steps: px; draws: of all directions and signs, 2 or more."""
     if draws < 2:
-        raise ValueError(f"expected at least 2 draws, got {draws}")
+        raise InputError(f"expected at least 2 draws, got {draws}")
     seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
-    rises, crossed = torch.zeros(2, len(steps), len(KINDS), draws, dtype=torch.float64)
+    rises, discontinuous = torch.zeros(2, len(steps), len(KINDS), draws, dtype=torch.float64)
     for index, number in enumerate(objective.view_numbers):
         center, piece = objective.evaluate_view(index, objective.active)
         for draw, seed in enumerate(seeds):
@@ -140,13 +141,13 @@ def depth_rises(
                 for kind, direction in enumerate(directions):
                     ends = [_moved(objective, index, sign * step * direction) for sign in (1, -1)]
                     rises[s, kind, draw] += sum(loss for loss, _ in ends) / 2 - center
-                    crossed[s, kind, draw] += sum(order != piece for _, order in ends) / 2
+                    discontinuous[s, kind, draw] += sum(order != piece for _, order in ends) / 2
             if progress:
                 progress(
                     index * draws + draw + 1, len(objective.views) * draws, "finite steps along and across the rays"
                 )
-    rises, crossed = objective.mean(rises), objective.mean(crossed)
-    return DepthRises(tuple(steps), rises.mean(dim=2), rises.std(dim=2) / draws**0.5, crossed.mean(dim=2))
+    rises, discontinuous = objective.mean_over_views(rises), objective.mean_over_views(discontinuous)
+    return DepthRises(tuple(steps), rises.mean(dim=2), rises.std(dim=2) / draws**0.5, discontinuous.mean(dim=2))
 
 
 def rays_of(objective: SceneObjective, index: int) -> Float[Tensor, "n 3"]:

@@ -31,6 +31,7 @@ from analysis.measures.split_control import SplitControl, split_control
 from analysis.measures.units import Metric, optimiser_units, scene_size, scene_units
 from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
 from landscape.eigen.pairs import EigenEnds
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, finished
 from landscape.probes import split
 from landscape.results import Progress, finite_or_none
@@ -66,7 +67,7 @@ class FamilyOptions:
 
     def __post_init__(self) -> None:
         if not (self.seconds > 0 and self.memory > 0):
-            raise ValueError(
+            raise InputError(
                 f"expected seconds and memory above 0 for the families, got {self.seconds} and {self.memory}"
             )
 
@@ -163,7 +164,7 @@ def measure_families(
             control = split_control(
                 objective.active, [view.camera for view in objective.views], objective.background, objective.settings
             )
-            scenes["split"] = _with(objective, control, training)
+            scenes["split"] = _with(objective, control)
     clock = _Clock(options.seconds, {name: len(scene.active) for name, scene in scenes.items()})
     unit, scale = _metric(options.metric, objective, training)
     streams: dict[tuple[SceneName, str], torch.Generator] = {
@@ -183,10 +184,10 @@ def measure_families(
     return FamilyFindings(options.metric, unit, tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)))
 
 
-def _with(objective: SceneObjective, control: SplitControl, training: Training) -> SceneObjective:
+def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:
     """The same loss over the same views of the split Gaussians."""
-    loss = training.config.loss
-    return SceneObjective(control.gaussians, objective.views, loss, objective.background, objective.settings)
+    settings = objective.loss_settings, objective.background, objective.settings
+    return SceneObjective(control.gaussians, objective.views, *settings)
 
 
 class _Clock:
@@ -213,7 +214,7 @@ def _metric(
         return f"positions in units of the scene's size, {size:.4g} world units", lambda scene: scene_units(scene, size)
     rates, extent = training.config.rates, training.extent
     if not (optimiser_units(objective, rates, extent) > 0).all():
-        raise ValueError(f"expected learning rates above 0 for the optimiser's metric, got {rates}")
+        raise InputError(f"expected learning rates above 0 for the optimiser's metric, got {rates}")
     words = (
         f"steps of the training's first learning rates: position {rates.position * extent:.3g} (extent {extent:.4g}), "
         f"log scale {rates.log_scales:.3g}, rotation {rates.quats:.3g}, opacity {rates.opacity_logits:.3g}, "
@@ -234,7 +235,7 @@ def _of_operator(
 ) -> list[tuple[str, int, Family]]:
     """(block, dim, family) of the whole and of every attribute of one operator.  ends: of the whole, where known."""
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
-    spaces, found = active_spaces(hessian, scale), []
+    spaces, found = active_spaces(hessian.objective, hessian.projector, scale), []
     traces = _traces(hessian, scale, split(generator))
     each = _seconds_a_product(operator, options.family.batch, hessian.objective) if options.seconds < inf else 0.0
     names = [WHOLE, *hessian.blocks]
@@ -280,7 +281,7 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnd
     known = BlockEigenvectors(objective, own, pixelwise, None if name == WHOLE else name, scale)
     if hessian.gauss_newton or name == "means":
         return Lead(known.steepest(1, 0))
-    return Lead(known.leads())
+    return Lead(known.warm_start())
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: SceneObjective) -> float:

@@ -17,10 +17,10 @@ import torch
 from rich.console import Console
 
 from analysis.console.drawing import Draw
-from analysis.console.options import ProbeOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.measurement import ProbeSettings, measure
+from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_data
 from analysis.probe.skips import estimator_skips, product_skips
 from analysis.probe.table import probe_table
@@ -28,11 +28,11 @@ from analysis.records.family_table import family_table
 from analysis.records.findings import verdict
 from analysis.records.provenance import provenance, require_seed
 from analysis.records.records import FILE, PROBE, Record, record_folder, require_replaceable
-from landscape.operators.distributed import Ranks, torchrun_ranks
+from landscape.errors import InputError
+from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import split
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.device import device_named
-from splat.curvature.distributed import DistributedObjective
 from splat.curvature.objective import SceneObjective
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint, load_checkpoint
@@ -61,7 +61,7 @@ def _run(
     out = options.out or options.checkpoint.parent / "probe"
     settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
     if ranks is not None and family_options is not None:
-        raise ValueError(
+        raise InputError(
             "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
         )
     writes = ranks is None or ranks.rank == 0
@@ -75,10 +75,9 @@ def _run(
         objective = scene_objective(checkpoint, scene, ranks)
     console.print(_introduction(scene, checkpoint, objective), highlight=False)
     with stages:
-        loss = checkpoint.training.config.loss
         generator = torch.Generator(device).manual_seed(options.seed)
-        findings = measure(objective, loss, settings, generator, stages.stage)
-        data = probe_data(findings, objective, loss)
+        findings = measure(objective, settings, generator, stages.stage)
+        data = probe_data(findings, objective)
         with stages.stage("skips"):
             gaussians, made = checkpoint.training.gaussians, (findings.matvecs, findings.spared)
             skips = product_skips(objective, gaussians, *made, repetitions=settings.timings)
@@ -115,13 +114,9 @@ def scene_objective(
     checkpoint: Checkpoint, scene: Scene, ranks: Ranks | None = None, *, keep_unseen: bool = False
 ) -> SceneObjective:
     """The training's loss over its views, at the checkpoint; ranks: share them.  keep_unseen: see `SceneObjective`."""
-    training, names = checkpoint.training, checkpoint.scene.train
-    config, gaussians = training.config, training.gaussians
-    if ranks is None:
-        return config.objective(gaussians, scene.load(names), keep_unseen=keep_unseen)
-    background = config.background_colour(gaussians.flat.dtype)
-    views = scene.load(ranks.share(names, "training view"))
-    return DistributedObjective(gaussians, views, ranks, config.loss, background, config.render)
+    ranks = ranks or ALONE
+    training, views = checkpoint.training, scene.load(ranks.share(checkpoint.scene.train, "training view"))
+    return training.config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
 
 def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:
@@ -131,7 +126,7 @@ def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:
     seconds = settings.seconds if options.seconds is None else options.seconds
     if shared:
         if options.seconds is not None and isfinite(options.seconds):
-            raise ValueError(f"expected --seconds inf under torchrun, as without --seconds, got {options.seconds:g}")
+            raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {options.seconds:g}")
         seconds = inf
     return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=seconds)
 

@@ -50,7 +50,7 @@ def _rows(rises: DepthRises) -> list[dict[str, Any]]:
     for i, (pixels, ratio, error) in enumerate(zip(rises.steps, *(x.tolist() for x in rises.ratios), strict=True)):
         row = {"pixels": pixels, "ratio": finite_or_none(ratio), "ratio_error": finite_or_none(error)}
         for kind, name in enumerate(KINDS):
-            for suffix, table in (("", rises.values), ("_error", rises.errors), ("_crossed", rises.crossed)):
+            for suffix, table in (("", rises.values), ("_error", rises.errors), ("_crossed", rises.discontinuous)):
                 row[f"{name}{suffix}"] = finite_or_none(float(table[i, kind]))
         rows.append(row)
     return rows

@@ -52,6 +52,7 @@ from landscape import (
     spectral_density,
     symmetric_axis,
 )
+from landscape.errors import InputError
 from landscape.probes import split
 from landscape.results import Progress
 from landscape.slices.finite_probe import NOISE_POINTS, STEPS, FiniteProbe, finite_probe
@@ -65,7 +66,6 @@ from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
-from splat.losses.reference import LossSettings
 
 FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density and along a side of a slice that are worth their time
 FEWEST_STARTS = 3  # of a density of less than MANY_MATVECS; two have three times the interval
@@ -115,13 +115,13 @@ class ProbeSettings:
 
     def __post_init__(self) -> None:
         if self.slice_points < FEWEST_POINTS or self.slice_points % 2 == 0:
-            raise ValueError(
+            raise InputError(
                 f"expected an odd number of at least {FEWEST_POINTS} slice points, got {self.slice_points}"
             )
         if not (self.slice_radius > 0 and self.slice_rise > 0):
-            raise ValueError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
+            raise InputError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
         if not (self.seconds > 0 and self.memory > 0):
-            raise ValueError(f"expected seconds and memory > 0, got {self.seconds} and {self.memory}")
+            raise InputError(f"expected seconds and memory > 0, got {self.seconds} and {self.memory}")
 
     @classmethod
     def quick(cls) -> "ProbeSettings":
@@ -177,10 +177,8 @@ class Findings:
     notes: tuple[str, ...]
 
 
-def measure(
-    objective: SceneObjective, loss: LossSettings, settings: ProbeSettings, generator: torch.Generator, stage: Stage
-) -> Findings:
-    """Run every stage.  loss: the objective's; stage(name): see `analysis.console.stages`."""
+def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch.Generator, stage: Stage) -> Findings:
+    """Run every stage.  stage(name): see `analysis.console.stages`."""
     with stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
@@ -189,13 +187,13 @@ def measure(
         value, render = _rendered(objective)
     with stage("checks") as report:
         operator_check = check_operator(operator, split(generator), settings.checked_vectors)
-        gradient_check = check_against_gradient(hessian, loss, split(generator), report, settings.checked_views)
+        gradient_check = check_against_gradient(hessian, split(generator), report, settings.checked_views)
     budget = Budget(settings.seconds, _unasked(settings), generator, stage)
     with budget.stage("traces") as share:
         allowed = replace(settings.traces, max_seconds=share.seconds)
         traces = exact_traces(objective, share.generator, allowed, share.report, samples=settings.trace_samples)
     with budget.stage("eigenvalues") as share:
-        eigen, start = _search(operator, settings, share), BlockEigenvectors(objective, *own).leads()
+        eigen, start = _search(operator, settings, share), BlockEigenvectors(objective, *own).warm_start()
         timed = CountingOperator(operator)
         ends = extreme_eigenpairs(timed, share.generator, eigen, start, share.report)
     power = density = finite = depth = None
@@ -229,7 +227,7 @@ def measure(
         depth=depth,
         plane=plane,
         matvecs=operator.matvecs,
-        spared=hessian.spared,
+        spared=hessian.views.spared,
         rank=hessian.rank,
         notes=tuple(budget.notes),
     )
@@ -327,7 +325,7 @@ def _plane(
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
-    workers = 1 if objective.collective or by_triton(center) else thread_count()
+    workers = 1 if objective.ranks.size > 1 or by_triton(center) else thread_count()
     allowed = _within(settings, share.seconds, render, workers)
     evaluate = evaluation(objective, allowed.workers)
     # Ritz vectors: H between any two of them is their values' diagonal matrix

@@ -21,11 +21,11 @@ NAMES = ("e₁", "e₂")  # of the slice's directions
 QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
-def probe_data(findings: Findings, objective: SceneObjective, loss: LossSettings) -> dict[str, Any]:
+def probe_data(findings: Findings, objective: SceneObjective) -> dict[str, Any]:
     """All scalars save timing and provenance."""
     return {
         "objective": {
-            **objective_of(objective, loss),
+            **objective_of(objective),
             "operator": "hessian",
             "value": findings.value,
             "gradient_norm": findings.gradient_norm,
@@ -76,10 +76,10 @@ def loss_name(loss: LossSettings) -> str:
     return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM)"
 
 
-def objective_of(objective: SceneObjective, loss: LossSettings) -> dict[str, Any]:
+def objective_of(objective: SceneObjective) -> dict[str, Any]:
     """What, beside the training views, makes the function whose curvature is measured."""
     return {
-        "loss": loss_name(loss),
+        "loss": loss_name(objective.loss_settings),
         "sizes": [[view.camera.width, view.camera.height] for view in objective.views],
         "background": objective.background.tolist(),
     }
@@ -173,7 +173,7 @@ def counts(active: ActiveCounts) -> dict[str, int]:
 def _work(findings: Findings, objective: SceneObjective) -> dict[str, int]:
     return {
         "rank": findings.rank,
-        "views_kept_linearised": objective.memory_plan.kept,
+        "views_kept_linearised": objective.linearized.kept,
         "products": findings.matvecs,
         "renders": 0 if findings.plane is None else findings.plane.slice.evaluations * objective.counts.views,
     }

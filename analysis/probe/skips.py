@@ -50,10 +50,10 @@ def product_skips(
     counts = {
         "gaussians_out_of_sight": len(gaussians) - len(active),
         "sh_bands_not_in_use": (stored + 1) ** 2 - (active.sh_degree + 1) ** 2,
-        "entries_behind_opaque_fronts": objective.total(sum(view.entries_behind for view in objective.linearized)),
-        "tiles_of_zero_cotangent": objective.total(sum(view.dark_tiles for view in objective.linearized)),
+        "entries_behind_opaque_fronts": _total(objective, sum(view.entries_behind for view in objective.linearized)),
+        "tiles_of_zero_cotangent": _total(objective, sum(view.dark_tiles for view in objective.linearized)),
     }
-    spared = objective.total(spared)
+    spared = _total(objective, spared)
     if not repetitions or by_triton(active.flat):
         return {name: Skip(count, None) for name, count in (*counts.items(), (NOT_CONCERNED, spared))}
     variants: dict[str, Callable[[], LinearizedView]] = {
@@ -70,6 +70,11 @@ def product_skips(
         name: Skip(count, max(times[name] - times[""], 0.0) * made if count else 0.0) for name, count in counts.items()
     }
     return {**skips, NOT_CONCERNED: Skip(spared, spared * times[""])}
+
+
+def _total(objective: SceneObjective, count: int) -> int:
+    """Over the views of all processes."""
+    return int(objective.ranks.sum(torch.tensor(count)))
 
 
 def estimator_skips(findings: Findings, seconds: Mapping[str, float]) -> dict[str, Skip]:

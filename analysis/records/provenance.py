@@ -7,13 +7,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from landscape.errors import InputError
+
 PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib", "pyvista", "plotly")
 
 
 def require_seed(seed: int) -> None:
     """ValueError where it is out of range."""
     if not 0 <= seed < 2**63:
-        raise ValueError(f"expected a seed in [0, 2^63), got {seed}")
+        raise InputError(f"expected a seed in [0, 2^63), got {seed}")
 
 
 def provenance(seed: int, *, lanes: int | None = None, **more: Any) -> dict[str, Any]:

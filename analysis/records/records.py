@@ -122,6 +122,8 @@ from typing import Any
 
 import numpy as np
 
+from landscape.errors import InputError
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -254,25 +256,25 @@ def read_record(folder: str | Path) -> Record:
     try:
         raw = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except ValueError as error:
-        raise ValueError(
+        raise InputError(
             f"expected JSON in {path}, got a file that is damaged or truncated ({error}); {again}"
         ) from None
     match raw:
         case {"format": {"name": name, "version": version}} if name == kind.format["name"]:
             pass
         case _:
-            raise ValueError(
+            raise InputError(
                 f'expected a record of `landscape {kind.command}` in {path}, got JSON without "format": {kind.format}'
             )
     if not isinstance(version, int) or version > kind.version:
-        raise ValueError(
+        raise InputError(
             f"expected a record of format version {kind.version} or older in {path}, got version {version}; "
             f"update splat-landscape or {kind.command} the checkpoint again"
         )
     try:
         check_layout(raw, kind)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}; {again}") from None
+        raise InputError(f"{path}: {error}; {again}") from None
     arrays = {group: _read_arrays(folder / f"{group}.npz", shapes, kind) for group, shapes in raw["arrays"].items()}
     return Record(folder, decoded(raw), arrays)
 
@@ -282,22 +284,22 @@ def check_layout(data: Mapping[str, Any], kind: Kind = PROBE) -> None:
     for section in kind.sections:
         entries = data.get(section)
         if not isinstance(entries, Mapping):
-            raise ValueError(f'expected an object "{section}", got {type(entries).__name__}')
+            raise InputError(f'expected an object "{section}", got {type(entries).__name__}')
         missing = [f"{section}.{key}" for key in _REQUIRED_KEYS.get(section, ()) if key not in entries]
         for name, entry in entries.items():
             required = _REQUIRED.get(section, ())
             if required and not isinstance(entry, Mapping):
-                raise ValueError(f'expected an object "{section}.{name}", got {type(entry).__name__}')
+                raise InputError(f'expected an object "{section}.{name}", got {type(entry).__name__}')
             missing += [f"{section}.{name}.{key}" for key in required if key not in entry]
         if missing:
-            raise ValueError(f'expected the key "{missing[0]}", got none')
+            raise InputError(f'expected the key "{missing[0]}", got none')
     _require_numbers(data["counts"], "counts", _REQUIRED_KEYS["counts"])
     notes = data.get("notes", [])
     if not isinstance(notes, list | tuple) or not all(isinstance(note, str) for note in notes):
-        raise ValueError(f'expected a list of sentences "notes", got {notes!r}')
+        raise InputError(f'expected a list of sentences "notes", got {notes!r}')
     for group, shapes in data["arrays"].items():
         if not isinstance(shapes, Mapping):
-            raise ValueError(f'expected shapes by name at "arrays.{group}", got {type(shapes).__name__}')
+            raise InputError(f'expected shapes by name at "arrays.{group}", got {type(shapes).__name__}')
     if data.get("slice") is not None:
         _check_slice(data["slice"], kind)
 
@@ -306,23 +308,23 @@ def _require_numbers(entries: Mapping[str, Any], section: str, keys: Iterable[st
     """Those of the keys that are there."""
     for key in keys:
         if not isinstance(entries.get(key, 0), Real):
-            raise ValueError(f'expected a number "{section}.{key}", got {entries[key]!r}')
+            raise InputError(f'expected a number "{section}.{key}", got {entries[key]!r}')
 
 
 def _check_slice(plane: Any, kind: Kind) -> None:
     if not isinstance(plane, Mapping):
-        raise ValueError(f'expected an object "slice", got {type(plane).__name__}')
+        raise InputError(f'expected an object "slice", got {type(plane).__name__}')
     found = plane.get("directions")
     directions = found if isinstance(found, list | tuple) else ()
     if not {"loss_scale", "center_loss"} <= set(plane) or len(directions) not in kind.axes:
         axes = " or ".join(map(str, kind.axes))
-        raise ValueError(f'expected "slice" to hold "loss_scale", "center_loss" and {axes} "directions"')
+        raise InputError(f'expected "slice" to hold "loss_scale", "center_loss" and {axes} "directions"')
     _require_numbers(plane, "slice", _POINTS)
     for direction in directions:
         if not isinstance(direction, Mapping):
-            raise ValueError(f'expected objects in "slice.directions", got {type(direction).__name__}')
+            raise InputError(f'expected objects in "slice.directions", got {type(direction).__name__}')
         if missing := {"name", "curvature", "unit"} - set(direction):
-            raise ValueError(f'expected the key "slice.directions.{min(missing)}", got none')
+            raise InputError(f'expected the key "slice.directions.{min(missing)}", got none')
 
 
 def _encoded(value: Any, where: str) -> Any:
@@ -373,12 +375,12 @@ def _read_arrays(path: Path, shapes: Mapping[str, list[int]], kind: Kind) -> dic
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"expected arrays in {path}, got a damaged or truncated file ({error}); {again}") from None
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"expected arrays in {path}, got a damaged or truncated file ({error}); {again}") from None
     for name, shape in shapes.items():
         got = list(arrays[name].shape) if name in arrays else None
         if got != shape:
-            raise ValueError(f"expected {name} of shape {shape} in {path}, got {got}; {again}")
+            raise InputError(f"expected {name} of shape {shape} in {path}, got {got}; {again}")
     return arrays
 
 
@@ -395,11 +397,11 @@ def _why_not_found(folder: Path) -> str:
 def require_replaceable(folder: Path, kind: Kind = PROBE) -> None:
     """Replacing deletes: raise ValueError unless folder is absent, empty or an older record of this kind."""
     if folder.is_dir() and any(folder.iterdir()) and not (folder / kind.file).is_file():
-        raise ValueError(
+        raise InputError(
             f"expected an empty folder or an older record to replace, got {folder} without {kind.file}; move it away"
         )
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"expected a folder to write a record to, got the file {folder}; move it away")
+        raise InputError(f"expected a folder to write a record to, got the file {folder}; move it away")
 
 
 def _clean_up_after_kills(folder: Path, previous: Path) -> None:

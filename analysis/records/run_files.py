@@ -10,6 +10,7 @@ from types import UnionType
 from typing import Any
 
 from analysis.records.records import decoded
+from landscape.errors import InputError
 
 RECORDS = "trajectory.csv"  # in a run
 
@@ -47,11 +48,11 @@ def _read(path: Path, layout: Mapping[str, Any], what: str, remedy: str) -> dict
     try:
         data = decoded(json.loads(path.read_text(encoding="utf-8")))
     except ValueError as error:
-        raise ValueError(f"expected {what} in {path}, got a damaged file ({error}); {remedy}") from None
+        raise InputError(f"expected {what} in {path}, got a damaged file ({error}); {remedy}") from None
     if not isinstance(data, dict):
-        raise ValueError(f"expected {what} in {path}, got {data!r} instead of an object; {remedy}")
+        raise InputError(f"expected {what} in {path}, got {data!r} instead of an object; {remedy}")
     if wrong := _wrong(data, layout, ""):
-        raise ValueError(f"expected {what} in {path}, got {wrong}; {remedy}")
+        raise InputError(f"expected {what} in {path}, got {wrong}; {remedy}")
     return data
 
 

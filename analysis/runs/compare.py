@@ -17,15 +17,18 @@ from typing import Any
 
 from rich.console import Console
 
-from analysis.runs.compare_table import Run, compare_table, comparison, frame
 from analysis.console.drawing import draw
-from analysis.console.options import CompareOptions, DeviceName, ProbeOptions
+from analysis.console.options import DeviceName
 from analysis.console.overrides import leaves
+from analysis.probe.options import ProbeOptions
+from analysis.records.findings import of_budgets
 from analysis.records.quantities import quantity
 from analysis.records.records import FILE, read_record
 from analysis.records.report import pictures_in, template_environment
 from analysis.records.run_files import CHECKPOINT, METRICS, read_scores
-from analysis.records.findings import of_budgets
+from analysis.runs.compare_table import Run, compare_table, comparison, frame
+from analysis.runs.options import CompareOptions
+from landscape.errors import InputError
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
 PAGE, TABLE, INDEX, PROBE = "compare.html", "compare.csv", "compare.json", "probe"
@@ -49,7 +52,7 @@ def run_compare(options: CompareOptions) -> int:
     missing = [path for path, checkpoint in zip(options.runs, checkpoints) if not probed(path, checkpoint)]
     if missing and not options.probe:
         again = "; ".join(f"landscape probe {path / CHECKPOINT}" for path in missing)
-        raise ValueError(
+        raise InputError(
             f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
         )
     for path in missing:
@@ -66,7 +69,7 @@ def run_compare(options: CompareOptions) -> int:
 def _folders(runs: Sequence[Path]) -> list[Path]:
     folders = [run.resolve() for run in runs]
     if len(set(folders)) < 2 or len(set(folders)) < len(folders):
-        raise ValueError(f"expected at least two runs, each once, got {', '.join(map(str, runs)) or 'none'}")
+        raise InputError(f"expected at least two runs, each once, got {', '.join(map(str, runs)) or 'none'}")
     return folders
 
 
@@ -82,7 +85,7 @@ def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> No
         first = of(checkpoints[0])
         for label, checkpoint in zip(labels, checkpoints, strict=True):
             if of(checkpoint) != first:
-                raise ValueError(
+                raise InputError(
                     f"expected runs with the same {what}, as their curvatures are not comparable else, got {first} in "
                     f"{labels[0]} and {of(checkpoint)} in {label}; compare them apart"
                 )

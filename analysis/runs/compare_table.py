@@ -14,10 +14,10 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from analysis.records.family_table import INDICES, OPERATOR_NAMES, Cell, bracketed
 from analysis.console.overrides import leaves
-from analysis.records.quantities import PLACES, SCORES, measured, quantity
+from analysis.records.family_table import INDICES, OPERATOR_NAMES, Cell, bracketed
 from analysis.records.findings import attribute_name
+from analysis.records.quantities import PLACES, SCORES, measured, quantity
 from splat.training.checkpoint import Checkpoint
 from splat.training.state import Method
 

@@ -17,11 +17,11 @@ from rich.table import Table
 
 from analysis.console.drawing import draw
 from analysis.records.family_table import bracketed
-from analysis.console.options import TrajectoryOptions
-from analysis.records.quantities import measured, quantity
-from analysis.records.run_files import CHECKPOINT
 from analysis.records.findings import ATTRIBUTES, attribute_name
-from analysis.records.run_files import NO_TIME, RECORDS
+from analysis.records.quantities import measured, quantity
+from analysis.records.run_files import CHECKPOINT, NO_TIME, RECORDS
+from analysis.runs.options import TrajectoryOptions
+from landscape.errors import InputError
 
 TABLE, PICTURE = "trajectories.csv", "trajectories.png"
 VALUES = {
@@ -68,9 +68,9 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
     """The rows of all runs.  FileNotFoundError or ValueError where a run has none, or is named twice."""
     folders = [run.resolve() for run in runs]
     if not folders:
-        raise ValueError("expected at least one run, got none; name the folders that landscape train wrote")
+        raise InputError("expected at least one run, got none; name the folders that landscape train wrote")
     if len(set(folders)) < len(folders):
-        raise ValueError(f"expected every run once, got {', '.join(str(run) for run in runs)}")
+        raise InputError(f"expected every run once, got {', '.join(str(run) for run in runs)}")
     common = Path(os.path.commonpath(folders))
     tables = []
     for run, folder in zip(runs, folders, strict=True):
@@ -85,9 +85,9 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
         try:
             table = pd.read_csv(path)
         except ValueError as error:  # pandas names no file
-            raise ValueError(f"expected the records of landscape train --probe-every in {path}, got {error}") from None
+            raise InputError(f"expected the records of landscape train --probe-every in {path}, got {error}") from None
         if not {"step", "state", *VALUES, *INDICES} <= set(table.columns):
-            raise ValueError(f"expected the records of landscape train --probe-every in {path}, got another table")
+            raise InputError(f"expected the records of landscape train --probe-every in {path}, got another table")
         name = folder.name if folder == common else folder.relative_to(common).as_posix()
         table.insert(0, "run", name)
         tables.append(table)
@@ -95,7 +95,7 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
     if set(together["state"]) == {"skipped"}:
         note = str(together["note"].iloc[-1])
         remedy = "; train with a larger --probe-share" if note.startswith(NO_TIME) else ""
-        raise ValueError(
+        raise InputError(
             f"expected at least one record that was not skipped, got {len(together)} skipped ({note}){remedy}"
         )
     return together

@@ -27,7 +27,6 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
-from analysis.console.options import SliceOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.command import scene_objective
@@ -47,8 +46,10 @@ from analysis.slice.directions import (
     find_directions,
     recorded_eigenvectors,
 )
+from analysis.slice.options import SliceOptions
 from analysis.slice.record import Found, slice_arrays, slice_data
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
+from landscape.errors import InputError
 from landscape.probes import split
 from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
 from splat.backend.device import device_named
@@ -58,6 +59,7 @@ from splat.model.gaussians import Gaussians
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint, load_checkpoint
 
+SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 COARSE = {1: 9, 2: 21}  # points that an adaptive slice begins with, by its dimension
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
@@ -80,18 +82,14 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         scene = checkpoint.load_scene(options.checkpoint, options.scene)
         objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
     with stages:
-        known = _known(options.checkpoint.parent / "probe", unfinished, checkpoint, objective)
+        known = _known(options.checkpoint.parent / "probe", unfinished, objective, console)
         try:
             found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
-        except ValueError:  # it would not end better the next time
-            shutil.rmtree(unfinished, ignore_errors=True)
-            raise
-        except KeyboardInterrupt:
+        except BaseException:
             if unfinished.is_dir():
-                again = shlex.join(command)
-                console.print(f"what was rendered is kept; to continue: {again}", soft_wrap=True, highlight=False)
+                console.print(f"what was rendered is kept; to continue: {shlex.join(command)}", **SAID)
             raise
-        data = slice_data(found, objective, checkpoint.training.config.loss)
+        data = slice_data(found, objective)
         data["notes"] = slice_notes(found.slice)
         data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
         with record_folder(out, SLICE) as folder:
@@ -108,11 +106,11 @@ def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> Slic
     holdout = min(SliceSettings.holdout, ceil(options.points**shape.dimension / 8))
     if options.all_points:
         if options.max_renders is not None:
-            raise ValueError("expected --all-points or --max-renders, got both; leave one out")
+            raise InputError("expected --all-points or --max-renders, got both; leave one out")
         return SliceSettings(tolerance=None, workers=workers)
     least = COARSE[shape.dimension] + holdout + 1
     if options.max_renders is not None and options.max_renders < least:
-        raise ValueError(
+        raise InputError(
             f"expected --max-renders of at least {least}, with which a slice of dimension {shape.dimension} can begin and be "
             f"judged, got {options.max_renders}"
         )
@@ -124,7 +122,7 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     """The other checkpoint's parameters, quaternions as unit ones on the near side."""
     here, there = checkpoint.training.gaussians, load_checkpoint(path).training.gaussians
     if (len(here), here.sh_degree) != (len(there), there.sh_degree):
-        raise ValueError(
+        raise InputError(
             f"expected a checkpoint of {len(here):,} Gaussians with SH degree {here.sh_degree} at the other end of the line, "
             f"got {len(there):,} with {there.sh_degree} in {path}; take two of one training after densification has ended"
         )
@@ -135,13 +133,16 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     return there.flat
 
 
-def _known(probe: Path, unfinished: Path, checkpoint: Checkpoint, objective: SceneObjective) -> list[Tensor]:
-    """Eigenvectors of an interrupted run and of the probe."""
+def _known(probe: Path, unfinished: Path, objective: SceneObjective, console: Console) -> list[Tensor]:
+    """Eigenvectors of an interrupted run and of the probe, where its record can be read."""
     kept = unfinished / "eigenvectors.npy"
     found = [torch.from_numpy(np.load(kept, allow_pickle=False))] if kept.is_file() else []
     center = objective.active.flat
-    name, precision = loss_name(checkpoint.training.config.loss), torch.finfo(center.dtype).eps
-    found += recorded_eigenvectors(probe, name, objective.loss(center), precision)
+    name, precision = loss_name(objective.loss_settings), torch.finfo(center.dtype).eps
+    try:
+        found += recorded_eigenvectors(probe, name, objective.loss(center), precision)
+    except (InputError, FileNotFoundError) as error:
+        console.print(f"the probe's eigenvectors are computed anew: {error}", **SAID)
     return [vectors.to(center.device) for vectors in found]
 
 
@@ -210,8 +211,8 @@ def _evaluation(objective: SceneObjective, workers: int) -> Loss:
     def evaluate(flat: Tensor) -> Evaluation:
         try:
             return inner(flat)
-        except ValueError as error:
-            raise ValueError(f"expected steps to where there is an image, got one that is too long ({error})") from None
+        except InputError as error:
+            raise InputError(f"expected steps to where there is an image, got one that is too long ({error})") from None
 
     return evaluate
 

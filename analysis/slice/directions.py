@@ -22,8 +22,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from analysis.console.options import Along
 from analysis.records.records import read_record
+from analysis.slice.options import Along
 from landscape import (
     EigenSettings,
     curvature_reach,
@@ -35,6 +35,7 @@ from landscape import (
     random_directions,
     symmetric_axis,
 )
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
 from landscape.results import Progress
 from landscape.slices.grid_evaluations import SAME_LOSS
@@ -62,7 +63,7 @@ class Shape:
     ) -> "Shape":
         """The shape that was asked for; ValueError where the wishes contradict each other."""
         if twice := [kind for kind in dict.fromkeys(along) if along.count(kind) > 1]:
-            raise ValueError(
+            raise InputError(
                 f"expected directions of different kinds, got --along {twice[0]} twice; leave one out, and for a plane of one "
                 "kind, eigenvectors or random, give --dimension 2"
             )
@@ -70,17 +71,17 @@ class Shape:
         named = list(along) or [default]
         kinds: tuple[Along, ...] = tuple(sorted(named, key=lambda kind: kind != "line"))  # a line keeps its ends
         if len(kinds) > 2:
-            raise ValueError(f"expected one or two directions, got {' and '.join(kinds)}; slice again for the others")
+            raise InputError(f"expected one or two directions, got {' and '.join(kinds)}; slice again for the others")
         if ("line" in kinds) != other:
             given = "one more checkpoint; add --along line" if other else "no other checkpoint; name it"
-            raise ValueError(f"expected two checkpoints for a line and one otherwise, got {given}")
+            raise InputError(f"expected two checkpoints for a line and one otherwise, got {given}")
         most = 2 if len(kinds) == 2 or set(kinds) <= PLANES else 1
         wanted = most if dimension is None else dimension
         if wanted > most or (wanted == 1 and len(kinds) == 2):
             advice = "give --along once" if wanted == 1 else "give --along twice"
-            raise ValueError(f"expected directions for dimension {wanted}, got {' and '.join(kinds)}; {advice}")
+            raise InputError(f"expected directions for dimension {wanted}, got {' and '.join(kinds)}; {advice}")
         if len(radii) > wanted or any(not 0 < radius < float("inf") for radius in radii):
-            raise ValueError(f"expected at most {wanted} radii, finite and above 0, got {list(radii)}")
+            raise InputError(f"expected at most {wanted} radii, finite and above 0, got {list(radii)}")
         symmetric_axis(1.0, points)  # says what is wrong with their number
         each = radii if len(radii) == wanted else [*radii, *radii, None, None][:wanted]
         return cls(kinds, wanted, tuple(each))
@@ -193,11 +194,13 @@ def largest_eigenvectors(
 
 
 def recorded_eigenvectors(folder: Path, loss: str, value: float, precision: float) -> list[Float[Tensor, "n k"]]:
-    """Those of the probe recorded in a folder, if any, where its objective is the Hessian of this loss with this value."""
-    try:
-        record = read_record(folder)
-    except (FileNotFoundError, ValueError):
+    """Those of the probe recorded in a folder, if any, where its objective is the Hessian of this loss with this value.
+
+    InputError or FileNotFoundError where the record cannot be read.
+    """
+    if not folder.is_dir():
         return []
+    record = read_record(folder)
     about = record.data.get("objective", {})
     same = (about.get("loss"), about.get("operator")) == (loss, "hessian")
     if not same or not isclose(about.get("value", nan), value, rel_tol=SAME_LOSS * precision):

@@ -32,7 +32,6 @@ from analysis.probe.record import counts, objective_of
 from analysis.slice.directions import Direction
 from landscape import FiniteProbe, Slice
 from splat.curvature.objective import SceneObjective
-from splat.losses.reference import LossSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,7 @@ class Found:
     matvecs: int
 
 
-def slice_data(found: Found, objective: SceneObjective, loss: LossSettings) -> dict[str, Any]:
+def slice_data(found: Found, objective: SceneObjective) -> dict[str, Any]:
     """All scalars save timing, notes and provenance."""
     grid, probe = found.slice, found.probe
     assert grid.slope is not None and grid.curvature is not None
@@ -57,7 +56,7 @@ def slice_data(found: Found, objective: SceneObjective, loss: LossSettings) -> d
     evaluations = grid.evaluations + (0 if probe is None else probe.evaluations)
     return {
         "objective": {
-            **objective_of(objective, loss),
+            **objective_of(objective),
             "operator": "hessian",
             "value": grid.center_loss,
             "gradient_norm": float(objective.gradient.double().norm()),

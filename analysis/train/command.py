@@ -33,12 +33,13 @@ from rich.text import Text
 from torch import Tensor
 
 from analysis.console.interruption import interruption
-from analysis.console.options import TrainOptions
 from analysis.console.overrides import assignments, leaves, overridden
 from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
+from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
+from landscape.errors import InputError
 from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
 from splat.scenes.images import IMAGE_SUFFIXES
@@ -75,7 +76,7 @@ SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and 
 def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     """Train, or continue, a run; returns the exit code.  command: as typed, for the message on how to resume."""
     if options.checkpoint_every < 1:
-        raise ValueError(f"expected checkpoint_every of at least 1, got {options.checkpoint_every}")
+        raise InputError(f"expected checkpoint_every of at least 1, got {options.checkpoint_every}")
     along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_share)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
@@ -146,7 +147,7 @@ def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig
 def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
     red, green, blue = scene.background.tolist()
     if options.method not in METHODS:
-        raise ValueError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}")
+        raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}")
     config = TrainConfig(
         iterations=options.iterations,
         seed=options.seed,
@@ -161,7 +162,7 @@ def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
     for key, name in OPTIONS.items():
         given = getattr(options, name)
         if key in changes and given != getattr(TrainOptions, name):
-            raise ValueError(
+            raise InputError(
                 f"expected one value for {key}, got --set {key}={changes[key]} beside the option --{name.replace('_', '-')}, "
                 f"which is {given}; leave one out"
             )
@@ -206,7 +207,7 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: 
     }
     for key, value in saved.items():
         if asked[key] != value:
-            raise ValueError(
+            raise InputError(
                 f"expected the settings that the run in {path.parent} was started with, {key} = {value}, got "
                 f"{asked[key]}; {remedy}"
             )

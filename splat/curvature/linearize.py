@@ -30,7 +30,7 @@ from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.dispatch import linearize_projection
 from splat.projection.formulas import ProjectionJacobian, lens_of
-from splat.render.forward import rasterize_view
+from splat.render.forward import rasterize_view, touches
 
 
 class LinearizedView:
@@ -91,8 +91,10 @@ class LinearizedView:
 
     @property
     def held(self) -> ProjectionJacobian:
-        """The projection's derivatives, Gaussian by Gaussian."""
-        return self._projection.held
+        """The projection's derivatives of the Gaussians that have weight in a pixel; takes a pass over the pixels."""
+        held = self._projection.held
+        seen = to_backend(touches(self._raster))[held.index]
+        return ProjectionJacobian(held.index[seen], held.splats, held.opacity_bar, *(part[seen] for part in held[3:]))
 
     @property
     def bytes(self) -> int:

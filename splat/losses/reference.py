@@ -18,6 +18,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
+
 WINDOW, SIGMA = 11, 1.5
 REACH = WINDOW // 2
 C1, C2 = 0.01**2, 0.03**2
@@ -29,6 +31,9 @@ class LossSettings:
     """Which loss a view contributes: the pixel loss, and ssim_weight = lambda in [0, 1], of 1 - SSIM.
 
     eps: Charbonnier's, in units of intensity.  literal: the pixel loss has the weight 1 instead of 1 - lambda.
+
+    >>> LossSettings("l2", ssim_weight=0.2).pixel_weight
+    0.8
     """
 
     pixel: PixelLoss = "l1"
@@ -38,9 +43,9 @@ class LossSettings:
 
     def __post_init__(self) -> None:
         if self.pixel not in ("l1", "charbonnier", "l2"):
-            raise ValueError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
+            raise InputError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
         if not (0 <= self.ssim_weight <= 1 and self.eps > 0):
-            raise ValueError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
+            raise InputError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
 
     @property
     def pixel_weight(self) -> float:

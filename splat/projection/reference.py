@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import harmonics
@@ -121,7 +122,7 @@ def require_sizes(lens: Lens, log_scales: np.ndarray, depths: np.ndarray, drawn:
     bad = drawn & (sizes > limit)
     if bad.any():
         first = int(np.argmax(bad))
-        raise ValueError(
+        raise InputError(
             f"expected log_scales of at most {limit - max(gain[first], 0.0):.1f} at depth {depths[first]:.3g} (a splat of "
             f"{LARGEST_SPLAT:.0e} px), got {log_scales[first].tolist()} at Gaussian {first} ({int(bad.sum())} of {len(bad)} "
             "are larger); remove them from the checkpoint, or lower its rates"

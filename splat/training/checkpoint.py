@@ -30,6 +30,7 @@ from typing import Any, TypeVar, get_type_hints
 import torch
 from torch import Tensor
 
+from landscape.errors import InputError, lacks_memory
 from splat.model.gaussians import Gaussians
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split
@@ -122,16 +123,16 @@ class Checkpoint:
                 folder, reference.images, reference.downscale, self.training.config.background, points=False
             )
             found.select([*reference.train, *reference.test])
-        except (ValueError, FileNotFoundError) as error:
+        except (InputError, FileNotFoundError) as error:
             if scene is None or not folder.is_dir():
                 raise
             name = Path(reference.absolute).name
-            raise ValueError(
+            raise InputError(
                 f"expected the training's scene {name} in {folder}, got another or a part: {error}"
             ) from None
         for frame, size in zip(found.select(reference.train), reference.sizes, strict=True):
             if [frame.camera.width, frame.camera.height] != size:
-                raise ValueError(
+                raise InputError(
                     f"expected view {frame.name!r} of {folder} at {size[0]} x {size[1]} px, as in the training, got "
                     f"{frame.camera.width} x {frame.camera.height}; its images have changed, restore them or train anew"
                 )
@@ -205,11 +206,16 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
     OSError where there is none or it may not be read; ValueError, which says what is wrong with it, where it is damaged or of
     another kind.
+
+    >>> load_checkpoint(Path("nowhere/checkpoint.pt"))
+    Traceback (most recent call last):
+        ...
+    FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file
     """
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
         raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found {found}")
-    damaged = ValueError(
+    damaged = InputError(
         f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
         f"{' (Gaussians from a PLY file cannot be read)' if path.suffix.lower() == '.ply' else ''}"
     )
@@ -222,31 +228,33 @@ def load_checkpoint(path: Path) -> Checkpoint:
                 action="ignore"
             ):  # torch warns of pickles of another kind before it refuses them
                 content = torch.load(file, map_location="cpu", weights_only=True)
-        except Exception:  # what torch stumbles over in a file of another kind is of many kinds too
-            raise damaged from None
+        except Exception as error:  # what torch stumbles over in a file of another kind is of many kinds too
+            if isinstance(error, OSError) or lacks_memory(error):
+                raise
+            raise damaged from error
     if not whole:
         raise damaged
     try:
         return _checkpoint(content)
-    except ValueError as error:
-        raise ValueError(f"expected a checkpoint written by landscape train, got {path}: {error}") from None
+    except InputError as error:
+        raise InputError(f"expected a checkpoint written by landscape train, got {path}: {error}") from None
 
 
 def _checkpoint(content: Any) -> Checkpoint:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"it does not hold the format {FORMAT!r}")
+        raise InputError(f"it does not hold the format {FORMAT!r}")
     version = _get(content, "version", int)
     if version not in (1, VERSION):
-        raise ValueError(f"its format version is {version!r}, this program reads up to {VERSION}")
+        raise InputError(f"its format version is {version!r}, this program reads up to {VERSION}")
     if version == 1:
         config = {**_get(content, "config", dict), "method": asdict(ThreeDGS())}
         content = {**content, "config": config, "regularizer": Regularizer(0).state()}
     training = restored_training(content)
     scene = _dataclass(SceneReference, {"start": "scene", "depths": None, **_get(content, "scene", dict)}, "scene")
     if len(scene.sizes) != len(scene.train):
-        raise ValueError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
+        raise InputError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
     if not all(type(index) is int and 0 <= index < len(scene.train) for index in training.order):
-        raise ValueError(f"its order does not index its {len(scene.train)} training views")
+        raise InputError(f"its order does not index its {len(scene.train)} training views")
     return Checkpoint(training, scene, _get(content, "torch", str))
 
 
@@ -255,7 +263,7 @@ def restored_training(content: dict[str, Any]) -> Training:
     flat = _get(content, "flat", Tensor)
     gaussians = Gaussians(_tensor(content, "flat", (flat.numel(),), flat.dtype), _get(content, "sh_degree", int))
     if not len(gaussians):
-        raise ValueError("it holds no Gaussian")
+        raise InputError("it holds no Gaussian")
     gaussians.require_finite()
     config = _get(content, "config", dict)
     if isinstance(thresholds := config.get("render"), dict):
@@ -283,11 +291,11 @@ def restored_training(content: dict[str, Any]) -> Training:
         step=_get(content, "step", int),
     )
     if not 0 <= training.step <= config.iterations:
-        raise ValueError(f"its step {training.step} is not among its {config.iterations} iterations")
+        raise InputError(f"its step {training.step} is not among its {config.iterations} iterations")
     if not 0 < training.extent < float("inf"):
-        raise ValueError(f"its extent is {training.extent}")
+        raise InputError(f"its extent is {training.extent}")
     if not 0 <= training.adam.updates <= training.step:
-        raise ValueError(f"its optimiser has made {short(training.adam.updates)} updates in {training.step} steps")
+        raise InputError(f"its optimiser has made {short(training.adam.updates)} updates in {training.step} steps")
     return training
 
 
@@ -296,10 +304,10 @@ T = TypeVar("T")
 
 def _get(content: dict, key: str, kind: type[T]) -> T:
     if key not in content:
-        raise ValueError(f"{key!r} is missing")
+        raise InputError(f"{key!r} is missing")
     value = content[key]
     if not isinstance(value, kind):
-        raise ValueError(f"{key!r} is {type(value).__name__}, expected {kind.__name__}")
+        raise InputError(f"{key!r} is {type(value).__name__}, expected {kind.__name__}")
     return value
 
 
@@ -307,16 +315,16 @@ def _tensor(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype) -
     value = _get(content, key, Tensor)
     kind = f"{value.dtype} of shape {tuple(value.shape)}"
     if tuple(value.shape) != tuple(shape) or value.dtype != dtype or dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"{key!r} is {kind}, expected {dtype} {tuple(shape)}")
+        raise InputError(f"{key!r} is {kind}, expected {dtype} {tuple(shape)}")
     if value.device.type != "cpu" or not value.is_contiguous():
-        raise ValueError(f"{key!r} is {kind} that does not hold its numbers one by one")
+        raise InputError(f"{key!r} is {kind} that does not hold its numbers one by one")
     return value
 
 
 def _finite(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype, signed: bool = False) -> Tensor:
     value = _tensor(content, key, shape, dtype)
     if not (value.isfinite() & (signed | (value >= 0))).all():
-        raise ValueError(f"{key!r} holds a number that is not finite{'' if signed else ', or a negative one'}")
+        raise InputError(f"{key!r} holds a number that is not finite{'' if signed else ', or a negative one'}")
     return value
 
 
@@ -330,7 +338,9 @@ def _restore(regularizer: Regularizer, state: dict) -> None:
             {key: restored_training(value) if _is_training(value) else value for key, value in state.items()}
         )
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
+        if lacks_memory(error):
+            raise
+        raise InputError(
             f"'regularizer' is not the state of its method ({error}); take another copy of the file, or train anew"
         ) from None
 
@@ -340,7 +350,9 @@ def _generator(state: Tensor) -> torch.Generator:
     try:
         return generator.set_state(state)
     except (RuntimeError, TypeError) as error:
-        raise ValueError(f"'generator' is not the state of a random generator ({error})") from None
+        if lacks_memory(error):
+            raise
+        raise InputError(f"'generator' is not the state of a random generator ({error})") from None
 
 
 def _dataclass(kind: type[T], content: dict, where: str) -> T:
@@ -348,14 +360,14 @@ def _dataclass(kind: type[T], content: dict, where: str) -> T:
     hints = get_type_hints(kind)
     if set(content) != set(hints):
         different = sorted(map(str, set(content) ^ set(hints)))
-        raise ValueError(f"{where!r} has missing or unknown keys: {', '.join(different)}")
+        raise InputError(f"{where!r} has missing or unknown keys: {', '.join(different)}")
     values = {}
     for key, hint in hints.items():
         value = content[key]
         if inner := _nested(hint, value, f"{where}.{key}"):
             value = _dataclass(inner, _get(content, key, dict), f"{where}.{key}")
         elif not fits(value, hint):
-            raise ValueError(f"'{where}.{key}' is {short(value)}, expected {getattr(hint, '__name__', hint)}")
+            raise InputError(f"'{where}.{key}' is {short(value)}, expected {getattr(hint, '__name__', hint)}")
         values[key] = value
     return kind(**values)
 
@@ -367,4 +379,4 @@ def _nested(hint: Any, value: Any, where: str) -> type | None:
     name = value.get("name") if isinstance(value, dict) else value
     if isinstance(name, str) and name in METHODS:
         return METHODS[name]
-    raise ValueError(f"'{where}' has the unknown name {short(name)}")
+    raise InputError(f"'{where}' has the unknown name {short(name)}")

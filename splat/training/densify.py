@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import Splats, on_screen, rotation_matrices
@@ -57,16 +58,16 @@ class DensifySettings:
 
     def __post_init__(self) -> None:
         if self.every < 1 or self.reset_every < 1:
-            raise ValueError(f"expected every and reset_every of at least 1, got {self.every} and {self.reset_every}")
+            raise InputError(f"expected every and reset_every of at least 1, got {self.every} and {self.reset_every}")
         if min(self.start, self.stop) < 0:
-            raise ValueError(f"expected start and stop of at least 0, got {self.start} and {self.stop}")
+            raise InputError(f"expected start and stop of at least 0, got {self.start} and {self.stop}")
         shares = self.start_share, self.stop_share, self.every_share
         if not all(0 <= share <= 1 for share in shares):
-            raise ValueError(f"expected start_share, stop_share and every_share in [0, 1], got {shares}")
+            raise InputError(f"expected start_share, stop_share and every_share in [0, 1], got {shares}")
         if not (self.gradient_threshold > 0 and self.clone_scale > 0 and self.prune_scale > 0):
-            raise ValueError(f"expected gradient_threshold, clone_scale and prune_scale above 0, got {self}")
+            raise InputError(f"expected gradient_threshold, clone_scale and prune_scale above 0, got {self}")
         if not 0 <= self.min_opacity < self.reset_opacity < 1:
-            raise ValueError(
+            raise InputError(
                 "expected 0 <= min_opacity < reset_opacity < 1 (else a reset would remove every Gaussian), "
                 f"got {self.min_opacity} and {self.reset_opacity}"
             )

@@ -31,6 +31,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.autograd import loss_against
 from splat.losses.cpu.loss import ViewLoss
 from splat.render.loss_and_gradient import loss_and_gradient
@@ -60,6 +61,12 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
 
     Between two items `training` is whole, so that it can be saved, evaluated or left there.  ValueError where there are no
     views, they lack what the method needs, or a loss or gradient is not finite.
+
+    >>> from splat import SyntheticSettings, TrainConfig, synthetic_scene
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> training = Training.start(made.truth, made.scene.extent(), TrainConfig(iterations=2))
+    >>> [done.step for done in train(training, made.scene.load())]
+    [1, 2]
     """
     config, regularizer = training.config, training.regularizer
     if not views:
@@ -87,7 +94,7 @@ def _require_finite(what: str, value: float, step: Step) -> None:
     """ValueError that names the step and its view, unless a loss, or the sum of a gradient, is finite."""
     if not isfinite(value):
         name = step.views[step.chosen].name
-        raise ValueError(f"expected a finite {what}, got {value} at step {step.number} on view {name}; lower the rates")
+        raise InputError(f"expected a finite {what}, got {value} at step {step.number} on view {name}; lower the rates")
 
 
 def _next_step(training: Training, number: int, views: Sequence[View], losses: Sequence[ViewLoss]) -> Step:

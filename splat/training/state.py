@@ -20,6 +20,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
+from landscape.operators.distributed import ALONE, Ranks
 from splat.curvature.objective import SceneObjective
 from splat.losses.cpu.loss import ViewLoss
 from splat.losses.reference import LossSettings
@@ -97,7 +99,7 @@ class Regularizer:
         """Take over a state.  ValueError, KeyError or RuntimeError where it does not fit."""
         self.generator.set_state(state["generator"])
         if type(state["history"]) is not list:
-            raise ValueError(f"expected the history as a list of rows, found {short(state['history'])}")
+            raise InputError(f"expected the history as a list of rows, found {short(state['history'])}")
         for row in state["history"]:
             _require_row(row)
         self.history = list(state["history"])
@@ -111,7 +113,7 @@ def _require_row(row: Any) -> None:
         or any(type(row.get(name, 0)) is not int for name in ("step", "count"))
         or any(type(value) is int and value < 0 for value in row.values())
     ):
-        raise ValueError(
+        raise InputError(
             "expected a row of the history with plain values, its step and its counts whole numbers of at least 0, "
             f"found {short(row)}"
         )
@@ -152,13 +154,13 @@ class LearningRates:
 
     def __post_init__(self) -> None:
         if not (0 < self.position < inf and 0 < self.position_final < inf):
-            raise ValueError(
+            raise InputError(
                 "expected finite position rates above 0 (decay is exponential), got "
                 f"{self.position}, {self.position_final}"
             )
         others = self.log_scales, self.quats, self.opacity_logits, self.sh_constant, self.sh_higher
         if not all(0 <= rate < inf for rate in others):
-            raise ValueError(f"expected finite learning rates of at least 0, got {self}")
+            raise InputError(f"expected finite learning rates of at least 0, got {self}")
 
 
 @dataclass(frozen=True)
@@ -170,6 +172,10 @@ class TrainConfig:
     random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
     method: what is added to 3DGS, with its settings (`splat/training/methods/methods.py`).
     ValueError where a setting is out of its range.
+
+    >>> from splat import METHODS
+    >>> TrainConfig(iterations=300, method=METHODS["stablegs"](warm_up=100)).method.name
+    'stablegs'
     """
 
     iterations: int = 2000
@@ -186,15 +192,15 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
-            raise ValueError(f"expected at least 1 iteration, got {self.iterations}")
+            raise InputError(f"expected at least 1 iteration, got {self.iterations}")
         if not 0 <= self.seed < 2**63:
-            raise ValueError(f"expected a seed in [0, 2^63), got {self.seed}")
+            raise InputError(f"expected a seed in [0, 2^63), got {self.seed}")
         if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
+            raise InputError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
         if self.sh_degree_every < 1:
-            raise ValueError(f"expected sh_degree_every of at least 1, got {self.sh_degree_every}")
+            raise InputError(f"expected sh_degree_every of at least 1, got {self.sh_degree_every}")
         if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
-            raise ValueError(f"expected a background of three numbers in [0, 1], got {self.background}")
+            raise InputError(f"expected a background of three numbers in [0, 1], got {self.background}")
 
     @property
     def is_white(self) -> bool:
@@ -204,10 +210,14 @@ class TrainConfig:
     def background_colour(self, dtype: torch.dtype) -> Float[Tensor, "3"]:
         return torch.tensor(self.background, dtype=dtype)
 
-    def objective(self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False) -> SceneObjective:
+    def objective(
+        self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False, ranks: Ranks = ALONE
+    ) -> SceneObjective:
         """This loss, on this background, averaged over views: the objective whose Hessian is studied.  See `SceneObjective`."""
         background = self.background_colour(gaussians.flat.dtype)
-        return SceneObjective(gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen)
+        return SceneObjective(
+            gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen, ranks=ranks
+        )
 
 
 @dataclass(eq=False)
@@ -216,6 +226,10 @@ class Training:
 
     extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.
     order: indices of the epoch's views still to come, last first.
+
+    >>> from splat import Gaussians
+    >>> Training.start(Gaussians(torch.ones(14), sh_degree=0), extent=1.0, config=TrainConfig()).step
+    0
     """
 
     config: TrainConfig
@@ -235,14 +249,14 @@ class Training:
         ValueError where there are no Gaussians, one is not finite, or their SH degree is above the training's.
         """
         if len(gaussians) == 0:
-            raise ValueError("expected at least one Gaussian to start from, got none; use a random start")
+            raise InputError("expected at least one Gaussian to start from, got none; use a random start")
         if gaussians.sh_degree > config.sh_degree:
-            raise ValueError(
+            raise InputError(
                 f"expected a start of at most the training's SH degree {config.sh_degree}, got {gaussians.sh_degree}; "
                 "drop bands with Gaussians.select or raise sh_degree"
             )
         if not 0 < extent < float("inf"):
-            raise ValueError(f"expected a finite extent above 0, got {extent}")
+            raise InputError(f"expected a finite extent above 0, got {extent}")
         gaussians.require_finite()
         flat = gaussians.flat.detach().clone()
         return cls(
@@ -294,7 +308,7 @@ class Training:
     def follow(self, change: Densified) -> None:
         """Replace the Gaussians: Adam's moments follow each one that is kept and are 0 for new ones."""
         if not len(change.gaussians):
-            raise ValueError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
+            raise InputError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
         self.gaussians = change.gaussians
         self.adam.select(change.parents, change.fresh)
         flat = change.gaussians.flat

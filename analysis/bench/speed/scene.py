@@ -108,7 +108,7 @@ class ViewBench:
     def stages(self) -> Calls:
         """The parts of a gradient and of a product with one vector, and compositing alone."""
         w, raster, adjoint = self.workload, self.raster, self.adjoint
-        passes = compositing_stages(w, self.view.camera, self.projected, raster, adjoint)
+        passes = compositing_stages(self.projected, self.view.camera, w.settings, raster, adjoint)
         held, (splats, _, drawn) = self.linearized, self.projected
         directions = held._projection.jvp(self.vectors[1] if by_triton(self.like) else self.vectors[1].numpy())
         tangent = raster.jvp(directions)

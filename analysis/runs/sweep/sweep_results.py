@@ -21,11 +21,11 @@ from rich import box
 from rich.table import Table
 
 from analysis.records.family_table import INDICES
+from analysis.records.findings import attribute_name, of_budgets
 from analysis.records.quantities import PLACES, SCORES, quantity
 from analysis.records.records import read_record
 from analysis.records.run_files import read_scores
 from analysis.runs.sweep.sweep_file import Cell, Sweep
-from analysis.records.findings import attribute_name, of_budgets
 from splat.training.checkpoint import write_atomically
 
 RESULTS, SUMMARY, PROBE = "results.csv", "summary.csv", "probe"

@@ -20,6 +20,7 @@ import triton.language as tl
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.backend.gpu.compile import jit, launch, sized
 from splat.backend.gpu.formula import triton_formula
 from splat.raster import formulas
@@ -136,7 +137,7 @@ def repeated(count: Int[Tensor, "n"], start: Int[Tensor, "n_1"]) -> Int[Tensor, 
     """The index i, count[i] times over; reads the total back.  ValueError where it is beyond what the kernels count to."""
     total = int(start[-1])
     if total >= LIMIT:
-        raise ValueError(
+        raise InputError(
             f"expected fewer than 2^31 tiles that splats touch in a view, got {total}; render smaller images, or Gaussians "
             "that are fewer or smaller"
         )

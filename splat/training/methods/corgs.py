@@ -34,6 +34,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.autograd import consistency_loss
 from splat.model.camera import Camera, slerp
 from splat.model.gaussians import Gaussians
@@ -62,12 +63,12 @@ class CoRGS(Method):
 
     def __post_init__(self) -> None:
         if min(self.prune_every, self.prune_start, self.pseudo_start) < 0:
-            raise ValueError(
+            raise InputError(
                 "expected prune_every, prune_start and pseudo_start of at least 0, got "
                 f"{self.prune_every}, {self.prune_start} and {self.pseudo_start}"
             )
         if not (0 < self.distance < inf and 0 <= self.weight < inf and 0 <= self.noise < inf):
-            raise ValueError(
+            raise InputError(
                 "expected a finite distance above 0, weight and noise of at least 0, got "
                 f"{self.distance}, {self.weight} and {self.noise}"
             )
@@ -115,7 +116,7 @@ class CoRegularizer(Regularizer):
         own, theirs = training.gaussians, partner.gaussians
         keep = confirmed(own, theirs, settings.distance), confirmed(theirs, own, settings.distance)
         if not keep[0].any():  # then there is no pair at all, and none of the partner stays either
-            raise ValueError(
+            raise InputError(
                 f"expected Gaussians of the two fields within {settings.distance} of each other, got none at step "
                 f"{step.number}; raise distance, which is in world units"
             )
@@ -132,7 +133,7 @@ class CoRegularizer(Regularizer):
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
         if not isinstance(state["partner"], Training | None):
-            raise ValueError("'partner' is no training")
+            raise InputError("'partner' is no training")
         self.partner = state["partner"]
 
 

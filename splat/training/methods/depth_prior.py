@@ -12,6 +12,7 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.scenes.view import View
 
 DepthKind = Literal["disparity", "depth"]
@@ -20,14 +21,14 @@ DepthKind = Literal["disparity", "depth"]
 def require_kind(kind: str) -> None:
     """ValueError unless it is one of the two."""
     if kind not in ("disparity", "depth"):
-        raise ValueError(f"expected depths 'disparity' (larger is nearer) or 'depth' (larger is farther), got {kind!r}")
+        raise InputError(f"expected depths 'disparity' (larger is nearer) or 'depth' (larger is farther), got {kind!r}")
 
 
 def require_maps(views: Sequence[View], method: str) -> None:
     """ValueError unless every view has a depth map."""
     without = [view.name for view in views if view.depth is None]
     if without:
-        raise ValueError(
+        raise InputError(
             f"expected a depth map of every training view for the method {method}, got none of {without[0]!r} "
             f"({len(without)} of {len(views)} have none); give a folder of them with --depths"
         )

@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.gaussians import Gaussians
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render_depth
@@ -56,14 +57,14 @@ class DNGaussian(Method):
     def __post_init__(self) -> None:
         weights = self.local_weight, self.global_weight
         if not all(0 <= weight < inf for weight in weights) or not any(weights):
-            raise ValueError(f"expected finite weights of at least 0, not both 0, got {weights}")
+            raise InputError(f"expected finite weights of at least 0, not both 0, got {weights}")
         if not 0 <= self.tolerance < inf or min(self.hard_start, self.soft_start) < 0:
-            raise ValueError(
+            raise InputError(
                 "expected tolerance, hard_start and soft_start of at least 0, got "
                 f"{self.tolerance}, {self.hard_start} and {self.soft_start}"
             )
         if not 2 <= self.smallest_patch <= self.largest_patch:
-            raise ValueError(
+            raise InputError(
                 f"expected 2 <= smallest_patch <= largest_patch, got {self.smallest_patch} and {self.largest_patch}"
             )
         require_kind(self.depths)

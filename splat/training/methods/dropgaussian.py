@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.training.state import Method, Regularizer, Step
 
 
@@ -26,7 +27,7 @@ class DropGaussian(Method):
 
     def __post_init__(self) -> None:
         if not 0 < self.p_max < 1:
-            raise ValueError(f"expected p_max above 0 and below 1, got {self.p_max}; for 0 use the method 3dgs")
+            raise InputError(f"expected p_max above 0 and below 1, got {self.p_max}; for 0 use the method 3dgs")
 
     def regularizer(self, seed: int) -> "DropRegularizer":
         return DropRegularizer(self, seed)

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.autograd import consistency_loss
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render
@@ -35,7 +36,7 @@ class DropoutGS(Method):
 
     def __post_init__(self) -> None:
         if not (0 < self.p < 1 and 0 < self.weight < inf):
-            raise ValueError(
+            raise InputError(
                 f"expected p above 0 and below 1 and a finite weight above 0, got {self.p} and {self.weight}; "
                 "for 0 use the method 3dgs"
             )

@@ -31,6 +31,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.gaussians import Gaussians
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render_depth
@@ -61,16 +62,16 @@ class FSGS(Method):
 
     def __post_init__(self) -> None:
         if self.neighbours < 1 or min(self.unpool_until, self.depth_until) < 0:
-            raise ValueError(
+            raise InputError(
                 "expected neighbours of at least 1, unpool_until and depth_until of at least 0, got "
                 f"{self.neighbours}, {self.unpool_until} and {self.depth_until}"
             )
         if not (0 < self.threshold < inf and 0 <= self.large < inf):
-            raise ValueError(
+            raise InputError(
                 f"expected a finite threshold above 0 and large of at least 0, got {self.threshold} and {self.large}"
             )
         if not (0 <= self.depth_weight < inf and 0 <= self.late_depth_weight < inf):
-            raise ValueError(
+            raise InputError(
                 f"expected finite depth weights of at least 0, got {self.depth_weight} and {self.late_depth_weight}"
             )
         require_kind(self.depths)

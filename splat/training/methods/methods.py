@@ -8,6 +8,9 @@ dropoutgs       the image without a random share of the Gaussians agrees with th
 fsgs            new Gaussians between distant neighbours; depth correlates with the user's depth maps
 dngaussian      depth has the shape of the user's depth maps, globally and in small patches
 cor-gs          two fields: each keeps the Gaussians that the other confirms, and agrees with it between the views
+
+>>> METHODS["stablegs"](warm_up=100).warm_up
+100
 """
 
 from splat.training.methods.corgs import CoRGS

@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
 from splat.training.state import Method, Regularizer, Step
 
@@ -35,9 +36,9 @@ class SAM(Method):
 
     def __post_init__(self) -> None:
         if not 0 < self.rho < inf:
-            raise ValueError(f"expected a finite rho above 0, got {self.rho}; for rho 0 use the method 3dgs")
+            raise InputError(f"expected a finite rho above 0, got {self.rho}; for rho 0 use the method 3dgs")
         if self.metric not in ("parameters", "rates"):
-            raise ValueError(f"expected metric 'parameters' or 'rates', got {self.metric!r}")
+            raise InputError(f"expected metric 'parameters' or 'rates', got {self.metric!r}")
 
     def regularizer(self, seed: int) -> "SAMRegularizer":
         return SAMRegularizer(self, seed)

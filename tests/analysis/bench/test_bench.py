@@ -11,15 +11,14 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from analysis.bench.command import run_bench
-from analysis.bench.speed.kernels import own_stages
+from analysis.bench.options import BenchOptions
+from analysis.bench.speed.kernels import random_splats, splat_problem, stages_of
 from analysis.bench.speed.meters import HostMeter, bandwidth
 from analysis.bench.speed.peak import CHAINS, STEPS, fma_peak, multiply_add
-from analysis.bench.speed.prototype import prototype_in
 from analysis.bench.speed.reference import reference_cost
 from analysis.bench.speed.scene import SCALED, ViewBench
-from analysis.bench.workloads import Size, random_splats, splat_problem, synthetic_workload
+from analysis.bench.workloads import Size, synthetic_workload
 from analysis.commands.cli import main
-from analysis.console.options import BenchOptions
 from analysis.console.timing import Timing, interleaved
 from figures import bench as figure
 from splat.backend.cpu.simd import lanes_of
@@ -82,12 +81,10 @@ def test_random_splats_are_ellipses_spread_over_the_image():
 
 
 def test_the_stages_of_the_kernels_leave_what_the_raster_computes():
-    rng = np.random.default_rng(2)
-    problem = splat_problem(TINY, *random_splats(TINY, rng), rng)
-    stages = own_stages(problem)
-    for call in stages.calls.values():
+    problem = splat_problem(TINY, np.random.default_rng(2))
+    calls, results, raster = stages_of(problem)
+    for call in calls.values():
         call()
-    results, raster = stages.results(), stages.raster
     planes = raster.pad(np.concatenate([problem.cotangents, np.zeros_like(problem.cotangents[:, :1])], axis=1))
     adjoint = raster.backward(planes[0])
     np.testing.assert_array_equal(results["backward + reduce"], adjoint.gradient)
@@ -236,12 +233,10 @@ def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
     ("arguments", "message"),
     [
         (["--repetitions", "0"], "at least 1 repetition"),
-        (["--prototype", "elsewhere"], "bench kernels --prototype"),
         (["--sizes", "many"], "GAUSSIANS@WIDTHxHEIGHT"),
         (["nowhere"], "nowhere"),
         (["--downscale", "2"], "--downscale with a scene's folder"),
         (["kernels", "--images", "images_4"], "--images and --downscale with a scene's folder"),
-        (["kernels", "--prototype", "nowhere"], "expected a prototype's"),
         (["kernels", "--device", "cuda"], "which measures the CPU's kernels; leave out --device"),
     ],
 )
@@ -249,20 +244,3 @@ def test_bad_input_gets_one_sentence(tmp_path, capsys, arguments, message):
     assert main(["bench", *arguments, "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err.strip()
     assert said.startswith("landscape: ") and message in said and "\n" not in said
-
-
-def test_a_prototype_runs_from_a_copy_that_leaves_nothing_behind(tmp_path):
-    folder = tmp_path / "prototype"
-    folder.mkdir()
-    kernels = "from pathlib import Path\nHERE = Path(__file__).parent\n"
-    (folder / "gen.py").write_text(
-        kernels + "def get(*a, **k):\n    (HERE / 'made.py').write_text('')\n    return HERE"
-    )
-    for name in ("rast", "binning", "simd", "tmpl"):
-        (folder / f"{name}.py").write_text("")
-    before, path = set(sys.modules), list(sys.path)
-    with prototype_in(folder) as prototype:
-        copy = prototype.kernels
-        assert copy != folder and (copy / "made.py").exists()
-    assert not copy.exists() and not (folder / "made.py").exists()
-    assert sys.path == path and not {"gen", "rast"} & (set(sys.modules) - before)

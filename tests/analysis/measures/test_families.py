@@ -293,7 +293,7 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
         else:
             known = BlockEigenvectors(objective, pixelwise if gauss_newton else own, pixelwise, attribute, scale)
             upwards = gauss_newton or block == "means"
-            assert torch.equal(lead.start, known.steepest(1, 0) if upwards else known.leads())
+            assert torch.equal(lead.start, known.steepest(1, 0) if upwards else known.warm_start())
     eye = torch.eye(objective.active.flat.numel(), dtype=torch.float64)
     diagonals = {newton: seen[newton, "all"][0].apply(eye).diagonal() for newton in (False, True)}
     for (gauss_newton, block), (_, lead) in seen.items():

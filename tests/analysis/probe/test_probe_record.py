@@ -8,9 +8,9 @@ import pytest
 
 from analysis.commands.cli import main
 from analysis.console.budget import SHARES
-from analysis.console.options import ProbeOptions
 from analysis.probe.command import run_probe
 from analysis.probe.measurement import ProbeSettings
+from analysis.probe.options import ProbeOptions
 from analysis.records.records import Record, read_record
 from splat.training.checkpoint import load_checkpoint
 from tests.analysis.probe.probed import unlimited
@@ -144,7 +144,7 @@ def skewed(run):
 
 
 def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_path, no_pictures, monkeypatch, capsys):
-    monkeypatch.setattr("splat.curvature.objective.hessian.SceneHessian.apply", skewed(run))
+    monkeypatch.setattr("splat.curvature.hessian.SceneHessian.apply", skewed(run))
     quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
     assert main([*quick, str(tmp_path / "lenient")]) == 0
     assert main([*quick, str(tmp_path / "strict"), "--strict"]) == 1

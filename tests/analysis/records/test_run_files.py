@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from analysis.console.options import TrainOptions
 from analysis.records.run_files import read_scores
 from analysis.runs.sweep.sweep_file import Cell
 from analysis.runs.sweep.sweep_results import results
+from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 
 SCORES = {"psnr": 20.0, "ssim": 0.5, "lpips": None}

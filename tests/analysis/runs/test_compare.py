@@ -101,11 +101,7 @@ def test_depth_over_lateral_is_compared_where_a_probe_has_it(runs, tmp_path, no_
     path.write_text(json.dumps(json.loads(path.read_text()) | {"depth": depth_section()}))
     assert main(["compare", *runs, "--out", str(tmp_path / "with")]) == 0
     lines = {line.strip().split("  ")[0]: line for line in capsys.readouterr().out.splitlines() if "depth" in line}
-    for name, value in (
-        ("gradient", "0.00680"),
-        ("curvature", "3.80"),
-        ("rise at 0.1 px", "0.280"),
-    ):
+    for name, value in (("gradient", "0.00680"), ("curvature", "3.80"), ("rise at 0.1 px", "0.280")):
         assert value in lines[f"depth / lateral {name}"] and lines[f"depth / lateral {name}"].rstrip().endswith("–")
     table = pd.read_csv(tmp_path / "with/compare.csv").set_index(["section", "quantity", "run"])
     rise = table.loc[("depth over lateral", "rise at 0.1 px", "plain/0")]

@@ -12,8 +12,8 @@ from PIL import Image
 from torch import Tensor
 
 from analysis.commands.cli import main
-from analysis.console.options import TrainOptions
 from analysis.train.command import _beginnings_after, planned
+from analysis.train.options import TrainOptions
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene

@@ -148,8 +148,8 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
-from splat.checkpoint import save_checkpoint
-from splat.train import Training, train
+from splat.training.checkpoint import save_checkpoint
+from splat.training.loop import Training, train
 training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
 for done in train(training, tiny_views()):
     if done.step % 4 == 0:

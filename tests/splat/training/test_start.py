@@ -176,7 +176,7 @@ def test_views_with_nothing_in_common_are_refused() -> None:
 
 
 def test_a_scene_starts_from_its_points_and_without_them_from_random_ones() -> None:
-    frames = tuple(Frame(v.name, v.camera, lambda v=v: (v.image, None), depth_range=(3.0, 5.0)) for v in views())
+    frames = tuple(Frame(v.name, v.camera, lambda v=v: v, depth_range=(3.0, 5.0)) for v in views())
     with_points = Scene("s", Path("s"), "synthetic", frames, some_points(), torch.zeros(3))
     without = Scene("s", Path("s"), "synthetic", frames, None, torch.zeros(3))
     generator = torch.Generator().manual_seed(0)
@@ -214,7 +214,7 @@ def test_lego_starts_round_its_middle(lego: Path) -> None:
 
 
 def test_the_source_of_the_points_can_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = tuple(Frame(v.name, v.camera, lambda v=v: (v.image, None), depth_range=(3.0, 5.0)) for v in views())
+    frames = tuple(Frame(v.name, v.camera, lambda v=v: v, depth_range=(3.0, 5.0)) for v in views())
     with_points = Scene("s", Path("s"), "synthetic", frames, some_points(), torch.zeros(3))
     without = Scene("s", Path("s"), "synthetic", frames, None, torch.zeros(3))
     elsewhere = Points(some_points().xyz + 5, some_points().rgb, some_points().observations, NAMES)

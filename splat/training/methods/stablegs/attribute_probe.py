@@ -30,6 +30,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import ATTRIBUTES, Gaussians
 from splat.projection.reference import NEEDLE, Splats, condition, on_screen
@@ -50,7 +51,7 @@ class Constants:
 
     def __post_init__(self) -> None:
         if not all(0 <= getattr(self, name) < inf for name in ATTRIBUTES):
-            raise ValueError(f"expected finite constants of at least 0, got {self}")
+            raise InputError(f"expected finite constants of at least 0, got {self}")
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Caps:
 
     def __post_init__(self) -> None:
         if not all(getattr(self, name) > 0 for name in ATTRIBUTES):
-            raise ValueError(f"expected caps above 0, got {self}; switch a probe off by leaving it out of attributes")
+            raise InputError(f"expected caps above 0, got {self}; switch a probe off by leaving it out of attributes")
 
 
 @dataclass(frozen=True)
@@ -92,15 +93,15 @@ class ProbeSettings:
     def __post_init__(self) -> None:
         unknown = set(self.attributes) - set(ATTRIBUTES)
         if unknown or len(set(self.attributes)) < len(self.attributes):
-            raise ValueError(f"expected attributes among {', '.join(ATTRIBUTES)}, each once, got {self.attributes}")
+            raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, each once, got {self.attributes}")
         if self.dimension not in ("active", "attribute"):
-            raise ValueError(f"expected dimension 'active' or 'attribute', got {self.dimension!r}")
+            raise InputError(f"expected dimension 'active' or 'attribute', got {self.dimension!r}")
         if not 0 < self.eps < inf:
-            raise ValueError(f"expected a finite eps above 0 (tau may be 0), got {self.eps}")
+            raise InputError(f"expected a finite eps above 0 (tau may be 0), got {self.eps}")
         if not 0 <= self.gamma <= 1:
-            raise ValueError(f"expected gamma in [0, 1] (1: depth alone, 0.5: the gradient itself), got {self.gamma}")
+            raise InputError(f"expected gamma in [0, 1] (1: depth alone, 0.5: the gradient itself), got {self.gamma}")
         if not 0 < self.kappa_full < inf:
-            raise ValueError(f"expected a finite kappa_full above 0, got {self.kappa_full}")
+            raise InputError(f"expected a finite kappa_full above 0, got {self.kappa_full}")
 
     @property
     def on(self) -> tuple[Attribute, ...]:
@@ -119,7 +120,7 @@ class Magnitude:
 
     def __post_init__(self) -> None:
         if not (isfinite(self.trace) and all(0 <= value < inf for value in (self.tau, self.uncapped, self.rho))):
-            raise ValueError(f"expected a finite trace, and finite tau and rho of at least 0, got {self}")
+            raise InputError(f"expected a finite trace, and finite tau and rho of at least 0, got {self}")
 
     @property
     def capped(self) -> bool:
@@ -147,7 +148,7 @@ def magnitudes(
         c, cap = getattr(settings.c, name), getattr(settings.caps, name)
         trace = traces.get(name)
         if trace is None or not isfinite(trace):
-            raise ValueError(f"expected a finite trace of {name}, got {trace}; lower the rates or leave {name} out")
+            raise InputError(f"expected a finite trace of {name}, got {trace}; lower the rates or leave {name} out")
         dim = each[name] * (active if settings.dimension == "active" else 1)
         tau = sqrt(max(trace, 0.0) / dim)
         rho = c / (tau + settings.eps)

@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.traces.trace import PAPER, estimate_traces
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import NothingInSight
@@ -75,11 +76,11 @@ class StableGS(Method):
 
     def __post_init__(self) -> None:
         if self.warm_up < 0 or self.every < 1:
-            raise ValueError(f"expected warm_up >= 0 and every >= 1, got {self.warm_up} and {self.every}")
+            raise InputError(f"expected warm_up >= 0 and every >= 1, got {self.warm_up} and {self.every}")
         if not (0 <= self.asp_weight < float("inf") and 0 <= self.vsp_weight < float("inf")):
-            raise ValueError(f"expected finite weights of at least 0, got {self.asp_weight} and {self.vsp_weight}")
+            raise InputError(f"expected finite weights of at least 0, got {self.asp_weight} and {self.vsp_weight}")
         if self.traces not in ("exact", "paper") or self.viewpoints not in ("all", "one"):
-            raise ValueError(
+            raise InputError(
                 f"expected traces 'exact' or 'paper' and viewpoints 'all' or 'one', got {self.traces!r} and "
                 f"{self.viewpoints!r}"
             )
@@ -101,7 +102,7 @@ class StableRegularizer(Regularizer):
         if self.settings.vsp_weight:
             self.geometry = capture_geometry([view.camera for view in views])
         if len(self.normals) not in (0, len(views)):  # restored
-            raise ValueError(
+            raise InputError(
                 f"expected an edge's normal for each of {len(views)} training views, found {len(self.normals)} in the saved "
                 "training; take another copy of it, or train anew"
             )
@@ -196,13 +197,13 @@ class StableRegularizer(Regularizer):
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
         if not fits(state["magnitudes"], dict[Attribute, dict[str, float]]):
-            raise ValueError(
+            raise InputError(
                 f"expected numbers for the magnitude of each attribute, found {short(state['magnitudes'])}"
             )
         self.magnitudes = {name: Magnitude(**values) for name, values in state["magnitudes"].items()}
         self.normals = state["normals"]
         if type(self.normals) is not list or not all(isinstance(n, Tensor) and n.shape == (2,) for n in self.normals):
-            raise ValueError(f"expected the normals as vectors of two numbers, found {short(self.normals)}")
+            raise InputError(f"expected the normals as vectors of two numbers, found {short(self.normals)}")
 
 
 def _edge_normal(step: Step, camera: Camera) -> Float[Tensor, "2"]:

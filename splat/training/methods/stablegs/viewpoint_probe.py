@@ -28,6 +28,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera, look_at, rotation_about, slerp
 from splat.model.capture import CaptureGeometry
 
@@ -55,16 +56,16 @@ class ViewpointSettings:
 
     def __post_init__(self) -> None:
         if not -1 <= self.t_min <= self.t_max <= 2:
-            raise ValueError(
+            raise InputError(
                 f"expected -1 <= t_min <= t_max <= 2, got {self.t_min} and {self.t_max}; 0 is the view, 1 its neighbour"
             )
         if not (0 <= self.theta_sigma <= 60 and 0 <= self.parallax_sigma < float("inf")):
-            raise ValueError(
+            raise InputError(
                 "expected theta_sigma of 0 to 60 degrees and a finite parallax_sigma of at least 0, got "
                 f"{self.theta_sigma} and {self.parallax_sigma}; to leave a mode out, switch it off"
             )
         if self.capture not in ("auto", "forward", "360") or self.axis not in ("normal", "tangent"):
-            raise ValueError(
+            raise InputError(
                 "expected capture 'auto', 'forward' or '360' and axis 'normal' or 'tangent', got "
                 f"{self.capture!r} and {self.axis!r}"
             )
@@ -141,7 +142,7 @@ def _surrounding(settings: ViewpointSettings, geometry: CaptureGeometry) -> bool
 def _on_shell(geometry: CaptureGeometry, gauss: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """Rotation and centre on the sphere about the target, in the direction of an isotropic Gaussian draw."""
     if geometry.target is None or geometry.orbit is None:
-        raise ValueError(
+        raise InputError(
             "expected cameras that look at a common place for a 360 capture, got parallel or diverging ones; "
             "use capture 'forward'"
         )

@@ -17,13 +17,13 @@ import torch
 import tyro
 
 from analysis.commands.cli import main
-from analysis.console.options import TrainOptions
 from analysis.records.provenance import usable_cores
 from analysis.records.records import record_folder, write_record
 from analysis.runs.sweep.sweep import _Cells, locked, missing, probe_arguments
 from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import results
+from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from splat.render.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene

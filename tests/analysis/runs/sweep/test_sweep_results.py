@@ -10,7 +10,6 @@ import pytest
 import torch
 from rich.console import Console
 
-from analysis.console.options import TrainOptions
 from analysis.records.records import record_folder, write_record
 from analysis.runs.sweep.sweep_file import Cell
 from analysis.runs.sweep.sweep_results import (
@@ -22,6 +21,7 @@ from analysis.runs.sweep.sweep_results import (
     unfinished,
     with_ratios,
 )
+from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from splat.training.loop import StepResult
 from tests.recorded import synthetic

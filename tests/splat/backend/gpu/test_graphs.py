@@ -136,24 +136,25 @@ def test_recorded_products_of_a_scene_are_those_that_are_not_recorded_to_the_las
         from tests.splat.fake_cuda_graph import FakeCudaGraph  # needs triton
 
         fake = FakeCudaGraph(monkeypatch)
-        monkeypatch.setattr(SceneObjective, "recordable", lambda self, vectors: True)
+        monkeypatch.setattr(SceneHessian, "recordable", lambda self, vectors: True)
         vars(hessian)["_recordings"] = CudaGraphCache(fake.capture)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         for seed in (1, 2):
             V = random_like((hessian.dim, 2), seed).to(device)
-            assert torch.equal(hessian.apply(V), hessian.project(hessian.launched(hessian.project(V))))
-    assert hessian.passes == 4 and (fake is None or fake.replays == 2)
+            assert torch.equal(hessian.apply(V), hessian.project(hessian.views.apply(hessian.project(V))))
+    assert fake is None or fake.replays == 2
 
 
 def test_products_on_the_cpu_of_large_views_and_of_views_that_are_not_kept_are_not_recorded(monkeypatch):
-    here, few = (objective(torch.device("cpu"), 2, memory) for memory in (2**30, 1))
-    assert (here.memory_plan.kept, few.memory_plan.kept, here.memory_plan.vectors) == (2, 1, 8)
+    here, few = (SceneHessian(objective(torch.device("cpu"), 2, memory)) for memory in (2**30, 1))
+    views = here.objective.linearized
+    assert (views.kept, few.objective.linearized.kept) == (2, 1)
     assert not here.recordable(1)
-    for made in (here, few):
-        vars(made)["active"] = SimpleNamespace(flat=SimpleNamespace(device=torch.device("cuda")))
+    for hessian in (here, few):
+        vars(hessian.objective)["active"] = SimpleNamespace(flat=SimpleNamespace(device=torch.device("cuda")))
     assert here.recordable(1) and not few.recordable(1)
-    monkeypatch.setattr("splat.curvature.objective.RECORDED", here._kept[0].workspace(8))
+    monkeypatch.setattr("splat.curvature.hessian.MOST_RECORDED", views.workspace(8))
     assert here.recordable(8) and here.recordable(9)  # nine take the memory of eight
-    monkeypatch.setattr("splat.curvature.objective.RECORDED", here._kept[0].workspace(8) - 1)
+    monkeypatch.setattr("splat.curvature.hessian.MOST_RECORDED", views.workspace(8) - 1)
     assert here.recordable(7) and not here.recordable(8)
