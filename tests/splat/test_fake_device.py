@@ -57,7 +57,7 @@ def put_on_gpu(training: Training, fake: FakeDevice) -> None:
     sums.total, sums.renders = fake.on_gpu(sums.total), fake.on_gpu(sums.renders)
 
 
-def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_six_times(monkeypatch):
+def test_a_training_step_stays_on_the_device_and_waits_six_times(monkeypatch):
     views = tiny_views()
     config = replace(tiny_config(), random_background=False)  # which would compare with another picture every step
     training = Training.start(tiny_gaussians(6), EXTENT, config)
@@ -90,7 +90,7 @@ def test_what_the_host_finds_out_about_neighbours_is_brought_back(monkeypatch, m
     assert not +fake.mixed
 
 
-def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait_for_it(monkeypatch):
+def test_products_of_a_scene_stay_on_the_device_and_do_not_wait(monkeypatch):
     gaussians = random_gaussians(4, 0, logit=1.0, spread=0.4)
     fake = FakeDevice(monkeypatch)
     monkeypatch.setattr("splat.backend.device.EMULATED", True)

@@ -18,7 +18,7 @@ A Number may carry a tangent, a tensor with the directions along its last axis: 
 import builtins
 import inspect
 from collections.abc import Callable
-from functools import cache
+from functools import cache, reduce
 from hashlib import sha256
 from pathlib import Path
 from types import CodeType, FunctionType
@@ -96,7 +96,7 @@ def _parts(x: Any) -> tuple[Any, Any]:
 
 
 def _elementwise(operation: Callable) -> Callable:
-    """A function of tensors as one of Numbers (without tangents) and constants; of constants alone, Python's own."""
+    """A function of tensors as one of Numbers without tangents and constants, at least one of them a Number."""
 
     def call(*numbers: Any) -> Any:
         semantic = next(x.semantic for x in numbers if isinstance(x, Number))
@@ -128,13 +128,6 @@ def _reciprocal(x: Number) -> Number:
     return _fma(r, _fma(-x, r, 1.0), r)
 
 
-def _largest(*numbers: Any) -> Any:
-    largest, *others = numbers
-    for other in others:
-        largest = _maximum(largest, other)
-    return largest
-
-
 def _value_of(x: Number) -> Number:
     return Number(x.semantic, x.value)
 
@@ -159,16 +152,12 @@ def variable(x: Number, lane: Number, i: int) -> Number:
     return Number(x.semantic, x.value, one.value.to(x.value.dtype, _semantic=x.semantic))
 
 
-def _integer(x: Number) -> Number:
-    return Number(x.semantic, x.value.to(tl.int32, _semantic=x.semantic))
-
-
-_maximum = _elementwise(tl.maximum)
+_maximum, _minimum = _elementwise(tl.maximum), _elementwise(tl.minimum)
 PRIMITIVES: dict[str, Callable] = {
     "value_of": _value_of, "select": select, "fma": _fma, "reciprocal": _reciprocal, "sqrt": _sqrt, "exp": _exp,
-    "maximum": _maximum, "max": _largest, "abs": _elementwise(tl.abs), "int": _integer,
-    "minimum": _elementwise(tl.minimum), "min": _elementwise(tl.minimum), "log": _elementwise(tl.log),
-    "exp2": _elementwise(tl.exp2), "ceil": _elementwise(tl.ceil), "floor": _elementwise(tl.floor),
+    "maximum": _maximum, "max": lambda *numbers: reduce(_maximum, numbers), "minimum": _minimum, "min": _minimum,
+    "abs": _elementwise(tl.abs), "log": _elementwise(tl.log), "exp2": _elementwise(tl.exp2), "ceil": _elementwise(tl.ceil),
+    "floor": _elementwise(tl.floor), "int": lambda x: Number(x.semantic, x._emit("to", x.value, tl.int32)),
 }  # fmt: skip
 
 

@@ -1,8 +1,7 @@
-"""The losses of `losses.py` on the CPU: value, gradient and Hessian-vector product of one view's image against its target,
-and value and gradients of the consistency of two images.
+"""The losses of `splat/losses/reference.py` on the CPU: value, gradient and Hessian-vector products of an image's loss against
+its target, and value and gradients of the consistency of two images.
 
-Planes are padded as in `raster/cpu.py`; only the first three are read, and the padding of an output is 0.  The formulas are in
-`losses_formulas.py` and `consistency_kernels.py`.
+Planes are padded as in `raster/cpu/raster.py`; only the first three are read, and the padding of an output is 0.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,12 +20,12 @@ from splat.losses.cpu.window import RING, Frame, moments_rows
 from splat.losses.formulas import KINDS
 from splat.losses.reference import LossSettings, window
 
-RINGS = 5 << 18  # bytes of the rows that a sweep keeps: with more of them, a vector more costs more than it shares
+RINGS = 5 << 18  # bytes of rings in a sweep: with more, another vector costs more cache than it shares
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 
 class ImageLoss:
-    """A loss of images of one size: their planes, and what its kernels are told."""
+    """A loss of images of one size: planes for them, and the sizes and weights that its kernels take."""
 
     def __init__(self, shape: Sequence[int], settings: LossSettings, dtype: type | np.dtype):
         _, height, width = shape
@@ -101,7 +100,7 @@ class ViewLoss(ImageLoss):
     def linearize(self, image: np.ndarray, second_order: bool = True) -> "LinearLoss":
         """Value, gradient and Hessian's products at padded planes (at least three), which must not change.
 
-        second_order: what the products need is held, too.
+        second_order: also keep what the products need.
         """
         gradient = aligned((4, self.frame.plane_rows, self.frame.stride), self.dtype)
         blurred = self.planes(1).reshape(-1) if second_order and self.structural else np.empty(0, self.dtype)
@@ -112,7 +111,7 @@ class ViewLoss(ImageLoss):
 
 
 class LinearLoss:
-    """A loss held still at an image: value, gradient (4, padded planes; that of alpha is 0) and Hessian-vector products."""
+    """A loss, linearised at an image: value, gradient (4 padded planes; that of alpha is 0) and Hessian-vector products."""
 
     def __init__(self, loss: ViewLoss, value: float, gradient: np.ndarray, image: np.ndarray, blurred: np.ndarray):
         self.loss, self.value, self.gradient, self._image, self._blurred = loss, value, gradient, image, blurred
@@ -159,7 +158,7 @@ class LinearLoss:
 
     @property
     def bytes(self) -> int:
-        """Memory of what is held, the target's included, the image's not."""
+        """Memory of what is kept, the target's included, the image's not."""
         target = self.loss.target.nbytes + self.loss._target_moments.nbytes
         return target + self.gradient.nbytes + self._blurred.nbytes
 

@@ -125,7 +125,7 @@ def test_kernels_give_the_specifications_value_gradient_and_products(size, setti
 @each_dtype
 @each_loss
 @each_size
-def test_quadratic_forms_are_those_of_the_specifications_products_and_of_the_diagonal(size, settings, dtype):
+def test_quadratic_forms_are_those_of_products_and_of_the_diagonal(size, settings, dtype):
     expected = truth(size, settings)
     exact, loss = (ViewLoss.of(expected.target.to(each), settings, each) for each in (torch.float64, dtype))
     diagonal = exact.cropped(exact.linearize(exact.padded(expected.image)).diagonal)
@@ -187,7 +187,7 @@ def test_padding_and_alpha_have_no_derivative(settings, dtype):
 
 
 @each_loss
-def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_vectors(settings, monkeypatch):
+def test_threads_change_no_bit_and_products_may_overwrite_their_vectors(settings, monkeypatch):
     monkeypatch.setattr("splat.losses.cpu.loss.RINGS", 1 << 16)  # so that two vectors are two sweeps
     expected = truth((37, 53), settings)
     x, y = expected.image.clone().requires_grad_(), expected.target.clone().requires_grad_()
@@ -271,7 +271,7 @@ def truth_of_both(size: tuple[int, int], settings: LossSettings) -> tuple[Tensor
 @each_dtype
 @each_loss
 @each_size
-def test_the_consistency_of_two_images_has_the_specifications_value_and_gradients(size, settings, dtype):
+def test_consistency_has_the_specifications_value_and_gradients(size, settings, dtype):
     value, *gradients = truth_of_both(size, settings)
     x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target(size))
     found = consistency_loss(x, y, settings)
