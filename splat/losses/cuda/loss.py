@@ -22,7 +22,7 @@ class CudaImageLoss:
     """A loss of images of one size: the constants, sizes and flags that its kernels take."""
 
     def __init__(self, image: Float[Tensor, "3 h w"], settings: LossSettings):
-        self.like, self.settings, self.shape = image.new_empty(0), settings, tuple(image.shape[-2:])
+        self.like, self.shape = image.new_empty(0), tuple(image.shape[-2:])
         count = 3 * self.shape[0] * self.shape[1]
         self.pixel, self.structural = settings.pixel_weight / count, settings.ssim_weight / count
         numbers = torch.tensor([settings.eps, self.pixel, self.structural], dtype=torch.float64)
