@@ -127,7 +127,7 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
         bench = ViewBench(workload)
         console.print(
             f"[bold]{workload.name}[/]: {len(workload.gaussians)} Gaussians, {bench.view.camera.width} x "
-            f"{bench.view.camera.height} px, {bench.linearized.touched} visible, {bench.linearized.entries} tile entries",
+            f"{bench.view.camera.height} px, {bench.linearized.touched} visible, {bench.linearized.intersections} tile entries",
             highlight=False,
         )
         calls = {**bench.stages(), **bench.wholes(), **bench.peers()}
@@ -219,7 +219,7 @@ def _bounds(
 ) -> pd.DataFrame:
     """What is asked for as ratios: of times, and of bytes over what the view's size allows."""
     view, lines = bench.linearized, ratios(times, by_triton(workload.gaussians.flat))
-    kept, sizes = bench.kept(), (view.touched, workload.pixels, view.entries)
+    kept, sizes = bench.kept(), (view.touched, workload.pixels, view.intersections)
     allowed = sum(each * size for each, size in zip(KEPT, sizes, strict=True))
     lines.append(_line(f"kept linearisation ({kept / 1e6:.1f} MB) / allowance", kept / allowed, 1.0))
     workspaces = {K: bench.workspace(K, meter) for K in VECTORS}

@@ -13,7 +13,9 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from landscape.errors import InputError
-from splat.training.state import Method, TrainConfig
+from splat.model.settings import current_settings
+from splat.model.typed import leaves
+from splat.training.state import MethodSettings, TrainConfig
 
 T = TypeVar("T")
 
@@ -31,26 +33,18 @@ def assignments(texts: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def leaves(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested settings as one level, by their dotted names.
-
-    >>> leaves({"probe": {"gamma": 0.5}, "viewpoint.parallax": False})
-    {'probe.gamma': 0.5, 'viewpoint.parallax': False}
-    """
-    result = {}
-    for key, value in settings.items():
-        result |= {f"{key}.{name}": v for name, v in leaves(value).items()} if isinstance(value, dict) else {key: value}
-    return result
-
-
 def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     """The settings with some of them changed.
 
     >>> overridden(TrainConfig(), {"densify.every": "50"}).densify.every
     50
+    >>> overridden(TrainConfig(), {"render.sums": "ordered"}).render.accumulation  # an older word for it
+    'deterministic'
     """
     own = _settable(TrainConfig)
     for key, value in changes.items():
+        if key == "render.sums":
+            key, value = "render.accumulation", current_settings({"sums": value})["accumulation"]
         path = key.split(".")
         if path[0] not in own + _settable(type(config.method)):
             raise InputError(
@@ -61,7 +55,7 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     return config
 
 
-def _names(settings: TrainConfig | Method) -> list[str]:
+def _names(settings: TrainConfig | MethodSettings) -> list[str]:
     """Of every single setting, but for the method's among the training's."""
     return [name for name in leaves(asdict(settings)) if name != "name" and not name.startswith("method.")]
 

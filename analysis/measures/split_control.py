@@ -112,4 +112,4 @@ def split_control(
 
 def _image(gaussians: Gaussians, camera: Camera, background: Tensor, settings: RenderSettings) -> Tensor:
     raster = rasterize_view(gaussians, camera, background, settings)
-    return torch.as_tensor(raster.crop(raster.planes[:3])).double()
+    return raster.crop(raster.planes[:3]).double()

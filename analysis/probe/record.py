@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import isfinite, isnan, sqrt
+from math import isfinite, isnan
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from landscape import EigenEnds, Eigenpairs, SpectralDensity, TraceEstimate, ani
 from landscape.operators.checks import ROUND_OFFS
 from landscape.spectrum.quantiles import quantile
 from splat.curvature.objective import ActiveCounts, SceneObjective
+from splat.curvature.traces import curvature_scale
 from splat.losses.reference import LossSettings
 
 NAMES = ("e₁", "e₂")  # of the slice's directions
@@ -88,7 +89,7 @@ def objective_of(objective: SceneObjective) -> dict[str, Any]:
 def _trace(trace: TraceEstimate) -> dict[str, Any]:
     sampled = trace.probes > 0
     method = "exact, the coupling of pixels sampled with random signs" if sampled else "exact"
-    return {**trace.record(), "tau": sqrt(max(trace.value, 0.0) / trace.dim) if trace.dim else 0.0, "method": method}
+    return {**trace.record(), "tau": curvature_scale(trace.value, trace.dim, 1, "active"), "method": method}
 
 
 def _eigenvalues(findings: Findings, objective: SceneObjective) -> dict[str, dict[str, Any]]:

@@ -20,6 +20,7 @@ from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
 from splat.raster.cpu.binning import reached_lists
+from splat.raster.cpu.raster import CpuRaster
 from splat.render.forward import rasterize_view
 
 REPETITIONS = 3
@@ -50,7 +51,9 @@ def product_skips(
     counts = {
         "gaussians_out_of_sight": len(gaussians) - len(active),
         "sh_bands_not_in_use": (stored + 1) ** 2 - (active.sh_degree + 1) ** 2,
-        "entries_behind_opaque_fronts": _total(objective, sum(view.entries_behind for view in objective.linearized)),
+        "entries_behind_opaque_fronts": _total(
+            objective, sum(view.intersections_behind for view in objective.linearized)
+        ),
         "tiles_of_zero_cotangent": _total(objective, sum(view.dark_tiles for view in objective.linearized)),
     }
     spared = _total(objective, spared)
@@ -106,8 +109,9 @@ def _with_every_entry(objective: SceneObjective) -> LinearizedView:
     """The first view with its tile lists as they were before any entry was dropped."""
     view = objective.linearize(0)
     raster = rasterize_view(objective.active, objective.views[0].camera, objective.background, objective.settings)
+    assert isinstance(raster, CpuRaster) and isinstance(view._raster, CpuRaster)  # on a GPU nothing is timed
     per_tile = np.diff(raster.lists.start)
-    view._raster.lists, view._raster._slot_start = reached_lists(raster.lists, per_tile, len(objective.active))
+    view._raster.reached = reached_lists(raster.lists, per_tile, len(objective.active))
     return view
 
 
@@ -115,5 +119,5 @@ def _with_every_tile(objective: SceneObjective) -> LinearizedView:
     """The first view with a cotangent that is nowhere 0, if next to it."""
     view = objective.linearize(0)
     cotangent = view._adjoint.cotangent
-    cotangent[cotangent == 0] = np.finfo(cotangent.dtype).tiny
+    cotangent[cotangent == 0] = torch.finfo(cotangent.dtype).tiny
     return view

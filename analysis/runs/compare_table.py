@@ -14,12 +14,12 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from analysis.console.overrides import leaves
 from analysis.records.family_table import INDICES, OPERATOR_NAMES, Cell, bracketed
 from analysis.records.findings import attribute_name
 from analysis.records.quantities import PLACES, SCORES, measured, quantity
+from splat.model.typed import leaves
 from splat.training.checkpoint import Checkpoint
-from splat.training.state import Method
+from splat.training.state import MethodSettings
 
 FAMILIES = "families"  # a section that only the page and the file show
 DEPTH = "depth over lateral"
@@ -127,7 +127,7 @@ def _families(runs: Sequence[Run]) -> Iterable[Row]:
                 yield Row(FAMILIES, "  split control", factors)
 
 
-def _method(method: Method) -> Entry:
+def _method(method: MethodSettings) -> Entry:
     """Its name, and beneath it the settings that are not the published ones.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS

@@ -66,9 +66,9 @@ def projector_of(objective: SceneObjective, *, gauss_newton: bool = False, apart
     active = objective.active
     if gauss_newton:
         n, bands = active.sh.shape[:2]
-        views = [view.held for view in objective.linearized]
+        views = [view.jacobian for view in objective.linearized]
         return Projector(objective.blocks, seen_parameters(views, n, bands, objective.gather_rows))
-    views = (view.held for view in objective.linearized)
+    views = (view.jacobian for view in objective.linearized)
     complete = objective.gather_rows, objective.mean_over_views
     colours = seen_colours(views, len(objective.views), active, *complete, apart=apart)
     return Projector(objective.blocks, colours, active.quats)

@@ -105,7 +105,7 @@ class SceneObjective:
         self.views, self.loss_settings, self.ranks = tuple(views), loss_settings, ranks
         self._views_of_ranks = [int(count) for count in ranks.gather(torch.tensor(len(views)))]
         # products are repeatable, however the training's steps were made
-        self.settings = replace(settings, sums="ordered")
+        self.settings = replace(settings, accumulation="deterministic")
         self.background = flat.new_zeros(3) if background is None else background.to(flat)
         self._losses = [loss_against(view.image, loss_settings, flat) for view in views]
         used = gaussians.select(torch.arange(len(gaussians)), degree)
@@ -156,9 +156,8 @@ class SceneObjective:
     def evaluate(self, flat: Float[Tensor, " p"]) -> tuple[float, Hashable]:
         """(L, smooth piece) at other parameters of the active Gaussians.
 
-        Splats are rendered and sorted anew.  The smooth piece says which splats each tile draws and in which order; it is the
-        same at two points only if L is smooth between them, but for the splats' thresholds in single pixels.  Changes nothing,
-        and may run in several threads at once.
+        Splats are rendered and sorted anew.  The smooth piece stands for the splats that each tile draws and their order: L may
+        be discontinuous between two points whose pieces differ.  Changes nothing, and may run in several threads at once.
         """
         gaussians = self.active.with_flat(flat.to(self.active.flat.device))
         gaussians.require_finite()
@@ -169,7 +168,7 @@ class SceneObjective:
     def evaluate_view(self, index: int, gaussians: Gaussians) -> tuple[float, Hashable]:
         """(l, smooth piece) of one view of this rank, at finite Gaussians in place of the active ones."""
         raster = rasterize_view(gaussians, self.views[index].camera, self.background, self.settings, finite=True)
-        return self._losses[index].value(raster.planes), raster.order
+        return self._losses[index].value(raster.planes), raster.draw_order
 
     def loss(self, flat: Float[Tensor, " p"]) -> float:
         """L alone, as of `evaluate`."""

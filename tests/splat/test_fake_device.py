@@ -21,7 +21,7 @@ from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.training.loop import train
 from splat.training.methods.corgs import _pruned, confirmed
-from splat.training.methods.fsgs import FSGS, unpool
+from splat.training.methods.depth.fsgs import FSGS, unpool
 from splat.training.state import Training
 from tests.splat.fake_device import FakeDevice
 from tests.splat.held_scenes import BACKGROUND, two_views
@@ -85,7 +85,7 @@ def test_what_the_host_finds_out_about_neighbours_is_brought_back(monkeypatch, m
         else:
             change = _pruned(there, confirmed(there, there.select(torch.arange(3)), 0.3))
         assert 0 < len(change.gaussians) != len(there)
-        training.follow(change)
+        training.replace_gaussians(change)
         _ = change.fresh & (change.gaussians.opacity_logits > 0)  # that it is there, too
     assert not +fake.mixed
 

@@ -13,16 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 from rich.console import Console
 from rich.progress import Progress
 
-from analysis.bench.speed.passes import Calls, cpu_stages, tangent_stages
+from analysis.bench.speed.passes import Calls, compositing_kernels, compositing_stages, tangent_stages
 from analysis.bench.tables import rich_table, write_table
 from analysis.bench.workloads import Size
 from analysis.console.timing import Timing, interleaved
 from splat.backend.cpu.threads import thread_count
 from splat.model.settings import RenderSettings
-from splat.raster.cpu.raster import Raster
+from splat.projection.dispatch import plain_gradient
+from splat.raster.cpu.raster import CpuRaster
 
 BACKGROUND = (0.1, 0.2, 0.3)
 BOUNDS = {1: 1.6, 4: 1.1}  # at most of H u K per tangent over a gradient, by K: what the project promises
@@ -67,20 +69,32 @@ def splat_problem(size: Size, rng: np.random.Generator) -> Problem:
     return Problem(size, splats, depths, cotangents, scales * rng.standard_normal((len(splats), K, 9), np.float32))
 
 
-def stages_of(p: Problem) -> tuple[Calls, dict[str, np.ndarray], Raster]:
-    """Every stage by its name, the arrays that they leave, and the raster that they work on."""
-    settings, drawn, size = RenderSettings(), np.ones(len(p.splats), np.bool_), (p.size.width, p.size.height)
-    raster = Raster(p.splats, p.depths, drawn, np.array(BACKGROUND), *size, settings)
-    planes = raster.pad(np.concatenate([p.cotangents, np.zeros_like(p.cotangents[:, :1])], axis=1))
+def stages_of(p: Problem) -> tuple[Calls, Callable[[], dict[str, np.ndarray]], CpuRaster]:
+    """Every stage by its name, what they leave in plain coordinates, and the raster that they work on."""
+    settings, size = RenderSettings(), (p.size.width, p.size.height)
+    splats, depths, drawn = (
+        torch.from_numpy(p.splats),
+        torch.from_numpy(p.depths),
+        torch.ones(len(p.splats), dtype=torch.bool),
+    )
+    raster = CpuRaster(splats, depths, drawn, torch.tensor(BACKGROUND), *size, settings)
+    cotangents = torch.from_numpy(p.cotangents)
+    planes = raster.pad(torch.cat([cotangents, torch.zeros_like(cotangents[:, :1])], dim=1))
     adjoint = raster.backward(planes[0])
-    first = cpu_stages(raster.splats, p.depths, drawn, size, settings, raster, adjoint)
+    first = compositing_stages((splats, depths, drawn), raster, adjoint)
     calls = {NAMES.get(name, name): call for name, call in first.items()}
-    results = {"backward + reduce": adjoint.gradient}
+    calls["backward + reduce"] = backward = compositing_kernels(raster, adjoint)
+    left = {}
     for K in BOUNDS:
-        more, results[f"J u {K}"], results[f"reduce {K}"] = tangent_stages(
-            raster, adjoint, p.directions[:, :K], planes[1 : 1 + K]
-        )
+        more, left[K] = tangent_stages(raster, adjoint, torch.from_numpy(p.directions[:, :K]), planes[1 : 1 + K])
         calls |= more
+
+    def results() -> dict[str, np.ndarray]:
+        found = {"backward + reduce": plain_gradient(raster.splats, torch.from_numpy(backward())).numpy()}
+        for K, arrays in left.items():
+            found[f"J u {K}"], found[f"reduce {K}"] = arrays()
+        return found
+
     return calls, results, raster
 
 
@@ -91,7 +105,7 @@ def measure(size: Size, repetitions: int, on_round: Callable[[], None]) -> dict[
     sums = {"gradient": ("binning", "packing", "slots", *COMPOSITING), "gradient, compositing": COMPOSITING}
     for K in BOUNDS:
         kernels = (f"J u {K}", f"tangent of backward {K}")
-        sums |= {f"H u {K}": (f"tangents {K}", *kernels, f"reduce {K}"), f"H u {K}, compositing": kernels}
+        sums |= {f"H u {K}": (*kernels, f"reduce {K}"), f"H u {K}, compositing": kernels}
     return times | {name: reduce(add, (times[stage] for stage in stages)) for name, stages in sums.items()}
 
 

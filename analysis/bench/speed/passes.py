@@ -3,119 +3,105 @@
     bin                   sort by depth, tile lists, order of the tiles
     pack                  parameters of the splats as the kernels read them
     forward
-    slots                 numbering of the (splat, tile) entries that are reached
-    backward + reduce     and the sum over each splat's entries
-    tangents K            packing of K tangents
+    slots                 numbering of the (splat, tile) intersections that some pixel reaches
+    backward + reduce     and the sum over each splat's intersections
     J u K                 the image's change along K tangents
     tangent of backward K
-    reduce K              the sum over each splat's entries
+    reduce K              the sum over each splat's intersections
 
-A gradient is the first five, a product with the Hessian the last four.  Arrays are allocated beforehand.
+A gradient is the first five, a product with the Hessian the last three.  Arrays are allocated beforehand.
 
-pairs: the (pixel, Gaussian) pairs that a pass evaluates: on the CPU every lane of every row of every entry that is reached, on
-a GPU every pixel of its tile.
+pairs: the (pixel, Gaussian) pairs that a pass evaluates: on the CPU every lane of every row of every intersection that is
+reached, on a GPU every pixel of its tile.
 """
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splat.backend.cpu.planes import aligned
 from splat.backend.cpu.threads import over_range, over_tiles
-from splat.model.camera import Camera
-from splat.model.settings import RenderSettings
-from splat.raster.cpu import binning, compositing, packing, tangents, tile
-from splat.raster.cpu.raster import Adjoint, Raster
+from splat.projection.dispatch import coefficients_of, plain_gradient
+from splat.raster.cpu import compositing, packing, tangents
+from splat.raster.cpu.raster import CpuAdjoint, CpuRaster
+from splat.raster.formulas import SPLAT
 
 Calls = dict[str, Callable[[], object]]
 
 
-def compositing_stages(
-    projected: tuple[Any, ...], camera: Camera, settings: RenderSettings, raster: Any, adjoint: Any
-) -> Calls:
+def compositing_stages(projected: tuple[Any, ...], raster: Any, adjoint: Any) -> Calls:
     """The first five stages of a view by name.  projected: splats, depths, which are drawn; `raster` stays as it was."""
-    size = camera.width, camera.height
-    if isinstance(raster, Raster):
-        splats, depths, drawn = (tensor.numpy() for tensor in projected)
-        return cpu_stages(splats, depths, drawn, size, settings, raster, adjoint)
-    from splat.raster.cuda.binning import bin_splats
-
-    splats, depths, drawn = projected
     return {
-        "bin": lambda: bin_splats(splats, depths, drawn, *size, raster.frame),
+        "bin": lambda: raster.bin(*projected[1:]),
         "pack": raster.pack,
         "forward": raster.forward,
-        "slots": raster.number_slots,
+        "slots": raster.number_accumulators,
         "backward + reduce": lambda: raster.backward(adjoint.cotangent),
     }
 
 
-def cpu_stages(
-    splats: np.ndarray,
-    depths: np.ndarray,
-    drawn: np.ndarray,
-    size: tuple[int, int],
-    settings: RenderSettings,
-    raster: Raster,
-    adjoint: Adjoint,
-) -> Calls:
-    """The first five stages, which read these splats (n, 9) and write what `raster` and `adjoint` hold already."""
-    n, cut = len(splats), np.log2(settings.alpha_min)
-    lists = binning.bin_splats(splats, depths, drawn, *size, settings)  # also the entries that `slots` drops
-    sums, params = aligned((int(raster.slot_start[-1]) * tile.SUMS,), raster.dtype), np.empty_like(raster.params)
-    drawing = (raster.params, raster.lists, raster.frame, raster.pixels)
+def compositing_kernels(raster: CpuRaster, adjoint: CpuAdjoint) -> Callable[[], np.ndarray]:
+    """ "backward + reduce" of a CPU into arrays that are there already: a call that leaves and returns the moments (n, 9)."""
+    lists, splat_start = raster.reached
+    sums, moments = (
+        aligned((int(splat_start[-1]) * SPLAT,), raster.dtype),
+        np.empty((len(raster.splats), SPLAT), raster.dtype),
+    )
+    arguments = (raster.params, lists, raster.frame, raster.pixels, raster.flat(adjoint.cotangent), sums)
 
-    def slots() -> np.ndarray:
-        raster.lists, raster._slot_start = lists, None
-        return raster.slot_start
+    def backward() -> np.ndarray:
+        over_tiles(compositing.backward, *arguments)
+        over_range(len(moments), packing.reduce_sums, splat_start, sums, moments)
+        return moments
 
-    def backward() -> None:
-        over_tiles(compositing.backward, *drawing, adjoint.cotangent, sums)
-        over_range(n, packing.reduce_gradient, splats, raster.slot_start, sums, adjoint.moments, adjoint.gradient)
-
-    return {
-        "bin": lambda: binning.bin_splats(splats, depths, drawn, *size, settings),
-        "pack": lambda: over_range(n, packing.pack_splats, splats, cut, np.inf, params),
-        "forward": lambda: over_tiles(compositing.forward, raster.params, lists, raster.frame, raster.pixels),
-        "slots": slots,
-        "backward + reduce": backward,
-    }
+    return backward
 
 
 def tangent_stages(
-    raster: Raster, adjoint: Adjoint, directions: np.ndarray, cotangents: np.ndarray
-) -> tuple[Calls, np.ndarray, np.ndarray]:
-    """The last four stages for directions (n, K, 9) and tangents of the cotangent (K, 4, plane); the arrays that they leave:
-    the image's changes (K, 3, h, w) and the products (n, K, 9)."""
-    splats, dtype, size, slot_start = raster.splats, raster.dtype, raster.frame.size, raster.slot_start
-    n, K, _ = directions.shape
-    directions, cotangents = np.ascontiguousarray(directions, np.float64), np.ascontiguousarray(cotangents).reshape(-1)
-    packed = aligned((n * K * tile.TANGENTS,), dtype)
+    raster: CpuRaster, adjoint: CpuAdjoint, directions: Float[Tensor, "n k 9"], cotangents: Float[Tensor, "k 4 H W"]
+) -> tuple[Calls, Callable[[], tuple[np.ndarray, np.ndarray]]]:
+    """The last three stages on a CPU, and what they leave, in plain coordinates: the images' changes (k, 3, h, w) and the
+    products (n, k, 9).
+
+    directions: plain tangents of the splats; cotangents: tangents of the adjoint's cotangent.
+    """
+    dtype, size, (lists, splat_start), K = raster.dtype, raster.frame.size, raster.reached, directions.shape[1]
+    packed = torch.stack(
+        [coefficients_of(raster.splats, each.contiguous()) for each in directions.double().unbind(1)], dim=1
+    )
+    packed = np.ascontiguousarray(packed.numpy(), dtype)
     planes, transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
-    sums = aligned((int(slot_start[-1]) * K * tile.SUMS,), dtype)
-    primal, products = (raster.lists, raster.frame, raster.pixels), np.empty_like(directions)
+    sums, product = aligned((int(splat_start[-1]) * K * SPLAT,), dtype), np.empty_like(packed)
+    primal, moments = (raster.params, packed.reshape(-1), lists, raster.frame, raster.pixels), adjoint.moments.numpy()
+    v_planes, dv_planes = raster.flat(adjoint.cotangent), raster.flat(cotangents)
     calls: Calls = {
-        f"tangents {K}": lambda: over_range(n, packing.pack_tangents, splats, directions, packed),
-        f"J u {K}": lambda: over_tiles(
-            tangents.tangent, raster.params, packed, *primal, planes, transmittances
-        ),
+        f"J u {K}": lambda: over_tiles(tangents.tangent, *primal, planes, transmittances),
         f"tangent of backward {K}": lambda: over_tiles(
-            tangents.curvature, raster.params, packed, *primal, adjoint.cotangent, transmittances, cotangents, sums
+            tangents.backward_tangent, *primal, v_planes, transmittances, dv_planes, sums
         ),
         f"reduce {K}": lambda: over_range(
-            n, packing.reduce_curvature, splats, directions, slot_start, sums, adjoint.moments, products
+            len(packed), packing.reduce_tangents, packed, splat_start, sums, moments, product
         ),
-    }  # fmt: skip
-    return calls, raster.crop(planes.reshape(K, 4, *raster.plane)[:, :3]), products
+    }
+
+    def left() -> tuple[np.ndarray, np.ndarray]:
+        plain = [plain_gradient(raster.splats, each.contiguous()) for each in torch.from_numpy(product).unbind(1)]
+        images = raster.crop(torch.from_numpy(planes).view(K, 4, *raster.plane)[:, :3])
+        return images.numpy(), torch.stack(plain, dim=1).numpy()
+
+    return calls, left
 
 
 def pairs_of(raster: Any) -> int:
     """(pixel, Gaussian) pairs that a pass evaluates."""
-    if not isinstance(raster, Raster):
+    if not isinstance(raster, CpuRaster):
         from splat.raster.cuda.binning import HEIGHT, WIDTH
 
-        return raster.entries_reached * WIDTH * HEIGHT
-    _ = raster.slot_start  # drops the entries that are not reached
-    rows = ((raster.lists.rows >> 8) & 255) - (raster.lists.rows & 255) + 1
+        return raster.intersections_reached * WIDTH * HEIGHT
+    packed = raster.reached[0].rows
+    rows = ((packed >> 8) & 255) - (packed & 255) + 1
     return int(rows.sum()) * raster.plane[1] // raster.frame.columns

@@ -24,7 +24,7 @@ RINGS = 5 << 18  # bytes of rings in a sweep: with more, another vector costs mo
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 
-class ImageLoss:
+class CpuImageLoss:
     """A loss of images of one size: planes for them, and the sizes and weights that its kernels take."""
 
     def __init__(self, shape: Sequence[int], settings: LossSettings, dtype: type | np.dtype):
@@ -42,18 +42,16 @@ class ImageLoss:
         """Uninitialised plane sets, (sets, 3, padded height, padded width)."""
         return aligned((sets, 3, self.frame.plane_rows, self.frame.stride), self.dtype)
 
-    def padded(self, image: Tensor | np.ndarray) -> np.ndarray:
+    def padded(self, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 H W"]:
         """Padded planes of an image, 0 outside it."""
         planes = self.planes(1)[0]
         planes[:] = 0
-        planes[:, : self.frame.height, : self.frame.width] = (
-            image.detach().numpy() if isinstance(image, Tensor) else image
-        )
-        return planes
+        planes[:, : self.frame.height, : self.frame.width] = image.detach().numpy()
+        return torch.from_numpy(planes)
 
-    def cropped(self, planes: np.ndarray) -> Tensor:
-        """The first three planes without their padding, as a tensor."""
-        return torch.from_numpy(np.ascontiguousarray(planes[:3, : self.frame.height, : self.frame.width]))
+    def cropped(self, planes: Float[Tensor, "k H W"]) -> Float[Tensor, "3 h w"]:
+        """The first three planes without their padding."""
+        return planes[:3, : self.frame.height, : self.frame.width].contiguous()
 
     def _sweep(self, *images: np.ndarray | None) -> float:
         """The loss by `gradient_rows`.  images: x, y and target, and where the two results go."""
@@ -61,43 +59,36 @@ class ImageLoss:
         over_range(len(pixels), gradient_rows, self.frame, self.loss, *images, pixels, distances)
         return float(self.pixel * pixels.sum() + self.structural * distances.sum())
 
-    def consistency(self, x: np.ndarray, y: np.ndarray) -> tuple[Tensor, np.ndarray]:
-        """The loss between two padded images, and its gradients in both (2, 3, ...)."""
+    def consistency(
+        self, x: Float[Tensor, "3 H W"], y: Float[Tensor, "3 H W"]
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "2 3 H W"]]:
+        """The loss between two padded images, and its gradients in both."""
         gradients = self.planes(2)
-        value = self._sweep(x.reshape(-1), y.reshape(-1), None, *gradients.reshape(2, -1))
-        return torch.tensor(value, dtype=torch.from_numpy(gradients).dtype), gradients
+        value = self._sweep(x.numpy().reshape(-1), y.numpy().reshape(-1), None, *gradients.reshape(2, -1))
+        return x.new_tensor(value), torch.from_numpy(gradients)
 
 
-class ViewLoss(ImageLoss):
+class CpuViewLoss(CpuImageLoss):
     """The loss of images against one target; what depends on the target alone is computed once."""
 
-    def __init__(self, target: Float[np.ndarray, "3 h w"], settings: LossSettings, dtype: type | np.dtype):
-        super().__init__(target.shape, settings, dtype)
-        self.target = self.padded(target)
-        self._target_moments = self._moments_of_target() if settings.ssim_weight else np.empty(0, self.dtype)
+    def __init__(self, target: Float[Tensor, "3 h w"], settings: LossSettings, dtype: torch.dtype):
+        super().__init__(target.shape, settings, NUMPY[dtype])
+        self.target, self._target_moments = self.padded(target).numpy(), np.empty(0, self.dtype)
+        if settings.ssim_weight:
+            self._target_moments = self.planes(2)  # mu and var
+            flat = self.target.reshape(-1), self._target_moments.reshape(-1)
+            over_range(3 * self.frame.height, moments_rows, self.frame, *flat)
 
-    @classmethod
-    def of(cls, target: Float[Tensor, "3 h w"], settings: LossSettings, dtype: torch.dtype) -> "ViewLoss":
-        """The loss against a tensor, for images of dtype."""
-        return cls(target.numpy(), settings, NUMPY[dtype])
-
-    def _moments_of_target(self) -> np.ndarray:
-        """mu and var."""
-        moments = self.planes(2)
-        flat = self.target.reshape(-1), moments.reshape(-1)
-        over_range(3 * self.frame.height, moments_rows, self.frame, *flat)
-        return moments
-
-    def _against(self, image: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _against(self, image: Float[Tensor, "k H W"]) -> tuple[np.ndarray, ...]:
         """The image's three planes, the target's, and the latter's moments, flat."""
-        x = np.ascontiguousarray(image[:3], self.dtype)
+        x = np.ascontiguousarray(image[:3].numpy(), self.dtype)
         return x.reshape(-1), self.target.reshape(-1), self._target_moments.reshape(-1)
 
-    def value(self, image: np.ndarray) -> float:
+    def value(self, image: Float[Tensor, "k H W"]) -> float:
         """The loss at padded planes: two blurs instead of the gradient's four."""
         return self._sweep(*self._against(image), None, np.empty(0, self.dtype))
 
-    def linearize(self, image: np.ndarray, second_order: bool = True) -> "LinearLoss":
+    def linearize(self, image: Float[Tensor, "k H W"], second_order: bool = True) -> "CpuLinearLoss":
         """Value, gradient and Hessian's products at padded planes (at least three), which must not change.
 
         second_order: also keep what the products need.
@@ -107,31 +98,31 @@ class ViewLoss(ImageLoss):
         gradient[:, self.frame.height :] = 0
         gradient[3] = 0
         value = self._sweep(*self._against(image), gradient.reshape(-1), blurred)
-        return LinearLoss(self, value, gradient, image, blurred)
+        return CpuLinearLoss(self, value, torch.from_numpy(gradient), image, blurred)
 
 
-class LinearLoss:
+class CpuLinearLoss:
     """A loss, linearised at an image: value, gradient (4 padded planes; that of alpha is 0) and Hessian-vector products."""
 
-    def __init__(self, loss: ViewLoss, value: float, gradient: np.ndarray, image: np.ndarray, blurred: np.ndarray):
+    def __init__(self, loss: CpuViewLoss, value: float, gradient: Tensor, image: Tensor, blurred: np.ndarray):
         self.loss, self.value, self.gradient, self._image, self._blurred = loss, value, gradient, image, blurred
 
     def scalar(self, like: Tensor) -> Float[Tensor, ""]:
         """The value as a tensor like another."""
         return like.new_tensor(self.value)
 
-    def hvp(self, tangents: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """l'' v for K padded tangents (K, 4, ...), to out (which may be the tangents themselves)."""
-        loss, height = self.loss, self.loss.frame.height
-        products = aligned((len(tangents), *self.gradient.shape), loss.dtype) if out is None else out
-        found = loss.planes(min(self._together, len(tangents)))
-        for first in range(0, len(tangents), self._together):
-            some, results = (each[first : first + self._together] for each in (tangents, products))
+    def hvp(self, tangents: Float[Tensor, "k 4 H W"], out: Tensor | None = None) -> Float[Tensor, "k 4 H W"]:
+        """l'' v for K padded tangents, to out (which may be the tangents themselves)."""
+        loss, height, vectors = self.loss, self.loss.frame.height, tangents.numpy()
+        products = aligned((len(vectors), *self.gradient.shape), loss.dtype) if out is None else out.numpy()
+        found = loss.planes(min(self._together, len(vectors)))
+        for first in range(0, len(vectors), self._together):
+            some, results = (each[first : first + self._together] for each in (vectors, products))
             self._products(some, found.reshape(len(found), -1)[: len(some)], None, None)
             results[:, :3, :height] = found[: len(some), :, :height]
             results[:, :, height:] = 0
             results[:, 3] = 0
-        return products
+        return torch.from_numpy(products)
 
     @property
     def _together(self) -> int:
@@ -139,10 +130,10 @@ class LinearLoss:
         rows = PRODUCT_FIELDS * RING * self.loss.frame.stride * self.loss.dtype.itemsize
         return max(1, RINGS // rows)
 
-    def curvatures(self, tangents: np.ndarray) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-        """v . l'' v for K padded tangents (K, 3 or more, ...), and v . D v with the diagonal D of l''."""
+    def curvatures(self, tangents: Float[Tensor, "k p H W"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
+        """v . l'' v for K padded tangents (at least three planes each), and v . D v with the diagonal D of l''."""
         forms = np.empty((2, len(tangents), 3 * self.loss.frame.height))
-        self._products(tangents, None, self.diagonal.reshape(-1), forms)
+        self._products(tangents.numpy(), None, self.diagonal.numpy().reshape(-1), forms)
         full, pixelwise = torch.from_numpy(forms.sum(axis=2))
         return full, pixelwise
 
@@ -167,9 +158,9 @@ class LinearLoss:
         return min(vectors, self._together) * self.gradient[:3].nbytes
 
     @cached_property
-    def diagonal(self) -> np.ndarray:
-        """The pixel-diagonal of l'', padded planes (3, ...): that of SSIM is one blur with the squared window."""
+    def diagonal(self) -> Float[Tensor, "3 H W"]:
+        """The pixel-diagonal of l'': that of SSIM is one blur with the squared window."""
         frame, diagonal = self.loss.frame, self.loss.planes(1)[0]
         diagonal[:, frame.height :] = 0
         self._sweep(diagonal_rows, frame._replace(taps=frame.taps**2), diagonal.reshape(-1))
-        return diagonal
+        return torch.from_numpy(diagonal)

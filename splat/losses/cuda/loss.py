@@ -138,7 +138,7 @@ class CudaLinearLoss:
         self.loss, self.total, self.gradient = loss, total, gradient
         self._residual, self._second, self._blurred = residual, second, blurred
 
-    @cached_property
+    @property
     def value(self) -> float:
         return float(self.total)
 

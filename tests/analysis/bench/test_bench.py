@@ -23,7 +23,9 @@ from analysis.console.timing import Timing, interleaved
 from figures import bench as figure
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import SceneObjective
-from splat.raster.cpu.tile import SUMS
+from splat.projection.dispatch import plain_gradient
+from splat.raster.formulas import SPLAT
+from tests.splat.raster.compositing_cases import plain_jvp, plain_product
 
 ROOT = Path(__file__).parents[3]
 TINY = Size(60, 40, 24)
@@ -85,13 +87,17 @@ def test_the_stages_of_the_kernels_leave_what_the_raster_computes():
     calls, results, raster = stages_of(problem)
     for call in calls.values():
         call()
-    planes = raster.pad(np.concatenate([problem.cotangents, np.zeros_like(problem.cotangents[:, :1])], axis=1))
+    results = results()
+    cotangents = torch.from_numpy(problem.cotangents)
+    planes = raster.pad(torch.cat([cotangents, torch.zeros_like(cotangents[:, :1])], dim=1))
     adjoint = raster.backward(planes[0])
-    np.testing.assert_array_equal(results["backward + reduce"], adjoint.gradient)
+    np.testing.assert_array_equal(results["backward + reduce"], plain_gradient(raster.splats, adjoint.moments))
     for K in (1, 4):
-        tangent = raster.jvp(problem.directions[:, :K])
+        tangent = plain_jvp(raster, torch.from_numpy(problem.directions[:, :K]))
         np.testing.assert_array_equal(results[f"J u {K}"], raster.crop(tangent.planes[:, :3]))
-        np.testing.assert_array_equal(results[f"reduce {K}"], tangent.curvature(adjoint, planes[1 : 1 + K]))
+        np.testing.assert_array_equal(
+            results[f"reduce {K}"], plain_product(raster, tangent, adjoint, planes[1 : 1 + K])
+        )
 
 
 def test_the_timed_gradients_are_the_gradient_of_the_view(bench):
@@ -107,13 +113,13 @@ def test_the_stages_of_a_scene_run_and_leave_the_view_as_it_was(bench):
     for call in {**bench.stages(), **bench.wholes()}.values():
         call()
     np.testing.assert_array_equal(bench.gradient(), before)
-    np.testing.assert_array_equal(bench.adjoint.gradient, bench.raster.backward(bench.cotangent).gradient)
+    np.testing.assert_array_equal(bench.adjoint.moments, bench.raster.backward(bench.cotangent).moments)
 
 
 def test_pairs_are_the_pixels_of_the_rows_that_are_passed(bench):
-    lists = bench.raster.lists
+    lists, _ = bench.raster.reached
     count = sum((int(r) >> 8 & 255) - (int(r) & 255) + 1 for r in lists.rows)
-    assert bench.linearized.entries == lists.rows.size > 0
+    assert bench.linearized.intersections == lists.rows.size > 0
     assert bench.pairs == count * lanes_of(np.float32)
 
 
@@ -121,8 +127,8 @@ def test_memory_is_that_of_the_arrays(bench):
     view = bench.linearized
     shared = 4 * 3 * view._raster.frame.size  # the image, which the loss holds as a view of the raster's planes
     assert view.bytes - shared <= bench.kept() <= 1.1 * view.bytes
-    for K in (1, 8):  # the sums of the entries, the planes of the tangents
-        least = 4 * K * (SUMS * view.entries + 5 * view._raster.frame.size)
+    for K in (1, 8):  # the sums of the intersections, the planes of the tangents
+        least = 4 * K * (SPLAT * view.intersections + 5 * view._raster.frame.size)
         blocks = 4 * 4 * K * view.gradient.numel()  # the argument, the result and their copies
         objects = 64 * 1024  # Python's own
         assert least <= bench.workspace(K, HostMeter()) <= view.workspace(K) + blocks + objects

@@ -75,7 +75,7 @@ def test_a_bench_on_a_gpu_measures_every_stage_and_names_a_missing_peer(gpu, mon
     expected = ViewBench(toy())
     for gradient in found:
         assert relative_error(gradient.cpu(), expected.gradient()) < 1e-5
-    entries = own.raster.entries_reached
+    entries = own.raster.intersections_reached
     assert own.pairs == 256 * entries > 0 and own.bytes_of("forward") == 68 * entries + 24 * 16 * 12
     assert BYTES.keys() == bench.OPERATIONS.keys()
 

@@ -50,7 +50,7 @@ def test_what_was_skipped_is_counted_and_its_time_said(record, dense, run):
     assert {name: skip["count"] for name, skip in skipped.items()} == {
         "gaussians_out_of_sight": len(gaussians) - len(objective.active),
         "sh_bands_not_in_use": 0,
-        "entries_behind_opaque_fronts": sum(view.entries_behind for view in views),
+        "entries_behind_opaque_fronts": sum(view.intersections_behind for view in views),
         "tiles_of_zero_cotangent": sum(view.dark_tiles for view in views),
         "products_of_views_not_concerned": 0,
         "samples_of_finished_traces": sum(128 - trace["probes"] for trace in record.data["traces"].values()),

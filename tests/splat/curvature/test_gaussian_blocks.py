@@ -11,9 +11,10 @@ from landscape.traces.control import controlled
 from landscape.traces.trace import TraceSettings
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.kept_views import VECTORS
+from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, SampledTrace, _signs, coupling_samples, exact_traces
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
@@ -70,15 +71,15 @@ def test_own_blocks_are_those_of_the_dense_hessian(loss: LossSettings, gauss_new
         assert abs(traces[name] - float(H.diagonal()[block].sum())) <= 1e-10 * float(H.diagonal()[block].abs().sum())
 
 
-def test_memory_decides_which_views_are_kept_and_changes_no_bit() -> None:
-    gaussians, loss = awkward_gaussians(), LossSettings()
+def test_memory_decides_which_views_are_kept_and_changes_no_bit(monkeypatch) -> None:
+    gaussians, loss, widths, hvp = awkward_gaussians(), LossSettings(), [], LinearizedView.hvp
+    monkeypatch.setattr(LinearizedView, "hvp", lambda view, U: widths.append(U.shape[1]) or hvp(view, U))
     roomy = objective_of(gaussians, loss, noise=0.3)
     tight = SceneObjective(gaussians, roomy.views, loss, BACKGROUND, memory=0)
     assert (tight.linearized.kept, roomy.linearized.kept) == (1, 2)
-    V = torch.randn(
-        SceneHessian(roomy).dim, VECTORS + 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
+    V = random_like((SceneHessian(roomy).dim, VECTORS + 3), 0)
     assert torch.equal(SceneHessian(roomy).apply(V), SceneHessian(tight).apply(V))
+    assert widths == [VECTORS, 3] * 4  # of two views, each time
 
 
 def test_under_l1_alone_the_appearance_has_no_curvature() -> None:
@@ -97,7 +98,7 @@ def test_traces_leave_the_radial_directions_of_the_quaternions_out() -> None:
 def test_the_pixel_diagonal_of_the_loss_is_that_of_its_dense_hessian(kind) -> None:
     target, generator = torch.rand(3, 9, 13, dtype=torch.float64), torch.Generator().manual_seed(0)
     image = target + 0.1 * torch.randn(3, 9, 13, generator=generator, dtype=torch.float64)
-    loss = ViewLoss.of(target, LossSettings(kind), torch.float64)
+    loss = CpuViewLoss(target, LossSettings(kind), torch.float64)
     linear = loss.linearize(loss.padded(image))
     units = torch.eye(image.numel(), dtype=torch.float64).view(-1, 3, 9, 13)
     columns = [loss.cropped(linear.hvp(loss.padded(unit)[None])[0]).reshape(-1) for unit in units]

@@ -11,7 +11,7 @@ from splat.curvature.hessian import SceneHessian, ViewSum
 from splat.curvature.kept_views import free_memory
 from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import project
@@ -68,7 +68,7 @@ def test_exactly_the_gaussians_that_touch_no_pixel_are_removed():
     for view in two_views():
         seen = render(gaussians, view.camera, BACKGROUND).image
         assert torch.equal(render(left, view.camera, BACKGROUND).image, seen)
-        held = LinearizedView(gaussians, view.camera, ViewLoss.of(view.image.double(), LOSS, torch.float64), BACKGROUND)
+        held = LinearizedView(gaussians, view.camera, CpuViewLoss(view.image.double(), LOSS, torch.float64), BACKGROUND)
         for product in (held.gradient, held.hvp(random_like((gaussians.flat.numel(), 1), 1))[:, 0]):
             for value in gaussians.with_flat(product.contiguous()).attributes.values():
                 assert not value[~scene.mask].any()

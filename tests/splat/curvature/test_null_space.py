@@ -93,9 +93,7 @@ def test_the_rank_is_that_of_the_stacked_jacobians_and_within_bounds(views: int,
         own = torch.cat([torch.arange(rows.start, rows.stop).view(n, -1)[i] for rows in objective.blocks.values()])
         unit = torch.zeros(operator.dim, len(own), dtype=torch.float64)
         unit[own, torch.arange(len(own))] = 1
-        stacked = torch.cat(
-            [torch.from_numpy(view._projection.jvp(unit.numpy())[i].T) for view in objective.linearized]
-        )
+        stacked = torch.cat([view._projection.jvp(unit)[i].T for view in objective.linearized])
         total += int(
             torch.linalg.matrix_rank(stacked / stacked.norm(dim=1, keepdim=True).clamp_min(1e-300), rtol=1e-11)
         )
@@ -113,7 +111,7 @@ def test_the_hessian_is_zero_along_the_harmonics_that_no_view_sees() -> None:
     assert float((H @ unseen).norm()) < 1e-10 * float(H.norm() * unseen.norm())
     lit = torch.zeros(len(objective.active), 2, 3)
     for m, view in enumerate(objective.linearized):
-        lit[torch.as_tensor(view.held.index), m] = torch.as_tensor(view.held.visible).float()
+        lit[torch.as_tensor(view.jacobian.index), m] = torch.as_tensor(view.jacobian.visible).float()
     # a view sees the harmonics in one direction, and slopes along the two directions across it; both views together three
     slopes = (2 * lit.any(dim=2).sum(dim=1)).clamp_max(3)
     assert operator.rank == 10 * len(objective.active) + int(lit.sum() + slopes.sum())
@@ -136,8 +134,8 @@ def test_ranks_are_those_of_dense_hessians(views: int, sh_degree: int) -> None:
 def test_dense_scenes_have_unseen_gaussians_and_clamped_channels() -> None:
     objective = scattered(8, 8, 2, 7, LOSSES[0], lightness=0.2)
     views = list(objective.linearized)
-    assert len({len(view.held.index) for view in views}) > 1
-    assert sum(int((torch.as_tensor(view.held.visible) == 0).sum()) for view in views) > 0
+    assert len({len(view.jacobian.index) for view in views}) > 1
+    assert sum(int((torch.as_tensor(view.jacobian.visible) == 0).sum()) for view in views) > 0
 
 
 def test_the_rank_is_that_of_the_specifications_hessian() -> None:
@@ -162,7 +160,7 @@ def test_a_view_does_not_see_gaussians_in_its_tiles_but_in_no_pixel() -> None:
     objective = SceneObjective(gaussians, views, LossSettings("l2"))
     first, second = objective.linearized
     assert len(objective.active) == first.touched == 5
-    assert 0 not in first.held.index and 0 in second.held.index
+    assert 0 not in first.jacobian.index and 0 in second.jacobian.index
     H = dense(SceneHessian(objective, keep_null=True))
     assert projector_of(objective, apart=True).rank == 10 * 5 + len(spectrum(H, objective.blocks["sh"]))
 
@@ -250,7 +248,7 @@ def test_a_gpu_takes_no_large_matrices_apart(
 
 def test_row_spaces_are_the_same_on_any_number_of_threads() -> None:
     objective, before, found = objective_of(3, 1, n=70), torch.get_num_threads(), []
-    held = [view.held for view in objective.linearized]
+    held = [view.jacobian for view in objective.linearized]
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)

@@ -3,7 +3,7 @@
 from tests.splat.ahead_of_time import compile_kernel, run_as_script
 
 LONG, INTEGERS = ("index",), ("n", "m", "K", "height", "width", "start", "count", "v_stride", "out_stride", "steps")
-DOUBLES = ("lens", "splats", "bar", "cotangents", "opacity_bar", "distances", "losses")
+DOUBLES = ("lens", "splats", "bar", "distances", "losses")
 
 
 def types(kernel, double: tuple[str, ...] = ()) -> dict[str, str]:
@@ -29,8 +29,8 @@ def kernels() -> list[tuple]:
         (projection.project_adjoint, (), few | bands),
         (projection.linearize_geometry, (), lanes),
         (projection.linearize_colour, (), lanes | bands),
-        (projection.plain_jacobian, ("out",), few),
-        (projection.push_forward, ("out",), wide | bands),
+        (projection.convert, ("out",), few | {"WAY": 3}),
+        (projection.push_forward, (), wide | bands),
         (projection.pull_back, (), wide | bands | {"SECOND_ORDER": True}),
         (losses.blur_along, (), pixels),
         (losses.feed, (), pixels | {"FIELDS": 3}),
