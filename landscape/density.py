@@ -145,11 +145,13 @@ class Lengths:
         rest, starts = max(self.rest - found / len(runs), 0.0), self.matvecs / steps
         low, _, high = absolute_integral(nodes[0], weights[0])  # of one run: they cost as much as a product
         x, w = torch.cat(nodes), torch.cat(weights) / len(runs)
+        unit = float(x.abs().max()) or 1.0 if len(x) else 1.0  # of squares that leave the range of floats
+        x = x / unit
         squares = float((w * x.square()).sum())
         if self.traced and squares:
             squares -= float((w * x * x.abs()).sum()) ** 2 / squares
         # the variance over random signs is 2 sum f(lambda)^2 at most
-        spread = (2 * rest * max(squares, 0.0) / starts) ** 0.5
+        spread = unit * (2 * rest * max(squares, 0.0) / starts) ** 0.5
         return t_quantile(starts - 1, CONFIDENCE) * spread + rest * (high - low) / 2
 
 

@@ -39,6 +39,7 @@ from landscape.sketched_diagonal import sketched_samples
 
 Method = Literal["auto", "signs"]
 FEWEST = 4  # test vectors of a sketch
+SQUARED = 1e-140, 1e140  # numbers whose squares, and sums of them, are floats with all their digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ def estimate_diagonal(
     """diag H with a standard error for every entry, from `probes` (3 or more) matvecs at most.
 
     batch: vectors in one application of the operator.  Keeps n x probes numbers in float64, and squares them: entries within
-    1e-150 to 1e150, as all of float32 are, have their errors; scale H before where others matter.  Method "auto" is "signs"
+    SQUARED, as all of float32 are, have their errors, and ValueError where the largest is not.  Method "auto" is "signs"
     with fewer than 8 probes, with no more rows than probes, and where a part of the diagonal is known; where all of it is
     known (`control.PartlyKnown`), nothing is probed.
 
@@ -132,6 +133,7 @@ def estimate_diagonal(
         until = half if choosing and done < half else probes
         Z = draw_probes(operator.dim, min(batch, until - done), generator, operator.dtype, "rademacher")
         Y = product(operator, Z)
+        _require_squares(float(Y.abs().max()) if Y.numel() else 0.0)
         samples = torch.cat([samples, Z.double() * Y.double()], dim=1)
         if isinstance(operator, PartlyKnown):
             control = (Z * product(operator.known, Z)).double() - operator.known_diagonal().double()[:, None]
@@ -145,6 +147,14 @@ def estimate_diagonal(
     if controls.numel():
         samples = _controlled(samples, controls)
     return _mean(samples, operator, probes, "signs")
+
+
+def _require_squares(largest: float) -> None:
+    """ValueError unless the square of the largest entry of products is a float with all its digits."""
+    if largest and not SQUARED[0] <= largest <= SQUARED[1]:
+        raise ValueError(
+            f"expected products H z with a largest entry from {SQUARED[0]:g} to {SQUARED[1]:g}, got {largest:.3g}; scale H"
+        )
 
 
 def _mean(samples: Float64[Tensor, "n k"], operator: SymmetricOperator, matvecs: int, method: str) -> DiagonalEstimate:

@@ -32,7 +32,7 @@ from torch import Tensor
 from landscape.absolute_sum import integrals_of_rules
 from landscape.lanczos import lanczos
 from landscape.operator import DenseOperator
-from landscape.results import Bracket, SpectralDensity, t_quantile
+from landscape.results import Bracket, SpectralDensity, standard_deviation, t_quantile
 
 EPS = torch.finfo(torch.float64).eps
 TINY = torch.finfo(torch.float64).tiny
@@ -91,11 +91,13 @@ def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: flo
         for column in zip(*(tail.excess(grid, p) for tail in tails), strict=True)
     )
     margin = t_quantile(len(tails) - 1, confidence) / len(tails) ** 0.5
-    beneath = least.mean(dim=0) - margin * least.std(dim=0) > 0  # t is certainly too low, up to the next of the grid
-    beyond = most.mean(dim=0) + margin * most.std(dim=0) <= 0  # certainly high enough
+    beneath = (
+        least.mean(dim=0) - margin * standard_deviation(least) > 0
+    )  # t is certainly too low, up to the next of the grid
+    beyond = most.mean(dim=0) + margin * standard_deviation(most) <= 0  # certainly high enough
     totals = density.rest * torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64) + known.sum()
     # n eigenvalues up to t add up to n t at most
-    floor = p * float(totals.mean() - margin * totals.std()) / density.dim
+    floor = p * float(totals.mean() - margin * float(standard_deviation(totals))) / density.dim
     low = float(grid[int(beneath.long().cumprod(0).sum().clamp_max(len(grid) - 1))])
     last = int(beyond.long().flip(0).cumprod(0).sum())
     high = float(grid[-last]) if last else inf

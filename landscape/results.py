@@ -45,12 +45,18 @@ def t_quantile(freedom: float, confidence: float) -> float:
     return float(stdtrit(freedom, (1 + confidence) / 2))
 
 
+def standard_deviation(samples: Float64[Tensor, "s *shape"]) -> Float64[Tensor, "*shape"]:
+    """Along the first axis; in units of the largest sample, as squares may leave the range of floats."""
+    unit = float(samples.abs().max()) or 1.0
+    return unit * (samples / unit).std(dim=0)
+
+
 def t_interval(samples: Float64[Tensor, " s"], confidence: float) -> tuple[float, float, float, float]:
     """Mean, standard error and both ends of Student's interval; a single sample has an infinite error."""
     count, mean = samples.numel(), float(samples.mean())
     if count < 2:
         return mean, inf, -inf, inf
-    error = float(samples.std()) / sqrt(count)
+    error = float(standard_deviation(samples)) / sqrt(count)
     half = t_quantile(count - 1, confidence) * error
     return mean, error, mean - half, mean + half
 
@@ -202,7 +208,10 @@ class Bracket:
     def __str__(self) -> str:
         if self.value is not None:
             return f"{self.value:.4g} in [{self.low:.4g}, {self.high:.4g}]" + (f" ({self.note})" if self.note else "")
-        return f">= {self.low:.4g}: {self.note}" if isfinite(self.low) else f"undefined: {self.note}"
+        if not isfinite(self.low):
+            return f"undefined: {self.note}"
+        ends = f"in [{self.low:.4g}, {self.high:.4g}]" if isfinite(self.high) else f">= {self.low:.4g}"
+        return f"{ends}: {self.note}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,13 +288,14 @@ class SpectralDensity:
         c = sum f(lambda) lambda / sum lambda^2 leaves the least of them; less where the trace has an error of its own.
         """
         shift = torch.zeros(len(self.nodes), dtype=torch.float64)
-        squares = float((self.weights * self.nodes.square()).sum())
-        if self.trace is None or not isfinite(self.trace[1]) or squares == 0:
+        unit = float(self.nodes.abs().max()) if self.nodes.numel() else 0.0  # of squares that leave the range of floats
+        if self.trace is None or not isfinite(self.trace[1]) or unit == 0:
             return shift, 0.0
         trace, error = self.trace
-        starts = len(self.nodes)
+        starts, x, off = len(self.nodes), self.nodes / unit, error / unit
+        squares = float((self.weights * x.square()).sum())
         own = 2 * self.rest * squares / starts**2  # variance of the start vectors' mean
-        slope = float((self.weights * self.nodes * function(self.nodes)).sum()) / squares * own / (own + error**2)
+        slope = float((self.weights * x * function(self.nodes) / unit).sum()) / squares * own / (own + off * off)
         seen = self.rest * (self.weights * self.nodes).sum(dim=1) + self.known.sum()
         return slope * (trace - seen), abs(slope) * error * NormalDist().inv_cdf((1 + confidence) / 2)
 
