@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from analysis.records import Record, read_record
-from analysis.verdict import attribute_name
+from analysis.records.findings import attribute_name
+from analysis.records.records import Record, read_record
 from figures.plane import Plane, plane, same_scale
 from figures.style import (
     BLACK,

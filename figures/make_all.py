@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from analysis.records import Record, read_record
+from analysis.records.records import Record, read_record
 from figures import slice1d, slice2d, spectrum, surface, traces
 from figures.style import folder_script, save
 

@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from analysis.records import PROBE, SLICE, Record, read_record
-from analysis.run_files import CHECKPOINT
+from analysis.records.records import PROBE, SLICE, Record, read_record
+from analysis.records.run_files import CHECKPOINT
 from figures.plane import Plane, plane
 from figures.style import BLACK, FIELD_MAP, MISSING, exponent_of, literal, unit_suffix
 

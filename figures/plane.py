@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.quantities import quantity
-from analysis.records import Record
+from analysis.records.quantities import quantity
+from analysis.records.records import Record
 from figures.style import exponent_of, literal, unit_suffix
 
 TRUE_PROPORTIONS = 2.5  # ranges whose ratio is below this are drawn to the same scale

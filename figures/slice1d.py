@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from analysis.quantities import quantity
-from analysis.records import Record
-from analysis.verdict import resolved
+from analysis.records.findings import resolved
+from analysis.records.quantities import quantity
+from analysis.records.records import Record
 from figures.plane import Direction, direction
 from figures.slice2d import CROSSED, RENDERED
 from figures.style import BLACK, BLUE, VERMILION, exponent_of, new_figure, script, style, unit_suffix

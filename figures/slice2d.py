@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from analysis.quantities import quantity
-from analysis.records import Record
+from analysis.records.quantities import quantity
+from analysis.records.records import Record
 from figures.plane import Direction, Plane, curvature_text, plane, same_scale
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
 

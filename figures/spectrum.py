@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from analysis.quantities import measured, power_of_ten
-from analysis.records import Record
+from analysis.records.quantities import measured, power_of_ten
+from analysis.records.records import Record
 from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, script, style
 
 DECADES = 5  # shown on either side of 0

@@ -18,8 +18,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from analysis.quantities import power_of_ten
-from analysis.records import Record, read_record
+from analysis.records.quantities import power_of_ten
+from analysis.records.records import Record, read_record
 
 COLUMN = 3.3
 FIELD_MAP = "cividis"

@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.ticker import MaxNLocator
 
-from analysis.quantities import quantity
-from analysis.records import Record
+from analysis.records.quantities import quantity
+from analysis.records.records import Record
 from figures import render_surface
 from figures.plane import Direction, Plane, plane
 from figures.render_surface import Box

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from analysis.quantities import measured, power_of_ten, quantity
-from analysis.records import Record
-from analysis.verdict import attribute_name
+from analysis.records.findings import attribute_name
+from analysis.records.quantities import measured, power_of_ten, quantity
+from analysis.records.records import Record
 from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, script, style
 
 SIGNS: dict[str, dict[str, Any]] = {

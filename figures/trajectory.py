@@ -20,18 +20,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from matplotlib.transforms import Affine2D
 
-from analysis.quantities import power_of_ten
-from analysis.verdict import ATTRIBUTES, attribute_name
-from figures.style import (
-    BLACK,
-    RUNS,
-    exponent_of,
-    literal,
-    new_figure,
-    save,
-    style,
-    unit_suffix,
-)  # fmt: skip
+from analysis.records.findings import ATTRIBUTES, attribute_name
+from analysis.records.quantities import power_of_ten
+from figures.style import BLACK, RUNS, exponent_of, literal, new_figure, save, style, unit_suffix  # fmt: skip
 
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
 INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
@@ -42,7 +33,7 @@ APART = 0.03  # of a panel's width, between the bars of two runs at the same ste
 
 
 def draw(table: pd.DataFrame) -> Figure:
-    """table: rows of `analysis/trajectory.py`, with the name of the run that each belongs to as "run".
+    """table: rows of `analysis/train/trajectory.py`, with the name of the run that each belongs to as "run".
 
     Raises ValueError where nothing was measured.
     """

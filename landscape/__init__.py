@@ -11,21 +11,15 @@ returns a frozen result that carries its error.  Bad arguments, and products tha
     processes     `Ranks`, `DistributedOperator`
 """
 
-from landscape.absolute_sum import absolute_sum
-from landscape.anisotropy import anisotropy, effective_rank, literal, mass_quantile, saddle, share
-from landscape.block_size import fastest_block
-from landscape.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
-from landscape.control import PartlyKnown
-from landscape.density import ActiveSpace, spectral_density
-from landscape.diagonal import DiagonalEstimate, GroupSums, estimate_diagonal
-from landscape.directions import gradient_direction, groups_of, line_between, orthonormal, random_directions
-from landscape.distributed import DistributedOperator, Ranks
-from landscape.eigen import EigenSettings, extreme_eigenpairs
-from landscape.families import Family, FamilySettings, Lead, families, family
-from landscape.finite_probe import FiniteProbe, finite_probe
-from landscape.lanczos import LanczosFactorization, lanczos
-from landscape.objective import ObjectiveHessian
-from landscape.operator import (
+from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
+from landscape.eigen.lanczos import LanczosFactorization, lanczos
+from landscape.eigen.pairs import EigenEnds, Eigenpairs
+from landscape.eigen.power import PowerSettings, power_ends, power_iteration
+from landscape.operators.block_size import fastest_block
+from landscape.operators.checks import DerivativeCheck, OperatorCheck, check_gradient, check_objective, check_operator
+from landscape.operators.distributed import DistributedOperator, Ranks
+from landscape.operators.objective import ObjectiveHessian
+from landscape.operators.operator import (
     CountingOperator,
     DenseOperator,
     ProjectedOperator,
@@ -34,22 +28,22 @@ from landscape.operator import (
     SumOperator,
     SymmetricOperator,
 )
-from landscape.power import PowerSettings, power_ends, power_iteration
-from landscape.quantiles import absolute_quantile, quantile
-from landscape.refinement import SliceSettings
-from landscape.results import (
-    Anisotropy,
-    Bracket,
-    EigenEnds,
-    Eigenpairs,
-    Progress,
-    Slice,
-    SpectralDensity,
-    StopReason,
-    TraceEstimate,
-)
-from landscape.slices import curvature_reach, evaluate_slice, symmetric_axis
-from landscape.trace import PAPER, TraceSettings, estimate_traces, total_trace
+from landscape.results import Bracket, Progress, StopReason
+from landscape.slices.directions import gradient_direction, groups_of, line_between, orthonormal, random_directions
+from landscape.slices.finite_probe import FiniteProbe, finite_probe
+from landscape.slices.refinement import SliceSettings
+from landscape.slices.slice import Slice
+from landscape.slices.slices import curvature_reach, evaluate_slice, symmetric_axis
+from landscape.spectrum.absolute_sum import absolute_sum
+from landscape.spectrum.anisotropy import Anisotropy, anisotropy, effective_rank, literal, mass_quantile, saddle, share
+from landscape.spectrum.density import ActiveSpace, spectral_density
+from landscape.spectrum.families import Family, FamilySettings, Lead, families, family
+from landscape.spectrum.quantiles import absolute_quantile, quantile
+from landscape.spectrum.rules import SpectralDensity
+from landscape.traces.control import PartlyKnown
+from landscape.traces.diagonal import DiagonalEstimate, GroupSums, estimate_diagonal
+from landscape.traces.estimate import TraceEstimate
+from landscape.traces.trace import PAPER, TraceSettings, estimate_traces, total_trace
 
 __all__ = [
     "PAPER",

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.budget import NEEDS_DENSITY
-from analysis.provenance import provenance
+from analysis.console.budget import NEEDS_DENSITY
+from analysis.records.provenance import provenance
 
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 

@@ -1,24 +1,37 @@
-"""landscape <- splat <- analysis <- figures, no arrow back; figures computes nothing and needs no torch."""
+"""The plan of the house: at most nine rooms in a folder, and imports that go one way.
+
+Every folder's rooms, its modules and sub-packages, are listed from the ground up: a room imports from rooms before its own in
+that list, never from one after, for types alone neither.  `figures` draws what `analysis` recorded, and needs no torch.
+"""
 
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-LAYERS = ("landscape", "splat", "analysis", "figures")
-ALLOWED = {
-    "landscape": {"landscape"},
-    "splat": {"landscape", "splat"},
-    "analysis": set(LAYERS),  # the command lives here and has its pictures drawn
-    "figures": {"analysis", "figures"},  # the recorded results
+MOST_ROOMS = 9
+ORDER = {
+    "": "landscape splat analysis figures",
+    "landscape": "linalg probes results operators traces eigen spectrum slices",
+    "splat": "model backend projection losses raster render scenes curvature training",
+    "analysis": "records console measures train probe slice runs bench commands",
 }
 
 
-def imported(path: Path) -> set[str]:
-    """The modules that a file imports anywhere, inside functions too."""
+@cache
+def modules() -> dict[str, Path]:
+    """Every module of the source, by its full name; a package by that of its folder."""
+    files = [path for layer in ORDER[""].split() for path in sorted((ROOT / layer).rglob("*.py"))]
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+
+
+@cache
+def imported(path: Path) -> frozenset[str]:
+    """The modules that a file imports anywhere, inside functions and for types too."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -27,49 +40,103 @@ def imported(path: Path) -> set[str]:
             assert node.level == 0, f"{path}: imports are written in full"
             assert node.module is not None
             names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+    return frozenset(names)
 
 
-def packages(path: Path) -> set[str]:
-    return {name.split(".")[0] for name in imported(path)}
+def sources(name: str) -> set[str]:
+    """The modules of the source that a module imports; of `from package import module` the module alone."""
+    found = imported(modules()[name]) & modules().keys()
+    return {each for each in found if not any(other.startswith(each + ".") for other in found)}
 
 
-def source_of(module: str) -> Path | None:
-    """The file of a module of this repository."""
-    path = ROOT / (module.replace(".", "/") + ".py")
-    return path if path.is_file() else None
+def rooms(folder: str) -> set[str]:
+    inside = [name.removeprefix(folder + ".") for name in modules() if not folder or name.startswith(folder + ".")]
+    return {name.split(".")[0] for name in inside}
 
 
-@pytest.mark.parametrize("layer", LAYERS)
-def test_no_arrow_points_back(layer):
-    files = sorted((ROOT / layer).rglob("*.py"))
-    assert len(files) > 3
-    for path in files:
-        assert packages(path) & set(LAYERS) <= ALLOWED[layer], path
-        assert "tests" not in packages(path), path
+def arrows(folder: str) -> set[tuple[str, str]]:
+    """(room, other room) wherever a module in the first imports one in the second."""
+    depth, found = len(folder.split(".")) if folder else 0, set()
+    for name in modules():
+        for other in sources(name):
+            ours, theirs = name.split("."), other.split(".")
+            same = ours[:depth] == theirs[:depth] == (folder.split(".") if folder else [])
+            if same and len(ours) > depth and len(theirs) > depth and ours[depth] != theirs[depth]:
+                found.add((ours[depth], theirs[depth]))
+    return found
 
 
-def test_oracles_import_nothing_of_the_source():
-    assert not packages(ROOT / "tests" / "oracles.py") & {*LAYERS, "tests"}
+def circles(edges: set[tuple[str, str]]) -> set[str]:
+    """The rooms that are left when rooms without arrows to others are taken away, one after the other."""
+    left = {room for edge in edges for room in edge}
+    while ground := {room for room in left if not any(a == room and b in left for a, b in edges)}:
+        left -= ground
+    return left
+
+
+def folders() -> list[str]:
+    return sorted({name.rpartition(".")[0] for name in modules()} | {"landscape", "splat", "analysis"} - {""})
+
+
+@pytest.mark.parametrize("folder", [folder for folder in folders() if folder not in ("", "figures")])
+def test_a_folder_has_nine_rooms_at_most_and_no_circle(folder):
+    assert len(rooms(folder)) <= MOST_ROOMS, sorted(rooms(folder))
+    assert not circles(arrows(folder))
+
+
+@pytest.mark.parametrize("folder", ORDER)
+def test_imports_go_one_way(folder):
+    order = ORDER[folder].split()
+    assert rooms(folder) == set(order)
+    back = {
+        (a, b) for a, b in arrows(folder) if order.index(b) > order.index(a) and (a, b) != ("analysis", "figures")
+    }  # the command has its pictures drawn
+    assert not back
+
+
+def test_circles_are_found():
+    assert circles({("a", "b"), ("b", "c"), ("c", "b")}) == {"b", "c"} | {"a"}
+    assert not circles({("a", "b"), ("b", "c"), ("a", "c")})
+
+
+@pytest.mark.parametrize(("one", "other"), [("cpu", "cuda"), ("cuda", "cpu")])
+def test_the_kernels_of_one_device_import_nothing_of_the_other(one, other):
+    of_one = [
+        name
+        for name in modules()
+        if name.startswith("splat.") and any(part.startswith(one) for part in name.split(".")[2:])
+    ]
+    of_one = [name for name in of_one if not name.startswith("splat.backend.")]
+    assert len(of_one) > 4
+    for name in of_one:
+        others = [
+            part for each in sources(name) for part in each.split(".")[2:] if not each.startswith("splat.backend.")
+        ]
+        assert not [part for part in others if part.startswith(other) or part.endswith(f"_{other}")], name
+
+
+def test_no_source_imports_tests_and_oracles_import_no_source():
+    for path in modules().values():
+        assert not any(name.split(".")[0] == "tests" for name in imported(path)), path
+    of_oracles = {name.split(".")[0] for name in imported(ROOT / "tests" / "oracles.py")}
+    assert not of_oracles & {*ORDER[""].split(), "tests"}
 
 
 def test_what_figures_read_of_analysis_does_not_draw():
-    waiting, seen = set((ROOT / "figures").glob("*.py")), set()
+    waiting, seen = {name for name in modules() if name.startswith("figures.")}, set()
     while waiting:
-        path = waiting.pop()
-        seen.add(path)
-        sources = {source_of(name) for name in imported(path) if name.startswith("analysis")}
-        waiting |= {source for source in sources if source} - seen
-    of_analysis = [path for path in seen if path.parent.name == "analysis"]
+        seen |= waiting
+        waiting = {each for name in waiting for each in sources(name) if each.startswith("analysis")} - seen
+    of_analysis = [name for name in seen if name.startswith("analysis.")]
     assert of_analysis
-    for path in of_analysis:
-        assert "figures" not in packages(path), path
+    for name in of_analysis:
+        assert not any(each.startswith("figures") for each in sources(name)), name
 
 
 def test_figures_need_no_torch():
-    modules = [f"figures.{path.stem}" for path in (ROOT / "figures").glob("*.py") if path.stem != "__init__"]
+    names = [name for name in modules() if name.startswith("figures.")]
     program = (
-        f"import importlib, sys; [importlib.import_module(m) for m in {modules!r}]; sys.exit('torch' in sys.modules)"
+        f"import importlib, sys; [importlib.import_module(m) for m in {names!r}]; sys.exit('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr or "figures imported torch"

@@ -29,124 +29,24 @@ Every kernel (`compositing.py`, `tangents.py`) takes tiles from a counter until 
 flat: `params` holds PARAMS floats a splat, `tangents` K x TANGENTS floats a splat, a plane stride x height floats.
 """
 
-from typing import NamedTuple
+from math import ceil, floor, inf, log, sqrt
 
 import numpy as np
 
-from splat.raster.jit import formula
-from splat.raster.simd import (
-    any_lane,
-    broadcast,
-    exp2,
-    fetch_and_increment,
-    fma,
-    iota,
-    lanes,
-    load,
-    maximum,
-    minimum,
-    select,
-    store,
-    store_sums,
-)
+from splat.backend.cpu.jit import formula
+from splat.backend.cpu.simd import exp2, fma, minimum, select
+from splat.projection.whitening import ROUND, plain_adjoint, whitened
 
-TILE_ROWS = 16
-NEVER = 1e30  # the stop index of a pixel that does not stop
-AHEAD = 6  # entries between a prefetch and its use
-
-PARAMS = 16  # one cache line in float32: mean x, y (pixel index units), the whitening, LO = log2 o; _REST: of a rounded number
-MX, MX_REST, MY, MY_REST, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT = range(13)
-CAPPED = 1 << 16  # in an entry's rows: its splat's alpha can reach the cap
-TANGENTS = 12  # q' = Q0 + QU u + QV v + QUU u^2 + QUV u v + QVV v^2, colour'
-Q0, QU, QV, QUU, QUV, QVV, DRED, DGREEN, DBLUE = range(9)
-SUMS = 9  # S, Su, Sv, Suu, Suv, Svv, G (3)
+Q0, QU, QV, QUU, QUV, QVV = range(6)  # q' = Q0 + QU u + QV v + QUU u^2 + QUV u v + QVV v^2
+WIDEN = 1e-4  # relative widening of an ellipse's level, so that no active pixel is missed
+DEGREE4, DEGREE2 = 15, 6  # how many moments u^j v^k there are up to these degrees
+CROSS = DEGREE4  # after the moments of s + v: those of w g_c + w h_c D_c, and the sums of w^2 h_c
+COLOUR = DEGREE4 + 3 * DEGREE2
+BLOCK_SUMS = COLOUR + 3
+TINY = np.finfo(np.float64).tiny  # an opacity below has no weight, and no inverse
 
 
-class Lists(NamedTuple):
-    """Which splats touch which tiles. An entry is a splat in a tile; the entries of a tile are in order of depth.
-
-    start: (tiles + 1,) first entry of each tile; splat: (entries,); rows: (entries,) first row | last row << 8 within the
-    tile, and CAPPED; slots: (entries,) where an entry's sums go, splat-major; order: the tiles as they are handed out.
-    """
-
-    start: np.ndarray
-    splat: np.ndarray
-    rows: np.ndarray
-    slots: np.ndarray
-    order: np.ndarray
-
-
-class Frame(NamedTuple):
-    """What all pixels share: tiles in a row, floats in a row of a plane, floats in a plane, cap, floor, background (3,).
-
-    row_offsets: 0, ..., TILE_ROWS - 1, each `lanes` times: read as vectors, they cost the kernels less than a conversion.
-    """
-
-    columns: int
-    stride: int
-    size: int
-    cap: float
-    floor: float
-    background: np.ndarray
-    row_offsets: np.ndarray
-
-
-class Pixels(NamedTuple):
-    """What `forward` leaves in each pixel: planes (red, green, blue, alpha), the final T, the entry at which it stopped."""
-
-    planes: np.ndarray
-    transmittance: np.ndarray
-    stop: np.ndarray
-
-
-@formula
-def scratch(like, size):
-    """A new array of like's dtype that starts on a cache line."""
-    buffer = np.empty(size + 16, like.dtype)
-    start = ((64 - (buffer.ctypes.data & 63)) & 63) // buffer.itemsize
-    return buffer[start : start + size]
-
-
-@formula
-def next_tile(counter, lists):
-    """The next tile that no thread has taken, or -1."""
-    turn = fetch_and_increment(counter)
-    return lists.order[turn] if turn < lists.order.size else np.int64(-1)
-
-
-@formula
-def corner_of(tile, lanes, columns, stride):
-    """Column and row of a tile's first pixel, and its index in a plane."""
-    x0, y0 = (tile % columns) * lanes, (tile // columns) * TILE_ROWS
-    return x0, y0, y0 * stride + x0
-
-
-@formula
-def row_range(packed):
-    """First row and one past the last row of an entry."""
-    return packed & 255, ((packed >> 8) & 255) + 1
-
-
-@formula
-def alpha_terms(params, o, x0, y0):
-    """u of a tile's columns, and what gives v and log2 alpha of its rows: v of row 0, its step, log2 o - u^2, cut.
-
-    The offset of the tile's corner is in double precision: far from the mean, v of a needle is a small difference.
-    """
-    along, across = params[o + ALONG], params[o + ACROSS]
-    shear = np.float64(params[o + SHEAR]) + params[o + SHEAR_REST]
-    dx = x0 - np.float64(params[o + MX]) - params[o + MX_REST]
-    dy = y0 - np.float64(params[o + MY]) - params[o + MY_REST]
-    u = fma(iota(params), along, along * dx)
-    v = fma(iota(params), across * shear, across * (shear * dx + dy))
-    terms = (v, broadcast(params, across), fma(-u, u, params[o + LO]), broadcast(params, params[o + CUT]))
-    return u, terms
-
-
-@formula
-def row_v(frame, L, y, terms):
-    """v of a tile's row y."""
-    return fma(load(frame.row_offsets, L * y), terms[1], terms[0])
+# --- one splat in one pixel -------------------------------------------------------------------------------------------
 
 
 @formula
@@ -172,33 +72,8 @@ def along_row(q, u):
 
 
 @formula
-def tangent_terms(tangents, j, u):
-    A, B, C = along_row(
-        (tangents[j], tangents[j + 1], tangents[j + 2], tangents[j + 3], tangents[j + 4], tangents[j + 5]), u
-    )
-    return A, B, broadcast(tangents, C)
-
-
-@formula
 def quadratic(v, terms):
     return terms[0] + v * (terms[1] + v * terms[2])
-
-
-@formula
-def broadcast3(array, i):
-    return broadcast(array, array[i]), broadcast(array, array[i + 1]), broadcast(array, array[i + 2])
-
-
-@formula
-def load3(array, i, step):
-    return load(array, i), load(array, i + step), load(array, i + 2 * step)
-
-
-@formula
-def store3(array, i, step, values):
-    store(array, i, values[0])
-    store(array, i + step, values[1])
-    store(array, i + 2 * step, values[2])
 
 
 @formula
@@ -222,13 +97,6 @@ def plus(x, y, c):
 def behind_all(g, background):
     """What the final transmittance is multiplied by in the loss: g . background - g_A."""
     return g[0] * background[0] + g[1] * background[1] + g[2] * background[2] - g[3]
-
-
-@formula
-def load_cotangent(planes, p, size):
-    """(g, g_A) of a row."""
-    g = load3(planes, p, size)
-    return g[0], g[1], g[2], load(planes, p + 3 * size)
 
 
 @formula
@@ -258,61 +126,10 @@ def step_curvature(tau, dR, dg, w, beta, rR, dq, g, colour, dcolour):
 
 
 @formula
-def reached(lists, tile, pixels, corner, stride):
-    """The first entry of a tile, and how many of its entries some pixel reaches before it stops."""
-    furthest = load(pixels.stop, corner)
-    for y in range(1, TILE_ROWS):
-        furthest = maximum(furthest, load(pixels.stop, corner + y * stride))
-    row = np.empty(lanes(pixels.stop), pixels.stop.dtype)
-    store(row, 0, furthest)
-    first = np.int64(lists.start[tile])
-    return first, np.int64(min(lists.start[tile + 1] - first, row.max()))
-
-
-@formula
-def dark(planes, first_plane, count, corner, size, stride):
-    """Whether `count` planes are exactly 0 all over a tile: a cotangent that leaves nothing to do."""
-    lit, one = broadcast(planes, 0.0), broadcast(planes, 1.0)
-    for plane in range(first_plane, first_plane + count):
-        for y in range(TILE_ROWS):
-            value = load(planes, plane * size + corner + y * stride)
-            lit = select((value >= 0.0) & (value <= 0.0), lit, one)  # NaN is neither
-    return not any_lane(lit > 0.0)
-
-
-@formula
-def clear_entries(lists, first, count, width, sums):
-    """Zeros for the sums, `width` an entry, of a tile's entries."""
-    for e in range(first, first + count):
-        at = np.int64(lists.slots[e]) * width
-        for j in range(width):
-            sums[at + j] = 0
-
-
-@formula
-def no_moments(params):
-    zero = broadcast(params, 0.0)
-    return zero, zero, zero, zero, zero, zero
-
-
-@formula
 def row_terms(v, s, w, h):
     """What a row adds to its columns' sums."""
     sv = s * v
     return s, sv, sv * v, w * h[0], w * h[1], w * h[2]
-
-
-@formula
-def add_row(moments, v, s, w, h):
-    t = row_terms(v, s, w, h)
-    return (
-        moments[0] + t[0],
-        moments[1] + t[1],
-        moments[2] + t[2],
-        moments[3] + t[3],
-        moments[4] + t[4],
-        moments[5] + t[5],
-    )
 
 
 @formula
@@ -323,6 +140,132 @@ def column_terms(columns, u):
     return S, Su, Sv, Su * u, Sv * u, Svv, G0, G1, G2
 
 
+# --- between a splat's numbers and its sums (W: `projection/whitening.py`) --------------------------------------------
+
+
 @formula
-def store_moments(sums, slot, moments, u):
-    store_sums(sums, slot * SUMS, column_terms(moments, u))
+def exponent_tangent(W, opacity, y):
+    """The coefficients Q0, QU, ... of q' along a splat's tangent y."""
+    u, v, uu, uv, vv = whitened(W, y)
+    return ratio(y[5], opacity), ROUND * u, ROUND * v, -0.5 * uu, -uv, -0.5 * vv
+
+
+@formula
+def ratio(x, opacity):
+    """x / opacity, 0 where nothing is drawn."""
+    return select(opacity > 0, x / opacity, 0.0)
+
+
+@formula
+def first_order(W, opacity, total):
+    """The gradient in mean, conic and opacity from a splat's sums."""
+    S, Su, Sv, Suu, Suv, Svv = total[0], total[1], total[2], total[3], total[4], total[5]
+    x, y, a, b, c = plain_adjoint(W, (ROUND * Su, ROUND * Sv, -0.5 * Suu, -Suv, -0.5 * Svv))
+    return x, y, a, b, c, ratio(S, opacity)
+
+
+@formula
+def second_order(W, opacity, y, moments, total):
+    """The gradient's tangent in mean, conic and opacity along a splat's tangent y; moments: S, Su, Sv of the gradient."""
+    S, Su, Sv = moments[0], moments[1], moments[2]
+    mu, mv, uu, uv, vv = whitened(W, y)
+    white = (
+        ROUND * (total[1] - mu * S) + uu * Su + uv * Sv,
+        ROUND * (total[2] - mv * S) + uv * Su + vv * Sv,
+        -0.5 * (total[3] - 2 * mu * Su),
+        -(total[4] - mu * Sv - mv * Su),
+        -0.5 * (total[5] - 2 * mv * Sv),
+    )
+    x, y_bar, a, b, c = plain_adjoint(W, white)
+    return x, y_bar, a, b, c, ratio(total[0] - S * ratio(y[5], opacity), opacity)
+
+
+# --- the pixels that a splat reaches ----------------------------------------------------------------------------------
+
+
+@formula
+def ellipse_of(splat, alpha_min, contour):
+    """Half-extents of a splat's ellipse and its widened level; a level of 0 where it is nowhere drawn."""
+    a, b, c, opacity = splat[2], splat[3], splat[4], splat[5]
+    drawn = (opacity >= alpha_min) & (opacity > 0)
+    level = min(contour * contour, 2 * log(select(drawn, opacity, 1.0) / alpha_min))
+    level = level * (1 + WIDEN) + WIDEN
+    det = a * c - b * b
+    level = select((level == inf) | (det <= 0), inf, level)
+    level = select(drawn, level, 0.0)
+    bounded = level < inf
+    return select(bounded, sqrt(level * c / det), inf), select(bounded, sqrt(level * a / det), inf), level, det
+
+
+@formula
+def pixels_within(centre, reach, size):
+    """First and last pixel index whose centre lies within reach, clipped to the image; empty if first > last."""
+    first = ceil(min(max(centre - reach, 0.0), size))
+    last = floor(max(min(centre + reach, size - 1.0), -1.0))
+    return int(first), int(last)
+
+
+@formula
+def rows_in_strip(splat, level, det, ey, left, right):
+    """Lowest and highest y, relative to the mean, of a bounded ellipse in the strip left <= x <= right (relative too)."""
+    b, c = splat[3], splat[4]
+    x_top = -b * ey / splat[2]  # where the ellipse is highest; it is lowest at -x_top
+    x = min(max(x_top, left), right)
+    high = (-b * x + sqrt(max(0.0, c * level - det * x * x))) / c
+    x = min(max(-x_top, left), right)
+    low = (-b * x - sqrt(max(0.0, c * level - det * x * x))) / c
+    return low, high
+
+
+@formula
+def rows_of_strip(splat, ellipse, column, tile, width, height):
+    """First and last pixel row of a splat's ellipse in a column of tiles; empty if first > last."""
+    ex, ey, level, det = ellipse
+    mx, my = splat[0] - 0.5, splat[1] - 0.5
+    x0, x1 = pixels_within(mx, ex, width)
+    left, right = max(column * tile, x0) - mx, min(column * tile + tile - 1, x1) - mx
+    low, high = rows_in_strip(splat, level, det, ey, left, right)
+    bounded = level < inf
+    return pixels_within(select(bounded, my + (low + high) / 2, my), select(bounded, (high - low) / 2, inf), height)
+
+
+@formula
+def box_of(splat, ellipse, width, height):
+    """First and last pixel column and row of the box of a splat's ellipse; empty if a first > its last."""
+    ex, ey, level, _det = ellipse
+    x0, x1 = pixels_within(splat[0] - 0.5, ex, width)
+    y0, y1 = pixels_within(splat[1] - 0.5, ey, height)
+    return x0, select(level > 0, x1, x0 - 1), y0, y1
+
+
+# --- a splat's own block of the Hessian -------------------------------------------------------------------------------
+
+
+def _moment_index() -> np.ndarray:
+    """Where the moment of u^j v^k lies among the fifteen, by [j, k]: powers of v outermost, as `store_powers` leaves them."""
+    index = np.full((5, 5), -1, np.int64)
+    place = 0
+    for k in range(5):
+        for j in range(5 - k):
+            index[j, k] = place
+            place += 1
+    return index
+
+
+MOMENT = _moment_index()
+MOMENT2 = np.array([[0, 3, 5], [1, 4, -1], [2, -1, -1]])  # of the six of degree 2, stored alike: 1, u, u^2, v, u v, v^2
+
+
+@formula
+def step_block(w, free, beta, R, g, h, colour):
+    """D, R in front of the splat, and s + v.  free: w where the cap does not hold, else 0; beta likewise."""
+    D = (free * colour[0] - beta * R[0], free * colour[1] - beta * R[1], free * colour[2] - beta * R[2])
+    weight = D[0] * (g[0] + h[0] * D[0]) + D[1] * (g[1] + h[1] * D[1]) + D[2] * (g[2] + h[2] * D[2])
+    return D, plus(R, w, colour), weight
+
+
+@formula
+def cross_terms(w, free, D, g, h):
+    """w g_c + w h_c D_c and w^2 h_c of a channel."""
+    wh = w * h
+    return free * g + wh * D, w * wh

@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.projection import Splats
-from splat.settings import RenderSettings
+from splat.model.settings import RenderSettings
+from splat.projection.reference import Splats
 
 TILE = 16
 

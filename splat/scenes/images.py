@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from splat.camera import Camera
+from splat.model.camera import Camera
 from splat.scenes.layers import FORMATS, UNREADABLE, read_depth, read_mask
 from splat.scenes.view import Frame, Picture, Subset
 

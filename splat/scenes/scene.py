@@ -19,13 +19,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.camera import Camera
-from splat.scenes.colmap import MODEL_FOLDERS, find_model, read_colmap
-from splat.scenes.dtu import is_dtu, mask_folder, read_dtu
+from splat.model.camera import Camera
+from splat.scenes.formats.colmap import MODEL_FOLDERS, find_model, read_colmap
+from splat.scenes.formats.dtu import is_dtu, mask_folder, read_dtu
+from splat.scenes.formats.llff import POSES, read_llff
+from splat.scenes.formats.transforms import BLENDER_FILES, SINGLE_FILE, read_blender, read_transforms
 from splat.scenes.images import Photo, frame, image_header, require_files
 from splat.scenes.layers import DEPTH_SUFFIXES, MASK_FOLDERS, MASK_SUFFIXES, find_layer
-from splat.scenes.llff import POSES, read_llff
-from splat.scenes.transforms import BLENDER_FILES, SINGLE_FILE, read_blender, read_transforms
 from splat.scenes.view import Frame, Points, View
 
 __all__ = ["Frame", "Points", "Scene", "View", "camera_extent", "load_scene"]

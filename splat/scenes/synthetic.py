@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.camera import Camera, look_at
-from splat.gaussians import Gaussians
-from splat.harmonics import Y00
-from splat.render import Rendering, render
+from splat.model.camera import Camera, look_at
+from splat.model.gaussians import Gaussians
+from splat.model.harmonics import Y00
+from splat.render.render import Rendering, render
 from splat.scenes.scene import Scene
 from splat.scenes.view import Frame, Picture, Points, inside_image, pixel_coordinates
 

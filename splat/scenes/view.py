@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splat.camera import Camera
+from splat.model.camera import Camera
 
 Subset = Literal["train", "test"]
 Picture = tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"] | None]

@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-from splat.camera import Camera
+from splat.model.camera import Camera
+from splat.scenes.formats.transforms import SINGLE_FILE
 from splat.scenes.scene import Scene
-from splat.scenes.transforms import SINGLE_FILE
 from splat.scenes.view import Frame, Points
 
 POINTS_FILE = "points.ply"

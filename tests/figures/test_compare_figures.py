@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from analysis.records import Record
+from analysis.records.records import Record
 from figures.compare import ALONE, beyond, draw_comparison, draw_densities, draw_sections, draw_slices, draw_traces
 from figures.style import RUNS, style
 from tests.figures.test_figures import POINT, laid_out

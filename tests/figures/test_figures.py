@@ -11,8 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from PIL import Image
 
-from analysis.drawing import module_environment
-from analysis.records import Record, read_record, record_folder, write_record
+from analysis.console.drawing import module_environment
+from analysis.records.records import Record, read_record, record_folder, write_record
 from figures import make_all, slice2d, spectrum, surface, traces
 from figures.plane import plane
 from figures.render_surface import Box

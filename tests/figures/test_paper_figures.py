@@ -10,7 +10,7 @@ import pytest
 from matplotlib.colors import to_hex
 from PIL import Image
 
-from analysis.records import SLICE, read_record, record_folder, write_record
+from analysis.records.records import SLICE, read_record, record_folder, write_record
 from figures import fig1, fig7
 from figures.manifold import Scale, landscape_of, start_of
 from figures.style import RUNS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from analysis.records import SLICE, Record, read_record, record_folder, write_record
+from analysis.records.records import SLICE, Record, read_record, record_folder, write_record
 from figures import make_all, slice1d, slice2d
 from figures.style import BLACK, BLUE, SKY, VERMILION
 from tests.figures.test_figures import require_layout

@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
 
-from analysis.cli import main
-from analysis.trajectories import gathered
-from analysis.trajectory import COLUMNS
+from analysis.commands.cli import main
+from analysis.runs.trajectories import gathered
+from analysis.train.trajectory import COLUMNS
 from figures import trajectory
 from figures.style import RUNS
 from figures.trajectory import APART, UNITS

@@ -8,7 +8,7 @@ import torch
 import torch.distributed as dist
 from torch.multiprocessing.spawn import spawn
 
-from landscape.distributed import Ranks
+from landscape.operators.distributed import Ranks
 
 Findings = dict[str, Any]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from landscape.operator import DenseOperator
+from landscape.operators.operator import DenseOperator
 from tests.oracles import symmetric_matrix
 
 N = 120

@@ -4,13 +4,13 @@ from math import inf, nan
 import pytest
 import torch
 
-from landscape.anisotropy import anisotropy
-from landscape.checks import check_operator
-from landscape.density import spectral_density
-from landscape.eigen import extreme_eigenpairs
-from landscape.power import power_ends
+from landscape.eigen.eigen import extreme_eigenpairs
+from landscape.eigen.power import power_ends
+from landscape.operators.checks import check_operator
 from landscape.results import Bracket, t_interval
-from landscape.trace import estimate_traces
+from landscape.spectrum.anisotropy import anisotropy
+from landscape.spectrum.density import spectral_density
+from landscape.traces.trace import estimate_traces
 from tests.landscape.spectra import generator, operator
 
 

@@ -15,7 +15,9 @@ def target() -> Any:
 
 
 def stand_in() -> None:
-    """A driver for this process, which has not launched anything: all of it that Triton needs to compile and to choose kernels."""
+    """A driver for this process, which has not launched anything: all of it that Triton needs to compile and to choose
+    kernels.
+    """
     from triton.runtime import driver
 
     driver.set_active(

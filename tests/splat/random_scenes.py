@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from splat.camera import Camera
-from splat.gaussians import Gaussians
+from splat.model.camera import Camera
+from splat.model.gaussians import Gaussians
 
 IMAGE = {torch.float32: 1e-6, torch.float64: 1e-12}
 DERIVATIVE = {torch.float32: 1e-5, torch.float64: 1e-12}

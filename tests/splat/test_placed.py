@@ -8,19 +8,21 @@ import torch
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
-from landscape.lanczos import lanczos
-from landscape.operator import DenseOperator
-from landscape.trace import TraceSettings
-from splat.curvature import SceneHessian, SceneObjective
-from splat.depth import depth_rises, depth_split
-from splat.localization import conditions, localize
-from splat.losses import LossSettings
-from splat.metrics import scene_units
-from splat.own_directions import OwnDirections
-from splat.regularizers.corgs import _pruned, confirmed
-from splat.regularizers.fsgs import FSGS, unpool
-from splat.split_control import split_control
-from splat.train import Training, train
+from analysis.measures.depth import depth_rises, depth_split
+from analysis.measures.localization import conditions, localize
+from analysis.measures.split_control import split_control
+from analysis.measures.units import scene_units
+from landscape.eigen.lanczos import lanczos
+from landscape.operators.operator import DenseOperator
+from landscape.traces.trace import TraceSettings
+from splat.curvature.block_eigenvectors import BlockEigenvectors
+from splat.curvature.hessian import SceneHessian
+from splat.curvature.objective import SceneObjective
+from splat.losses.reference import LossSettings
+from splat.training.loop import train
+from splat.training.methods.corgs import _pruned, confirmed
+from splat.training.methods.fsgs import FSGS, unpool
+from splat.training.state import Training
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.placed import Placed
 from tests.splat.random_scenes import random_gaussians, random_like
@@ -57,7 +59,7 @@ def test_a_step_of_a_training_stays_on_the_device_and_waits_for_it_six_times(mon
     config = replace(tiny_config(), random_background=False)  # which would compare with another picture every step
     training = Training.start(tiny_gaussians(6), EXTENT, config)
     placed = Placed(monkeypatch)
-    monkeypatch.setattr("splat.device.EMULATED", True)
+    monkeypatch.setattr("splat.backend.device.EMULATED", True)
     with placed:
         put_on_gpu(training, placed)
         steps = train(training, views)
@@ -88,7 +90,7 @@ def test_what_the_host_finds_out_about_neighbours_is_brought_back(monkeypatch, m
 def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait_for_it(monkeypatch):
     gaussians = random_gaussians(4, 0, logit=1.0, spread=0.4)
     placed = Placed(monkeypatch)
-    monkeypatch.setattr("splat.device.EMULATED", True)
+    monkeypatch.setattr("splat.backend.device.EMULATED", True)
     with placed:
         flat = placed.on_gpu(gaussians.flat)
         views = two_views(16, 12)[:1]
@@ -101,7 +103,7 @@ def test_products_with_the_hessian_of_a_scene_stay_on_the_device_and_do_not_wait
         hessian.apply(V)
         assert not +placed.waits and not +placed.brought  # so that they can be recorded
         _ = objective.gradient, objective.block_diagonal(), objective.loss(flat), scene_units(objective)
-        known = OwnDirections(objective, *objective.own_blocks)
+        known = BlockEigenvectors(objective, *objective.gaussian_blocks)
         known.steepest(1, 1)
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
         split_control(objective.active, [views[0].camera])

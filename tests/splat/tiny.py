@@ -3,13 +3,13 @@
 import torch
 from torch import Tensor
 
-from splat.camera import Camera
-from splat.checkpoint import SceneReference
-from splat.densify import DensifySettings
-from splat.gaussians import Gaussians
-from splat.render import render
+from splat.model.camera import Camera
+from splat.model.gaussians import Gaussians
+from splat.render.render import render
 from splat.scenes.view import View
-from splat.train import TrainConfig
+from splat.training.checkpoint import SceneReference
+from splat.training.densify import DensifySettings
+from splat.training.state import TrainConfig
 
 WIDTH, HEIGHT, EXTENT = 20, 14, 2.0
 REFERENCE = SceneReference(

@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from analysis.cli import main
-from analysis.probe import scene_objective
-from analysis.records import Record
-from splat.adam import Adam
-from splat.checkpoint import load_checkpoint, save_checkpoint
-from splat.densify import ScreenGradients
-from splat.losses import photometric_loss
-from splat.render import render
+from analysis.commands.cli import main
+from analysis.probe.command import scene_objective
+from analysis.records.records import Record
+from splat.losses.reference import photometric_loss
+from splat.render.render import render
 from splat.scenes.synthetic import synthetic_scene
 from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.densify import ScreenGradients
+from splat.training.optim.adam import Adam
 from tests.analysis.probe.probed import SCENE, unlimited
 
 
@@ -44,7 +44,7 @@ def record(run) -> Record:
 @pytest.fixture
 def no_pictures(monkeypatch):
     """For tests of the numbers alone."""
-    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(lambda target: []))
+    monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(lambda target: []))
 
 
 @pytest.fixture(scope="session")

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from analysis.cli import main
-from analysis.records import Record, read_record
+from analysis.commands.cli import main
+from analysis.records.records import Record, read_record
 from splat.scenes.synthetic import SyntheticSettings
 
 SCENE = SyntheticSettings(gaussians=60, views=5, width=16, height=12)

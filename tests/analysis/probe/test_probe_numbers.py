@@ -8,10 +8,10 @@ import pytest
 import torch
 from rich.console import Console
 
-from analysis.probe_record import literal_index
-from analysis.probe_table import probe_table
+from analysis.measures.depth import STEPS, depth_split
+from analysis.probe.record import literal_index
+from analysis.probe.table import probe_table
 from landscape import DenseOperator, EigenSettings, PowerSettings, extreme_eigenpairs, power_ends
-from splat.depth import STEPS, depth_split
 
 ATTRIBUTES = ["means", "log_scales", "quats", "opacity_logits", "sh"]
 

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.budget import SHARES
-from analysis.cli import main
-from analysis.measurement import ProbeSettings
-from analysis.options import ProbeOptions
-from analysis.probe import run_probe
-from analysis.records import Record, read_record
-from splat.checkpoint import load_checkpoint
+from analysis.commands.cli import main
+from analysis.console.budget import SHARES
+from analysis.console.options import ProbeOptions
+from analysis.probe.command import run_probe
+from analysis.probe.measurement import ProbeSettings
+from analysis.records.records import Record, read_record
+from splat.training.checkpoint import load_checkpoint
 from tests.analysis.probe.probed import unlimited
 
 
@@ -106,9 +106,13 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
 
 def test_a_quick_probe_leaves_the_same_pictures_out_whoever_starts_their_drawing(run, tmp_path, monkeypatch):
     begun, drawn = [], []
-    monkeypatch.setattr("analysis.drawing.drawing", lambda *told: begun.append(told) or nullcontext(lambda target: []))
+    monkeypatch.setattr(
+        "analysis.console.drawing.drawing", lambda *told: begun.append(told) or nullcontext(lambda target: [])
+    )
     assert main(["probe", str(run / "checkpoint.pt"), "--quick", "--out", str(tmp_path / "command")]) == 0
-    monkeypatch.setattr("analysis.recording.draw", lambda module, target, *told: drawn.append((module, *told)) or [])
+    monkeypatch.setattr(
+        "analysis.console.recording.draw", lambda module, target, *told: drawn.append((module, *told)) or []
+    )
     assert run_probe(ProbeOptions(run / "checkpoint.pt", quick=True, out=tmp_path / "function")) == 0
     assert begun == drawn == [("make_all", "--without", "surface")]
 
@@ -128,7 +132,7 @@ def test_a_budget_that_ends_is_said_and_what_was_reached_is_recorded(run, tmp_pa
 
 def skewed(run):
     """SceneHessian.apply with a hundredth of the result moved to the next row."""
-    from splat.curvature import SceneHessian
+    from splat.curvature.hessian import SceneHessian
 
     original = SceneHessian.apply
 
@@ -140,7 +144,7 @@ def skewed(run):
 
 
 def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_path, no_pictures, monkeypatch, capsys):
-    monkeypatch.setattr("splat.curvature.SceneHessian.apply", skewed(run))
+    monkeypatch.setattr("splat.curvature.objective.hessian.SceneHessian.apply", skewed(run))
     quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
     assert main([*quick, str(tmp_path / "lenient")]) == 0
     assert main([*quick, str(tmp_path / "strict"), "--strict"]) == 1

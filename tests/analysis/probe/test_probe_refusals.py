@@ -9,8 +9,8 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from analysis.cli import main
-from analysis.records import read_record
+from analysis.commands.cli import main
+from analysis.records.records import read_record
 from splat.scenes.synthetic import synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from tests.analysis.probe.probed import SCENE
@@ -73,7 +73,9 @@ def test_a_probe_that_is_killed_leaves_the_old_record_whole(run, record, tmp_pat
     shutil.copytree(record.folder, out)
     before = (out / "probe.json").read_bytes()
     command = ["probe", str(run / "checkpoint.pt"), "--out", str(out), "--quick"]
-    process = subprocess.Popen([sys.executable, "-m", "analysis.cli", *command], cwd=ROOT, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "analysis.commands.cli", *command], cwd=ROOT, stderr=subprocess.DEVNULL
+    )
     deadline = time.monotonic() + 100
     while not list(tmp_path.glob(".kept.partial-*/probe.json")):  # it is writing the new one
         assert process.poll() is None and time.monotonic() < deadline
@@ -87,7 +89,7 @@ def test_an_interrupted_probe_writes_nothing(run, tmp_path, monkeypatch):
     def interrupt(target):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(interrupt))
+    monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(interrupt))
     assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 130
     assert list(tmp_path.iterdir()) == []
 
@@ -96,7 +98,7 @@ def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
     def fail(target):
         raise RuntimeError("drawing failed: no fonts")
 
-    monkeypatch.setattr("analysis.drawing.drawing", lambda *_: nullcontext(fail))
+    monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(fail))
     assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 0
     assert "drawing failed: no fonts" in read_record(tmp_path / "probe").data["notes"]
     assert "Drawing failed: no fonts." in (tmp_path / "probe" / "report.html").read_text()

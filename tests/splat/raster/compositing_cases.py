@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splat.projection import Splats, project
-from splat.raster.cpu import Raster
+from splat.model.settings import SMOOTH, RenderSettings
+from splat.projection.reference import Splats, project
+from splat.raster.cpu.raster import Raster
 from splat.raster.reference import rasterize_reference
-from splat.settings import SMOOTH, RenderSettings
 from tests.splat.random_scenes import NUMPY, random_camera, random_gaussians, random_like
 
 BLOCKS = {"means": slice(0, 2), "conics": slice(2, 5), "opacities": slice(5, 6), "colours": slice(6, 9)}

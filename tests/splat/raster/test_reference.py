@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from splat.camera import Camera
-from splat.gaussians import Gaussians
-from splat.render import Rendering, render
-from splat.settings import SMOOTH, RenderSettings
+from splat.model.camera import Camera
+from splat.model.gaussians import Gaussians
+from splat.model.settings import SMOOTH, RenderSettings
+from splat.render.render import Rendering, render
 from tests.oracles import composited_picture, splat_of_gaussian
 from tests.splat.random_scenes import random_camera, random_gaussians, relative_error
 

@@ -3,16 +3,16 @@
 import json
 from pathlib import Path
 
-import folders
 import numpy as np
 import pytest
 import torch
-from folders import NAMES, SIZE
 from PIL import Image
 
 from splat.scenes.layers import dtu_number, find_layer, read_depth, read_mask
 from splat.scenes.scene import load_scene
 from splat.scenes.view import View
+from tests.splat.scenes import folders
+from tests.splat.scenes.folders import NAMES, SIZE
 
 WIDTH, HEIGHT = SIZE
 

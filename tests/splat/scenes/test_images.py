@@ -5,16 +5,16 @@ import struct
 import zlib
 from pathlib import Path
 
-import folders
 import numpy as np
 import pytest
 import torch
-from folders import CENTRE, FOCAL, NAMES, SIZE, intrinsics
 from PIL import Image
 
 from splat.scenes.images import resize_by_area
 from splat.scenes.scene import load_scene
 from tests.oracles import distorted_picture, opencv_distortion
+from tests.splat.scenes import folders
+from tests.splat.scenes.folders import CENTRE, FOCAL, NAMES, SIZE, intrinsics
 
 LENS = {"k1": -0.22, "k2": 0.07, "p1": 0.004, "p2": -0.003}
 LENS_SIZE, LENS_INTRINSICS = (160, 120), (130.0, 128.0, 78.0, 61.5)

@@ -4,15 +4,15 @@ import shutil
 from math import cos, pi, sin
 from pathlib import Path
 
-import folders
 import pytest
 import torch
-from folders import NAMES
 
-from splat.camera import Camera
-from splat.scenes.capture import forward_facing
+from splat.model.camera import Camera
+from splat.model.capture import forward_facing
 from splat.scenes.scene import Scene, camera_extent, load_scene
 from splat.scenes.view import Frame
+from tests.splat.scenes import folders
+from tests.splat.scenes.folders import NAMES
 
 
 def scene_of(cameras: list[Camera]) -> Scene:
@@ -21,7 +21,7 @@ def scene_of(cameras: list[Camera]) -> Scene:
 
 
 def camera_turned(degrees: float, centre: tuple[float, float, float] = (0, 0, 0)) -> Camera:
-    """Looks along +z, turned about the vertical axis."""
+    """StoppingRule along +z, turned about the vertical axis."""
     c, s = cos(degrees * pi / 180), sin(degrees * pi / 180)
     rotation = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]], dtype=torch.float64)
     return Camera(rotation, torch.tensor(centre, dtype=torch.float64), 10.0, 10.0, 1.0, 1.0, 2, 2)

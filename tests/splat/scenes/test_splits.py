@@ -3,11 +3,11 @@
 from fractions import Fraction
 from pathlib import Path
 
-import folders
 import pytest
 
 from splat.scenes.scene import load_scene
 from splat.scenes.splits import explicit_split, llff_split, split_scene, usual_views
+from tests.splat.scenes import folders
 
 FERN = tuple(f"image{i:03d}.png" for i in range(20))
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from splat.gaussians import Gaussians
-from splat.projection import rotation_matrices
-from splat.render import render
-from splat.scenes.capture import forward_facing
+from splat.model.capture import forward_facing
+from splat.model.gaussians import Gaussians
+from splat.projection.reference import rotation_matrices
+from splat.render.render import render
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.synthetic import SyntheticScene, SyntheticSettings, synthetic_scene
 from splat.scenes.view import Frame, inside_image

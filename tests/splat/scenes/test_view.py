@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from splat.camera import Camera
+from splat.model.camera import Camera
 from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
 
 

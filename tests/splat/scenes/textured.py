@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from splat.camera import Camera, look_at
+from splat.model.camera import Camera, look_at
 from splat.scenes.view import View
 
 WIDTH, HEIGHT, FOCAL = 112, 84, 100.0

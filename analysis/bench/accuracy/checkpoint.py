@@ -1,0 +1,94 @@
+"""A trained scene as a case of the accuracy study: its truth is a long run, kept beside the results.
+
+    traces    `exact_traces` of SAMPLES samples
+    ends      Lanczos to a residual of FINE
+    sums      quadrature with STARTS x STEPS products
+
+OUT/truth.json belongs to one checkpoint at one size of its pictures; for another it is computed anew.  The truth of the sums
+has an error of a few percent (half its brackets); estimates that are better than that cannot be told apart.  The diagonal
+is left out: nothing but as many products as rows gives it.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from analysis.bench.accuracy.cases import Case, Truth
+from analysis.bench.accuracy.methods import Method
+from analysis.bench.workloads import workload_of
+from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
+from landscape.spectrum.absolute_sum import absolute_sum
+from landscape.spectrum.anisotropy import effective_rank, mass_quantile
+from landscape.spectrum.density import ActiveSpace, spectral_density
+from landscape.traces.trace import TraceSettings, total_trace
+from splat.curvature.hessian import SceneHessian
+from splat.curvature.objective import SceneObjective
+from splat.curvature.traces import exact_traces
+from splat.training.checkpoint import write_atomically
+
+# a scene's products cost too much for more, and for what the matrices have shown to be the same as another, or no rival
+BUDGETS = (12, 36)  # matvecs a block
+LEFT_OUT = (
+    "Hutchinson, Gaussian",
+    "Hutchinson, adaptive",
+    "chosen by",
+    "PyHessian",
+    "lobpcg",
+    "power iteration",
+    "in blocks",
+)
+SAMPLES, FINE, MOST = 128, 1e-6, 250
+STARTS, STEPS = 6, 24
+TRUTH = "truth.json"
+
+
+def checkpoint_case(path: Path, out: Path, downscale: float = 1.0) -> Case:
+    """The case of a checkpoint; its truth is read from OUT/truth.json, or computed and written there."""
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a checkpoint as written by `landscape train`, got no file {path}")
+    workload = workload_of(path)
+    if downscale != 1:
+        workload = workload.resized(1 / downscale)
+    objective = SceneObjective(
+        workload.gaussians, workload.views, workload.loss, workload.background, workload.settings
+    )
+    hessian = SceneHessian(objective)
+    key = {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "downscale": downscale, "dim": hessian.dim}
+    stored = out / TRUTH
+    kept = json.loads(stored.read_text()) if stored.is_file() else {}
+    if kept.get("of") != key:
+        kept = {"of": key, "truth": asdict(_truth(objective, hessian))}
+        write_atomically(stored, json.dumps(kept, indent=1).encode())
+    active = ActiveSpace(hessian.project, hessian.rank)
+    return Case(workload.name, "checkpoint", hessian, Truth(**kept["truth"]), None, objective, active)
+
+
+def affordable(method: Method) -> bool:
+    """Whether a method is run on a checkpoint."""
+    return method.quantity != "diagonal" and not any(name in method.name for name in LEFT_OUT)
+
+
+def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:
+    def generator(stream: int) -> torch.Generator:
+        return torch.Generator().manual_seed(1_000_000 + stream)  # far from the seeds of what is compared
+
+    traces = exact_traces(objective, generator(0), TraceSettings.fixed(SAMPLES))
+    scales = {name: float(part.abs().sum()) for name, part in objective.block_diagonal().diagonals.items()}
+    ends = extreme_eigenpairs(hessian, generator(1), EigenSettings(rtol=FINE, basis=128, max_matvecs=MOST))
+    active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)
+    density = spectral_density(hessian, generator(2), STARTS * STEPS, STARTS, active=active, ends=ends, trace=trace)
+    rank, quantile = effective_rank(ends, density).value, mass_quantile(ends, density).value
+    assert rank is not None and quantile is not None
+    return Truth(
+        traces={name: trace.value for name, trace in traces.items()},
+        scales=scales,
+        largest=float(ends.largest.values[0]),
+        smallest=float(ends.smallest.values[0]),
+        absolute_sum=absolute_sum(density).value or 0.0,
+        effective_rank=rank,
+        mass_quantile=quantile,
+        diagonal=None,
+    )

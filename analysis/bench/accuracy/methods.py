@@ -1,0 +1,269 @@
+"""Every estimator of `landscape` and `splat.curvature.traces` at the settings that the accuracy study compares.
+
+A method is run on an operator that counts, with a seed, and returns an `Answer` for each part of its quantity:
+
+    traces            one part a block
+    ends              "largest" and "smallest"
+    sum of |lambda|, effective rank, mass quantile     one part, from one spectral density ("sums")
+    diagonal          one part, a vector
+
+Work that is not products H v is charged in products: a pass over the pixels for all own blocks, and to find their ends, PASS
+(the most that was measured on fern: 1.05 to 1.2 with vectors of 512 bits, 0.65 to 1.1 with 256, and 0.15); a product with the
+images' Jacobian JACOBIAN (its share of a product's arithmetic; there is no backward pass).
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+from math import inf, nan
+from typing import Literal
+
+import torch
+from jaxtyping import Float64
+from scipy.stats import t as student
+from torch import Tensor
+
+from analysis.bench.accuracy.cases import Case, MeteredOperator
+from analysis.bench.speed.scene import OPERATIONS
+from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
+from landscape.eigen.pairs import EigenEnds
+from landscape.eigen.power import PowerSettings, power_ends
+from landscape.results import Bracket
+from landscape.spectrum.absolute_sum import absolute_sum
+from landscape.spectrum.anisotropy import effective_rank, mass_quantile
+from landscape.spectrum.density import spectral_density
+from landscape.traces.diagonal import Method as DiagonalMethod
+from landscape.traces.diagonal import estimate_diagonal
+from landscape.traces.trace import PAPER, TraceSettings, estimate_traces
+from splat.curvature.block_eigenvectors import BlockEigenvectors
+from splat.curvature.traces import ONE_PERCENT, exact_traces
+
+Origin = Literal["default", "own", "peer"]
+PASS = 1.35
+JACOBIAN = OPERATIONS["J u 1"] / (OPERATIONS["J u 1"] + OPERATIONS["tangent of backward 1"])
+BUDGETS = (12, 24, 48, 96)  # matvecs a block
+TOLERANCES = (1e-1, 1e-2)  # of residuals; 1e-3 is the default
+DENSITIES = ((2, 12), (4, 24), (8, 48))  # start vectors and steps; by default 192 products are divided as they go
+PROBES = (8, 16, 64)  # of a diagonal; 32 is the default
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """An estimate.  error: as the method reports it (nan: it does not); low, high: where it says that the truth is.
+
+    error, low and high of a diagonal are vectors, too.
+    """
+
+    part: str
+    value: float | Float64[Tensor, " n"]
+    error: float | Float64[Tensor, " n"] = nan
+    low: float | Float64[Tensor, " n"] = nan
+    high: float | Float64[Tensor, " n"] = nan
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """One estimator at one setting.  run(case, operator, seed): the answers, one a part.
+
+    estimator: the name of what several packages have alike, "" where this method stands alone.
+    """
+
+    quantity: str
+    name: str
+    settings: str
+    run: Callable[[Case, MeteredOperator, int], list[Answer]]
+    origin: Origin = "own"
+    applies: Callable[[Case], bool] = lambda case: True
+    estimator: str = ""
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _is_scene(case: Case) -> bool:
+    return case.objective is not None
+
+
+def _is_matrix(case: Case) -> bool:
+    return case.objective is None
+
+
+def own_methods(budgets: tuple[int, ...] = BUDGETS) -> Iterator[Method]:
+    """All of them; the library's defaults are marked."""
+    yield from trace_methods(budgets)
+    yield from end_methods()
+    yield from density_methods()
+    yield from diagonal_methods()
+
+
+# --- traces -----------------------------------------------------------------------------------------------------------
+
+
+def trace_methods(budgets: tuple[int, ...]) -> Iterator[Method]:
+    yield _traces("chosen by its probes", "rtol 0.05", TraceSettings(), "default", _is_matrix)
+    for rtol in (0.2, 0.1):
+        yield _traces("chosen by its probes", f"rtol {rtol:g}", TraceSettings(rtol=rtol))
+    for rtol in (0.2, 0.1, 0.05):
+        yield _traces("Hutchinson, adaptive", f"rtol {rtol:g}", TraceSettings(rtol=rtol, method="hutchinson"))
+    yield _traces("StableGS", "10 probes", PAPER)
+    for budget in budgets:
+        fixed = TraceSettings.fixed(budget)
+        yield _traces("Hutchinson, Rademacher", f"{budget} probes", fixed)
+        yield _traces("Hutchinson, Gaussian", f"{budget} probes", replace(fixed, distribution="gaussian"))
+        yield _traces("Hutchinson, one probe for all", f"{budget} probes", replace(fixed, reading="full"))
+        for method in ("hutch++", "xtrace"):
+            if budget >= TraceSettings(max_probes=100, method=method).least:
+                name = {"hutch++": "Hutch++", "xtrace": "XTrace"}[method]
+                yield _traces(name, f"{budget} matvecs", replace(fixed, method=method))
+    yield _exact("rtol 0.01", ONE_PERCENT, "default")
+    for samples in (8, 64):
+        yield _exact(f"{samples} samples", TraceSettings.fixed(samples))
+
+
+def _traces(
+    name: str,
+    text: str,
+    settings: TraceSettings,
+    origin: Origin = "own",
+    applies: Callable[[Case], bool] = lambda case: True,
+) -> Method:
+    def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
+        found = estimate_traces(operator, generator(seed), settings)
+        return [Answer(part, x.value, x.standard_error, x.low, x.high) for part, x in found.items()]
+
+    return Method("traces", name, text, run, origin, applies)
+
+
+def _exact(text: str, settings: TraceSettings, origin: Origin = "own") -> Method:
+    def run(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
+        assert case.objective is not None
+        found = exact_traces(case.objective, generator(seed), settings)
+        passes = 2 if case.objective.couples_pixels else 1
+        operator.charge(passes * PASS + JACOBIAN * sum(x.matvecs for x in found.values()))
+        return [Answer(part, x.value, x.standard_error, x.low, x.high) for part, x in found.items()]
+
+    return Method("traces", "exact pass, sampled coupling", text, run, origin, _is_scene)
+
+
+# --- both ends --------------------------------------------------------------------------------------------------------
+
+
+def end_methods() -> Iterator[Method]:
+    yield _lanczos("rtol 0.001", EigenSettings(), "default", _is_matrix)
+    yield _lanczos("rtol 0.001", EigenSettings(), applies=_is_scene)
+    yield Method("ends", "led by own blocks", "rtol 0.001", _from_own_blocks, "default", _is_scene)
+    for rtol in TOLERANCES:
+        yield _lanczos(f"rtol {rtol:g}", EigenSettings(rtol=rtol))
+    yield _lanczos("basis 20", EigenSettings(basis=20))
+    yield _lanczos("block 2", EigenSettings(block=2))
+    for rtol in (1e-1, 1e-2, 1e-3):
+        power = PowerSettings(rtol, max_matvecs=300)
+        yield Method("ends", "power iteration, shifted", f"rtol {rtol:g}", _power(power))
+
+
+def _lanczos(
+    text: str,
+    settings: EigenSettings,
+    origin: Origin = "own",
+    applies: Callable[[Case], bool] = lambda case: True,
+) -> Method:
+    def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
+        return end_answers(extreme_eigenpairs(operator, generator(seed), settings))
+
+    name = "Lanczos, both ends"
+    return Method("ends", name if settings.block == 1 else f"{name}, in blocks", text, run, origin, applies)
+
+
+def _from_own_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
+    """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
+    assert case.objective is not None
+    start = BlockEigenvectors(case.objective, case.objective.block_diagonal()).leads()
+    operator.charge(PASS)
+    return end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
+
+
+def _power(settings: PowerSettings) -> Callable[[Case, MeteredOperator, int], list[Answer]]:
+    def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
+        return end_answers(power_ends(operator, generator(seed), settings))
+
+    return run
+
+
+def end_answers(ends: EigenEnds) -> list[Answer]:
+    """Eigenvalues with their residuals."""
+    pairs = {"largest": ends.largest, "smallest": ends.smallest}
+    return [
+        Answer(part, float(p.values[0]), float(p.residuals[0]), *p.interval()) for part, p in pairs.items() if len(p)
+    ]
+
+
+# --- sums over the spectrum -------------------------------------------------------------------------------------------
+
+
+def density_methods() -> Iterator[Method]:
+    """The quantile's lambda_1 is that of Lanczos as it is by default, which a probe has anyway: its products do not count."""
+    yield _density("as it goes", "default")
+    for starts, steps in DENSITIES:
+        yield _density(f"{starts} x {steps}", "own", matvecs=starts * steps, starts=starts)
+    yield _density("as it goes, trace and ends known", "own", known=True)
+
+
+def _density(text: str, origin: Origin, known: bool = False, **division: int) -> Method:
+    """known: as a probe has it, which needs traces and ends for themselves: their products do not count."""
+
+    def run(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
+        before = {"ends": case.ends, "trace": (sum(case.truth.traces.values()), 0.0)} if known else {}
+        density = spectral_density(operator, generator(seed + 1), active=case.active, **division, **before)
+        found = {
+            "sum of |lambda|": absolute_sum(density),
+            "effective rank": effective_rank(case.ends, density),
+            "mass quantile": mass_quantile(case.ends, density),
+        }
+        return [_bracketed(part, bracket) for part, bracket in found.items()]
+
+    return Method("sums", "Lanczos quadrature", text, run, origin)
+
+
+def _bracketed(part: str, bracket: Bracket) -> Answer:
+    value = nan if bracket.value is None else bracket.value
+    return Answer(part, value, (bracket.high - bracket.low) / 2, bracket.low, bracket.high)
+
+
+# --- the diagonal -----------------------------------------------------------------------------------------------------
+
+
+def diagonal_methods() -> Iterator[Method]:
+    names: dict[DiagonalMethod, str] = {"auto": "chosen by its probes", "signs": "random signs"}
+    for probes, (method, name) in product((32, *PROBES), names.items()):
+
+        def run(
+            _: Case, operator: MeteredOperator, seed: int, probes: int = probes, method: DiagonalMethod = method
+        ) -> list[Answer]:
+            found = estimate_diagonal(operator, generator(seed), probes, method=method)
+            freedom = found.samples.shape[1] - 1
+            half = float(student.ppf((1 + CONFIDENCE) / 2, freedom)) * found.standard_errors
+            return [Answer("all", found.values, found.standard_errors, found.values - half, found.values + half)]
+
+        origin: Origin = "default" if (probes, method) == (32, "auto") else "own"
+        yield Method("diagonal", name, f"{probes} probes", run, origin)
+
+    def gaussian_blocks(case: Case, operator: MeteredOperator, _: int) -> list[Answer]:
+        assert case.objective is not None
+        values = block_diagonal(case)
+        operator.charge(PASS)
+        known = torch.zeros_like(values) if not case.objective.couples_pixels else torch.full_like(values, inf)
+        return [Answer("all", values, known, values - known, values + known)]
+
+    yield Method("diagonal", "own blocks, no coupling", "one pass", gaussian_blocks, applies=_is_scene)
+
+
+def block_diagonal(case: Case) -> Float64[Tensor, " n"]:
+    """The diagonal of the own blocks, less the radial directions of the quaternions."""
+    assert case.objective is not None
+    parts = case.objective.block_diagonal().diagonals_across(case.objective.active.quats)
+    result = torch.empty(case.operator.dim, dtype=torch.float64)
+    for name, rows in case.operator.blocks.items():
+        result[rows] = parts[name].reshape(-1)
+    return result

@@ -1,0 +1,96 @@
+"""What a bench measures with on the device that it runs on: a clock, the memory of a call, and the machine's ceilings.
+
+HostMeter   wall clock; memory of NumPy's arrays, by tracemalloc; ceilings of every thread together
+GpuMeter    time between two CUDA events around a call's launches, once the device has nothing else to do; memory of torch's
+            allocator.  What a call does on the host counts as far as the device waits for it
+
+ceilings    fused multiply-adds a second on registers; bytes a second, read and written, of a copy that fits no cache
+"""
+
+import tracemalloc
+from collections.abc import Callable
+from typing import Protocol
+
+import torch
+
+from analysis.bench.speed.peak import fma_peak
+from analysis.console.timing import interleaved, wall_clock
+
+COPIED = 1 << 28  # bytes of each of the two arrays of a copy: five times an H200's second-level cache
+REPETITIONS = 7  # of the calls that measure a ceiling
+
+
+class Meter(Protocol):
+    """device: where calls run; seconds(call): the time that a call takes; allocated(call): the most bytes that it allocates at
+    a time, when it is made for the second time: some things are allocated once; fma_peak(): fused multiply-adds a second."""
+
+    device: torch.device
+
+    def seconds(self, call: Callable[[], object]) -> float: ...
+
+    def allocated(self, call: Callable[[], object]) -> int: ...
+
+    def fma_peak(self) -> float: ...
+
+
+class HostMeter:
+    """Of the CPU."""
+
+    device = torch.device("cpu")
+
+    def seconds(self, call: Callable[[], object]) -> float:
+        return wall_clock(call)
+
+    def allocated(self, call: Callable[[], object]) -> int:
+        call()
+        tracemalloc.start()
+        call()
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    def fma_peak(self) -> float:
+        return fma_peak()
+
+
+class GpuMeter:
+    """Of one GPU."""
+
+    def __init__(self, device: torch.device):
+        self.device = device
+
+    def seconds(self, call: Callable[[], object]) -> float:
+        with torch.cuda.device(self.device):
+            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            torch.cuda.synchronize()
+            start.record()
+            call()
+            end.record()
+            end.synchronize()
+            return start.elapsed_time(end) / 1e3
+
+    def allocated(self, call: Callable[[], object]) -> int:
+        call()
+        torch.cuda.synchronize(self.device)
+        torch.cuda.reset_peak_memory_stats(self.device)
+        before = torch.cuda.memory_allocated(self.device)
+        call()
+        return torch.cuda.max_memory_allocated(self.device) - before
+
+    def fma_peak(self) -> float:
+        from analysis.bench.speed.peak_cuda import PROGRAMS, STEPS, multiply_adds
+
+        programs = PROGRAMS * torch.cuda.get_device_properties(self.device).multi_processor_count
+        call, made = multiply_adds(self.device, programs, STEPS)
+        return made / interleaved({"peak": call}, REPETITIONS, clock=self.seconds)["peak"].minimum
+
+
+def meter_of(device: torch.device) -> Meter:
+    return HostMeter() if device.type == "cpu" else GpuMeter(device)
+
+
+def bandwidth(meter: Meter, size: int = COPIED) -> float:
+    """Bytes a second that a copy of so many bytes reads and writes."""
+    source, target = (torch.zeros(size // 4, device=meter.device) for _ in range(2))
+    copies = {"copy": lambda: target.copy_(source)}
+    return 2 * size / interleaved(copies, REPETITIONS, clock=meter.seconds)["copy"].minimum

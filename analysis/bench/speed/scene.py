@@ -1,0 +1,240 @@
+"""First and second order of a scene's loss by stage: time, memory, and what both are worth on this machine.
+
+    project, ..., project adjoint   the stages of a gradient of one view, in the project's own kernels
+    rasterizer        splats to image, and cotangent of the image to adjoint of the splats: tile lists, forward, backward
+    compositing       forward and backward (with its sums) alone
+    gradient          stored parameters to the gradient in them: every stage
+    gradient, autograd  the same as a training makes it, through torch
+    gradient, atomic  ... with sums as they come (on a GPU)
+    gsplat            ... by that package's kernels (on a GPU)
+    linearize         what `LinearizedView` does once
+    H v K             a product with K vectors, per vector
+    block diagonal    Hessian blocks of all attributes, one pass
+
+One code for the CPU and for GPUs: where the workload's Gaussians are decides which kernels run, and a `Meter` measures them.
+
+Arithmetic is counted from `raster/formulas.py`: additions, multiplications, fused multiply-adds, divisions and
+minima of one pixel and Gaussian, comparisons and integer operations left out, each worth one fused multiply-add.  Bytes are
+those that a pass reads and writes for each entry (its splat's 64, its index and slot, 48 a tangent, 36 of sums, written and
+added up) and for each pixel of the image, in single precision; they come from memory or a cache.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from analysis.bench.speed.meters import Meter
+from analysis.bench.speed.passes import Calls, compositing_stages, pairs_of
+from analysis.bench.speed.peer import MissingPeer, gsplat_gradient
+from analysis.bench.workloads import Workload
+from analysis.console.timing import Timing, interleaved
+from landscape.probes import draw_probes
+from splat.backend.device import by_triton
+from splat.curvature.gaussian_blocks import PerGaussianBlocks
+from splat.curvature.linearize import LinearizedView
+from splat.losses.autograd import loss_against, view_loss
+from splat.model.settings import Sums
+from splat.projection.dispatch import projected, pulled
+from splat.projection.formulas import lens_of
+from splat.raster.dispatch import rasterize
+from splat.render.render import render
+
+VECTORS = (1, 4, 8)
+PRODUCTS = tuple(f"H v {K}" for K in VECTORS)
+OPERATIONS = {"forward": 17, "backward + reduce": 30, "J u 1": 25, "tangent of backward 1": 46}
+BYTES = {  # an entry, a pixel
+    "forward": (4 + 64, 24),
+    "backward + reduce": (8 + 64 + 2 * 36, 24),
+    "J u 1": (4 + 64 + 48, 4 + 20),
+    "tangent of backward 1": (8 + 64 + 48 + 2 * 36, 24 + 20),
+}
+
+
+class ViewBench:
+    """One view of a workload, ready to be timed: `calls`, and what they work on.
+
+    lack: why there is no gradient by gsplat to compare with on a GPU.
+    """
+
+    def __init__(self, workload: Workload, index: int = 0):
+        self.workload, self.view = workload, workload.views[index]
+        self.like, camera = workload.gaussians.flat.detach(), self.view.camera
+        self.lens = lens_of(camera, workload.settings)
+        self.background = workload.background.to(self.like)
+        self.loss = loss_against(self.view.image, workload.loss, self.like)
+        self.projected = projected(workload.gaussians, self.lens)
+        self.raster = self._rasterize()
+        self.cotangent = self.loss.linearize(self.raster.planes).gradient
+        self.adjoint = self.raster.backward(self.cotangent)
+        self.linearized = self._linearize()
+        generator = torch.Generator(self.like.device).manual_seed(0)
+        vectors = draw_probes(self.like.numel(), max(VECTORS), generator, self.like.dtype)
+        self.vectors = {K: vectors[:, :K].contiguous() for K in VECTORS}
+        self.lack: str | None = None
+
+    def _rasterize(self) -> Any:
+        camera, settings = self.view.camera, self.workload.settings
+        return rasterize(*self.projected, self.background, camera.width, camera.height, settings)
+
+    def _linearize(self) -> Any:
+        w = self.workload
+        return LinearizedView(w.gaussians, self.view.camera, self.loss, self.background, w.settings)
+
+    def _rasterizer(self) -> Any:
+        return self._rasterize().backward(self.cotangent)
+
+    def gradient(self) -> torch.Tensor:
+        """Of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
+        splats, depths, drawn = projected(self.workload.gaussians, self.lens)
+        camera, settings = self.view.camera, self.workload.settings
+        raster = rasterize(splats, depths, drawn, self.background, camera.width, camera.height, settings)
+        adjoint = raster.backward(self.loss.linearize(raster.planes).gradient)
+        return self._to_parameters(splats, drawn, adjoint)
+
+    def _to_parameters(self, splats: torch.Tensor, drawn: torch.Tensor, adjoint: Any) -> torch.Tensor:
+        bar = torch.as_tensor(adjoint.gradient)
+        return pulled(self.workload.gaussians, self.lens, splats, drawn, bar)
+
+    def gradient_by_autograd(self, sums: Sums = "ordered") -> torch.Tensor:
+        """The same, as a step of a training makes it."""
+        w, settings = self.workload, replace(self.workload.settings, sums=sums)
+        flat = self.like.clone().requires_grad_()
+        image = render(w.gaussians.with_flat(flat), self.view.camera, self.background, settings).image
+        return torch.autograd.grad(view_loss(image, self.loss), flat)[0]
+
+    def stages(self) -> Calls:
+        """The parts of a gradient and of a product with one vector, and compositing alone."""
+        w, raster, adjoint = self.workload, self.raster, self.adjoint
+        passes = compositing_stages(w, self.view.camera, self.projected, raster, adjoint)
+        held, (splats, _, drawn) = self.linearized, self.projected
+        directions = held._projection.jvp(self.vectors[1] if by_triton(self.like) else self.vectors[1].numpy())
+        tangent = raster.jvp(directions)
+        curved = held._loss.hvp(tangent.planes)
+        return {
+            "project": lambda: projected(w.gaussians, self.lens),
+            **passes,
+            "loss": lambda: self.loss.linearize(raster.planes),
+            "project adjoint": lambda: self._to_parameters(splats, drawn, adjoint),
+            "compositing": lambda: (passes["forward"](), passes["backward + reduce"]()),
+            "J u 1": lambda: raster.jvp(directions),
+            "loss H v 1": lambda: held._loss.hvp(tangent.planes),
+            "tangent of backward 1": lambda: tangent.curvature(adjoint, curved),
+        }
+
+    def wholes(self) -> Calls:
+        """What the ratios are about."""
+        products = {f"H v {K}": lambda U=U: self.linearized.hvp(U) for K, U in self.vectors.items()}
+        return {
+            "rasterizer": self._rasterizer,
+            "gradient": self.gradient,
+            "gradient, autograd": self.gradient_by_autograd,
+            "linearize": self._linearize,
+            **products,
+            "block diagonal": self._block_diagonal,
+        }
+
+    def peers(self) -> Calls:
+        """On a GPU, gradients to compare with: by the faster sums, and by gsplat where there is one."""
+        if not by_triton(self.like):
+            return {}
+        calls: Calls = {"gradient, atomic": lambda: self.gradient_by_autograd("atomic")}
+        try:
+            calls["gsplat"] = gsplat_gradient(self.workload, self.view, self.loss)
+        except MissingPeer as error:
+            self.lack = str(error)
+        return calls
+
+    def _block_diagonal(self) -> PerGaussianBlocks:
+        vars(self.linearized._loss).pop("diagonal", None)  # it keeps the loss's share, which is part of the cost
+        return self.linearized.block_diagonal()
+
+    @property
+    def pairs(self) -> int:
+        """(pixel, Gaussian) pairs that a pass evaluates."""
+        return pairs_of(self.raster)
+
+    def bytes_of(self, name: str) -> int:
+        """What a pass reads and writes."""
+        an_entry, a_pixel = BYTES[name]
+        return an_entry * self.linearized.entries + a_pixel * self.workload.pixels
+
+    def workspace(self, K: int, meter: Meter) -> int:
+        """Bytes that a product with K vectors allocates at most at a time, its result included."""
+        return meter.allocated(lambda: self.linearized.hvp(self.vectors[K]))
+
+    def kept(self) -> int:
+        """Bytes of the arrays that the linearisation holds, the target's included, the Gaussians' not."""
+        held, gaussians = _buffers(self._linearize(), {}), _buffers(self.workload.gaussians, {})
+        return sum(size for address, size in held.items() if address not in gaussians)
+
+
+def _buffers(item: Any, found: dict[int, int], depth: int = 0) -> dict[int, int]:
+    """Address and bytes of every array that an object holds, in attributes, tuples, lists or dictionaries."""
+    if isinstance(item, torch.Tensor):
+        found[item.untyped_storage().data_ptr()] = item.untyped_storage().nbytes()
+    elif isinstance(item, np.ndarray):
+        while isinstance(item.base, np.ndarray):
+            item = item.base
+        found[item.ctypes.data] = max(item.nbytes, found.get(item.ctypes.data, 0))
+    elif depth < 6:
+        inner = item.values() if isinstance(item, dict) else item if isinstance(item, tuple | list) else None
+        for part in inner if inner is not None else vars(item).values() if hasattr(item, "__dict__") else ():
+            _buffers(part, found, depth + 1)
+    return found
+
+
+# --- scaling ----------------------------------------------------------------------------------------------------------
+
+SHARES = (1 / 8, 1 / 4, 1 / 2, 1.0)  # of the Gaussians
+FACTORS = (1 / 4, 1 / 2, 1.0, 2.0)  # of an image's sides
+SCALED = ("gradient", "linearize", *PRODUCTS)
+
+
+def powers_of_two(most: int) -> list[int]:
+    """1, 2, 4, ... and most itself.
+
+    >>> powers_of_two(6)
+    [1, 2, 4, 6]
+    """
+    return sorted({*(2**k for k in range(most.bit_length()) if 2**k <= most), most})
+
+
+def scaling(workload: Workload, repetitions: int, meter: Meter) -> Iterator[tuple[str, int, dict[str, Timing]]]:
+    """What grows, to how much, and the times of everything in SCALED: Gaussians, pixels, views and, on the CPU, threads."""
+    for share in SHARES:
+        part = workload.thinned(max(1, round(share * len(workload.gaussians))))
+        yield "gaussians", len(part.gaussians), scaled_times(part, repetitions, meter)
+    for factor in FACTORS:
+        part = workload.resized(factor)
+        yield "pixels", part.pixels, scaled_times(part, repetitions, meter)
+    for views in powers_of_two(len(workload.views)):
+        yield "views", views, scaled_times(workload, repetitions, meter, views)
+    if by_triton(workload.gaussians.flat):
+        return
+    before = torch.get_num_threads()
+    try:
+        for threads in powers_of_two(before):
+            torch.set_num_threads(threads)
+            yield "threads", threads, scaled_times(workload, repetitions, meter)
+    finally:
+        torch.set_num_threads(before)
+
+
+def scaled_times(workload: Workload, repetitions: int, meter: Meter, views: int = 1) -> dict[str, Timing]:
+    """The times of everything in SCALED over the first views."""
+    benches = [ViewBench(workload, index).wholes() for index in range(views)]
+
+    def over_views(name: str) -> Callable[[], object]:
+        return lambda: [bench[name]() for bench in benches]
+
+    return interleaved({name: over_views(name) for name in SCALED}, repetitions, clock=meter.seconds)
+
+
+def per_vector(times: dict[str, Timing]) -> dict[str, Timing]:
+    """Products as times per vector; the rest as it is."""
+    return {
+        name: time / int(name.split()[-1]) if name in PRODUCTS else time for name, time in times.items()
+    }  # fmt: skip

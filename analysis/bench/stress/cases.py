@@ -1,0 +1,185 @@
+"""Scenes at the limits of the renderer, a few Gaussians and pixels each, and inputs that it has to refuse.
+
+Every parameter is a float32 number held in float64, so that both precisions begin at the same point.  A scene with thresholds
+is drawn again, with the next seed, until no pixel lies within MARGIN of alpha_min or of the transmittance at which it stops:
+both precisions then make the same decisions, and what is left is round-off.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from math import log
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splat.model.camera import Camera
+from splat.model.gaussians import ATTRIBUTES, Gaussians
+from splat.model.settings import RenderSettings
+from splat.projection.reference import project
+from splat.raster.reference import rasterize_reference
+from splat.render.render import render
+
+WIDTH, HEIGHT = 24, 16
+CENTRE = (0.1, 0.05, -0.1)
+BACKGROUND = torch.tensor([0.2, 0.5, 0.875], dtype=torch.float64)
+MARGIN = 1e-4  # relative; ln alpha is wrong by at most about 1e-5 in float32, for needles
+ATTEMPTS = 50
+Change = Callable[[dict[str, Tensor]], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One scene, one view.  gaussians: in float64; target: the picture it is compared with.
+
+    dense: whether it is small enough for a dense Hessian.  stand_in: a scene of the same derivatives, to many digits, on which
+    the specification can be evaluated where it cannot be on this one.
+    """
+
+    name: str
+    gaussians: Gaussians
+    camera: Camera
+    settings: RenderSettings
+    target: Float[Tensor, "3 h w"]
+    dense: bool = True
+    stand_in: Gaussians | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Refusal:
+    """An input that must raise ValueError with these words in it."""
+
+    name: str
+    gaussians: Gaussians
+    words: tuple[str, ...]
+
+
+def camera_of(width: int = WIDTH, height: int = HEIGHT, unit: float = 1.0, focal: float = 24.0) -> Camera:
+    centre = torch.tensor(CENTRE, dtype=torch.float64) * unit
+    return Camera(torch.eye(3).double(), centre, focal, 0.9 * focal, width / 2 + 0.3, height / 2 - 0.2, width, height)
+
+
+def gaussians_of(n: int, generator: torch.Generator, change: Change = lambda _: None, unit: float = 1.0) -> Gaussians:
+    """n Gaussians in front of `camera_of`, SH degree 1 (0 for a crowd); change: alters the attributes in place."""
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    quats = normal(n, 4)
+    attributes = {
+        "means": (0.4 * normal(n, 3) + torch.tensor([0.0, 0.0, 4.0])) * unit,
+        "log_scales": 0.4 * normal(n, 3) - 1.5 + log(unit),
+        "quats": quats / quats.norm(dim=1, keepdim=True),
+        "opacity_logits": normal(n),
+        "sh": 0.4 * normal(n, 4 if n < 100 else 1, 3),
+    }
+    change(attributes)
+    return Gaussians.pack(attributes).to(torch.float32).to(torch.float64)
+
+
+def steady(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> bool:
+    """Whether every threshold decides alike when it is moved by MARGIN either way."""
+
+    def image(factor: float) -> Tensor:
+        moved = replace(
+            settings, alpha_min=settings.alpha_min * factor, transmittance_min=settings.transmittance_min * factor
+        )
+        splats = project(gaussians, camera, settings)
+        size = (camera.width, camera.height)
+        return rasterize_reference(splats, BACKGROUND, *size, moved, tile=max(size))[0]
+
+    return torch.equal(image(1 - MARGIN), image(1 + MARGIN))
+
+
+def set_rows(name: str, value: object, rows: slice | int | tuple[slice | int, int] = slice(None)) -> Change:
+    """attributes[name][rows] = value."""
+
+    def change(attributes: dict[str, Tensor]) -> None:
+        attributes[name][rows] = torch.as_tensor(value, dtype=torch.float64)
+
+    return change
+
+
+def duplicate(attributes: dict[str, Tensor]) -> None:
+    for value in attributes.values():
+        value[1:] = value[0].clone()
+
+
+def scale_quats(factor: float) -> Change:
+    def change(attributes: dict[str, Tensor]) -> None:
+        attributes["quats"] *= factor
+
+    return change
+
+
+def _case(
+    name: str, seed: int, change: Change = lambda _: None, *, n: int = 3, camera: Camera | None = None, unit: float = 1.0,
+    target: float | None = None, settings: RenderSettings | None = None,
+) -> Case:  # fmt: skip
+    camera = camera or camera_of(unit=unit)
+    settings = settings or RenderSettings(near=0.2 * unit)
+    for attempt in range(ATTEMPTS):
+        generator = torch.Generator().manual_seed(seed * ATTEMPTS + attempt)
+        gaussians = gaussians_of(n, generator, change, unit)
+        if steady(gaussians, camera, settings):
+            break
+    else:
+        raise ValueError(f"expected a scene without a pixel at a threshold for {name!r}, got none in {ATTEMPTS} seeds")
+    size = (3, camera.height, camera.width)
+    picture = torch.rand(size, generator=generator) if target is None else torch.full(size, target)
+    return Case(name, gaussians, camera, settings, picture, dense=n < 100 and camera.width * camera.height < 1000)
+
+
+def cases(seed: int) -> Iterator[Case]:
+    """Every scene whose derivatives must be right."""
+    yield _case("one Gaussian", seed, n=1)
+    yield _case("the same depth", seed, set_rows("means", 4.0, (slice(None), 2)))
+    crowd = camera_of(8, 6, focal=8.0)
+    yield _case("2,000 at the same depth", seed, set_rows("means", 4.0, (slice(None), 2)), n=2000, camera=crowd)
+    yield _case("exact duplicates", seed, duplicate)
+    yield _case("needles, aspect 1e6", seed, set_rows("log_scales", [3.0, -10.8, -10.8]))
+    yield _case("pancakes, aspect 1e6", seed, set_rows("log_scales", [3.0, 3.0, -10.8]))
+    yield _case("one fills the image", seed, set_rows("log_scales", 5.0, 0))
+    yield _case("across the near plane", seed, set_rows("means", [[0, 0, 0.101], [0, 0, 0.3], [0, 0, 0.099]]))
+    yield _case("opacity logits of 50", seed, set_rows("opacity_logits", 50.0))
+    yield _case("an opacity logit of -50", seed, set_rows("opacity_logits", -50.0, 0))
+    yield _case("log-scales of 20", seed, set_rows("log_scales", 20.0, 0))
+    yield _case("log-scales of -20", seed, set_rows("log_scales", -20.0, 0))
+    long = set_rows("log_scales", 20.0, (0, 1))
+    infinite, shorter = _case("one log-scale of 20", seed, long), set_rows("log_scales", 5.0, (0, 1))
+    attributes = {name: value.clone() for name, value in infinite.gaussians.attributes.items()}
+    shorter(attributes)
+    yield replace(infinite, stand_in=Gaussians.pack(attributes))
+    yield _case("quaternions of length 1e6", seed, scale_quats(1e6))
+    yield _case("quaternions of length 1e-6", seed, scale_quats(1e-6))
+    yield _case("world units of 1e-6", seed, unit=1e-6)
+    yield _case("world units of 1e6", seed, unit=1e6)
+    yield _case("nearly transparent", seed, set_rows("opacity_logits", -5.0))
+    yield _case("no thresholds", seed, settings=RenderSettings(alpha_min=0.0, transmittance_min=0.0))
+    yield _case("one pixel", seed, camera=camera_of(1, 1))
+    yield _case("1 x 10,000 pixels", seed, camera=camera_of(10_000, 1, focal=5000.0))
+    yield _case("10,000 x 1 pixels", seed, camera=camera_of(1, 10_000, focal=5000.0))
+    yield _case("a grey target", seed, target=0.5)
+    yield _case("a black target", seed, target=0.0)
+    fitted = _case("zero residual everywhere", seed)
+    rendered = render(fitted.gaussians, fitted.camera, BACKGROUND, fitted.settings, backend="reference")
+    yield replace(fitted, target=rendered.image.float())
+
+
+def refusals(seed: int) -> Iterator[Refusal]:
+    """Inputs that no number may come of; Gaussian 1 is the bad one."""
+
+    def bad(name: str, attribute: str, value: object) -> Refusal:
+        change = set_rows(attribute, value, 1)
+        return Refusal(name, gaussians_of(3, torch.Generator().manual_seed(seed), change), (attribute, "Gaussian 1 "))
+
+    for attribute in ATTRIBUTES:
+        for value in (float("nan"), float("inf")):
+            yield bad(f"{attribute} {value}", attribute, value)
+    yield bad("quaternion of length 0", "quats", 0.0)
+    yield bad("quaternion of length 1e-12", "quats", 5e-13)
+    yield bad("quaternion of length 1e12", "quats", 5e11)
+    yield bad("log-scales of 400", "log_scales", 400.0)
+    yield bad("sh of 1e20", "sh", 1e20)
+    everywhere = gaussians_of(3, torch.Generator().manual_seed(seed), set_rows("opacity_logits", -50.0))
+    yield Refusal("all transparent", everywhere, ("expected Gaussians in sight",))

@@ -1,0 +1,54 @@
+"""`landscape demo`: make a synthetic scene, train on three of its views, probe the result, say what to open.
+
+OUT/scene    the scene (`splat.scenes.synthetic`) as transforms.json with pictures
+OUT/run      the training, and in OUT/run/probe the record of the probe
+"""
+
+import shlex
+from itertools import count
+from pathlib import Path
+
+from rich.console import Console
+
+from analysis.console.options import DemoOptions, ProbeOptions, TrainOptions
+from analysis.probe.command import run_probe
+from analysis.records.run_files import CHECKPOINT
+from analysis.train.command import run_training
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+
+SCENE = SyntheticSettings(width=160, height=120)
+VIEWS, ITERATIONS, SECONDS = 3, 600, 40
+
+
+def run_demo(options: DemoOptions) -> int:
+    """Make, train, probe; returns the exit code."""
+    out, console = free_folder(options.out), Console()
+    if out != options.out:
+        console.print(f"{options.out} exists, so this run goes to {out}", highlight=False, soft_wrap=True)
+    console.print("the first run compiles the kernels, which takes about a minute; later runs find them in a cache")
+    with Console(stderr=True).status("making a synthetic scene"):
+        write_transforms_scene(synthetic_scene(SCENE).scene, out / "scene")
+    training = TrainOptions(out / "scene", out=out / "run", views=VIEWS, iterations=ITERATIONS)
+    typed = ["train", str(training.scene), "--out", str(training.out), "--views", str(VIEWS)]
+    typed += ["--iterations", str(ITERATIONS)]
+    checkpoint = out / "run" / CHECKPOINT
+    _announce(console, typed)
+    if code := run_training(training, ["landscape", *typed]):
+        return code
+    typed = ["probe", str(checkpoint), "--seconds", str(SECONDS)]
+    _announce(console, typed)
+    return run_probe(ProbeOptions(checkpoint, seconds=SECONDS), ["landscape", *typed])
+
+
+def _announce(console: Console, arguments: list[str]) -> None:
+    """The command that does the same."""
+    console.print(f"\n$ {shlex.join(['landscape', *arguments])}", style="bold", highlight=False, soft_wrap=True)
+
+
+def free_folder(wanted: Path) -> Path:
+    """wanted, or the first of wanted-2, wanted-3, ... that does not exist yet."""
+    if not wanted.exists():
+        return wanted
+    candidates = (wanted.with_name(f"{wanted.name}-{number}") for number in count(2))
+    return next(folder for folder in candidates if not folder.exists())

@@ -1,0 +1,72 @@
+"""`landscape sfm`: a scene from a folder of photographs, with a progress bar for every stage."""
+
+import shlex
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from analysis.console.options import SfmOptions
+from splat.scenes.sfm.sfm import Mapped, Stage, scene_from_photos
+
+STAGES: dict[Stage, str] = {
+    "features": "finding features",
+    "matches": "matching photographs",
+    "mapping": "placing photographs",
+    "images": "undistorting",
+}
+NAMED = 5  # photographs without a place that are named
+
+
+def run_sfm(options: SfmOptions) -> int:
+    """Make the scene and say what came of it; returns the exit code."""
+    out = options.out or options.photos.resolve().with_name(f"{options.photos.resolve().name}-scene")
+    progress = _progress()
+    try:
+        bars = {stage: progress.add_task(text, start=False, visible=False) for stage, text in STAGES.items()}
+
+        def show(stage: Stage, done: int, total: int) -> None:
+            if not progress.tasks[bars[stage]].started:
+                progress.start()
+                progress.start_task(bars[stage])
+            progress.update(bars[stage], completed=done, total=total, visible=True)
+
+        mapped = scene_from_photos(options.photos, out, show)
+    finally:
+        progress.stop()
+    _report(mapped, out)
+    return 0
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+    )
+
+
+def _report(mapped: Mapped, out: Path) -> None:
+    console = Console()
+
+    def say(text: str) -> None:
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+    total = mapped.placed + len(mapped.left_out)
+    say(
+        f"{out}: {mapped.placed} of {total} photographs placed, {mapped.points} points, "
+        f"mean reprojection error {mapped.error:.2f} px"
+    )
+    if mapped.left_out:
+        rest = len(mapped.left_out) - NAMED
+        names = ", ".join(mapped.left_out[:NAMED]) + (f" and {rest} more" if rest > 0 else "")
+        say(f"left out: {names}; they overlap too little with the others")
+    if len(mapped.models) > 1:
+        sizes = ", ".join(map(str, mapped.models))
+        say(
+            f"the photographs fell apart into {len(mapped.models)} models, of {sizes}; the largest was kept: to join them, "
+            "add photographs between them"
+        )
+    say(f"next: landscape train {shlex.quote(str(out))}")

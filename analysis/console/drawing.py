@@ -1,0 +1,65 @@
+"""Pictures of a record: the figures' own commands, each run in a process of its own.
+
+`figures/` reads what this package wrote and is not imported here, so that the arrow between them points one way; a
+renderer that ends its process (VTK does, where OpenGL is missing) cannot take a probe along.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+Draw = Callable[[Path], list[str]]
+"""Draws into a folder; returns what it warned of.  Raises RuntimeError with its words if it failed."""
+
+
+@contextmanager
+def drawing(module: str, *options: str) -> Iterator[Draw]:
+    """`python -m figures.MODULE OPTIONS` of a folder that is named later: the process loads its libraries meanwhile."""
+    command = [sys.executable, "-m", f"figures.{module}", *options]
+    with _group([*command, "-"]) as process:  # without a folder there is nothing to draw
+        yield lambda target: _said(process, [*command, str(target)], str(target))
+
+
+def draw(module: str, target: Path, *options: str) -> list[str]:
+    """Run `python -m figures.MODULE OPTIONS TARGET`, a folder or a file; as `Draw` does."""
+    command = [sys.executable, "-m", f"figures.{module}", *options, str(target)]
+    with _group(command) as process:
+        return _said(process, command)
+
+
+@contextmanager
+def _group(command: list[str]) -> Iterator[subprocess.Popen[str]]:
+    """A process that ends with the block, and with it those that it has started: they would keep its output open for ever."""
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=module_environment(),
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def _said(process: subprocess.Popen[str], command: list[str], told: str = "") -> list[str]:
+    """What the process warned of, once it is told this and has ended.  command: does the same by hand."""
+    lines = [line for line in process.communicate(told)[1].splitlines() if line.strip()]
+    if process.returncode:
+        raise RuntimeError(f"drawing failed; draw again with: {' '.join(command)}\n" + "\n".join(lines))
+    return [line.split("Warning: ", 1)[1] for line in lines if "Warning: " in line]
+
+
+def module_environment() -> dict[str, str]:
+    """In which `python -m` finds the modules of this repository, and all that this process finds."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}

@@ -1,0 +1,38 @@
+"""A record with its pictures: the one way in which the commands write what they found."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from analysis.console.drawing import Draw, draw
+from analysis.console.stages import Stages
+from analysis.records.records import Kind, write_data, write_record
+
+
+def write_with_pictures(
+    folder: Path,
+    data: dict[str, Any],
+    arrays: Mapping[str, Mapping[str, np.ndarray]],
+    kind: Kind,
+    stages: Stages,
+    start: float,
+    drawn: Draw | None = None,
+    options: Sequence[str] = (),
+) -> None:
+    """Write the record into `folder`, draw its pictures, and add to data how long all took since `start` and what was said.
+
+    drawn: draws the pictures, where `drawing` has begun with it; else options: of the command that draws them.
+    """
+    data["timing"] = {"total": perf_counter() - start}
+    write_record(folder, data, arrays, kind)
+    with stages.stage("pictures"):
+        try:
+            data["notes"] += draw("make_all", folder, *options) if drawn is None else drawn(folder)
+        except RuntimeError as error:  # the numbers stand without pictures
+            data["notes"].append(" ".join(str(error).split()))
+    # the pictures are drawn from the record; only now is it known how long they took
+    data["timing"] = {**stages.timing, "total": perf_counter() - start}
+    write_data(folder, data, arrays, kind)

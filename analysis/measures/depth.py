@@ -1,0 +1,213 @@
+"""Positions along and across the rays: how much of their gradient and curvature lies in depth, and what finite steps do.
+
+v_im is the unit vector from the centre of view m's camera to the mean of Gaussian i, as in Eq. (7); g_im and H_im are the
+gradient and the own 3 x 3 block of that view's loss in that mean.
+
+              depth            lateral: two directions        summed over
+    gradient  (g . v)^2        |g|^2 - (g . v)^2              pairs of a Gaussian and a view with g != 0
+    curvature v^T H v          tr H - v^T H v                 Gaussians; the mean over views
+    rise      (L_m(+d) + L_m(-d)) / 2 - L_m, all Gaussians moved by d_i at once; the mean over views
+
+The ratios are of depth to one lateral direction: of root mean square gradients, and of mean curvatures.  The paper's text on
+Eq. (4) says that the gradient's is "typically 100x" and that large eigenvalues follow.  But a mean that moves by d along its
+ray keeps its place in the image and changes the size s of its splat by s d / z; across the ray it moves the splat by f d / z.
+With splats that are small beside the focal length f, ratios far below 1 are to be expected.
+
+Derivatives do not see that Gaussians change their order: it is locally constant.  The rises do, as they are true renders.
+Steps d_i are along v or along a random direction across it, of random sign, and of the length that moves a splat by so many
+pixels where it is across: px |mean - centre| / f.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from math import inf, nan
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from landscape.probes import draw_probes
+from landscape.results import Bracket, Progress
+from landscape.traces.estimate import TraceEstimate
+from landscape.traces.trace import TraceSettings
+from splat.curvature.objective import SceneObjective
+from splat.curvature.traces import ONE_PERCENT, SampledTrace, sampled_traces
+
+KINDS = ("depth", "lateral")
+LATERAL_DIRECTIONS = 2
+STEPS = (0.01, 0.1, 1.0, 10.0)  # px
+DRAWS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSplit:
+    """components: |g . v| and |g - (g . v) v| of every pair of a Gaussian and a view with a gradient, per world unit.
+
+    depth, lateral: the traces of the positions' curvature along and across the rays.
+    """
+
+    components: Float64[Tensor, "pairs 2"]
+    depth: TraceEstimate
+    lateral: TraceEstimate
+
+    @cached_property
+    def gradient_ratio(self) -> float:
+        """Of the root mean squares; nan without a lateral gradient."""
+        depth, lateral = self.components.square().sum(dim=0).tolist()
+        return (LATERAL_DIRECTIONS * depth / lateral) ** 0.5 if lateral > 0 else nan
+
+    @cached_property
+    def median_ratio(self) -> float:
+        """The median over the pairs of |g . v| over the root mean square of g's lateral components."""
+        depth, lateral = self.components.unbind(dim=1)
+        return float((LATERAL_DIRECTIONS**0.5 * depth / lateral).median()) if len(depth) else nan
+
+    @cached_property
+    def curvature_ratio(self) -> Bracket:
+        """Of the mean curvatures, with the intervals of both traces; undefined where the lateral one may be 0 or less."""
+        depth, lateral = self.depth, self.lateral
+        if lateral.low <= 0:
+            return Bracket(None, -inf, inf, "the lateral curvature is negative or its sign undetermined")
+        ends = [LATERAL_DIRECTIONS * a / b for a in (depth.low, depth.high) for b in (lateral.low, lateral.high)]
+        return Bracket(LATERAL_DIRECTIONS * depth.value / lateral.value, min(ends), max(ends))
+
+
+@dataclass(frozen=True, eq=False)
+class DepthRises:
+    """Rises of the loss by steps along and across the rays (columns: KINDS), rows by length.
+
+    steps: px.  errors: standard errors of the means over draws.  crossed: in which share of the renders the order of the splats
+    or the set of visible ones was another.
+    """
+
+    steps: tuple[float, ...]
+    values: Float64[Tensor, "s 2"]
+    errors: Float64[Tensor, "s 2"]
+    crossed: Float64[Tensor, "s 2"]
+
+    @property
+    def ratios(self) -> tuple[Float64[Tensor, " s"], Float64[Tensor, " s"]]:
+        """Depth over lateral, with standard errors."""
+        (depth, lateral), relative = self.values.unbind(dim=1), self.errors / self.values
+        return depth / lateral, (depth / lateral).abs() * relative.square().sum(dim=1).sqrt()
+
+
+def depth_split(
+    objective: SceneObjective,
+    generator: torch.Generator,
+    settings: TraceSettings = ONE_PERCENT,
+    progress: Progress | None = None,
+) -> DepthSplit:
+    """Gradient and curvature of the active Gaussians' positions.  settings: as for `exact_traces`, for either trace."""
+    rays = [rays_of(objective, index) for index in range(len(objective.views))]
+    parts = (False, True) if objective.couples_pixels else (False,)  # the blocks whole, and pixel by pixel
+    components, own = [], torch.zeros(len(KINDS), len(parts), dtype=torch.float64)
+    for ray, view in zip(rays, objective.linearized, strict=True):
+        components.append(along_and_across(view.gradient[objective.blocks["means"]].view(-1, 3), ray))
+        for part, gauss_newton in enumerate(parts):
+            own[:, part] += _split_traces(view.block_diagonal(gauss_newton=gauss_newton).geometry[:, :3, :3], ray).cpu()
+    pairs = objective.stacked(torch.stack(components, dim=1)).flatten(0, 1)
+    dims = (len(objective.active), LATERAL_DIRECTIONS * len(objective.active))
+    traces = [
+        SampledTrace(
+            kind, dim, known, pixelwise[0] if pixelwise else None, settings, settings.min_probes, settings.max_probes
+        )
+        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean(own).tolist(), strict=True)
+    ]
+    found = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
+    return DepthSplit(pairs[pairs.any(dim=1)], **found)
+
+
+def depth_rises(
+    objective: SceneObjective,
+    generator: torch.Generator,
+    steps: Sequence[float] = STEPS,
+    draws: int = DRAWS,
+    progress: Progress | None = None,
+) -> DepthRises:
+    """What steps along and across the rays do to the loss.  steps: px; draws: of all directions and signs, 2 or more."""
+    if draws < 2:
+        raise ValueError(f"expected at least 2 draws, got {draws}")
+    seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
+    rises, crossed = torch.zeros(2, len(steps), len(KINDS), draws, dtype=torch.float64)
+    for index, number in enumerate(objective.view_numbers):
+        center, piece = objective.evaluate_view(index, objective.active)
+        for draw, seed in enumerate(seeds):
+            directions = _directions(objective, index, torch.Generator(generator.device).manual_seed(seed + number))
+            for s, step in enumerate(steps):
+                for kind, direction in enumerate(directions):
+                    ends = [_moved(objective, index, sign * step * direction) for sign in (1, -1)]
+                    rises[s, kind, draw] += sum(loss for loss, _ in ends) / 2 - center
+                    crossed[s, kind, draw] += sum(order != piece for _, order in ends) / 2
+            if progress:
+                progress(
+                    index * draws + draw + 1, len(objective.views) * draws, "finite steps along and across the rays"
+                )
+    rises, crossed = objective.mean(rises), objective.mean(crossed)
+    return DepthRises(tuple(steps), rises.mean(dim=2), rises.std(dim=2) / draws**0.5, crossed.mean(dim=2))
+
+
+def rays_of(objective: SceneObjective, index: int) -> Float[Tensor, "n 3"]:
+    """v of every active Gaussian in a view that this process holds."""
+    means = objective.active.means
+    return F.normalize(means - objective.views[index].camera.centre.to(means), dim=1)
+
+
+def along_and_across(vectors: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float64[Tensor, "n 2"]:
+    """The lengths of the parts of vectors along and across their rays.
+
+    >>> along_and_across(torch.tensor([[3.0, -4.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]]))
+    tensor([[4., 3.]], dtype=torch.float64)
+    """
+    v, g = rays.double(), vectors.double()
+    return torch.stack([(g * v).sum(dim=1).abs(), _across(g, v).norm(dim=1)], dim=1)
+
+
+def _across(vectors: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    return vectors - (vectors * rays).sum(dim=1, keepdim=True) * rays
+
+
+def _split_traces(blocks: Float[Tensor, "n 3 3"], rays: Float[Tensor, "n 3"]) -> Float64[Tensor, "2"]:
+    """Of both KINDS, summed."""
+    H, v = blocks.double(), rays.double()
+    depth = (v[:, None, :] @ H @ v[:, :, None]).sum()
+    return torch.stack([depth, H.diagonal(dim1=1, dim2=2).sum() - depth])
+
+
+def _signs(
+    objective: SceneObjective,
+    rays: Sequence[Float[Tensor, "n 3"]],
+    index: int,
+    generators: Sequence[torch.Generator],
+    names: Sequence[str],
+) -> Float[Tensor, "p b s"]:
+    """Random signs along the rays, and random signs in space with what lies along the rays taken out (`traces.Draw`)."""
+    flat, ray = objective.active.flat, rays[index]
+    U = flat.new_zeros(flat.numel(), len(names), len(generators))
+    for j, generator in enumerate(generators):
+        z = draw_probes(4 * len(ray), 1, generator, flat.dtype, "rademacher").view(-1, 4).to(ray)
+        moves = {"depth": z[:, :1] * ray, "lateral": _across(z[:, 1:], ray)}
+        for i, name in enumerate(names):
+            U[objective.blocks["means"], i, j] = moves[name].reshape(-1)
+    return U
+
+
+def _directions(
+    objective: SceneObjective, index: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Along and across the rays, of the length of a pixel."""
+    ray, camera, means = rays_of(objective, index), objective.views[index].camera, objective.active.means
+    pixel = (means - camera.centre.to(means)).norm(dim=1, keepdim=True) / float(camera.fx)
+    z = draw_probes(4 * len(ray), 1, generator, torch.float64, "gaussian").view(-1, 4).to(means)
+    return z[:, :1].sign() * ray * pixel, F.normalize(_across(z[:, 1:], ray), dim=1) * pixel
+
+
+def _moved(objective: SceneObjective, index: int, moves: Float[Tensor, "n 3"]) -> tuple[float, object]:
+    """`evaluate_view` with the means moved."""
+    flat = objective.active.flat.clone()
+    flat[objective.blocks["means"]] += moves.reshape(-1)
+    gaussians = objective.active.with_flat(flat)
+    gaussians.require_finite()
+    return objective.evaluate_view(index, gaussians)

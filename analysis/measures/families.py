@@ -1,0 +1,345 @@
+"""The anisotropy families of a checkpoint: of all attributes together and of each, of the Hessian and of Gauss-Newton.
+
+Curvature is compared in the units of a metric (`analysis.measures.units`): D H D.  The split control
+(`analysis.measures.split_control`)
+measures the same of the scene with every Gaussian split into two coincident halves.  Its images are nearly the same, so what an
+index changes by is what the number of Gaussians alone does to it.
+
+    scene       "trained": the checkpoint; "split": every Gaussian of it that a view sees, split in two
+    operator    "hessian", exact, or "gauss-newton"
+    block       "all", or an attribute: that diagonal block of the operator
+    effect      an index of the split scene over that of the trained one, with what both brackets leave open
+
+Every family stops at its tolerance, its budget of products, or when its share of the time is spent.  The time left is divided
+among the families to come in proportion to their Gaussians.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from math import inf
+from time import monotonic
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from analysis.console.budget import Stage
+from analysis.measures.memory import basis_within, vectors_within
+from analysis.measures.split_control import SplitControl, split_control
+from analysis.measures.units import Metric, optimiser_units, scene_size, scene_units
+from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
+from landscape.eigen.pairs import EigenEnds
+from landscape.operators.operator import SymmetricOperator, finished
+from landscape.probes import split
+from landscape.results import Progress, finite_or_none
+from landscape.spectrum.families import WHOLE, Lead
+from landscape.traces.trace import total_trace
+from splat.curvature.active_spaces import active_spaces
+from splat.curvature.block_eigenvectors import BlockEigenvectors
+from splat.curvature.hessian import SceneHessian
+from splat.curvature.objective import SceneObjective
+from splat.curvature.traces import exact_traces
+from splat.training.state import Training
+
+SceneName = Literal["trained", "split"]
+OPERATORS = {"hessian": False, "gauss-newton": True}  # name -> gauss_newton
+PARTS = 6  # the whole and five attributes
+FEWEST_STEPS = 2  # that make a density
+TRACE_SAMPLES = 8  # of SSIM's coupling: to a few percent, within which start vectors do not know it
+DENSITY_SHARE = 0.45  # of a family's time: 48 of 108 products by default
+
+
+@dataclass(frozen=True)
+class FamilyOptions:
+    """In which metric, whether the split control too, and how much work.
+
+    family: budget of each; seconds: for all of them together; memory: GiB for the vectors of a basis.
+    """
+
+    metric: Metric = "parameters"
+    split_control: bool = False
+    family: FamilySettings = field(default_factory=FamilySettings)
+    seconds: float = inf
+    memory: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (self.seconds > 0 and self.memory > 0):
+            raise ValueError(
+                f"expected seconds and memory above 0 for the families, got {self.seconds} and {self.memory}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class FamilyRow:
+    """One family and what it is of.  dim: rows of the operator, those of the null space (see `Family.rank`) counted."""
+
+    scene: SceneName
+    operator: str
+    block: str
+    gaussians: int
+    dim: int
+    family: Family
+
+    def record(self) -> dict[str, Any]:
+        found, ends = self.family, self.family.ends
+        return {
+            "operator": self.operator,
+            "block": self.block,
+            "split": self.scene == "split",
+            "gaussians": self.gaussians,
+            "dim": self.dim,
+            "rank": found.rank,
+            "lambda_max": ends.largest.record(),
+            "lambda_min": ends.smallest.record(),
+            "beyond": finite_or_none(ends.beyond),
+            "indices": found.indices.record(),
+            "starts": len(found.density.nodes),
+            "steps": found.density.nodes.shape[1],
+            "matvecs": ends.matvecs + found.density.matvecs,
+        }
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What the split does to one index: split over trained; value is None where one of the two is not determined."""
+
+    operator: str
+    block: str
+    index: str
+    factor: Bracket
+
+    def record(self) -> dict[str, Any]:
+        return {"operator": self.operator, "block": self.block, "index": self.index, **self.factor.record()}
+
+
+@dataclass(frozen=True, eq=False)
+class FamilyFindings:
+    """unit: what the metric's units are, in words; control and effects: None and empty without the split control."""
+
+    metric: Metric
+    unit: str
+    rows: tuple[FamilyRow, ...]
+    control: SplitControl | None
+    effects: tuple[Effect, ...]
+    notes: tuple[str, ...]
+
+    def record(self) -> dict[str, Any]:
+        """The keys that this adds to a record's data (see `analysis.records.records`)."""
+        found = {"families": [{"metric": self.metric, "unit": self.unit, **row.record()} for row in self.rows]}
+        if self.control is None:
+            return found
+        return {**found, "split_control": {**self.control.record(), "effects": [e.record() for e in self.effects]}}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Nodes and weights of every density."""
+        return {
+            f"{row.scene}.{row.operator}.{row.block}.{part}": found.numpy()
+            for row in self.rows
+            for part, found in zip(("nodes", "weights"), row.family.density.table(), strict=True)
+        }
+
+
+def measure_families(
+    objective: SceneObjective,
+    training: Training,
+    options: FamilyOptions,
+    generator: torch.Generator,
+    stage: Stage,
+    ends: EigenEnds | None = None,
+) -> FamilyFindings:
+    """Every family of the scene and, if asked for, of the split scene.
+
+
+    training: that of the checkpoint; stage: see `analysis.console.stages`; ends: of the objective's Hessian in the
+    stored parameters,
+    where they have been looked for.
+    """
+    scenes: dict[SceneName, SceneObjective] = {"trained": objective}
+    control, notes = None, []
+    if options.split_control:
+        with stage("split control"):
+            control = split_control(
+                objective.active, [view.camera for view in objective.views], objective.background, objective.settings
+            )
+            scenes["split"] = _with(objective, control, training)
+    clock = _Clock(options.seconds, {name: len(scene.active) for name, scene in scenes.items()})
+    unit, scale = _metric(options.metric, objective, training)
+    streams: dict[tuple[SceneName, str], torch.Generator] = {
+        (scene, operator): split(generator)
+        for scene in scenes  # the trained one first: its numbers are the same without the split control
+        for operator in OPERATORS
+    }
+    rows: list[FamilyRow] = []
+    for (scene, operator), stream in streams.items():
+        with stage(f"families: {operator}{', split' if scene == 'split' else ''}") as report:
+            hessian = SceneHessian(scenes[scene], gauss_newton=OPERATORS[operator])
+            D = scale(scenes[scene])
+            known = ends if scene == "trained" and operator == "hessian" and D is None else None
+            measured = _of_operator(hessian, D, known, options, stream, partial(clock.share, scene), report, notes)
+            count = len(scenes[scene].active)
+            rows += [FamilyRow(scene, operator, block, count, dim, found) for block, dim, found in measured]
+    return FamilyFindings(options.metric, unit, tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)))
+
+
+def _with(objective: SceneObjective, control: SplitControl, training: Training) -> SceneObjective:
+    """The same loss over the same views of the split Gaussians."""
+    loss = training.config.loss
+    return SceneObjective(control.gaussians, objective.views, loss, objective.background, objective.settings)
+
+
+class _Clock:
+    """Divides the time that is left among the families to come, in proportion to the Gaussians of their scene."""
+
+    def __init__(self, seconds: float, gaussians: Mapping[SceneName, int]) -> None:
+        self.end, self.gaussians = monotonic() + seconds, dict(gaussians)
+        self.to_come: dict[SceneName, int] = {name: PARTS * len(OPERATORS) for name in gaussians}
+
+    def share(self, scene: SceneName) -> float:
+        part = self.gaussians[scene] / sum(count * self.gaussians[name] for name, count in self.to_come.items())
+        self.to_come[scene] -= 1
+        return max(self.end - monotonic(), 0.0) * part
+
+
+def _metric(
+    metric: Metric, objective: SceneObjective, training: Training
+) -> tuple[str, Callable[[SceneObjective], Tensor | None]]:
+    """The unit in words, and D of a scene; the split scene has the units of the trained one."""
+    if metric == "parameters":
+        return "the stored parameters as they are", lambda _: None
+    if metric == "scene":
+        size = scene_size(objective)
+        return f"positions in units of the scene's size, {size:.4g} world units", lambda scene: scene_units(scene, size)
+    rates, extent = training.config.rates, training.extent
+    if not (optimiser_units(objective, rates, extent) > 0).all():
+        raise ValueError(f"expected learning rates above 0 for the optimiser's metric, got {rates}")
+    words = (
+        f"steps of the training's first learning rates: position {rates.position * extent:.3g} (extent {extent:.4g}), "
+        f"log scale {rates.log_scales:.3g}, rotation {rates.quats:.3g}, opacity {rates.opacity_logits:.3g}, "
+        f"colour {rates.sh_constant:.3g} and {rates.sh_higher:.3g}"
+    )
+    return words, lambda scene: optimiser_units(scene, rates, extent)
+
+
+def _of_operator(
+    hessian: SceneHessian,
+    scale: Tensor | None,
+    ends: EigenEnds | None,
+    options: FamilyOptions,
+    generator: torch.Generator,
+    seconds: Callable[[], float],
+    report: Progress,
+    notes: list[str],
+) -> list[tuple[str, int, Family]]:
+    """(block, dim, family) of the whole and of every attribute of one operator.  ends: of the whole, where known."""
+    operator = hessian if scale is None else ScaledOperator(hessian, scale)
+    spaces, found = active_spaces(hessian, scale), []
+    traces = _traces(hessian, scale, split(generator))
+    each = _seconds_a_product(operator, options.family.batch, hessian.objective) if options.seconds < inf else 0.0
+    names = [WHOLE, *hessian.blocks]
+    for done, name in enumerate(names):
+        stream, allowed = split(generator), seconds()
+        if name != WHOLE and name not in spaces:  # an attribute without parameters, or wholly null
+            continue
+        report(done, len(names), name)
+        settings = _fitted(operator, options, allowed, each, notes)
+
+        def say(_: int, __: int, state: str, done: int = done) -> None:
+            report(done, len(names), state)
+
+        dim = hessian.dim if name == WHOLE else hessian.blocks[name].stop - hessian.blocks[name].start
+        leads = {name: replace(_lead(hessian, name, scale, ends), trace=traces.get(name))}
+        found.append((name, dim, families(operator, stream, settings, [name], spaces, say, leads)[name]))
+    report(len(names), len(names), "done")
+    return found
+
+
+def _traces(hessian: SceneHessian, scale: Tensor | None, generator: torch.Generator) -> dict[str, tuple[float, float]]:
+    """The operator's traces with standard errors, of the whole and of every attribute."""
+    found = exact_traces(
+        hessian.objective, generator, samples=TRACE_SAMPLES, gauss_newton=hessian.gauss_newton, scale=scale
+    )
+    return {WHOLE: total_trace(found), **{name: total_trace({name: trace}) for name, trace in found.items()}}
+
+
+def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnds | None) -> Lead:
+    """Where an earlier search knows the ends of the whole to lie, or the Gaussians' own blocks those of it or an attribute.
+
+    Both of the Hessian's whole and of rotations; of positions the largest, as several Gaussians make their least curvatures
+    together, and of Gauss-Newton, which has a null space for its smallest.
+    """
+    if name not in (WHOLE, "means", "quats"):
+        return Lead()
+    if name == WHOLE and ends is not None:
+        return Lead(torch.cat([ends.largest.vectors[:, :1], ends.smallest.vectors[:, :1]], dim=1))
+    objective = hessian.objective
+    own, pixelwise = objective.gaussian_blocks
+    if hessian.gauss_newton:
+        own = objective.pixelwise_blocks
+    known = BlockEigenvectors(objective, own, pixelwise, None if name == WHOLE else name, scale)
+    if hessian.gauss_newton or name == "means":
+        return Lead(known.steepest(1, 0))
+    return Lead(known.leads())
+
+
+def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: SceneObjective) -> float:
+    """With `batch` vectors where the scene is; the kernels may be compiled for the first."""
+    V, start = objective.active.flat.new_ones(operator.dim, batch), 0.0
+    for _ in range(2):
+        start = monotonic()
+        finished(operator.apply(V))
+    return monotonic() - start
+
+
+def _fitted(
+    operator: SymmetricOperator, options: FamilyOptions, seconds: float, each: float, notes: list[str]
+) -> FamilySettings:
+    """The budget, as far as time and memory allow it.  each: seconds of a product with as many vectors as a batch has."""
+    settings, eigen = options.family, options.family.eigen
+    room = vectors_within(operator, options.memory)
+    basis = basis_within(eigen, room)
+    if basis < eigen.basis:
+        notes.append(f"the families' Lanczos kept {basis} vectors instead of {eigen.basis}, to stay within memory")
+    batch = max(1, min(settings.batch, room // settings.steps))
+    rounds = -(-settings.starts // batch)
+    steps = settings.steps
+    if rounds * steps * each > DENSITY_SHARE * seconds:
+        steps = max(FEWEST_STEPS, int(DENSITY_SHARE * seconds / (rounds * each)))
+        notes.append("some densities of the families took fewer steps than asked for, to stay within the time")
+    eigen = replace(eigen, basis=basis, max_seconds=min(eigen.max_seconds, (1 - DENSITY_SHARE) * seconds))
+    return replace(settings, eigen=eigen, batch=batch, steps=min(steps, settings.steps))
+
+
+def _effects(rows: list[FamilyRow]) -> tuple[Effect, ...]:
+    """Index by index, the split scene's over the trained one's."""
+    split_rows = {(row.operator, row.block): row.family for row in rows if row.scene == "split"}
+    effects = []
+    for row in rows:
+        after = split_rows.get((row.operator, row.block))
+        if row.scene == "split" or after is None:
+            continue
+        for index, before in vars(row.family.indices).items():
+            factor = quotient(getattr(after.indices, index), before)
+            effects.append(Effect(row.operator, row.block, index, factor))
+    return tuple(effects)
+
+
+def quotient(after: Bracket | None, before: Bracket | None) -> Bracket:
+    """after / before with all that their brackets leave open (90% where each holds with 95%); undetermined where either may be
+    zero or without bound.
+
+    >>> str(quotient(Bracket(6.0, 5.0, 8.0), Bracket(2.0, 2.0, 2.5)))
+    '3 in [2, 4]'
+    """
+    for bracket in (after, before):
+        if bracket is None or bracket.value is None or not _bounded(bracket):
+            note = "" if bracket is None else bracket.note
+            return Bracket(None, inf, inf, note or "not determined")
+    assert after and before and after.value is not None and before.value is not None
+    corners = [a / b for a in (after.low, after.high) for b in (before.low, before.high)]
+    return Bracket(after.value / before.value, min(corners), max(corners))
+
+
+def _bounded(bracket: Bracket) -> bool:
+    return -inf < bracket.low <= bracket.high < inf and bracket.low * bracket.high > 0

@@ -1,0 +1,118 @@
+"""Where a vector over a scene's parameters lives: on which attributes, how many Gaussians, and which kind of Gaussians.
+
+mass           of Gaussian i in a vector v: m_i = sum of v^2 over its parameters; shares are of sum_i m_i = |v|^2
+participation  (sum_i m_i)^2 / sum_i m_i^2: over how many Gaussians the mass is spread, 1 to n
+condition      kappa of a splat's 2-D covariance Sigma' = r r^T + blur 1 (`projection.py`), lambda_max / lambda_min: the largest
+               over the views on whose image its 3-sigma box lies; `rendered` with the blur, `bare` without
+needle         a Gaussian with kappa > 100
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from splat.model.camera import Camera
+from splat.model.gaussians import Gaussians
+from splat.model.settings import RenderSettings
+from splat.projection.reference import NEEDLE, condition, on_screen, project
+
+
+@dataclass(frozen=True, eq=False)
+class Conditions:
+    """The largest condition number of each Gaussian's splats; 1 where no view shows it."""
+
+    rendered: Float64[Tensor, " n"]
+    bare: Float64[Tensor, " n"]
+
+
+@dataclass(frozen=True)
+class Localization:
+    """Where a vector lives.  needles, needles_bare: shares of mass on needles; heaviest: index and share, largest first."""
+
+    attributes: dict[str, float]
+    participation: float
+    needles: float
+    needles_bare: float
+    needle_count: int
+    needle_bare_count: int
+    heaviest: tuple[tuple[int, float], ...]
+
+    def record(self) -> dict[str, object]:
+        return {
+            "attributes": self.attributes,
+            "participation": self.participation,
+            "needles": self.needles,
+            "needles_bare": self.needles_bare,
+            "needle_count": self.needle_count,
+            "needle_bare_count": self.needle_bare_count,
+            "heaviest": [[index, share] for index, share in self.heaviest],
+        }
+
+
+def mass_shares(vector: Float[Tensor, " p"], blocks: Mapping[str, slice]) -> dict[str, float]:
+    """The share of a vector's squared length that lies in each block.
+
+    >>> mass_shares(torch.tensor([3.0, 0.0, 4.0]), {"a": slice(0, 2), "b": slice(2, 3)})
+    {'a': 0.36, 'b': 0.64}
+    """
+    squares = vector.double().square()
+    return {name: float(squares[rows].sum() / squares.sum()) for name, rows in blocks.items()}
+
+
+def masses(vector: Float[Tensor, " p"], gaussians: Gaussians) -> Float64[Tensor, " n"]:
+    """The mass of every Gaussian in a vector laid out like `gaussians.flat`."""
+    if vector.shape != gaussians.flat.shape:
+        raise ValueError(f"expected a vector of {gaussians.flat.numel()} parameters, got shape {tuple(vector.shape)}")
+    parts = [vector[rows].double().view(len(gaussians), -1).square().sum(dim=1) for rows in gaussians.blocks.values()]
+    total = torch.stack(parts).sum(dim=0)
+    if not 0 < float(total.sum()) < torch.inf:
+        raise ValueError(f"expected a finite vector that is not zero, got a squared length of {float(total.sum())}")
+    return total
+
+
+def participation(mass: Float[Tensor, " n"]) -> float:
+    """Over how many Gaussians the mass is spread.
+
+    >>> participation(torch.tensor([0.0, 2.0, 2.0, 0.0]))
+    2.0
+    """
+    return float(mass.sum().square() / mass.square().sum())
+
+
+@torch.no_grad()
+def conditions(
+    gaussians: Gaussians, cameras: Sequence[Camera], settings: RenderSettings = RenderSettings()
+) -> Conditions:
+    """The condition numbers of every Gaussian's splats, in double precision."""
+    gaussians = gaussians.to(torch.float64)
+    unblurred = replace(settings, blur=0.0)
+    rendered, bare = (gaussians.flat.new_ones(len(gaussians)) for _ in range(2))
+    for camera in cameras:
+        shown = on_screen(project(gaussians, camera, settings), camera)
+        for worst, how in ((rendered, settings), (bare, unblurred)):
+            worst[shown] = torch.maximum(worst, condition(project(gaussians, camera, how).conics))[shown]
+    return Conditions(rendered, bare)
+
+
+def localize(
+    vector: Float[Tensor, " p"], gaussians: Gaussians, conditions: Conditions, heaviest: int = 10
+) -> Localization:
+    """Where a vector laid out like `gaussians.flat` lives; conditions: of the same Gaussians."""
+    mass = masses(vector, gaussians)
+    if len(conditions.rendered) != len(gaussians):
+        raise ValueError(f"expected conditions of {len(gaussians)} Gaussians, got {len(conditions.rendered)}")
+    share = mass / mass.sum()
+    needles, bare = conditions.rendered > NEEDLE, conditions.bare > NEEDLE
+    top = share.topk(min(heaviest, len(share)))
+    return Localization(
+        attributes=mass_shares(vector, gaussians.blocks),
+        participation=participation(mass),
+        needles=float(share[needles].sum()),
+        needles_bare=float(share[bare].sum()),
+        needle_count=int(needles.sum()),
+        needle_bare_count=int(bare.sum()),
+        heaviest=tuple(zip(top.indices.tolist(), top.values.tolist(), strict=True)),
+    )

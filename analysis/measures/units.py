@@ -1,0 +1,43 @@
+"""Metrics of the parameter space: in which units curvature is compared, as D of D H D (`landscape.ScaledOperator`).
+
+parameters   D = 1: curvature per squared unit of the stored parameters
+scene        positions in units of the scene's size, the rest as it is: what two scenes may be compared in
+optimiser    D the learning rate of every parameter at the first step: curvature per step of the training
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splat.curvature.objective import SceneObjective
+from splat.training.state import LearningRates, learning_rates, position_rate
+
+Metric = Literal["parameters", "scene", "optimiser"]
+FACING = 0.7  # views are forward-facing where every axis keeps this share of its length along their mean
+
+
+def scene_size(objective: SceneObjective) -> float:
+    """World units: the median depth of the active Gaussians in the first view where the views face one way; else the mean
+    distance of the cameras from their centroid."""
+    cameras = [view.camera for view in objective.views]
+    axes = torch.stack([camera.forward for camera in cameras])
+    mean = axes.mean(dim=0)
+    if float((axes @ mean).min()) > FACING * float(mean.norm()):
+        depth = (objective.active.means.cpu().double() - cameras[0].centre) @ cameras[0].forward
+        return float(depth[depth > 0].median())
+    centres = torch.stack([camera.centre for camera in cameras])
+    return float((centres - centres.mean(dim=0)).norm(dim=1).mean())
+
+
+def scene_units(objective: SceneObjective, size: float | None = None) -> Float[Tensor, " p"]:
+    """D with the scene's size for positions; size: world units, `scene_size` by default."""
+    scale = torch.ones_like(objective.active.flat)
+    scale[objective.blocks["means"]] = scene_size(objective) if size is None else size
+    return scale
+
+
+def optimiser_units(objective: SceneObjective, rates: LearningRates, extent: float) -> Float[Tensor, " p"]:
+    """D with the learning rates of the first step; extent: what the training multiplies the position rate by."""
+    return learning_rates(objective.active, rates, position_rate(rates, extent, 0, 1))

@@ -1,0 +1,196 @@
+"""`landscape probe`: one checkpoint in, one record folder out (`analysis.records.records`), a table, and where to look.
+
+The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.
+"""
+
+import shlex
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
+from math import inf, isfinite
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from analysis.console.drawing import Draw
+from analysis.console.options import ProbeOptions
+from analysis.console.recording import write_with_pictures
+from analysis.console.stages import Stages
+from analysis.probe.measurement import ProbeSettings, measure
+from analysis.probe.record import probe_arrays, probe_data
+from analysis.probe.skips import estimator_skips, product_skips
+from analysis.probe.table import probe_table
+from analysis.records.family_table import family_table
+from analysis.records.findings import verdict
+from analysis.records.provenance import provenance, require_seed
+from analysis.records.records import FILE, PROBE, Record, record_folder, require_replaceable
+from landscape.operators.distributed import Ranks, torchrun_ranks
+from landscape.probes import split
+from splat.backend.cpu.simd import lanes_of
+from splat.backend.device import device_named
+from splat.curvature.distributed import DistributedObjective
+from splat.curvature.objective import SceneObjective
+from splat.scenes.scene import Scene
+from splat.training.checkpoint import Checkpoint, load_checkpoint
+
+if TYPE_CHECKING:
+    from analysis.measures.families import FamilyOptions
+
+CHECK_FAILED = 1
+WITHOUT_SURFACE = "the picture of the slice as a surface was left out; python -m figures.surface {} draws it"
+
+
+def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
+    """Probe the checkpoint; returns the exit code.  command: as typed, for the record; drawn: see `write_with_pictures`.
+
+    Started by torchrun, the processes share the views, and the first one writes.
+    """
+    require_seed(options.seed)
+    device = device_named(options.device)
+    with torchrun_ranks(device) as ranks:
+        return _run(options, command, drawn, device, ranks)
+
+
+def _run(
+    options: ProbeOptions, command: Sequence[str], drawn: Draw | None, device: torch.device, ranks: Ranks | None
+) -> int:
+    out = options.out or options.checkpoint.parent / "probe"
+    settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
+    if ranks is not None and family_options is not None:
+        raise ValueError(
+            "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
+        )
+    writes = ranks is None or ranks.rank == 0
+    require_replaceable(out)
+    console, start = Console(stderr=True, quiet=not writes), perf_counter()
+    stages = Stages(console)
+    with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
+        checkpoint = load_checkpoint(options.checkpoint)
+        checkpoint.training.move(device)
+        scene = checkpoint.load_scene(options.checkpoint, options.scene)
+        objective = scene_objective(checkpoint, scene, ranks)
+    console.print(_introduction(scene, checkpoint, objective), highlight=False)
+    with stages:
+        loss = checkpoint.training.config.loss
+        generator = torch.Generator(device).manual_seed(options.seed)
+        findings = measure(objective, loss, settings, generator, stages.stage)
+        data = probe_data(findings, objective, loss)
+        with stages.stage("skips"):
+            gaussians, made = checkpoint.training.gaussians, (findings.matvecs, findings.spared)
+            skips = product_skips(objective, gaussians, *made, repetitions=settings.timings)
+            skips |= estimator_skips(findings, stages.timing)
+            data["skipped"] = {name: skip.record() for name, skip in skips.items()}
+        data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
+        arrays = probe_arrays(findings)
+        if family_options is not None:
+            from analysis.measures.families import measure_families
+
+            found = measure_families(
+                objective, checkpoint.training, family_options, split(generator), stages.stage, findings.ends
+            )
+            data |= found.record()
+            data["notes"] += found.notes
+            data["provenance"]["families"] = asdict(family_options)
+            arrays["families"] = found.arrays()
+        if options.quick:
+            data["notes"].append(WITHOUT_SURFACE.format(out))
+        if writes:
+            with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
+                surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
+                write_with_pictures(folder, data, arrays, PROBE, stages, start, drawn, options.pictures)
+                from analysis.records.report import write_report
+
+                write_report(folder, surface.result())
+    if writes:
+        _conclude(data, out)
+    failed = any(check["passed"] is False for check in data["checks"].values())
+    return CHECK_FAILED if options.strict and failed else 0
+
+
+def scene_objective(
+    checkpoint: Checkpoint, scene: Scene, ranks: Ranks | None = None, *, keep_unseen: bool = False
+) -> SceneObjective:
+    """The training's loss over its views, at the checkpoint; ranks: share them.  keep_unseen: see `SceneObjective`."""
+    training, names = checkpoint.training, checkpoint.scene.train
+    config, gaussians = training.config, training.gaussians
+    if ranks is None:
+        return config.objective(gaussians, scene.load(names), keep_unseen=keep_unseen)
+    background = config.background_colour(gaussians.flat.dtype)
+    views = scene.load(ranks.share(names, "training view"))
+    return DistributedObjective(gaussians, views, ranks, config.loss, background, config.render)
+
+
+def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:
+    """shared: by several processes, none of whose clocks may decide what is measured."""
+    settings = ProbeSettings.quick() if options.quick else ProbeSettings()
+    points = settings.slice_points if options.slice_points is None else options.slice_points
+    seconds = settings.seconds if options.seconds is None else options.seconds
+    if shared:
+        if options.seconds is not None and isfinite(options.seconds):
+            raise ValueError(f"expected --seconds inf under torchrun, as without --seconds, got {options.seconds:g}")
+        seconds = inf
+    return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=seconds)
+
+
+def _family_options(options: ProbeOptions) -> "FamilyOptions | None":
+    """None where no families are asked for; the split control and a metric ask for them too."""
+    if not (options.families or options.split_control or options.metric != "parameters"):
+        return None
+    from analysis.measures.families import FamilyOptions  # a fifth of a second of imports
+
+    return FamilyOptions(options.metric, options.split_control, seconds=options.family_seconds)
+
+
+def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjective) -> str:
+    counts, training = objective.counts, checkpoint.training
+    camera = objective.views[0].camera
+    return (
+        f"{scene.name} after {training.step} steps: {counts.views} views of {camera.width} x {camera.height} px, "
+        f"{counts.active_gaussians:,} of {counts.gaussians:,} Gaussians in sight, "
+        f"{counts.active_parameters:,} active parameters"
+    )
+
+
+def _provenance(
+    options: ProbeOptions, command: Sequence[str], settings: ProbeSettings, checkpoint: Checkpoint, scene: Scene
+) -> dict[str, Any]:
+    dtype = checkpoint.training.gaussians.flat.dtype
+    return provenance(
+        options.seed,
+        lanes=lanes_of(np.float32),
+        checkpoint=str(options.checkpoint),
+        scene=scene.name,
+        scene_folder=str(scene.root),
+        views=list(checkpoint.scene.train),
+        iteration=checkpoint.training.step,
+        dtype=str(dtype).removeprefix("torch."),
+        threads=torch.get_num_threads(),
+        command=shlex.join(command),
+        settings=asdict(settings),
+    )
+
+
+def _embedded_surface(record: Record) -> str:
+    from analysis.records.report import embedded_surface  # a quarter of a second of imports
+
+    return embedded_surface(record)
+
+
+def _conclude(data: dict[str, Any], out: Path) -> None:
+    """The table, what was not reached or failed, and the files to open."""
+    from analysis.records.report import FILE as REPORT
+
+    console = Console()
+    console.print(probe_table(data))
+    if "families" in data:
+        console.print(family_table(data))
+    for line in verdict(data):
+        if line.level != "fact":
+            console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False)
+    pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
+    console.print(f"{data['timing']['total']:.1f} s; open {out / REPORT}", soft_wrap=True, highlight=False)
+    console.print(f"pictures: {pictures}; numbers: {FILE}, in {out}", soft_wrap=True, highlight=False)

@@ -1,0 +1,368 @@
+"""What `landscape probe` measures at one point of a scene's loss, stage by stage.
+
+    linearise           every view held still, every Gaussian's own block of H, a first render
+    checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
+    traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
+    eigenvalues         the two largest and the smallest, led by the blocks of single Gaussians
+    (`splat.curvature.block_eigenvectors`)
+    power iteration     both ends as the paper takes them; not in a quick probe, whose few products do not take it there
+    density             stochastic Lanczos quadrature, for sums and quantiles of |lambda|; not in a quick probe, whose few
+                        products would leave them known to a factor of 1000
+    finite probe        the second difference of the loss along the first eigenvector, over a range of steps; not in a quick
+                        probe
+    slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
+    depth               the positions' gradient and curvature along the rays and across them, and what finite steps there do to
+                        the loss; not in a quick probe
+
+Every kernel has worked once when the checks are done: what follows compiles nothing.  The estimators stop at their
+tolerance, at their budget of products, or when their share of the time is spent; each result says which.  Time that a stage
+leaves goes to the later ones.  The numbers depend on the seed alone unless time ran out.
+"""
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from time import monotonic
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from analysis.console.budget import Budget, Share, Stage
+from analysis.measures.depth import STEPS as DEPTH_STEPS
+from analysis.measures.gradient_check import check_against_gradient
+from analysis.measures.memory import basis_within, vectors_within
+from analysis.probe.depth_stage import DepthFindings, measure_depth
+from landscape import (
+    CountingOperator,
+    DerivativeCheck,
+    EigenEnds,
+    EigenSettings,
+    OperatorCheck,
+    PowerSettings,
+    Slice,
+    SpectralDensity,
+    TraceEstimate,
+    TraceSettings,
+    check_operator,
+    curvature_reach,
+    evaluate_slice,
+    extreme_eigenpairs,
+    power_ends,
+    spectral_density,
+    symmetric_axis,
+)
+from landscape.probes import split
+from landscape.results import Progress
+from landscape.slices.finite_probe import NOISE_POINTS, STEPS, FiniteProbe, finite_probe
+from landscape.slices.grid_evaluations import Loss
+from landscape.slices.refinement import SliceSettings
+from landscape.spectrum.density import ActiveSpace
+from landscape.traces.trace import total_trace
+from splat.backend.cpu.threads import single_threaded, thread_count
+from splat.backend.device import by_triton
+from splat.curvature.block_eigenvectors import BlockEigenvectors
+from splat.curvature.hessian import SceneHessian
+from splat.curvature.objective import SceneObjective
+from splat.curvature.traces import exact_traces
+from splat.losses.reference import LossSettings
+
+FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density and along a side of a slice that are worth their time
+FEWEST_STARTS = 3  # of a density of less than MANY_MATVECS; two have three times the interval
+MANY_MATVECS = 48
+MOST_AT_ONCE = 4  # start vectors
+FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
+FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
+SHORTEST = 1e-9  # seconds
+
+
+@dataclass(frozen=True)
+class ProbeSettings:
+    """How much of everything; the defaults are for numbers to 1%.
+
+    checked_vectors, checked_views: of the self-checks; None: all views.
+    trace_samples: exactly so many for each trace; None: as many as `traces` asks for.
+    power: None: no power iteration.  density_matvecs: products of the spectral density; 0: it is left out.
+    slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
+        of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
+        slice_holdout: renders that judge this error.
+    probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
+        noise of a render.
+    depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
+    timings: how often each product is timed that tells what a skip saves; 0: that is not told.
+    seconds: for all estimators together.  memory: GiB for the vectors of a basis.
+    """
+
+    checked_vectors: int = 4
+    checked_views: int | None = None
+    traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.01, max_probes=128))
+    trace_samples: int | None = None
+    eigen: EigenSettings = field(default_factory=lambda: EigenSettings(largest=2, smallest=1, max_matvecs=150))
+    power: PowerSettings | None = field(default_factory=lambda: PowerSettings(max_matvecs=40))
+    density_matvecs: int = 96
+    slice_points: int = 41
+    slice_radius: float = 3.0
+    slice_rise: float = 0.001
+    slice_tolerance: float = 0.01
+    slice_holdout: int = 30
+    probe_steps: tuple[float, ...] = STEPS
+    depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=64))
+    depth_steps: tuple[float, ...] = DEPTH_STEPS
+    noise_points: int = NOISE_POINTS
+    timings: int = 3
+    seconds: float = 45.0
+    memory: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.slice_points < FEWEST_POINTS or self.slice_points % 2 == 0:
+            raise ValueError(
+                f"expected an odd number of at least {FEWEST_POINTS} slice points, got {self.slice_points}"
+            )
+        if not (self.slice_radius > 0 and self.slice_rise > 0):
+            raise ValueError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
+        if not (self.seconds > 0 and self.memory > 0):
+            raise ValueError(f"expected seconds and memory > 0, got {self.seconds} and {self.memory}")
+
+    @classmethod
+    def quick(cls) -> "ProbeSettings":
+        """Numbers to 10%, in a quarter of the time."""
+        return cls(
+            checked_vectors=2,
+            checked_views=1,
+            traces=TraceSettings(rtol=0.1),
+            trace_samples=5,
+            eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=60),
+            power=None,
+            density_matvecs=0,
+            slice_tolerance=0.1,
+            slice_holdout=FEWEST_HELD_OUT,
+            probe_steps=(),
+            depth=None,
+            timings=0,
+            seconds=12.0,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneSlice:
+    """The slice, the rise of the loss that makes a curvature unit, and that unit along each direction."""
+
+    slice: Slice
+    loss_scale: float
+    units: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What was measured; density, finite, depth and plane are None where a note says why, power where it was not asked for.
+
+    matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
+    of the directions that are not exactly flat.
+    """
+
+    value: float
+    gradient_norm: float
+    operator_check: OperatorCheck
+    gradient_check: DerivativeCheck
+    traces: dict[str, TraceEstimate]
+    ends: EigenEnds
+    power: EigenEnds | None
+    density: SpectralDensity | None
+    finite: FiniteProbe | None
+    depth: DepthFindings | None
+    plane: PlaneSlice | None
+    matvecs: int
+    spared: int
+    rank: int
+    notes: tuple[str, ...]
+
+
+def measure(
+    objective: SceneObjective, loss: LossSettings, settings: ProbeSettings, generator: torch.Generator, stage: Stage
+) -> Findings:
+    """Run every stage.  loss: the objective's; stage(name): see `analysis.console.stages`."""
+    with stage("linearise") as report:
+        hessian = SceneHessian(objective)
+        operator = CountingOperator(hessian)
+        gradient = _linearised_gradient(objective, report)
+        own = objective.gaussian_blocks
+        value, render = _rendered(objective)
+    with stage("checks") as report:
+        operator_check = check_operator(operator, split(generator), settings.checked_vectors)
+        gradient_check = check_against_gradient(hessian, loss, split(generator), report, settings.checked_views)
+    budget = Budget(settings.seconds, _unasked(settings), generator, stage)
+    with budget.stage("traces") as share:
+        allowed = replace(settings.traces, max_seconds=share.seconds)
+        traces = exact_traces(objective, share.generator, allowed, share.report, samples=settings.trace_samples)
+    with budget.stage("eigenvalues") as share:
+        eigen, start = _search(operator, settings, share), BlockEigenvectors(objective, *own).leads()
+        timed = CountingOperator(operator)
+        ends = extreme_eigenpairs(timed, share.generator, eigen, start, share.report)
+    power = density = finite = depth = None
+    if settings.power is not None:
+        with budget.stage("power iteration") as share:
+            each = replace(settings.power, max_seconds=share.seconds / 2)
+            power = power_ends(operator, share.generator, each, share.report)
+    if settings.density_matvecs:
+        with budget.stage("density") as share:
+            active, room = ActiveSpace(hessian.project, hessian.rank), vectors_within(operator, settings.memory)
+            run = partial(spectral_density, operator, active=active, ends=ends, trace=total_trace(traces))
+            density = _density(run, room, settings, timed.seconds / timed.matvecs, share)
+    if settings.probe_steps:
+        with budget.stage("finite probe") as share:
+            finite = _finite(objective, operator, ends, settings, render, share)
+    with budget.stage("slice") as share:
+        plane = _plane(objective, gradient, value, ends, settings, render, share)
+    if settings.depth is not None:
+        with budget.stage("depth") as share:
+            depth = measure_depth(objective, settings.depth, settings.depth_steps, render, share)
+    return Findings(
+        value=value,
+        gradient_norm=float(gradient.double().norm()),
+        operator_check=operator_check,
+        gradient_check=gradient_check,
+        traces=traces,
+        ends=ends,
+        power=power,
+        density=density,
+        finite=finite,
+        depth=depth,
+        plane=plane,
+        matvecs=operator.matvecs,
+        spared=hessian.spared,
+        rank=hessian.rank,
+        notes=tuple(budget.notes),
+    )
+
+
+def _unasked(settings: ProbeSettings) -> list[str]:
+    optional = {
+        "power iteration": settings.power,
+        "density": settings.density_matvecs,
+        "finite probe": settings.probe_steps,
+        "depth": settings.depth,
+    }
+    return [name for name, wanted in optional.items() if not wanted]
+
+
+def _linearised_gradient(objective: SceneObjective, report: Progress) -> Tensor:
+    report(0, 1, f"{len(objective.views)} views")
+    gradient = objective.gradient
+    report(1, 1, f"{len(objective.views)} views")
+    return gradient
+
+
+def _search(operator: CountingOperator, settings: ProbeSettings, share: Share) -> EigenSettings:
+    """For the ends: in the time of the stage, with a basis that memory has room for."""
+    eigen = settings.eigen
+    basis = basis_within(eigen, vectors_within(operator, settings.memory))
+    if basis < eigen.basis:
+        share.notes.append(
+            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {settings.memory:g} GiB"
+        )
+    return replace(eigen, max_seconds=share.seconds, basis=basis)
+
+
+def _density(
+    run: Callable[..., SpectralDensity], room: int, settings: ProbeSettings, each: float, share: Share
+) -> SpectralDensity | None:
+    """As many products as time allows at so many seconds each, in runs that memory has room for (of that many vectors); None
+    where they are too few."""
+    matvecs = int(min(settings.density_matvecs, share.seconds / each))
+    starts = FEWEST_STARTS if matvecs < MANY_MATVECS else None
+    batch, longest = (
+        (MOST_AT_ONCE, room // (MOST_AT_ONCE + 1)) if room > FEWEST_STEPS * MOST_AT_ONCE else (1, room // 2)
+    )
+    if min(matvecs // FEWEST_STARTS, longest) < FEWEST_STEPS:
+        share.notes.append(
+            f"the spectral density was left out: time and memory allowed {matvecs} products in runs of {longest}"
+        )
+        return None
+    if matvecs < settings.density_matvecs:
+        share.notes.append(f"the spectral density took {matvecs} products instead of {settings.density_matvecs}")
+    return run(share.generator, progress=share.report, matvecs=matvecs, starts=starts, longest=longest, batch=batch)
+
+
+def _rendered(objective: SceneObjective) -> tuple[float, float]:
+    """The loss at the centre, and the seconds that rendering it takes; for the first render the kernels may compile."""
+    objective.loss(objective.active.flat)
+    start = monotonic()
+    return objective.loss(objective.active.flat), monotonic() - start
+
+
+def _finite(
+    objective: SceneObjective,
+    operator: CountingOperator,
+    ends: EigenEnds,
+    settings: ProbeSettings,
+    render: float,
+    share: Share,
+) -> FiniteProbe | None:
+    """Along the first eigenvector; None where its renders, of so many seconds each, would take longer than they may."""
+    if (2 * len(settings.probe_steps) + settings.noise_points + 1) * render > max(share.seconds, SHORTEST):
+        share.notes.append(
+            "the finite probe was left out: its renders would have taken more than its share of the time"
+        )
+        return None
+    center, vector = objective.active.flat, ends.largest.vectors[:, 0]
+    return finite_probe(
+        objective.evaluate, center, vector, operator, settings.probe_steps, share.report, settings.noise_points
+    )
+
+
+def _plane(
+    objective: SceneObjective,
+    gradient: Tensor,
+    value: float,
+    ends: EigenEnds,
+    settings: ProbeSettings,
+    render: float,
+    share: Share,
+) -> PlaneSlice | None:
+    center, loss_scale = objective.active.flat, settings.slice_rise * value
+    curvatures: Float64[Tensor, 2] = ends.largest.values[:2]
+    if loss_scale <= 0 or not curvatures.all():
+        share.notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")
+        return None
+    first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
+    axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
+    vectors = ends.largest.vectors[:, :2]
+    workers = 1 if objective.collective or by_triton(center) else thread_count()
+    allowed = _within(settings, share.seconds, render, workers)
+    evaluate = evaluation(objective, allowed.workers)
+    # Ritz vectors: H between any two of them is their values' diagonal matrix
+    known = curvatures.diag()
+    plane = evaluate_slice(
+        evaluate, center, vectors, axes, gradient, known, allowed, share.generator, progress=share.report
+    )
+    share.notes.extend(slice_notes(plane))
+    return PlaneSlice(plane, loss_scale, (first, second))
+
+
+def evaluation(objective: SceneObjective, workers: int) -> Loss:
+    """The objective for so many threads at once: each alone, or one with all processors to itself."""
+    if workers == 1:
+        return objective.evaluate
+
+    def alone(theta: Tensor) -> tuple[float, Hashable]:
+        with single_threaded():
+            return objective.evaluate(theta)
+
+    return alone
+
+
+def slice_notes(found: Slice) -> list[str]:
+    """That a slice is not as good as was asked for."""
+    if found.reason in ("tolerance", "exact"):
+        return []
+    return [f"the slice's interpolation stopped at its {found.reason}, before its error was down to the tolerance"]
+
+
+def _within(settings: ProbeSettings, seconds: float, each: float, workers: int) -> SliceSettings:
+    """Adaptive, on all points asked for: with less time than that takes, at so many seconds a render, a quarter of the renders
+    is held out, and refinement decides as often."""
+    points, tolerance, limit = settings.slice_points**2, settings.slice_tolerance, max(seconds, SHORTEST)
+    if min(points, FEWEST_RENDERS) * each <= seconds:
+        return SliceSettings(tolerance, settings.slice_holdout, workers=workers, max_seconds=limit)
+    few = min(settings.slice_holdout, max(FEWEST_HELD_OUT, int(seconds / each / 4)))
+    return SliceSettings(tolerance, holdout=few, batch=few, workers=workers, max_seconds=limit)

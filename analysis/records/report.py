@@ -1,0 +1,154 @@
+"""A self-contained page about one record: what it says in words, the pictures, an interactive surface, every number.
+
+The page carries its pictures and plotly.js within it, and its content security policy forbids every request
+to a network.  Text from the record is escaped.
+"""
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import plotly.graph_objects as go
+import plotly.io
+from plotly.offline import get_plotlyjs
+
+from analysis.records.family_table import INDICES, family_lines
+from analysis.records.findings import attribute_name, verdict
+from analysis.records.quantities import limits, measured, quantity
+from analysis.records.records import Record, read_record
+
+FILE = "report.html"
+PICTURES = {
+    "traces": "Trace of each attribute's block of the Hessian, and the curvature scale τ that follows from it.",
+    "spectrum": "Ritz values of the active operator. Bars are residuals: a true eigenvalue lies within each.",
+    "slice2d": "The loss on the plane of the two directions. Dots: renders, blue where sorts were crossed; dashed: the model.",
+    "surface": "The same plane as a surface.",
+}
+
+
+def write_report(folder: str | Path, surface: str | None = None) -> Path:
+    """Write report.html about the record in `folder`, with the pictures that lie beside it; returns its path.
+
+    surface: `embedded_surface` of the record, where it is known already.  The page replaces an older one at once.  Raises
+    FileNotFoundError or ValueError as `read_record` does.
+    """
+    record = read_record(folder)
+    path = record.folder / FILE
+    temporary = path.with_suffix(".html.tmp")
+    temporary.write_text(render_report(record, surface), encoding="utf-8")
+    temporary.replace(path)
+    return path
+
+
+def template_environment() -> jinja2.Environment:
+    """Of the pages whose templates lie beside this file."""
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def render_report(record: Record, surface: str | None = None) -> str:
+    """The page as text; surface: as for `write_report`."""
+    environment = template_environment()
+    environment.filters |= {
+        "quantity": quantity,
+        "limits": limits,
+        "measured": measured,
+        "attribute": attribute_name,
+        "cell": _cell,
+    }
+    surface = embedded_surface(record) if surface is None else surface
+    return environment.get_template("report.html.jinja").render(
+        data=record.data,
+        verdict=verdict(record.data),
+        pictures=pictures_in(record.folder, PICTURES),
+        families=family_lines(record.data),
+        indices=INDICES,
+        surface=surface,
+        plotly_js=get_plotlyjs() if surface else "",
+    )
+
+
+def interactive_surface(record: Record) -> go.Figure | None:
+    """The recorded slice as a surface to turn and zoom, with the quadratic model where known; None without a slice."""
+    about = record.data.get("slice")
+    if about is None or "slice" not in record.arrays:
+        return None
+    arrays = record.arrays["slice"]
+    layers = [("loss", "loss", "Cividis", 1.0), ("model", "quadratic model", "Greys", 0.45)]
+    figure = go.Figure()
+    for name, label, colours, opacity in layers:
+        if name in arrays:
+            change = np.where(np.isfinite(arrays[name]), arrays[name], np.nan) - about["center_loss"]
+            figure.add_surface(
+                x=arrays["x"], y=arrays["y"], z=change.T, name=label, colorscale=colours, opacity=opacity,
+                showscale=name == "loss", showlegend=True, visible=True if name == "loss" else "legendonly",
+                colorbar={"exponentformat": "power", "len": 0.8},
+            )  # fmt: skip
+    names = [_plain(direction["name"]) for direction in about["directions"]]
+    figure.update_layout(
+        scene={
+            "xaxis_title": f"step along {names[0]}",
+            "yaxis_title": f"step along {names[1]}",
+            "zaxis_title": "change of loss",
+            "aspectmode": "cube",
+            "camera": {"eye": {"x": 1.2, "y": -1.9, "z": 1.0}, "center": {"x": 0, "y": 0, "z": -0.15}},
+            **{f"{axis}axis_exponentformat": "power" for axis in "xyz"},
+        },
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        height=520,
+        legend={"orientation": "h"},
+    )
+    return figure
+
+
+def embedded_surface(record: Record) -> str:
+    """`interactive_surface` as a part of a page, empty without a slice."""
+    figure = interactive_surface(record)
+    if figure is None:
+        return ""
+    buttons = ["toImage", "zoom3d", "pan3d", "orbitRotation", "resetCameraDefault3d"]
+    settings = {"displaylogo": False, "responsive": True, "plotlyServerURL": "", "modeBarButtons": [buttons]}
+    return plotly.io.to_html(figure, full_html=False, include_plotlyjs=False, div_id="surface", config=settings)
+
+
+def _plain(text: str) -> str:
+    """plotly reads some tags in its texts; a record's text has none to be read."""
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def pictures_in(folder: Path, captions: Mapping[str, str]) -> list[dict[str, str]]:
+    """The pictures that were drawn, as data URIs with their captions."""
+    drawn = [(name, caption, folder / f"{name}.png") for name, caption in captions.items()]
+    return [
+        {
+            "name": name,
+            "caption": caption,
+            "uri": f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}",
+        }
+        for name, caption, path in drawn
+        if path.is_file()
+    ]
+
+
+def _cell(value: Any) -> str:
+    """A value of the record in a table: counts with separators, numbers with few digits, the rest as it is."""
+    match value:
+        case None:
+            return quantity(None)
+        case bool():
+            return "yes" if value else "no"
+        case int():
+            return f"{value:,}"
+        case float():
+            return quantity(value)
+        case list():
+            return ", ".join(_cell(item) for item in value)
+    return str(value)

@@ -1,0 +1,195 @@
+"""`landscape compare`: several probed runs in one table and on one page.
+
+OUT/compare.html    everything side by side; needs no network
+OUT/compare.csv     every number, see `analysis/runs/compare_table.py`
+OUT/compare.json    {"runs": {LABEL: folder of its record}}, from which `figures/compare.py` draws
+OUT/*.png           traces, densities of the spectrum and slices in common limits
+
+What must be the same for curvatures to be comparable at all is demanded: the loss, the training views and their sizes.  What
+must be kept in mind beside that is said: other starts, steps, budgets, checks that failed, numbers of Gaussians.
+"""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from analysis.runs.compare_table import Run, compare_table, comparison, frame
+from analysis.console.drawing import draw
+from analysis.console.options import CompareOptions, DeviceName, ProbeOptions
+from analysis.console.overrides import leaves
+from analysis.records.quantities import quantity
+from analysis.records.records import FILE, read_record
+from analysis.records.report import pictures_in, template_environment
+from analysis.records.run_files import CHECKPOINT, METRICS, read_scores
+from analysis.records.findings import of_budgets
+from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
+
+PAGE, TABLE, INDEX, PROBE = "compare.html", "compare.csv", "compare.json", "probe"
+PICTURES = {
+    "compare_traces": "Traces by attribute, with their intervals. Filled: positive; open: negative; crossed: not decided.",
+    "compare_densities": "How many directions are at least so curved, down (left) and up (right). Thin: each start "
+    "vector's quadrature alone: where these lie apart, its few steps do not decide. Dashed: the ends found.",
+    "compare_slices": "The plane of the two steepest directions of each run, in the window that all have, the same colours.",
+    "compare_sections": "The loss along the two steepest directions of each run, in steps of parameter units.",
+}
+
+
+def run_compare(options: CompareOptions) -> int:
+    """Read, probe where asked to, compare; returns the exit code."""
+    folders = _folders(options.runs)
+    common = Path(os.path.commonpath(folders))
+    common = common.parent if common in folders else common
+    labels = [str(folder.relative_to(common)) for folder in folders]
+    checkpoints = [load_checkpoint(folder / CHECKPOINT) for folder in folders]
+    require_same(labels, checkpoints)
+    missing = [path for path, checkpoint in zip(options.runs, checkpoints) if not probed(path, checkpoint)]
+    if missing and not options.probe:
+        again = "; ".join(f"landscape probe {path / CHECKPOINT}" for path in missing)
+        raise ValueError(
+            f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
+        )
+    for path in missing:
+        _probe(path, options.device)
+    runs = [
+        Run(path, label, checkpoint, _metrics(path), read_record(path / PROBE).data)
+        for path, label, checkpoint in zip(options.runs, labels, checkpoints)
+    ]
+    out = options.out or common / "compare"
+    _write(runs, out)
+    return 0
+
+
+def _folders(runs: Sequence[Path]) -> list[Path]:
+    folders = [run.resolve() for run in runs]
+    if len(set(folders)) < 2 or len(set(folders)) < len(folders):
+        raise ValueError(f"expected at least two runs, each once, got {', '.join(map(str, runs)) or 'none'}")
+    return folders
+
+
+def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> None:
+    """ValueError where the runs' curvatures are those of different functions."""
+    demanded: dict[str, Callable[[Checkpoint], Any]] = {
+        "training views": lambda c: c.scene.train,
+        "sizes of the views": lambda c: c.scene.sizes,
+        "loss": lambda c: c.training.config.loss,
+        "background": lambda c: c.training.config.background,
+    }
+    for what, of in demanded.items():
+        first = of(checkpoints[0])
+        for label, checkpoint in zip(labels, checkpoints, strict=True):
+            if of(checkpoint) != first:
+                raise ValueError(
+                    f"expected runs with the same {what}, as their curvatures are not comparable else, got {first} in "
+                    f"{labels[0]} and {of(checkpoint)} in {label}; compare them apart"
+                )
+
+
+def probed(run: Path, checkpoint: Checkpoint) -> bool:
+    """Whether the run has a record of this checkpoint's step."""
+    if not (run / PROBE / FILE).is_file():
+        return False
+    return read_record(run / PROBE).data["provenance"].get("iteration") == checkpoint.training.step
+
+
+def _probe(run: Path, device: DeviceName) -> None:
+    from analysis.probe.command import run_probe
+
+    path = run / CHECKPOINT
+    run_probe(ProbeOptions(path, device=device), ["landscape", "probe", str(path), "--device", device])
+
+
+def _metrics(run: Path) -> dict[str, Any]:
+    """Nothing of a run that was stopped before it was scored."""
+    return read_scores(run) if (run / METRICS).is_file() else {}
+
+
+def cautions(runs: Sequence[Run]) -> list[str]:
+    """What differs between the runs, or is missing from some, that a reader has to keep in mind."""
+    settings: dict[str, Callable[[Run], Any]] = {
+        "scene": lambda run: run.data["provenance"].get("scene"),
+        "steps": lambda run: run.checkpoint.training.step,
+        "start": lambda run: getattr(run.checkpoint.scene, "start", None),
+        "seed": lambda run: run.checkpoint.training.config.seed,
+        "held-out views": lambda run: run.checkpoint.scene.test,
+        "random background": lambda run: run.checkpoint.training.config.random_background,
+        "precision": lambda run: run.data["provenance"].get("dtype"),
+    }
+    lines = [f"The {what} are not the same." if what.endswith("s") else f"The {what} is not the same."
+             for what, of in settings.items() if any(of(run) != of(runs[0]) for run in runs)]  # fmt: skip
+    if len({row["unit"] for run in runs for row in run.data.get("families", [])}) > 1:
+        lines.append("The units of the families are not the same.")
+    found = [leaves(run.data["provenance"].get("settings", {})) for run in runs]
+    different = [
+        f"{name} {', '.join(str(settings.get(name)) for settings in found)}"
+        for name in dict.fromkeys(name for settings in found for name in settings)
+        if any(settings.get(name) != found[0].get(name) for settings in found)
+    ]
+    if different:
+        order = ", ".join(run.label for run in runs)
+        lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
+    for run in runs:
+        failed = [name.replace("_", " ") for name, check in run.data["checks"].items() if check["passed"] is False]
+        lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]
+        lines += [f"{run.label}: {line.text}" for line in of_budgets(run.data["eigenvalues"])]
+        lines += [f"{run.label} was not scored." for _ in range(not run.metrics)]
+    if without := [run for run in runs if not run.data.get("split_control")]:
+        lines.append(
+            "Anisotropy depends on the number of Gaussians; how much, the split control says, which is missing: "
+            + "; ".join(f"landscape probe {run.folder / CHECKPOINT} --split-control" for run in without)
+        )
+    return lines
+
+
+def split_controls(runs: Sequence[Run]) -> list[str]:
+    """What the split changes in the images of each run that has a split control."""
+    lines = []
+    for run in runs:
+        if control := run.data.get("split_control"):
+            rows = run.data.get("families", [])
+            seen = next((row["gaussians"] for row in rows if row["split"]), control["gaussians"])
+            lost = control["gaussians"] - seen
+            lines.append(
+                f"{run.label}: the split into {control['gaussians']:,} halves changes the images by {quantity(control['rms'])} "
+                f"(root mean square; {quantity(control['psnr'])} dB)"
+                + (f", and {lost:,} of the halves touch no pixel." if lost else ".")
+            )
+    return lines
+
+
+def _write(runs: Sequence[Run], out: Path) -> None:
+    """Table, pictures, page; and the table and the cautions once more for the terminal."""
+    console, labels = Console(), [run.label for run in runs]
+    rows, notes = comparison(runs), cautions(runs)
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode())
+    index = {"runs": {run.label: str((run.folder / PROBE).resolve()) for run in runs}}
+    write_atomically(out / INDEX, (json.dumps(index, indent=2) + "\n").encode())
+    try:
+        draw("compare", out)
+    except RuntimeError as error:  # the numbers stand without pictures
+        notes.append(" ".join(str(error).split()))
+    write_atomically(out / PAGE, render_page(runs, rows, notes, out).encode())
+    console.print(compare_table(rows, labels))
+    for note in notes:
+        console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"open {out / PAGE}; numbers: {out / TABLE}", highlight=False, soft_wrap=True)
+
+
+def render_page(runs: Sequence[Run], rows: Sequence[Any], notes: Sequence[str], out: Path) -> str:
+    """The page as text, with the pictures that lie in the folder."""
+    environment = template_environment()
+    sections = {
+        name: [row for row in rows if row.section == name] for name in dict.fromkeys(row.section for row in rows)
+    }
+    return environment.get_template("compare.html.jinja").render(
+        runs=runs,
+        sections=sections,
+        notes=notes,
+        controls=split_controls(runs),
+        pictures=pictures_in(out, PICTURES),
+        objective=runs[0].data.get("objective", {}),
+    )

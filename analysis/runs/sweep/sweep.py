@@ -1,0 +1,220 @@
+"""`landscape sweep`: methods x seeds x scenes, a `landscape train` and `landscape probe` for each, several at once.
+
+OUT/SCENE/METHOD/SEED       the run, as `landscape train` writes it; in it probe/, where it was probed
+OUT/SCENE/METHOD/SEED.log   what its commands said
+OUT/results.csv, OUT/summary.csv    see `analysis/runs/sweep/sweep_results.py`; rewritten after every cell
+
+Every cell runs as the commands that a user would type, in processes of their own: one that crashes, or is killed for its
+memory, does not end the sweep, several run at once each on its share of the processors, and any can be repeated by hand.
+What is there already is not done again: the next start continues where the last one ended.  The results do not depend on the
+number of threads, only the seconds do.
+"""
+
+import fcntl
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+from time import monotonic
+
+from rich.console import Console
+
+from analysis.console.drawing import module_environment
+from analysis.console.interruption import interruption
+from analysis.console.options import SweepOptions
+from analysis.records.provenance import usable_cores
+from analysis.records.records import FILE, read_record
+from analysis.records.run_files import CHECKPOINT, METRICS
+from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
+from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
+from analysis.runs.sweep.sweep_results import PROBE, of_other_threads, summarize, tables, unfinished, write_results
+from analysis.train.command import planned, resumed
+
+CELL_FAILED = 1
+LOCK = ".lock"
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+POLL = 0.5  # seconds
+
+
+def run_sweep(options: SweepOptions) -> int:
+    """Run what is missing; returns the exit code."""
+    if options.jobs < 1:
+        raise ValueError(f"expected at least 1 job, got {options.jobs}")
+    sweep = read_sweep(options.file, options.out, options.probe)
+    to_do = {cell.name: missing(cell, sweep) for cell in sweep.cells}
+    sweep.out.mkdir(parents=True, exist_ok=True)
+    with locked(sweep.out) as lock, interruption() as interrupted:
+        cells = _Cells(sweep, to_do, options.jobs, interrupted, lock)
+        cells.run()
+    return _conclude(cells, stopped=interrupted.is_set())
+
+
+def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
+    """What is still to be done for a cell.  ValueError or FileNotFoundError where it cannot be, or has other settings."""
+    try:
+        _, _, config, reference = planned(cell.training, cell.out)
+        wanted: list[Stage] = ["train", "probe"] if sweep.probe else ["train"]
+        if not cell.out.exists():
+            return wanted
+        remedy = f"remove {cell.out}, or choose another out"
+        training = resumed(cell.out / CHECKPOINT, config, reference, remedy)
+    except (ValueError, FileNotFoundError) as error:
+        raise type(error)(f"{sweep.file}, {cell.name}: {error}") from None
+    if training.step < config.iterations or not (cell.out / METRICS).is_file():
+        return wanted
+    return ["probe"] if sweep.probe and not _probed(cell, sweep) else []
+
+
+def _probed(cell: Cell, sweep: Sweep) -> bool:
+    if not (cell.out / PROBE / FILE).is_file():
+        return False
+    data = read_record(cell.out / PROBE).data
+    return data["provenance"].get("iteration") == cell.training.iterations and (
+        "split_control" in data or not sweep.split_control
+    )
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[int]:
+    """A lock on the folder, as a file that the commands of a sweep inherit: one killed alone leaves them at work."""
+    with (out / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"expected no other sweep at work in {out}, got one, or a command that it left behind; wait until it ends"
+            ) from None
+        yield file.fileno()
+
+
+class _Cells:
+    """The cells under way.  to_do: by a cell's name; failed: what to say about those that failed."""
+
+    def __init__(self, sweep: Sweep, to_do: dict[str, list[Stage]], jobs: int, interrupted: Event, lock: int) -> None:
+        self.sweep, self.to_do, self.jobs, self.interrupted, self.lock = sweep, to_do, jobs, interrupted, lock
+        self.failed: dict[str, str] = {}
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.progress = SweepProgress(sweep, to_do, jobs)
+
+    @property
+    def statuses(self) -> dict[str, str]:
+        def status(cell: Cell) -> str:
+            if cell.name in self.failed:
+                return "failed"
+            return "done" if not self.to_do[cell.name] else "under way" if cell.out.exists() else "to do"
+
+        return {cell.name: status(cell) for cell in self.sweep.cells}
+
+    def run(self) -> None:
+        """All that is missing, so many cells at once, until it is done or Ctrl-C stopped it."""
+        write_results(self.sweep, self.statuses)  # a file that is damaged is refused before hours are spent
+        told: set[int] = set()
+        cells = [cell for cell in self.sweep.cells if self.to_do[cell.name]]
+        with ThreadPoolExecutor(self.jobs) as pool, self.progress:
+            pending = {pool.submit(self._cell, cell) for cell in cells}
+            try:
+                while pending:
+                    done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
+                    for future in done:
+                        self.progress.ended(future.result(), self.statuses)
+                        write_results(self.sweep, self.statuses)
+                    self.progress.update()
+                    if self.interrupted.is_set():
+                        self._tell(signal.SIGINT, told)
+            except BaseException:
+                self.interrupted.set()
+                self._tell(signal.SIGTERM, set())
+                raise
+
+    def _tell(self, what: signal.Signals, told: set[int]) -> None:
+        """Send a signal to every command that has not been told yet; at the second Ctrl-C it would not save."""
+        for process in list(self.running.values()):
+            if process.pid not in told:
+                told.add(process.pid)
+                process.send_signal(what)
+
+    def _cell(self, cell: Cell) -> Cell:
+        """Do what is missing; what fails is noted."""
+        while self.to_do[cell.name] and not self.interrupted.is_set():
+            stage, start = self.to_do[cell.name][0], monotonic()
+            self.progress.started(cell, stage)
+            code = self._command(cell, stage)
+            if code == 0:
+                self.to_do[cell.name].pop(0)
+                self.progress.took(stage, monotonic() - start)
+            elif not self.interrupted.is_set():
+                self.failed[cell.name] = f"{cell.name}: {stage} ended with exit code {code}; see {log_of(cell)}"
+                break
+        return cell
+
+    def _command(self, cell: Cell, stage: Stage) -> int:
+        """Run `landscape train` or `landscape probe`; returns its exit code, negative where a signal killed it."""
+        words = (
+            arguments(replace(cell.training, resume=cell.out.exists()))
+            if stage == "train"
+            else probe_arguments(cell, self.sweep)
+        )
+        path = log_of(cell)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab", buffering=0) as log:
+            log.write(f"$ {shlex.join(['landscape', *words])}\n".encode())
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "analysis.commands.cli", *words],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=_environment(self.jobs),
+                pass_fds=(self.lock,),
+                start_new_session=True,  # the terminal's Ctrl-C comes here alone, and is passed on once
+            )
+            self.running[cell.name] = process
+            code = process.wait()
+            del self.running[cell.name]
+        return code
+
+
+def probe_arguments(cell: Cell, sweep: Sweep) -> list[str]:
+    words = ["probe", str(cell.out / CHECKPOINT)]
+    if sweep.probe_seconds is not None:
+        words += ["--seconds", str(sweep.probe_seconds)]
+    if sweep.split_control:
+        words += ["--split-control", "--family-seconds", str(sweep.family_seconds)]
+    return words
+
+
+def log_of(cell: Cell) -> Path:
+    return cell.out.with_name(f"{cell.out.name}.log")
+
+
+def _environment(jobs: int) -> dict[str, str]:
+    """Of a command: its share of the processors, or of the threads that this process was given."""
+    environment = module_environment()
+    if jobs > 1:
+        given = os.environ.get("OMP_NUM_THREADS", "")
+        share = max(1, (int(given) if given.isdigit() else usable_cores()) // jobs)
+        environment |= dict.fromkeys(THREADS, str(share))
+    return environment
+
+
+def _conclude(cells: _Cells, stopped: bool) -> int:
+    """The tables, and what did not go well; returns the exit code."""
+    sweep, console = cells.sweep, Console()
+    rows = write_results(sweep, cells.statuses)
+    for table in tables(summarize(rows)):
+        console.print(table)
+    for line in [*unfinished(rows), *of_other_threads(rows)]:
+        console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
+    for line in cells.failed.values():
+        console.print(line, style="red", soft_wrap=True, highlight=False, markup=False)
+    done = sum(status == "done" for status in cells.statuses.values())
+    console.print(f"{done} of {len(sweep.cells)} cells done; tables: {sweep.out}", soft_wrap=True, highlight=False)
+    if done < len(sweep.cells):
+        console.print("the same command continues", highlight=False)
+    return 130 if stopped else CELL_FAILED if cells.failed else 0

@@ -1,0 +1,207 @@
+"""The file of a sweep: methods x seeds x scenes in TOML, and the cells that follow from it.
+
+    out = "../runs/sweep"                    # folder of the results
+    seeds = [0, 1, 2]
+    iterations = 3000                        # any option of `landscape train`, for every cell
+    start = "triangulated"
+    probe = true                             # probe every cell after its training
+    split_control = true                     # ... with the split control
+    probe_seconds = 45                       # ... with so much time, and for the families
+    family_seconds = 600
+
+    [scenes.fern]
+    path = "../data/fern"                    # and any option of `landscape train`, for this scene
+    views = 3
+
+    [methods.3dgs]                           # a method of that name at its published settings
+    [methods."asp-only"]
+    method = "stablegs"                      # and any option of `landscape train`, for this method
+    set = { vsp_weight = 0, probe.attributes = ["means"] }
+
+Paths are relative to the file.  An option of a method goes before one of a scene, and that before one of the top.  A cell is
+one run of `landscape train` in OUT/SCENE/METHOD/SEED; all of the first seed come before those of the second, so that a sweep
+that is stopped has compared like with like.
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from analysis.console.options import ProbeOptions, TrainOptions
+from analysis.console.overrides import leaves, read_value
+
+FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")
+OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
+TRAINING = {name: hint for name, hint in get_type_hints(TrainOptions).items() if name not in OF_THE_SWEEP}
+TOP = {
+    "out": Path,
+    "seeds": tuple[int, ...],
+    "probe": bool,
+    "split_control": bool,
+    "probe_seconds": float,
+    "family_seconds": float,
+}
+SCENE, METHOD = {"path": Path}, {"method": str}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training: the names of its scene and method, and its options, with the seed and the folder."""
+
+    scene: str
+    method: str
+    training: TrainOptions
+
+    @property
+    def seed(self) -> int:
+        return self.training.seed
+
+    @property
+    def out(self) -> Path:
+        assert self.training.out is not None
+        return self.training.out
+
+    @property
+    def name(self) -> str:
+        return f"{self.scene}/{self.method}/{self.seed}"
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Cells in the order in which they run; probe: whether each is probed, and how.  scenes: in the file's order."""
+
+    file: Path
+    out: Path
+    cells: tuple[Cell, ...]
+    probe: bool
+    split_control: bool
+    probe_seconds: float | None
+    family_seconds: float
+
+    @property
+    def scenes(self) -> list[str]:
+        return list(dict.fromkeys(cell.scene for cell in self.cells))
+
+
+def read_sweep(file: Path, out: Path | None = None, probe: bool = False) -> Sweep:
+    """The sweep in a file; out and probe go before what the file says.  ValueError names the key that is wrong."""
+    if not file.is_file():
+        raise FileNotFoundError(f"expected a sweep in TOML at {file}, found no such file; the README has an example")
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"expected a sweep in TOML in {file}, got a file that is none: {error}") from None
+    try:
+        return _sweep(content, file, out, probe)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -> Sweep:
+    tables = {name: _tables(content.pop(name, None), name) for name in ("scenes", "methods")}
+    top = _values(content, TOP | TRAINING, "", file.parent)
+    seeds = top.pop("seeds", (0,))
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise ValueError(f"expected different seeds, at least one, got seeds = {list(seeds)}")
+    if (folder := out or top.pop("out", None)) is None:
+        raise ValueError(
+            'expected the folder of the results, as in out = "sweeps/fern", got no out; add it or give --out'
+        )
+    own = {name: top.pop(name) for name in TOP if name in top and name not in ("out", "seeds")}
+    shared = {name: value for name, value in top.items() if name in TRAINING}
+    pairs = {
+        (scene, method): shared | _scene(scene_table, scene, file) | _method(method_table, method, file)
+        for scene, scene_table in tables["scenes"].items()
+        for method, method_table in tables["methods"].items()
+    }
+    cells = tuple(
+        Cell(scene, method, TrainOptions(**options, seed=seed, out=folder / scene / method / str(seed)))
+        for seed in seeds
+        for (scene, method), options in pairs.items()
+    )
+    return Sweep(
+        file=file,
+        out=folder,
+        cells=cells,
+        probe=probe or own.get("probe", False),
+        split_control=own.get("split_control", False),
+        probe_seconds=own.get("probe_seconds"),
+        family_seconds=own.get("family_seconds", ProbeOptions.family_seconds),
+    )
+
+
+def _tables(found: Any, name: str) -> dict[str, dict[str, Any]]:
+    """The tables [name.X], at least one, each X fit for a folder."""
+    if not isinstance(found, dict) or not found:
+        raise ValueError(f"expected at least one table [{name}.NAME], got {'none' if not found else repr(found)}")
+    for key, table in found.items():
+        if not isinstance(table, dict):
+            raise ValueError(f"expected a table [{name}.{key}], got {key} = {table!r}")
+        if not FOLDER_NAME.fullmatch(key):
+            raise ValueError(
+                f"expected a name of letters, digits, - _ + . or blanks, as it names a folder, got {key!r}"
+            )
+    return found
+
+
+def _scene(table: Mapping[str, Any], name: str, file: Path) -> dict[str, Any]:
+    values = _values(table, SCENE | TRAINING, f"scenes.{name}.", file.parent)
+    if "path" not in values:
+        raise ValueError(f"expected the folder of the scene as scenes.{name}.path, got none")
+    return {"scene": values.pop("path"), **values}
+
+
+def _method(table: Mapping[str, Any], name: str, file: Path) -> dict[str, Any]:
+    where = f"methods.{name}."
+    changes = table.get("set", {})
+    if not isinstance(changes, dict):
+        raise ValueError(f"expected a table {where}set of settings, as in set = {{ gamma = 0.5 }}, got {changes!r}")
+    rest = {key: value for key, value in table.items() if key != "set"}
+    values = _values(rest, METHOD | TRAINING, where, file.parent)
+    texts = tuple(f"{key}={_text(value)}" for key, value in leaves(changes).items())
+    return {"method": name, **values, "set": texts}
+
+
+def _values(table: Mapping[str, Any], hints: Mapping[str, Any], where: str, folder: Path) -> dict[str, Any]:
+    """The values of a table by the types that are expected; paths from the folder."""
+    values = {}
+    for key, value in table.items():
+        if key not in hints:
+            raise ValueError(f"expected a key among {', '.join(hints)}, got {where}{key}")
+        read = read_value(value, hints[key], where + key)
+        values[key] = folder / read if isinstance(read, Path) else read
+    return values
+
+
+def _text(value: Any) -> str:
+    """A value as `--set` reads it.
+
+    >>> _text(True), _text(["means", "sh"]), _text(0.5)
+    ('true', 'means,sh', '0.5')
+    """
+    if isinstance(value, list):
+        return ",".join(map(_text, value))
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def arguments(training: TrainOptions) -> list[str]:
+    """The words of the command line that say the same as the options.
+
+    >>> arguments(TrainOptions(Path("fern"), out=Path("runs/fern"), views=9, densify=False, set=("gamma=0.5",)))
+    ['train', 'fern', '--out', 'runs/fern', '--views', '9', '--set', 'gamma=0.5', '--no-densify']
+    """
+    words = ["train", str(training.scene)]
+    for field in fields(training)[1:]:
+        value = getattr(training, field.name)
+        option = field.name.replace("_", "-")
+        if value == field.default:
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            for each in value if isinstance(value, tuple) else [value]:
+                words += [f"--{option}", str(each)]
+    return words

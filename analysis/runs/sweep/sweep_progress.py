@@ -1,0 +1,108 @@
+"""How far a sweep is, and about how long it will take: a line for every cell that ends, and a bar.
+
+The time left is estimated from the pace of the steps up to each run's last checkpoint: that of the same scene and method where
+it is known, else the mean of those that are known.  The time of a probe is estimated from the probes before it, else from the
+time that it may take.
+"""
+
+from collections.abc import Mapping
+from datetime import timedelta
+from statistics import mean
+from time import monotonic
+from types import TracebackType
+from typing import Literal
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Column
+
+from analysis.probe.measurement import ProbeSettings
+from analysis.train.training_time import TrainingTime
+from analysis.runs.sweep.sweep_file import Cell, Sweep
+
+Stage = Literal["train", "probe"]
+
+
+class SweepProgress:
+    """A context manager.  to_do: what is missing, by a cell's name; the caller takes away what is done."""
+
+    def __init__(self, sweep: Sweep, to_do: Mapping[str, list[Stage]], jobs: int) -> None:
+        self.sweep, self.to_do, self.jobs = sweep, to_do, jobs
+        self.active: dict[str, Stage] = {}
+        self.probes: list[float] = []
+        self._due: tuple[tuple[list[TrainingTime], int], float | None] = (([], 0), None)
+        self._console = Console(stderr=True)
+        self._bar = Progress(
+            TextColumn("sweep", table_column=Column(no_wrap=True)),
+            BarColumn(bar_width=20, table_column=Column(min_width=10)),
+            TextColumn("{task.fields[state]}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)),
+            console=self._console,
+            refresh_per_second=2,
+            expand=True,
+        )
+        self._task = self._bar.add_task("", total=sum(cell.training.iterations for cell in sweep.cells), state="")
+
+    def __enter__(self) -> "SweepProgress":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def started(self, cell: Cell, stage: Stage) -> None:
+        self.active[cell.name] = stage
+
+    def took(self, stage: Stage, seconds: float) -> None:
+        if stage == "probe":
+            self.probes.append(seconds)
+
+    def ended(self, cell: Cell, statuses: Mapping[str, str]) -> None:
+        """Say how it ended, where it began at all, and how much is left."""
+        if self.active.pop(cell.name, None) is None:
+            return
+        count = sum(status == "done" for status in statuses.values())
+        line = f"{cell.name}: {statuses[cell.name]}; {count} of {len(statuses)} cells, {self.left()} left"
+        self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def update(self) -> None:
+        """Look at the folders and redraw the bar."""
+        spent = {cell.name: TrainingTime.read(cell.out) for cell in self.sweep.cells}
+        words = [
+            f"{name} {spent[name].step}" if stage == "train" else f"{name} probe" for name, stage in self.active.items()
+        ]
+        state = f"{self.left()} left{': ' * bool(words)}{', '.join(words)}"
+        self._bar.update(self._task, completed=sum(each.step for each in spent.values()), state=state)
+
+    def left(self) -> str:
+        """The time that is left, counted down between the checkpoints and the ends of stages."""
+        now, spent = monotonic(), [TrainingTime.read(cell.out) for cell in self.sweep.cells]
+        state = spent, sum(map(len, self.to_do.values()))
+        if state != self._due[0]:
+            seconds = self.seconds(spent)
+            self._due = state, None if seconds is None else now + seconds
+        due = self._due[1]
+        return "--" if due is None else str(timedelta(seconds=round(max(0.0, due - now))))
+
+    def seconds(self, spent: list[TrainingTime]) -> float | None:
+        """About how many seconds are left; None before the first checkpoint."""
+        paces: dict[tuple[str, str], list[float]] = {}
+        for cell, each in zip(self.sweep.cells, spent, strict=True):
+            if each.step:
+                paces.setdefault((cell.scene, cell.method), []).append(each.wall / each.step)
+        if not paces:
+            return None
+        other = mean(mean(each) for each in paces.values())
+        total = 0.0
+        for cell, each in zip(self.sweep.cells, spent, strict=True):
+            pace = mean(paces.get((cell.scene, cell.method), [other]))
+            total += pace * (cell.training.iterations - each.step)
+            total += self._probe_seconds() * ("probe" in self.to_do[cell.name])
+        return total / self.jobs
+
+    def _probe_seconds(self) -> float:
+        if self.probes:
+            return mean(self.probes)
+        whole = self.sweep.probe_seconds or ProbeSettings().seconds
+        return whole + self.sweep.family_seconds * self.sweep.split_control

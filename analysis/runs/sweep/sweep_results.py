@@ -1,0 +1,208 @@
+"""What the cells of a sweep came to: a row a cell, and mean and standard deviation over the seeds.
+
+OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or "to do"); of what has been trained: psnr (dB),
+                  ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads (that
+                  its steps might use; none where a resume changed them); wall_ratio, cpu_ratio: over the seconds of the
+                  first method, of the same scene and seed, the wall's only at the same number of threads; where it was probed,
+                  trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error (standard error or residual), of the latter
+                  also the _reason why the search ended ("... budget": the end may lie farther out), and the anisotropy
+                  indices with _low and _high, without value where one of these is unbounded; with the split control,
+                  split_INDEX: its factor on the index
+OUT/summary.csv   scene, method, and of every number its _mean, its sample standard deviation _std and the count _n
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from rich import box
+from rich.table import Table
+
+from analysis.records.family_table import INDICES
+from analysis.records.quantities import PLACES, SCORES, quantity
+from analysis.records.records import read_record
+from analysis.records.run_files import read_scores
+from analysis.runs.sweep.sweep_file import Cell, Sweep
+from analysis.records.findings import attribute_name, of_budgets
+from splat.training.checkpoint import write_atomically
+
+RESULTS, SUMMARY, PROBE = "results.csv", "summary.csv", "probe"
+TRAINING = SCORES | {"gaussians": "Gaussians", "wall_ratio": "time ×", "cpu_ratio": "CPU time ×"}
+DECIMALS = PLACES | {"gaussians": 0, "wall_ratio": 2, "cpu_ratio": 2}
+SPLIT = "split_"
+REASONS = {"lambda_max_reason": "max", "lambda_min_reason": "min"}
+ACROSS = 3  # quantities in a table, each with its deviation: as many as 80 columns hold beside scene and method
+
+
+def write_results(sweep: Sweep, statuses: Mapping[str, str]) -> pd.DataFrame:
+    """Write both files from what lies in the folders; returns the rows.  statuses: of each cell, by name."""
+    rows = results(sweep.cells, statuses)
+    sweep.out.mkdir(parents=True, exist_ok=True)
+    for name, frame in ((RESULTS, rows), (SUMMARY, summarize(rows))):
+        write_atomically(sweep.out / name, frame.to_csv(index=False).encode())
+    return rows
+
+
+def results(cells: Sequence[Cell], statuses: Mapping[str, str]) -> pd.DataFrame:
+    """A row for each cell, in their order."""
+    rows = [
+        {"scene": cell.scene, "method": cell.method, "seed": cell.seed, "status": statuses[cell.name]}
+        | (_metrics(cell.out) | _probe(cell.out) if statuses[cell.name] == "done" else {})
+        for cell in cells
+    ]
+    return with_ratios(pd.DataFrame(rows))
+
+
+def with_ratios(rows: pd.DataFrame) -> pd.DataFrame:
+    """Seconds over those of the first method, of the same scene and seed; those by the clock only at as many threads.
+
+    >>> both = {"scene": "fern", "method": ["3dgs", "sam"], "seed": 0, "wall_seconds": [10.0, 21.0], "cpu_seconds": [9.0, 18.0]}
+    >>> with_ratios(pd.DataFrame(both | {"threads": 2}))[["wall_ratio", "cpu_ratio"]].values.tolist()
+    [[1.0, 1.0], [2.1, 2.0]]
+    """
+    if "wall_seconds" not in rows:
+        return rows
+    first = rows[rows["method"] == rows["method"].iloc[0]].set_index(["scene", "seed"])
+    keys = pd.MultiIndex.from_arrays([rows["scene"], rows["seed"]])
+    for clock in ("wall", "cpu"):
+        reference = first[f"{clock}_seconds"].reindex(keys).to_numpy()
+        rows[f"{clock}_ratio"] = rows[f"{clock}_seconds"] / reference
+    same = rows["threads"] == first["threads"].reindex(keys).to_numpy()
+    rows["wall_ratio"] = rows["wall_ratio"].where(same)
+    return rows
+
+
+def summarize(rows: pd.DataFrame) -> pd.DataFrame:
+    """Mean, sample standard deviation and count of every number, for each scene and method, in the order of the rows.
+
+    >>> rows = pd.DataFrame({"scene": "fern", "method": "sam", "seed": [0, 1], "status": "done", "psnr": [18.0, 20.0]})
+    >>> summarize(rows).round(3).to_dict("records")
+    [{'scene': 'fern', 'method': 'sam', 'psnr_mean': 19.0, 'psnr_std': 1.414, 'psnr_n': 2}]
+    """
+    numbers = [name for name in rows if name not in ("scene", "method", "seed", "status", *REASONS)]
+    if not numbers:
+        return rows.filter(items=["scene", "method"]).drop_duplicates()
+    grouped = rows.groupby(["scene", "method"], sort=False)[numbers].agg(["mean", "std", "count"])
+    grouped.columns = [f"{name}_{'n' if what == 'count' else what}" for name, what in grouped.columns]
+    return grouped.reset_index()
+
+
+def _metrics(run: Path) -> dict[str, float]:
+    metrics = read_scores(run)
+    scores = {
+        f"{prefix}{key}": _scores(metrics.get(part))[key]
+        for part, prefix in (("test", ""), ("train", "train_"))
+        for key in ("psnr", "ssim", "lpips")
+    }
+    seconds = metrics.get("seconds") or {}
+    return {
+        **scores,
+        "gaussians": metrics["gaussians"],
+        **{f"{clock}_seconds": seconds.get(clock, math.nan) for clock in ("wall", "cpu")},
+        "threads": seconds.get("threads") or math.nan,
+    }
+
+
+def _scores(part: Mapping[str, Any] | None) -> dict[str, float]:
+    """Of the held-out views, where there are any."""
+    part = part or {}
+    return {key: math.nan if part.get(key) is None else float(part[key]) for key in ("psnr", "ssim", "lpips")}
+
+
+def _probe(run: Path) -> dict[str, float | str | None]:
+    """Traces, ends and indices of the run's record; nothing without one."""
+    if not (run / PROBE).is_dir():
+        return {}
+    data = read_record(run / PROBE).data
+    row: dict[str, float | str | None] = {}
+    for name, trace in data["traces"].items():
+        row |= {f"trace_{name}": trace["value"], f"trace_{name}_error": trace["standard_error"]}
+    for end in ("max", "min"):
+        pair = data["eigenvalues"][end]
+        row |= {f"lambda_{end}": pair["value"], f"lambda_{end}_error": pair["residual"]}
+    row |= {name: data["eigenvalues"][end].get("reason") or "" for name, end in REASONS.items()}
+    for name, index in data["anisotropy"].items():
+        row |= {name: _bounded(index), f"{name}_low": index["low"], f"{name}_high": index["high"]}
+    whole = [
+        e for e in data.get("split_control", {}).get("effects", []) if (e["operator"], e["block"]) == ("hessian", "all")
+    ]
+    return row | {f"{SPLIT}{effect['index']}": _bounded(effect) for effect in whole}
+
+
+def _bounded(index: Mapping[str, Any]) -> float | None:
+    """The value that a mean may be taken of: none where the number may be without bound."""
+    return None if index["low"] is None or index["high"] is None else index["value"]
+
+
+def unfinished(rows: pd.DataFrame) -> list[str]:
+    """Which ends of the spectrum may lie farther out than the means have them, with the cells."""
+    cells: dict[str, list[str]] = {}
+    for row in rows.reindex(columns=["scene", "method", "seed", *REASONS]).dropna().to_dict("records"):
+        for line in of_budgets({end: {"reason": row[name]} for name, end in REASONS.items()}):
+            cells.setdefault(line.text, []).append(f"{row['scene']}/{row['method']}/{row['seed']}")
+    return [f"{', '.join(names)}: {text}" for text, names in cells.items()]
+
+
+def of_other_threads(rows: pd.DataFrame) -> list[str]:
+    """Which cells' times by the clock are not compared, in a line if there are any."""
+    found = rows.reindex(columns=["scene", "method", "seed", "wall_ratio", "cpu_ratio"]).dropna(subset="cpu_ratio")
+    cells = found.to_dict("records")
+    names = [f"{c['scene']}/{c['method']}/{c['seed']}" for c in cells if math.isnan(c["wall_ratio"])]
+    if not names:
+        return []
+    return [f"{', '.join(names)}: not trained with as many threads as the first method; their time × is left out"]
+
+
+def tables(summary: pd.DataFrame) -> list[Table]:
+    """Scores and time; and, where cells were probed, curvature: mean ± standard deviation."""
+    traces = {name: attribute_name(name.removeprefix("trace_")) for name in _columns(summary, "trace_")}
+    ends = {"lambda_max": "λ max", "lambda_min": "λ min"}
+    indices = {name: name.replace("_", " ") for name in INDICES}
+    split = {f"{SPLIT}{name}": title for name, title in indices.items()}
+    parts = {
+        "mean ± standard deviation over the seeds": TRAINING,
+        "traces": traces,
+        "ends of the spectrum": ends,
+        "anisotropy": indices,
+        "what splitting every Gaussian in two multiplies the anisotropy by": split,
+    }
+    found = []
+    for title, columns in parts.items():
+        known = _known(summary, columns)
+        groups = [known[i : i + ACROSS] for i in range(0, len(known), ACROSS)]
+        found += [_table(summary, title, {name: columns[name] for name in group}) for group in groups]
+    return found
+
+
+def _columns(summary: pd.DataFrame, prefix: str) -> list[str]:
+    names = [name.removesuffix("_mean") for name in summary if name.startswith(prefix) and name.endswith("_mean")]
+    return [name for name in names if not name.endswith("_error")]
+
+
+def _known(summary: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
+    return [name for name in columns if f"{name}_n" in summary and summary[f"{name}_n"].to_numpy().any()]
+
+
+def _table(summary: pd.DataFrame, title: str, columns: Mapping[str, str]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=title)
+    table.add_column("scene", no_wrap=True)
+    table.add_column("method", no_wrap=True)
+    table.add_column("n", justify="right")
+    for heading in columns.values():
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in summary.to_dict("records"):
+        most = max(int(row[f"{name}_n"]) for name in columns)
+        table.add_row(row["scene"], row["method"], str(most), *(_cell(row, name, most) for name in columns))
+    return table
+
+
+def _cell(row: Mapping[Any, Any], name: str, most: int) -> str:
+    """Mean and deviation, and how many they are of where that is not all."""
+    mean, deviation, n = (row[f"{name}_{what}"] for what in ("mean", "std", "n"))
+    if not n:
+        return quantity(None)
+    parts = [mean] if n < 2 or math.isnan(deviation) else [mean, deviation]
+    text = " ± ".join(f"{part:.{DECIMALS[name]}f}" for part in parts) if name in DECIMALS else quantity(*parts)
+    return text if n == most else f"{text} (n = {n})"

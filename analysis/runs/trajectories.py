@@ -1,0 +1,138 @@
+"""`landscape trajectory`: the records along several trainings (`analysis/train/trajectory.py`) in one table and one picture.
+
+OUT/trajectories.csv    the rows of all runs, each with its "run": the run's folder, from the one that holds them all
+OUT/trajectories.png    drawn by `figures/trajectory.py`, which also draws PDF
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from analysis.console.drawing import draw
+from analysis.records.family_table import bracketed
+from analysis.console.options import TrajectoryOptions
+from analysis.records.quantities import measured, quantity
+from analysis.records.run_files import CHECKPOINT
+from analysis.records.findings import ATTRIBUTES, attribute_name
+from analysis.records.run_files import NO_TIME, RECORDS
+
+TABLE, PICTURE = "trajectories.csv", "trajectories.png"
+VALUES = {
+    **{f"trace_{name}": f"trace of {attribute_name(name)}" for name in ATTRIBUTES},
+    "lambda_max": "largest eigenvalue",
+    "lambda_min": "smallest eigenvalue",
+}
+INDICES = ("literal", "saddle", "share", "effective_rank")
+
+
+def run_trajectory(options: TrajectoryOptions) -> int:
+    """Gather, draw, print; returns the exit code."""
+    table = gathered(options.runs)
+    _require_same_function(options.runs)
+    common = Path(os.path.commonpath([run.resolve() for run in options.runs]))
+    out = options.out or common / "trajectory"
+    out.mkdir(parents=True, exist_ok=True)
+    path, console = out / TABLE, Console()
+    temporary = path.with_suffix(".csv.partial")
+    table.to_csv(temporary, index=False)
+    temporary.replace(path)
+    console.print(first_and_last(table))
+    try:
+        draw("trajectory", path)
+        drawn = f"picture: {out / PICTURE}; "
+    except RuntimeError as error:  # the numbers stand without the picture
+        console.print(" ".join(str(error).split()), style="yellow", highlight=False, soft_wrap=True)
+        drawn = ""
+    console.print(f"{drawn}numbers: {path}", soft_wrap=True, highlight=False)
+    return 0
+
+
+def _require_same_function(runs: Sequence[Path]) -> None:
+    """ValueError where the curvatures of the runs that have a checkpoint are those of different functions."""
+    from analysis.runs.compare import require_same  # these need torch, which no refusal above waits for
+    from splat.training.checkpoint import load_checkpoint
+
+    kept = {str(run): run / CHECKPOINT for run in runs if (run / CHECKPOINT).is_file()}
+    if len(kept) > 1:
+        require_same(list(kept), [load_checkpoint(path) for path in kept.values()])
+
+
+def gathered(runs: Sequence[Path]) -> pd.DataFrame:
+    """The rows of all runs.  FileNotFoundError or ValueError where a run has none, or is named twice."""
+    folders = [run.resolve() for run in runs]
+    if not folders:
+        raise ValueError("expected at least one run, got none; name the folders that landscape train wrote")
+    if len(set(folders)) < len(folders):
+        raise ValueError(f"expected every run once, got {', '.join(str(run) for run in runs)}")
+    common = Path(os.path.commonpath(folders))
+    tables = []
+    for run, folder in zip(runs, folders, strict=True):
+        path = folder / RECORDS
+        if not folder.is_dir():
+            raise FileNotFoundError(f"expected the folder of a run, {run} does not exist")
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"expected {RECORDS} in the run {run}, found none; train with --probe-every, as in "
+                f"landscape train SCENE --out {run} --probe-every 500"
+            )
+        try:
+            table = pd.read_csv(path)
+        except ValueError as error:  # pandas names no file
+            raise ValueError(f"expected the records of landscape train --probe-every in {path}, got {error}") from None
+        if not {"step", "state", *VALUES, *INDICES} <= set(table.columns):
+            raise ValueError(f"expected the records of landscape train --probe-every in {path}, got another table")
+        name = folder.name if folder == common else folder.relative_to(common).as_posix()
+        table.insert(0, "run", name)
+        tables.append(table)
+    together = pd.concat(tables, ignore_index=True)
+    if set(together["state"]) == {"skipped"}:
+        note = str(together["note"].iloc[-1])
+        remedy = "; train with a larger --probe-share" if note.startswith(NO_TIME) else ""
+        raise ValueError(
+            f"expected at least one record that was not skipped, got {len(together)} skipped ({note}){remedy}"
+        )
+    return together
+
+
+def first_and_last(table: pd.DataFrame) -> Table:
+    """The first and the last record of every run that were measured."""
+    result = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    result.add_column("", no_wrap=True)
+    for name in ("first", "last"):
+        result.add_column(name, justify="right")
+    for run, rows in table.groupby("run", sort=False):
+        known = rows[rows["state"] != "skipped"]
+        skipped = len(rows) - len(known)
+        result.add_section()
+        if known.empty:
+            result.add_row(f"{escape(str(run))}: all {skipped} records were skipped", "", "")
+            continue
+        ends: list[Mapping[str, Any]] = [known.iloc[0], known.iloc[-1]]
+        note = f" ({skipped} skipped)" if skipped else ""
+        result.add_row(
+            f"[bold]{escape(str(run))}[/]{note}", *(f"step {end['step']:,} ({end['state']})" for end in ends)
+        )
+        result.add_row("Gaussians", *(f"{end['gaussians']:,}" for end in ends))
+        for key, title in VALUES.items():
+            result.add_row(title, *(measured(_known(end[key]), _known(end[f"{key}_error"])) for end in ends))
+        for key in INDICES:
+            result.add_row(key.replace("_", " "), *(_bracketed(end, key) for end in ends))
+    return result
+
+
+def _bracketed(row: Mapping[str, Any], key: str) -> str:
+    value, low, high = (_known(row[name]) for name in (key, f"{key}_low", f"{key}_high"))
+    if low is None or high is None:
+        return bracketed({"value": value, "low": low, "high": high, "note": ""}).value
+    return f"{quantity(value)} ({quantity(low)} to {quantity(high)})"
+
+
+def _known(number: float) -> float | None:
+    return None if pd.isna(number) else float(number)

@@ -1,0 +1,267 @@
+"""`landscape slice`: one checkpoint in, its loss along a line or over a plane out, as a record with pictures.
+
+    load            the checkpoint, its scene, the other checkpoint of a line
+    linearise       every view held still
+    directions      eigenvectors from the probe beside the checkpoint or by Lanczos, and their curvatures
+    slice           renders where needed, in parallel, interpolated elsewhere (`landscape.slices.refinement`)
+    finite steps    along a line: second differences at steps over four decades, beside the infinitesimal curvature
+
+What is found on the way is kept in `.NAME.unfinished` beside the record, from which the same command continues; the
+directory goes when the record is complete.  A line moves all Gaussians, also those in sight at one of its ends only.
+"""
+
+import os
+import shlex
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from math import ceil, inf
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from torch import Tensor
+
+from analysis.console.options import SliceOptions
+from analysis.console.recording import write_with_pictures
+from analysis.console.stages import Stages
+from analysis.probe.command import scene_objective
+from analysis.probe.measurement import evaluation, slice_notes
+from analysis.probe.record import loss_name
+from analysis.records.findings import of_slice, resolved
+from analysis.records.provenance import provenance, require_seed
+from analysis.records.quantities import measured, quantity
+from analysis.records.records import SLICE, record_folder, require_replaceable
+from analysis.slice.directions import (
+    RISE,
+    Direction,
+    Shape,
+    at_right_angles,
+    axis_of,
+    cosine,
+    find_directions,
+    recorded_eigenvectors,
+)
+from analysis.slice.record import Found, slice_arrays, slice_data
+from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
+from landscape.probes import split
+from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
+from splat.backend.device import device_named
+from splat.curvature.hessian import SceneHessian
+from splat.curvature.objective import SceneObjective
+from splat.model.gaussians import Gaussians
+from splat.scenes.scene import Scene
+from splat.training.checkpoint import Checkpoint, load_checkpoint
+
+COARSE = {1: 9, 2: 21}  # points that an adaptive slice begins with, by its dimension
+DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
+
+
+def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
+    """Slice the checkpoint's loss; returns the exit code.  command: as typed, for the record."""
+    require_seed(options.seed)
+    shape = Shape.of(options.along, options.dimension, options.radius, options.points, options.other is not None)
+    device = device_named(options.device)
+    settings = _settings(options, shape, device)
+    out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
+    require_replaceable(out, SLICE)
+    unfinished = out.with_name(f".{out.name}.unfinished")
+    console, start = Console(stderr=True), perf_counter()
+    stages = Stages(console)
+    with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
+        checkpoint = load_checkpoint(options.checkpoint)
+        checkpoint.training.move(device)
+        other = None if options.other is None else _other_end(checkpoint, options.other)
+        scene = checkpoint.load_scene(options.checkpoint, options.scene)
+        objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
+    with stages:
+        known = _known(options.checkpoint.parent / "probe", unfinished, checkpoint, objective)
+        try:
+            found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
+        except ValueError:  # it would not end better the next time
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise
+        except KeyboardInterrupt:
+            if unfinished.is_dir():
+                again = shlex.join(command)
+                console.print(f"what was rendered is kept; to continue: {again}", soft_wrap=True, highlight=False)
+            raise
+        data = slice_data(found, objective, checkpoint.training.config.loss)
+        data["notes"] = slice_notes(found.slice)
+        data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
+        with record_folder(out, SLICE) as folder:
+            write_with_pictures(folder, data, slice_arrays(found), SLICE, stages, start)
+    shutil.rmtree(unfinished, ignore_errors=True)
+    _conclude(data, out)
+    return 0
+
+
+def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
+    """As asked for; a line of few points holds an eighth of them out, and a GPU is full with one render."""
+    most = torch.get_num_threads() if device.type == "cpu" else 1
+    workers = most if options.workers is None else options.workers
+    holdout = min(SliceSettings.holdout, ceil(options.points**shape.dimension / 8))
+    if options.all_points:
+        if options.max_renders is not None:
+            raise ValueError("expected --all-points or --max-renders, got both; leave one out")
+        return SliceSettings(tolerance=None, workers=workers)
+    least = COARSE[shape.dimension] + holdout + 1
+    if options.max_renders is not None and options.max_renders < least:
+        raise ValueError(
+            f"expected --max-renders of at least {least}, with which a slice of dimension {shape.dimension} can begin and be "
+            f"judged, got {options.max_renders}"
+        )
+    renders = inf if options.max_renders is None else options.max_renders
+    return SliceSettings(options.tolerance, holdout, workers=workers, max_evaluations=renders)
+
+
+def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
+    """The other checkpoint's parameters, quaternions as unit ones on the near side."""
+    here, there = checkpoint.training.gaussians, load_checkpoint(path).training.gaussians
+    if (len(here), here.sh_degree) != (len(there), there.sh_degree):
+        raise ValueError(
+            f"expected a checkpoint of {len(here):,} Gaussians with SH degree {here.sh_degree} at the other end of the line, "
+            f"got {len(there):,} with {there.sh_degree} in {path}; take two of one training after densification has ended"
+        )
+    there = Gaussians(there.flat.to(here.flat, copy=True), there.sh_degree)
+    quats = there.quats
+    quats /= quats.norm(dim=1, keepdim=True)
+    quats *= torch.where((quats * here.quats).sum(dim=1, keepdim=True) < 0, -1.0, 1.0).to(quats)
+    return there.flat
+
+
+def _known(probe: Path, unfinished: Path, checkpoint: Checkpoint, objective: SceneObjective) -> list[Tensor]:
+    """Eigenvectors of an interrupted run and of the probe."""
+    kept = unfinished / "eigenvectors.npy"
+    found = [torch.from_numpy(np.load(kept, allow_pickle=False))] if kept.is_file() else []
+    center = objective.active.flat
+    name, precision = loss_name(checkpoint.training.config.loss), torch.finfo(center.dtype).eps
+    found += recorded_eigenvectors(probe, name, objective.loss(center), precision)
+    return [vectors.to(center.device) for vectors in found]
+
+
+def _measure(
+    objective: SceneObjective,
+    shape: Shape,
+    other: Float[Tensor, " n"] | None,
+    known: list[Tensor],
+    settings: SliceSettings,
+    options: SliceOptions,
+    unfinished: Path,
+    stages: Stages,
+) -> Found:
+    center = objective.active.flat
+    seed = torch.Generator(center.device).manual_seed(options.seed)
+    generators = {name: split(seed) for name in ("eigenvectors", "random", "holdout")}
+    with stages.stage("linearise") as report:
+        report(0, 1, f"{len(objective.views)} views")
+        gradient = objective.gradient
+        report(1, 1, f"{len(objective.views)} views")
+    operator = CountingOperator(SceneHessian(objective))
+    true = CountingOperator(SceneHessian(objective, keep_null=True))  # H itself: a line may lead anywhere
+    with stages.stage("directions") as report:
+        exact = find_directions(shape, objective, operator, other, known, generators, report)
+        _keep_eigenvectors(exact, unfinished)
+        directions = at_right_angles(exact)
+        vectors = torch.stack([direction.vector for direction in directions], dim=1)
+        curvatures = (vectors.double() * true.apply(vectors).double()).sum(dim=0).tolist()
+    loss_scale = RISE * objective.loss(center)
+    axes = [
+        axis_of(direction.kind, radius, options.points, curvature, loss_scale)
+        for direction, radius, curvature in zip(directions, shape.radii, curvatures, strict=True)
+    ]
+    loss = _evaluation(objective, settings.workers)
+    digest = slice_digest(center, vectors, torch.cat(axes))
+    store = unfinished / f"{digest[:16]}.npz"
+    with stages.stage("slice") as report:
+        found = evaluate_slice(
+            loss, center, vectors, axes, gradient, true, settings, generators["holdout"], store, report
+        )
+    probe = None
+    if shape.dimension == 1:
+        reach = 1.0 if shape.kinds[0] == "line" else float(axes[0][-1])
+        with stages.stage("finite steps") as report:
+            steps = [reach * step for step in DECADES]
+            probe = finite_probe(_evaluation(objective, 1), center, vectors[:, 0], true, steps, report)
+    return Found(found, probe, directions, vectors, cosine(exact), loss_scale, operator.matvecs + true.matvecs)
+
+
+def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:
+    """For the run that continues this one, should it be killed."""
+    vectors = [direction.vector.cpu().numpy() for direction in directions if direction.kind == "eigenvectors"]
+    if not vectors:
+        return
+    unfinished.mkdir(parents=True, exist_ok=True)
+    partial = unfinished / f"eigenvectors.{os.getpid()}.tmp"
+    with partial.open("wb") as stream:
+        np.save(stream, np.stack(vectors, axis=1), allow_pickle=False)
+    partial.replace(unfinished / "eigenvectors.npy")
+
+
+def _evaluation(objective: SceneObjective, workers: int) -> Loss:
+    """`evaluation`, with words for steps that lead too far."""
+    inner = evaluation(objective, workers)
+
+    def evaluate(flat: Tensor) -> Evaluation:
+        try:
+            return inner(flat)
+        except ValueError as error:
+            raise ValueError(f"expected steps to where there is an image, got one that is too long ({error})") from None
+
+    return evaluate
+
+
+def _provenance(
+    options: SliceOptions, command: Sequence[str], settings: SliceSettings, checkpoint: Checkpoint, scene: Scene
+) -> dict[str, Any]:
+    return provenance(
+        options.seed,
+        checkpoint=str(options.checkpoint),
+        other=None if options.other is None else str(options.other),
+        scene=scene.name,
+        scene_folder=str(scene.root),
+        views=list(checkpoint.scene.train),
+        iteration=checkpoint.training.step,
+        dtype=str(checkpoint.training.gaussians.flat.dtype).removeprefix("torch."),
+        threads=torch.get_num_threads(),
+        command=shlex.join(command),
+        settings=asdict(settings),
+    )
+
+
+def _conclude(data: dict[str, Any], out: Path) -> None:
+    """The curvatures, how well the slice is known, and the files to open."""
+    say = partial(Console().print, soft_wrap=True, highlight=False)
+    for direction in data["slice"]["directions"]:
+        curvature = measured(direction["curvature"], direction["residual"] or 0.0)
+        text = f"{direction['name']}: curvature {curvature}, slope {quantity(direction['slope'])}"
+        say(f"{text}; one curvature unit is a step of {quantity(direction['unit'])}")
+    if data["finite_probe"]:
+        say(_finite_curvature(data["finite_probe"]))
+    for line in of_slice(data["slice"]):
+        say(line.text)
+    for note in data["notes"]:
+        say(note, style="yellow")
+    say(f"{data['timing']['total']:.1f} s, {data['counts']['renders']:,} renders of a view")
+    pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))) or "none"
+    say(f"pictures: {pictures}; numbers: {SLICE.file}, in {out}")
+
+
+def _finite_curvature(probe: dict[str, Any]) -> str:
+    """Between what the curvature lies that the steps see which round-off does not hide."""
+    sure, steps = np.array(resolved(probe)), np.array(probe["steps"])
+    if not sure.any():
+        return f"at finite steps: round-off hides the curvature at all {len(sure)} steps"
+    values = np.array(probe["curvatures"], float)[sure]
+    crossed = int((sure & np.array(probe["crossed"] or [False] * len(sure))).sum())
+    across = f", {crossed} of them with another order of splats" if crossed else ""
+    return (
+        f"at finite steps: curvature from {quantity(values.min())} to {quantity(values.max())}, at the {sure.sum()} of "
+        f"{len(sure)} steps that round-off does not hide (±{quantity(steps[sure].min())} to ±{quantity(steps[sure].max())})"
+        f"{across}"
+    )

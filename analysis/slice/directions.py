@@ -1,0 +1,206 @@
+"""The directions that `landscape slice` looks along, by name, and how far it looks.
+
+    eigenvectors    e₁, e₂: unit eigenvectors of the two largest eigenvalues of H.  Radius in curvature units; 3
+    random          r₁, r₂: Gaussian, of every attribute of every Gaussian as long as that attribute is (of a mean: as its
+                    distance from the origin), so that a radius of 0.001 changes each by about a thousandth; 0.001
+    gradient        unit vector of the steepest ascent.  Radius in parameter units; 3 curvature units
+    line            from the checkpoint, at 0, to the other, at 1.  Radius: how far beyond both; 0.5
+
+    curvature unit  sqrt(2 rise L / |d.H d|): the step within which the curvature alone changes the loss by rise L
+
+Of two kinds in one plane the second (then e₁⊥, say) is its part at a right angle to the first, drawn out to its old length.
+Eigenvectors that are known already are taken where H itself confirms them: |H v - lambda v| within the tolerance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import isclose, nan
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from analysis.console.options import Along
+from analysis.records.records import read_record
+from landscape import (
+    EigenSettings,
+    curvature_reach,
+    extreme_eigenpairs,
+    gradient_direction,
+    groups_of,
+    line_between,
+    orthonormal,
+    random_directions,
+    symmetric_axis,
+)
+from landscape.operators.operator import SymmetricOperator
+from landscape.results import Progress
+from landscape.slices.grid_evaluations import SAME_LOSS
+from splat.curvature.objective import SceneObjective
+
+RISE = 0.001  # of the loss, within a curvature unit
+UNITS = 3.0  # default radii: in curvature units, ...
+SHARE = 0.001  # ... as a share of the parameters' sizes, ...
+BEYOND = 0.5  # ... beyond a line's ends
+PLANES = {"eigenvectors", "random"}  # kinds that are two directions, where no other is named
+RTOL, MAX_MATVECS = 1e-3, 300  # of the eigenvectors
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What to slice along: one or two kinds of directions, in how many dimensions, a radius for each or none."""
+
+    kinds: tuple[Along, ...]
+    dimension: int
+    radii: tuple[float | None, ...]
+
+    @classmethod
+    def of(
+        cls, along: Sequence[Along], dimension: int | None, radii: Sequence[float], points: int, other: bool
+    ) -> "Shape":
+        """The shape that was asked for; ValueError where the wishes contradict each other."""
+        if twice := [kind for kind in dict.fromkeys(along) if along.count(kind) > 1]:
+            raise ValueError(
+                f"expected directions of different kinds, got --along {twice[0]} twice; leave one out, and for a plane of one "
+                "kind, eigenvectors or random, give --dimension 2"
+            )
+        default: Along = "line" if other else "eigenvectors"
+        named = list(along) or [default]
+        kinds: tuple[Along, ...] = tuple(sorted(named, key=lambda kind: kind != "line"))  # a line keeps its ends
+        if len(kinds) > 2:
+            raise ValueError(f"expected one or two directions, got {' and '.join(kinds)}; slice again for the others")
+        if ("line" in kinds) != other:
+            given = "one more checkpoint; add --along line" if other else "no other checkpoint; name it"
+            raise ValueError(f"expected two checkpoints for a line and one otherwise, got {given}")
+        most = 2 if len(kinds) == 2 or set(kinds) <= PLANES else 1
+        wanted = most if dimension is None else dimension
+        if wanted > most or (wanted == 1 and len(kinds) == 2):
+            advice = "give --along once" if wanted == 1 else "give --along twice"
+            raise ValueError(f"expected directions for dimension {wanted}, got {' and '.join(kinds)}; {advice}")
+        if len(radii) > wanted or any(not 0 < radius < float("inf") for radius in radii):
+            raise ValueError(f"expected at most {wanted} radii, finite and above 0, got {list(radii)}")
+        symmetric_axis(1.0, points)  # says what is wrong with their number
+        each = radii if len(radii) == wanted else [*radii, *radii, None, None][:wanted]
+        return cls(kinds, wanted, tuple(each))
+
+    @property
+    def name(self) -> str:
+        return f"{'-'.join(self.kinds)}-{self.dimension}d"
+
+    def kind(self, axis: int) -> Along:
+        return self.kinds[min(axis, len(self.kinds) - 1)]
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """One column of the slice's directions.  residual: |H v - lambda v| of an eigenvector; scale: what a step of 1 is."""
+
+    kind: Along
+    name: str
+    vector: Float[Tensor, " n"]
+    residual: float | None = None
+    scale: str = "param. units"
+
+
+def find_directions(
+    shape: Shape,
+    objective: SceneObjective,
+    operator: SymmetricOperator,
+    other: Float[Tensor, " n"] | None,
+    known: Sequence[Float[Tensor, "n k"]],
+    generators: dict[str, torch.Generator],
+    report: Progress,
+) -> list[Direction]:
+    """The directions of a shape.  other: where a line ends; known: eigenvectors to try before they are computed."""
+    center, found = objective.active.flat, []
+    for kind in shape.kinds:
+        count = shape.dimension if len(shape.kinds) == 1 else 1
+        if kind == "eigenvectors":
+            vectors, residuals = largest_eigenvectors(operator, count, known, generators[kind], report)
+            found += [Direction(kind, f"e{'₁₂'[i]}", vectors[:, i], residuals[i]) for i in range(count)]
+        elif kind == "random":
+            groups = groups_of(objective.blocks, len(objective.active), center.numel())
+            vectors = random_directions(center, groups, generators[kind], count)
+            scale = "share of param. sizes"
+            found += [Direction(kind, f"r{'₁₂'[i]}", vectors[:, i], scale=scale) for i in range(count)]
+        elif kind == "gradient":
+            found.append(Direction(kind, "gradient", gradient_direction(objective.gradient)[:, 0]))
+        else:
+            assert other is not None
+            found.append(Direction(kind, "line", line_between(center, other)[:, 0], scale="share of the way"))
+    return found
+
+
+def at_right_angles(found: Sequence[Direction]) -> list[Direction]:
+    """The directions of a slice: those found, but of two kinds the second's part at a right angle to the first, as long."""
+    if len({direction.kind for direction in found}) < 2:
+        return list(found)
+    first, second = found
+    across = orthonormal(torch.stack([first.vector, second.vector], dim=1))[:, 1]
+    length = torch.linalg.vector_norm(second.vector.double()).to(across.dtype)
+    return [first, replace(second, name=f"{second.name}⊥", vector=across * length, residual=None)]
+
+
+def cosine(directions: Sequence[Direction]) -> float | None:
+    """Of the angle between two directions as they are found."""
+    if len(directions) < 2:
+        return None
+    unit = [direction.vector.double() / direction.vector.double().norm() for direction in directions]
+    return float(torch.dot(*unit))
+
+
+def axis_of(kind: Along, radius: float | None, points: int, curvature: float, rise: float) -> Float64[Tensor, " _"]:
+    """The steps along a direction with so much curvature, where the loss may rise by `rise` in a curvature unit.
+
+    >>> axis_of("line", 0.5, 5, 1.0, 1.0), axis_of("eigenvectors", 2.0, 3, 8.0, 1.0)
+    (tensor([-0.5000,  0.0000,  0.5000,  1.0000,  1.5000], dtype=torch.float64), tensor([-1.,  0.,  1.], dtype=torch.float64))
+    """
+    if kind == "line":
+        beyond = BEYOND if radius is None else radius
+        between = max(round((points - 1) / (1 + 2 * beyond)), 1)
+        outside = max(round(beyond * between), 1)
+        return torch.arange(-outside, between + outside + 1, dtype=torch.float64) / between
+    if kind == "eigenvectors" or (kind == "gradient" and radius is None):
+        return symmetric_axis(curvature_reach(curvature, rise, UNITS if radius is None else radius), points)
+    return symmetric_axis(SHARE if radius is None else radius, points)
+
+
+def largest_eigenvectors(
+    operator: SymmetricOperator,
+    count: int,
+    known: Sequence[Float[Tensor, "n k"]],
+    generator: torch.Generator,
+    report: Progress,
+) -> tuple[Float[Tensor, "n {count}"], list[float]]:
+    """The first of the known that the operator confirms, else by Lanczos, begun from what is known; with residuals."""
+    start = None
+    for vectors in (each[:, :count] for each in known):
+        if vectors.shape != (operator.dim, count) or not vectors.isfinite().all():
+            continue
+        vectors = vectors.to(operator.dtype)
+        product, exact = operator.apply(vectors).double(), vectors.double()
+        values = (exact * product).sum(dim=0)
+        residuals = (product - values * exact).norm(dim=0)
+        if (residuals <= RTOL * values.abs()).all() and ((exact.norm(dim=0) - 1).abs() <= RTOL).all():
+            report(1, 1, "known already")
+            return vectors, residuals.tolist()
+        start = vectors
+    settings = EigenSettings(largest=count, smallest=0, rtol=RTOL, max_matvecs=MAX_MATVECS)
+    pairs = extreme_eigenpairs(operator, generator, settings, start, report).largest
+    return pairs.vectors, pairs.residuals.tolist()
+
+
+def recorded_eigenvectors(folder: Path, loss: str, value: float, precision: float) -> list[Float[Tensor, "n k"]]:
+    """Those of the probe recorded in a folder, if any, where its objective is the Hessian of this loss with this value."""
+    try:
+        record = read_record(folder)
+    except (FileNotFoundError, ValueError):
+        return []
+    about = record.data.get("objective", {})
+    same = (about.get("loss"), about.get("operator")) == (loss, "hessian")
+    if not same or not isclose(about.get("value", nan), value, rel_tol=SAME_LOSS * precision):
+        return []
+    vectors: np.ndarray | None = record.arrays.get("eigenvectors", {}).get("largest")
+    return [] if vectors is None else [torch.from_numpy(vectors)]

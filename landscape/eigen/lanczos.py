@@ -1,0 +1,83 @@
+"""The Lanczos recurrence with full re-orthogonalisation (Lanczos 1950, Paige 1972).
+
+    H Q = Q T + r e_m^T      Q (n, m) orthonormal, T tridiagonal, r orthogonal to Q
+
+Vectors are in the operator's dtype, T in float64.  Every new vector is orthogonalised twice against all the earlier
+ones: the first pass leaves components of the size of its own round-off, the second removes them and corrects the
+entries of T ("twice is enough", Kahan and Parlett).  Rows of the workspaces are vectors, so that each is contiguous.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import isfinite
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from landscape.linalg import is_roundoff, norm, orthogonalise, unit_columns
+from landscape.operators.operator import SymmetricOperator, product, require_finite
+from landscape.results import Progress
+
+
+@dataclass(frozen=True, eq=False)
+class LanczosFactorization:
+    """H Q = Q T + r e_m^T, m the steps made: fewer than asked for where Q spans an invariant subspace (r = 0) or was enough."""
+
+    Q: Float[Tensor, "n m"]
+    T: Float64[Tensor, "m m"]
+    r: Float[Tensor, " n"]
+
+
+def lanczos(
+    operator: SymmetricOperator,
+    starts: Float[Tensor, "n k"],
+    steps: int,
+    progress: Progress | None = None,
+    scale: float = 0.0,
+    enough: Callable[[Sequence[tuple[Float64[Tensor, "m m"], float]]], bool] | None = None,
+) -> list[LanczosFactorization]:
+    """One factorisation per column of starts, run in lock-step so that the operator sees blocks of k vectors.
+
+    Memory: k * steps vectors.  starts: not zero, of any length.  A recurrence ends early where its remainder is round-off.
+    scale: |H|, where starts do not show it (because they were projected off the largest eigenvectors, say): round-off is
+    then relative to it.  enough: is given (T, |r|) of every run after each step; once it returns True, all end.
+
+    >>> from landscape.operators.operator import DenseOperator
+    >>> A = DenseOperator(torch.diag(torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)))
+    >>> (f,) = lanczos(A, torch.ones(3, 1, dtype=torch.float64), steps=3)
+    >>> [round(x, 9) for x in torch.linalg.eigvalsh(f.T).tolist()]
+    [1.0, 2.0, 4.0]
+    """
+    n, k = starts.shape
+    if steps < 1:
+        raise ValueError(f"expected at least one Lanczos step, got {steps}")
+    units = unit_columns(starts)
+    steps = min(steps, n)
+    basis = starts.new_empty(k, steps, n, dtype=operator.dtype)
+    T = torch.zeros(k, steps, steps, dtype=torch.float64)
+    remainders = units.T.to(operator.dtype).contiguous()
+    sizes, lengths, running = [0] * k, [0.0] * k, list(range(k))
+    for j in range(steps):
+        for i in running:
+            basis[i, j] = remainders[i]
+            if j:
+                T[i, j - 1, j] = T[i, j, j - 1] = lengths[i]
+        products = product(operator, torch.stack([basis[i, j] for i in running], dim=1), finite=False).T
+        for i, column in zip(list(running), products, strict=True):
+            w = column.clone()[None]
+            length = norm(w)
+            require_finite(operator, isfinite(length))
+            size = max(scale, length)
+            T[i, j, j] = orthogonalise(w, basis[i, : j + 1])[j, 0]
+            sizes[i], lengths[i] = j + 1, norm(w)
+            if is_roundoff(lengths[i], max(size, float(T[i].abs().max())), operator.dtype):
+                running.remove(i)
+                lengths[i] = 0.0
+            remainders[i] = w[0] / (lengths[i] or 1.0)
+        if progress:
+            progress((j + 1) * k, steps * k, f"Lanczos step {j + 1} of {steps}")
+        rules = [T[i, :m, :m] for i, m in enumerate(sizes)]
+        if not running or (enough and enough(list(zip(rules, lengths, strict=True)))):
+            break
+    return [LanczosFactorization(basis[i, :m].T, T[i, :m, :m], remainders[i] * lengths[i]) for i, m in enumerate(sizes)]

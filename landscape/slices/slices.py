@@ -1,0 +1,167 @@
+"""Slices of an objective: its values on a grid of one or two directions, beside the quadratic model there.
+
+    f(x)     = L(center + sum_d x_d e_d)              true evaluations where needed (`refinement`), interpolated elsewhere
+    model(x) = L + b . x + x^T A x / 2                b = E^T g,  A = E^T H E
+
+x is in multiples of the directions as given: for unit eigenvectors, in parameter units.  `curvature_reach` gives ranges
+in units of the curvature instead: where the quadratic along an eigenvector has risen by a given amount,
+x = r sqrt(2 dL / |lambda|).
+"""
+
+from collections.abc import Sequence
+from math import isfinite, sqrt
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from landscape.operators.operator import SymmetricOperator, product
+from landscape.results import Progress, StopReason
+from landscape.slices.grid_evaluations import GridEvaluations, Loss
+from landscape.slices.refinement import SliceSettings, evaluate_adaptively
+from landscape.slices.slice import Slice
+
+
+def symmetric_axis(radius: float, points: int = 41) -> Float64[Tensor, " points"]:
+    """Evenly spaced from -radius to radius, with 0 itself among them; points is odd, 3 or more.
+
+    >>> symmetric_axis(1.0, 5)
+    tensor([-1.0000, -0.5000,  0.0000,  0.5000,  1.0000], dtype=torch.float64)
+    """
+    if points < 3 or points % 2 == 0:
+        raise ValueError(f"expected an odd number of points, 3 or more, got {points}")
+    if not (radius > 0 and isfinite(radius)):
+        raise ValueError(f"expected a finite radius above 0, got {radius}")
+    half = points // 2
+    return torch.arange(-half, half + 1, dtype=torch.float64) * (radius / half)
+
+
+def curvature_reach(curvature: float, rise: float, multiple: float = 1.0) -> float:
+    """multiple * sqrt(2 rise / |curvature|): with multiple = 1, the distance at which the quadratic term alone is rise.
+
+    For a unit direction: curvature in loss per squared parameter unit, rise in loss, the result in parameter units.
+    ValueError where the curvature is 0 or not finite, or rise or multiple is not above 0.
+
+    >>> curvature_reach(curvature=-8.0, rise=1.0)
+    0.5
+    """
+    if curvature == 0 or not isfinite(curvature) or rise <= 0 or multiple <= 0:
+        raise ValueError(
+            f"expected a curvature that is not zero, rise > 0 and multiple > 0, got {curvature}, {rise} and {multiple};"
+            " give the range in parameter units instead"
+        )
+    return multiple * sqrt(2 * rise / abs(curvature))
+
+
+def evaluate_slice(
+    loss: Loss,
+    center: Float[Tensor, " n"],
+    directions: Float[Tensor, "n d"],
+    coordinates: Sequence[Float64[Tensor, " _"]],
+    gradient: Float[Tensor, " n"] | None = None,
+    operator: SymmetricOperator | Float64[Tensor, "d d"] | None = None,
+    settings: SliceSettings = SliceSettings(),
+    generator: torch.Generator | None = None,
+    store: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Slice:
+    """loss on the grid coordinates[0] x coordinates[1] (d = 2) or along coordinates[0] (d = 1).
+
+    loss(theta) is the objective, or (objective, signature) where it is piecewise smooth: points whose signature differs from
+    the centre's are marked.  It must be safe to call from settings.workers threads.  coordinates: increasing, in multiples of
+    the directions.  gradient, operator: both at center, both or neither: with them the quadratic model comes beside it, for d
+    matvecs, or for none where the operator is given as the matrix E^T H E.  generator draws the hold-out points
+    (`refinement`); it may be None only where settings.tolerance is.  store: a file that keeps the evaluations, from which a
+    killed run continues.  ValueError where the objective at the centre is not finite, or store holds another slice.
+
+    >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
+    >>> line = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :1], [axis], generator=generator)
+    >>> line.loss[::10], int(line.evaluated.sum()), line.reason
+    (tensor([4., 1., 0., 1., 4.], dtype=torch.float64), 13, 'tolerance')
+    """
+    _require_slice(center, directions, coordinates)
+    _require_model(gradient, operator, directions)
+    if settings.tolerance is not None and generator is None:
+        raise ValueError(
+            "expected a generator for the hold-out points of an adaptive slice, got none; "
+            "pass torch.Generator().manual_seed(0), or SliceSettings(tolerance=None) to evaluate every point"
+        )
+    axes = [axis.detach().double() for axis in coordinates]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    shape, points = grid.shape[:-1], grid.reshape(-1, len(axes))
+    file = None if store is None else Path(store)
+    found = GridEvaluations(loss, center, directions, points, settings.workers, file, progress)
+    reason: StopReason
+    if settings.tolerance is None or generator is None:
+        found.require(range(len(points)))
+        values, holdout, looks, reason = found.value, np.empty(0), 0, "exact"
+    else:
+        x, y = axes[0].numpy(), axes[1].numpy() if len(axes) == 2 else np.zeros(1)
+        values, holdout, looks, reason = evaluate_adaptively(found, x, y, settings, generator)
+    slope = curvature = model = None
+    if gradient is not None and operator is not None:
+        slope, curvature = _derivatives(gradient, operator, directions)
+        model = found.center_loss + points @ slope + ((points @ curvature) * points).sum(dim=1) / 2
+        model = model.reshape(shape)
+    return Slice(
+        coordinates=tuple(axes),
+        loss=torch.from_numpy(values).reshape(shape),
+        evaluated=torch.from_numpy(found.known).reshape(shape),
+        holdout=torch.from_numpy(holdout),
+        center_loss=found.center_loss,
+        model=model,
+        slope=slope,
+        curvature=curvature,
+        crossed=torch.from_numpy(found.crossed).reshape(shape) if found.has_signature else None,
+        evaluations=int(found.known.sum()) + 1,
+        reason=reason,
+        looks=looks,
+    )
+
+
+def _derivatives(
+    gradient: Tensor, operator: SymmetricOperator | Float64[Tensor, "d d"], directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """b and A of the model, on the CPU as all that a slice gives."""
+    spans = directions.detach().double()
+    slope = (spans.T @ gradient.double()).cpu()
+    if isinstance(operator, Tensor):
+        return slope, operator.double().cpu()
+    curvature = (spans.T @ product(operator, directions.to(operator.dtype)).double()).cpu()
+    return slope, (curvature + curvature.T) / 2
+
+
+def _require_model(
+    gradient: Tensor | None, operator: SymmetricOperator | Float64[Tensor, "d d"] | None, directions: Tensor
+) -> None:
+    if (gradient is None) != (operator is None):
+        raise ValueError("expected both gradient and operator for the quadratic model, or neither; got one of them")
+    n, d = directions.shape
+    for name, given, shape in (("gradient", gradient, (n,)), ("E^T H E", operator, (d, d))):
+        if not isinstance(given, Tensor):
+            continue
+        if given.shape != shape:
+            raise ValueError(f"expected {name} of shape {shape} for the quadratic model, got {tuple(given.shape)}")
+        if not torch.isfinite(given).all():
+            raise ValueError(f"expected finite {name} for the quadratic model, got NaN or infinity")
+
+
+def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Tensor]) -> None:
+    n = center.numel()
+    if center.ndim != 1 or directions.ndim != 2 or directions.shape[0] != n or directions.shape[1] not in (1, 2):
+        raise ValueError(
+            f"expected a flat center (n,) and one or two directions (n, d), got {tuple(center.shape)} and "
+            f"{tuple(directions.shape)}"
+        )
+    if len(coordinates) != directions.shape[1] or any(axis.ndim != 1 or axis.numel() == 0 for axis in coordinates):
+        raise ValueError(
+            f"expected one vector of coordinates per direction ({directions.shape[1]}), got shapes "
+            f"{[tuple(axis.shape) for axis in coordinates]}"
+        )
+    if not all(axis.isfinite().all() and (axis.diff() > 0).all() for axis in coordinates):
+        raise ValueError("expected finite coordinates that increase, got others; sort them and drop repeated ones")
+    lengths = torch.linalg.vector_norm(directions.double(), dim=0)
+    if not ((lengths > 0) & torch.isfinite(lengths)).all():
+        raise ValueError(f"expected finite directions that are not zero, got lengths {lengths.tolist()}")

@@ -1,0 +1,266 @@
+"""The whole spectrum, by stochastic Lanczos quadrature (Golub and Meurant 1994; Ubaru, Chen and Saad 2017).
+
+For a start vector z of length 1 the Ritz values theta_j of m Lanczos steps and the squared first components w_j of T's
+eigenvectors are the Gauss rule of the measure mu_z(x) = sum_i (z . v_i)^2 delta(x - lambda_i):
+
+    z^T f(H) z = sum_j w_j f(theta_j)     exactly for polynomials f of degree below 2m
+    tr f(H)    = n E z^T f(H) z           for independent entries of mean 0 and variance 1 / n
+
+Where a null space is known, with P the projector off it and r the rank of P, the start vectors are P z / |P z|.  The density is
+then that of the r other eigenvalues, and sums over them are r times its integrals.  |P z|^2 is r on average, so these are
+ratios: without bias for a Gaussian z, else with one that is sd(|P z|^2) / r times the spread it comes with.  Not to divide by
+|P z|^2 would add its own skewed spread to every sum.
+
+**Uneven signs.**  Entries are random signs, which see a diagonal matrix without error, times magnitudes with squares uniform on
+[1 - UNEVEN, 1 + UNEVEN], which have a 600th of the variance of Gaussian entries there.  Signs alone coincide: of an eigenvalue
+that two rows share, all of k start vectors see the same direction with the probability 2^(1 - k), and it would pass for
+simple.  Uneven ones see directions about 0.03 apart, 30 times what SAME tells from none.
+
+**Eigenvalues that are known.**  A few eigenvalues that dominate are most of the variance over start vectors.  Eigenpairs that
+were found before are projected out as a null space is, and each is counted as the one eigenvalue that it is, instead of
+(z . v)^2 times.  The same is done with those that the first runs find.  A Ritz pair with a residual of at most SETTLED times
+its distance to the others is an eigenpair; its eigenvalue is simple where two start vectors come to the same eigenvector (of a
+multiple one each sees another).  Its node is taken out of the rules of the start vectors that found it; what remains of each is
+the Gauss rule of what remains of its measure.  The start vectors to come are projected off v.
+
+**Few long runs or many short ones.**  For a given number of products, longer runs make sum |lambda| better known where its
+bounds (`absolute_sum`) are wide or runs still find eigenvalues; more runs do where start vectors differ.  `Lengths` looks at
+both while the first runs are under way.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import ceil, inf
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from landscape.eigen.lanczos import LanczosFactorization, lanczos
+from landscape.eigen.pairs import EigenEnds
+from landscape.linalg import gram, norm
+from landscape.operators.operator import ProjectedOperator, SymmetricOperator
+from landscape.results import Progress, t_quantile
+from landscape.spectrum.absolute_sum import absolute_integral
+from landscape.spectrum.rules import SpectralDensity
+
+UNEVEN = 0.1  # spread of the squares of a start vector's entries about 1
+SETTLED = 1e-4  # the error of an eigenvector that runs find
+FOUND, CLOSE = 1e-2, 0.1  # of one that was found before, and its residual, as a share of the eigenvalue
+SAME = 1e-6  # by which the squared cosine between two of them may miss 1
+# where their number is free: Student's interval of three is half as long again, and kernels like blocks of four
+FEWEST_STARTS = 4
+FIRST_LOOK, GROWTH = 12, 4 / 3  # steps
+CONFIDENCE = 0.95  # of the interval that is to be short
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveSpace:
+    """What the known null space of an operator P H P leaves: the orthogonal projector `project(V) -> P V` and its rank."""
+
+    project: Callable[[Tensor], Tensor]
+    rank: int
+
+    def __post_init__(self) -> None:
+        if self.rank < 1:
+            raise ValueError(f"expected a projector of rank 1 or more, got {self.rank}")
+
+
+def spectral_density(
+    operator: SymmetricOperator,
+    generator: torch.Generator,
+    matvecs: int = 192,
+    starts: int | None = None,
+    longest: int | None = None,
+    batch: int = FEWEST_STARTS,
+    progress: Progress | None = None,
+    active: ActiveSpace | None = None,
+    ends: EigenEnds | None = None,
+    trace: tuple[float, float] | None = None,
+) -> SpectralDensity:
+    """Gauss rules of random start vectors, one Lanczos run each.
+
+    matvecs: products in all, at most.
+    starts: number of start vectors (2 or more), each with matvecs // starts steps; None: runs as long as pays (`Lengths`), and
+        as many of them as matvecs allow.  longest: the most steps of a run; None: no other limit than matvecs and the rank.
+    batch: runs at a time (memory: (batch + 1) vectors for each step of a run); eigenvalues are told apart as `known` only where
+        it is 2 or more.
+    active: leaves the eigenvalues of a known null space out; `dim` of the result is then the rank.
+    ends: eigenpairs found before by `extreme_eigenpairs`; those that are accurate enough are `known` from the beginning.
+    trace: of the operator, with its standard error, where it is known better than from so few start vectors.
+
+    >>> from landscape.operators.operator import DenseOperator
+    >>> H = DenseOperator(torch.diag(torch.tensor([5.0, -1.0, *[2.0] * 98], dtype=torch.float64)))
+    >>> density = spectral_density(H, torch.Generator().manual_seed(0), matvecs=12)
+    >>> [round(x, 9) for x in density.known.tolist()], density.rest, round(density.integral(torch.abs).value, 9)
+    ([-1.0, 5.0], 98, 202.0)
+    """
+    least = FEWEST_STARTS if starts is None else starts
+    if least < 2 or matvecs < 2 * least or batch < 1:
+        raise ValueError(
+            f"expected starts >= 2, matvecs >= 2 a start vector and batch >= 1, got {least}, {matvecs} and {batch}"
+        )
+    found = _Runs(operator, generator, active, ends, lambda done, state: progress and progress(done, matvecs, state))
+    most = min(matvecs // least, found.rank, longest or found.rank)
+    steps, count = most, least
+    if starts is None:
+        lengths = Lengths(matvecs, most, found.rank - len(found.known), trace is not None)
+        found.add(min(batch, least), most, lengths)
+        steps = lengths.best or most
+        count = len(found.rules) + (matvecs - found.matvecs) // steps
+    while len(found.rules) < count:
+        found.add(min(count - len(found.rules), batch * most // steps), steps)
+    return found.density(trace)
+
+
+class Lengths:
+    """Where runs end that are as long as pays: the interval of sum |lambda| that all products buy is then shortest.
+
+    It is looked at as the first runs grow; they end with the first look that is worse than the one before.  best: steps.
+    traced: whether the trace is known.
+    """
+
+    def __init__(self, matvecs: int, most: int, rest: int, traced: bool) -> None:
+        self.matvecs, self.most, self.rest, self.traced = matvecs, most, rest, traced
+        self.best, self.half, self.next = 0, inf, FIRST_LOOK
+
+    def __call__(self, runs: Sequence[tuple[Float64[Tensor, "m m"], float]]) -> bool:
+        """Whether these runs, T and |r| of each, are long enough."""
+        steps = max(len(T) for T, _ in runs)
+        if steps < min(self.next, self.most):
+            return False
+        self.next, half = ceil(GROWTH * steps), self.half_width(runs, steps)
+        if half >= self.half:
+            return True
+        self.best, self.half = steps, half
+        return False
+
+    def half_width(self, runs: Sequence[tuple[Float64[Tensor, "m m"], float]], steps: int) -> float:
+        """Of the interval that runs of so many steps leave products for, from as many start vectors."""
+        nodes, weights, found = [], [], 0
+        for T, length in runs:
+            values, S = torch.linalg.eigh(T)
+            known = settled(values, S, length)
+            nodes.append(values[~known])
+            weights.append(S[0, ~known].square())
+            found += int(known.sum())
+        rest, starts = max(self.rest - found / len(runs), 0.0), self.matvecs / steps
+        low, _, high = absolute_integral(nodes[0], weights[0])  # of one run: they cost as much as a product
+        x, w = torch.cat(nodes), torch.cat(weights) / len(runs)
+        unit = float(x.abs().max()) or 1.0 if len(x) else 1.0  # of squares that leave the range of floats
+        x = x / unit
+        squares = float((w * x.square()).sum())
+        if self.traced and squares:
+            squares -= float((w * x * x.abs()).sum()) ** 2 / squares
+        # the variance over random signs is 2 sum f(lambda)^2 at most
+        spread = unit * (2 * rest * max(squares, 0.0) / starts) ** 0.5
+        return t_quantile(starts - 1, CONFIDENCE) * spread + rest * (high - low) / 2
+
+
+class _Runs:
+    """The rules of the runs so far, and the eigenvalues that are known, with their vectors."""
+
+    def __init__(
+        self,
+        operator: SymmetricOperator,
+        generator: torch.Generator,
+        active: ActiveSpace | None,
+        ends: EigenEnds | None,
+        progress: Callable[[int, str], object],
+    ) -> None:
+        self.generator, self.active, self.progress = generator, active, progress
+        self.rank = operator.dim if active is None else active.rank
+        self.known, self.missed, V = found_before(ends, operator, generator.device)
+        self.operator = ProjectedOperator(operator, lambda X: X - V @ (V.T @ X)) if V.shape[1] else operator
+        self.V, self.matvecs = V, 0
+        self.rules: list[tuple[Float64[Tensor, " m"], Float64[Tensor, " m"], bool]] = []  # nodes, weights, all of it
+
+    def add(self, count: int, steps: int, enough: Lengths | None = None) -> None:
+        """So many runs, side by side."""
+        if len(self.known) == self.rank:  # nothing is left to be seen
+            self.rules += [(self.known[:0], self.known[:0], True)] * count
+            return
+        Z = draw_starts(self.operator.dim, count, self.generator, self.operator.dtype)
+        if self.active is not None:
+            Z = self.active.project(Z)
+        Z = Z - self.V @ (self.V.T @ Z)
+        before, size = self.matvecs, float(self.known.abs().max()) if len(self.known) else 0.0
+
+        def report(done: int, _: int, state: str) -> None:
+            self.progress(before + done, f"density: {state}")
+
+        runs = lanczos(self.operator, Z, steps, report, size, enough)
+        self.matvecs += sum(len(run.T) for run in runs)
+        spectra = [torch.linalg.eigh(run.T) for run in runs]
+        others = [torch.ones_like(values, dtype=torch.bool) for values, _ in spectra]
+        if not self.rules and count > 1:
+            known, residuals, V, others = found_by_all(runs, spectra)
+            self.known, self.V = torch.cat([self.known, known]), torch.cat([self.V, V], dim=1)
+            self.missed = torch.cat([self.missed, missed(known, residuals)])
+        for run, (values, S), left in zip(runs, spectra, others, strict=True):
+            mass = S[0, left].square()
+            self.rules.append((values[left], mass / mass.sum(), norm(run.r) == 0))
+
+    def density(self, trace: tuple[float, float] | None) -> SpectralDensity:
+        """All of them, with nodes of weight 0 after those of shorter ones: after m that are all of it, m + 1 (`quantiles`)."""
+        longest = max((1 + whole) * len(nodes) + whole for nodes, _, whole in self.rules)
+        nodes = torch.zeros(len(self.rules), longest, dtype=torch.float64)
+        weights = torch.zeros_like(nodes)
+        for i, (at, mass, _) in enumerate(self.rules):
+            nodes[i, : len(at)], weights[i, : len(at)] = at, mass
+        whole = torch.tensor([whole for _, _, whole in self.rules])
+        known, order = self.known.sort()
+        return SpectralDensity(nodes, weights, self.rank, self.matvecs, known, whole, trace, self.missed[order])
+
+
+def draw_starts(n: int, count: int, generator: torch.Generator, dtype: torch.dtype) -> Float[Tensor, "n count"]:
+    """Random signs of uneven magnitudes: of mean 0 and variance 1."""
+    rows = torch.empty(count, n, dtype=dtype, device=generator.device)
+    for row in rows:
+        row.uniform_(-1, 1, generator=generator)
+    return torch.copysign((1 - UNEVEN + 2 * UNEVEN * rows.abs()).sqrt(), rows).T.contiguous()
+
+
+def found_before(
+    ends: EigenEnds | None, operator: SymmetricOperator, device: torch.device
+) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Float[Tensor, "n k"]]:
+    """Eigenvalues, what they miss (`SpectralDensity`) and orthonormal vectors of the pairs that are good."""
+    if ends is None:
+        none = torch.zeros(0, dtype=torch.float64)
+        return none, none, torch.zeros(operator.dim, 0, dtype=operator.dtype, device=device)
+    pairs = (ends.largest,) if ends.smallest is ends.largest else (ends.largest, ends.smallest)
+    values, residuals, errors = (
+        torch.cat([getattr(pair, name) for pair in pairs]) for name in ("values", "residuals", "vector_errors")
+    )
+    good = (errors < FOUND) & (residuals <= CLOSE * values.abs())
+    vectors = torch.cat([pair.vectors for pair in pairs], dim=1)[:, good.to(ends.largest.vectors.device)]
+    return values[good], missed(values[good], residuals[good]), torch.linalg.qr(vectors).Q
+
+
+def missed(values: Float64[Tensor, " k"], residuals: Float64[Tensor, " k"]) -> Float64[Tensor, " k"]:
+    """See `SpectralDensity.of_known`; an eigenvalue of 0 adds nothing."""
+    return torch.where(values == 0, 0.0, 4 * (residuals / values).square())
+
+
+def settled(values: Float64[Tensor, " m"], S: Float64[Tensor, "m m"], length: float) -> Bool[Tensor, " m"]:
+    """Which Ritz pairs are eigenpairs.  values, S: of T; length: of r."""
+    far = torch.tensor([inf], dtype=torch.float64)
+    gaps = torch.diff(values, prepend=-far, append=far)
+    return length * S[-1].abs() <= SETTLED * torch.minimum(gaps[:-1], gaps[1:])
+
+
+def found_by_all(
+    runs: Sequence[LanczosFactorization], spectra: Sequence[tuple[Tensor, Tensor]]
+) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Float[Tensor, "n k"], list[Bool[Tensor, " m"]]]:
+    """The simple eigenvalues that all runs have found, with residuals and vectors, and which nodes of each run are others."""
+    masks = [settled(values, S, norm(run.r)) for run, (values, S) in zip(runs, spectra, strict=True)]
+    vectors = [run.Q @ S[:, mask].to(run.Q) for run, (_, S), mask in zip(runs, spectra, masks, strict=True)]
+    same = [gram(vectors[0], other).cpu().square() > 1 - SAME for other in vectors]
+    common = torch.stack([match.any(dim=1) for match in same]).all(dim=0)
+    others = []
+    for match, mask in zip(same, masks, strict=True):
+        others.append(~mask)
+        others[-1][mask] = ~match[common].any(dim=0)
+    values, S = spectra[0]
+    residuals = norm(runs[0].r) * S[-1].abs()
+    return values[masks[0]][common], residuals[masks[0]][common], vectors[0][:, common], others

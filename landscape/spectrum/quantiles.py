@@ -1,0 +1,181 @@
+"""Quantiles of a spectrum from stochastic Lanczos quadrature, with brackets that assume nothing of the spectrum.
+
+    quantile            lambda that the share p of all eigenvalues lies at or below
+    absolute_quantile   t such that the share p of sum |lambda_i| comes from |lambda_i| <= t
+
+**One start vector.**  Its measure mu has a Gauss rule, nodes x_1 < x_2 < ... and weights w_j.  Whatever mu is (Chebyshev,
+Markov and Stieltjes; Akhiezer 1965, Sec. 2.5),
+
+    sum_{j<k} w_j  <=  mu(x < x_k)  <=  mu(x <= x_k)  <=  sum_{j<=k} w_j
+
+and the same holds for integrals from a node to infinity of an f whose derivatives f, f', f'', ... have the signs +, -, +, ...
+there.  For the curvature at magnitudes above t take y = x^2 and the measure y dmu, whose Gauss rule (nodes y_j, weights u_j)
+follows from that of mu: f(y) = y^(-1/2) gives
+
+    sum_{j>k} u_j / sqrt(y_j)  <=  sum of |lambda| over lambda^2 > y_k, or >= y_k  <=  sum_{j>=k} u_j / sqrt(y_j)
+
+**All start vectors.**  For random signs z the share of eigenvalues that z sees in a set of true share F is F on average, with
+a variance of at most 2 F (1 - F) / n a start vector: the beta distribution of that mean and variance says how far the mean
+over the start vectors may be off at F = p.  The sums of curvature are compared by Student's interval of (curvature above t) -
+(1 - p) (all curvature), which is linear in what the start vectors see.  A bracket ends where the test just fails to exclude t.
+Eigenvalues that are known are counted as such, and the tests are of the others.
+"""
+
+from math import inf
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.special import betaincinv
+from torch import Tensor
+
+from landscape.eigen.lanczos import lanczos
+from landscape.operators.operator import DenseOperator
+from landscape.results import Bracket, standard_deviation, t_quantile
+from landscape.spectrum.absolute_sum import integrals_of_rules
+from landscape.spectrum.rules import SpectralDensity
+
+EPS = torch.finfo(torch.float64).eps
+TINY = torch.finfo(torch.float64).tiny
+
+
+def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Bracket:
+    """The eigenvalue that the share p (0 < p < 1) of all eigenvalues lies at or below: 0.5 is the median.
+
+    confidence: that the bracket holds the truth; an end of it that no node bounds is infinite.
+
+    >>> from landscape.spectrum.density import spectral_density
+    >>> H = DenseOperator(torch.diag(torch.linspace(0, 1, 1001, dtype=torch.float64)))
+    >>> median = quantile(spectral_density(H, torch.Generator().manual_seed(0), matvecs=160, starts=4), 0.5)
+    >>> 0.4 < median.low < 0.5 < median.high < 0.6
+    True
+    """
+    _require_share(p)
+    rules = list(zip(density.nodes, density.weights, strict=True))
+    grid = torch.cat([density.nodes[density.weights > 0], density.known]).unique()
+    below, upto = (torch.zeros(len(rules), len(grid), dtype=torch.float64) for _ in range(2))
+    for i, (nodes, weights) in enumerate(rules):
+        nodes, order = nodes[weights > 0].sort()
+        sums = torch.nn.functional.pad((weights[weights > 0][order] / weights.sum().clamp_min(TINY)).cumsum(0), (1, 0))
+        # mu(x <= grid) is at least the sum before its last node that is not above, at most the sum to the next node
+        below[i] = sums[(torch.searchsorted(nodes, grid, right=True) - 1).clamp_min(0)]
+        upto[i] = sums[(torch.searchsorted(nodes, grid) + 1).clamp_max(len(nodes))]
+    trials = len(rules) * density.rest / 2
+    # of the others, the share that has to lie at or below as well
+    share = (p * density.dim - torch.searchsorted(density.known, grid, right=True)) / max(density.rest, 1)
+    inner, size = share.clamp(TINY, 1 - EPS).numpy(), max(trials, TINY)
+    levels = np.array([[(1 - confidence) / 2], [(1 + confidence) / 2]])
+    least, most = torch.from_numpy(betaincinv(size * inner, size * (1 - inner), levels))
+    above = grid[(share > 0) & ((upto.mean(dim=0) < least) | (share > 1))]
+    reached = grid[(share <= 0) | ((below.mean(dim=0) >= most) & (share <= 1))]
+    high = _first(reached, inf)
+    nodes, weights = density.table()
+    at, order = nodes.flatten().sort()
+    sums = weights.flatten()[order].cumsum(0)
+    value = float(at[int(torch.searchsorted(sums, p * sums[-1]).clamp_max(len(at) - 1))])
+    return _within(density, value, above.max() if len(above) else -inf, high)
+
+
+def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: float = 0.95) -> Bracket:
+    """The magnitude t such that the share p (0 < p < 1) of sum |lambda| comes from eigenvalues with |lambda| <= t."""
+    _require_share(p)
+    totals = integrals_of_rules(density).T.tolist()
+    tails = [_Tail(*rule, (low, high)) for rule, (low, _, high) in zip(density.rules(), totals, strict=True)]
+    known = density.known.abs().sort().values
+    grid = torch.cat([torch.zeros(1, dtype=torch.float64), known, *(tail.magnitudes for tail in tails)]).unique()
+    if len(grid) == 1:
+        return Bracket(None, 0.0, inf, "the operator is zero")
+    at_or_below = torch.nn.functional.pad(known.cumsum(0), (1, 0))[torch.searchsorted(known, grid, right=True)]
+    certain = p * known.sum() - at_or_below  # what is known above t, less (1 - p) of all that is known
+    least, most = (
+        density.rest * torch.stack(column) + certain
+        for column in zip(*(tail.excess(grid, p) for tail in tails), strict=True)
+    )
+    margin = t_quantile(len(tails) - 1, confidence) / len(tails) ** 0.5
+    beneath = (
+        least.mean(dim=0) - margin * standard_deviation(least) > 0
+    )  # t is certainly too low, up to the next of the grid
+    beyond = most.mean(dim=0) + margin * standard_deviation(most) <= 0  # certainly high enough
+    totals = density.rest * torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64) + known.sum()
+    # n eigenvalues up to t add up to n t at most
+    floor = p * float(totals.mean() - margin * float(standard_deviation(totals))) / density.dim
+    low = float(grid[int(beneath.long().cumprod(0).sum().clamp_max(len(grid) - 1))])
+    last = int(beyond.long().flip(0).cumprod(0).sum())
+    high = float(grid[-last]) if last else inf
+    return _within(density, _middle_of_magnitudes(density, p), max(low, floor), high)
+
+
+class _Tail:
+    """What one start vector says of the curvature at magnitudes above t."""
+
+    def __init__(
+        self, nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"], total: tuple[float, float]
+    ) -> None:
+        self.total = total
+        scale = float(nodes.abs().max()) if len(nodes) else 0.0
+        squares = (nodes / scale).square() if scale else torch.zeros_like(nodes)
+        mass = weights * squares
+        kept = mass > 0
+        steps = (len(nodes) - 1) // 2  # x^2 dmu is known to degree 2 m - 3 in x: to m - 2 in y
+        if not kept.any() or steps == 0:
+            self.magnitudes = self.carried = torch.zeros(0, dtype=torch.float64)
+            return
+        (rule,) = lanczos(DenseOperator(torch.diag(squares[kept])), mass[kept].sqrt()[:, None], steps)
+        y, vectors = torch.linalg.eigh(rule.T)
+        positive = y > 0  # all are, up to round-off
+        root = y[positive].sqrt()
+        self.magnitudes = scale * root
+        self.carried = scale * float(mass.sum()) * vectors[0, positive].square() / root
+
+    def excess(self, t: Float64[Tensor, " g"], p: float) -> tuple[Float64[Tensor, " g"], Float64[Tensor, " g"]]:
+        """Bounds of (curvature above t) - (1 - p) (all curvature), for t and all that follows up to the next node."""
+        low, high = self.total
+        above = torch.nn.functional.pad(self.carried.flip(0).cumsum(0).flip(0), (0, 2))  # at node k and beyond
+        following = torch.searchsorted(self.magnitudes, t, right=True)  # the first node above t
+        least = above[following + 1]
+        most = torch.where(following > 0, above[(following - 1).clamp_min(0)], torch.full_like(t, high)).clamp_max(high)
+        return least - (1 - p) * high, most - (1 - p) * low
+
+
+def _within(density: SpectralDensity, value: float, low: Tensor | float, high: Tensor | float) -> Bracket:
+    """The bracket with the value in it, and what it was made of."""
+    low, high = float(low), float(high)
+    steps = int((density.weights > 0).sum(dim=1).max())
+    note = f"{len(density.nodes)} start vectors of {steps} Lanczos steps at most"
+    return Bracket(min(max(value, low), high), low, high, note)
+
+
+def _middle_of_magnitudes(density: SpectralDensity, p: float) -> float:
+    """The magnitude that the share p of sum |lambda| lies at or below, in the middle of what is certain.
+
+    Of what a node carries half is taken to lie below it (see above), and more in proportion up to the next node.  What is
+    known, and the nodes of a rule that is the measure itself, are where they are.
+    """
+    exact, curves = [(density.known.abs(), density.known.abs())], []
+    for nodes, weights in density.rules():
+        points = nodes.abs(), density.rest * weights * nodes.abs() / len(density.nodes)
+        (curves if (weights > 0).all() else exact).append(points)
+    at, mass = (torch.cat(parts) for parts in zip(*exact, strict=True))
+    grid = torch.cat([at, *(nodes for nodes, _ in curves)]).unique()
+    smooth = np.zeros(len(grid))
+    for nodes, amounts in curves:
+        nodes, order = nodes.sort()
+        below = amounts[order].cumsum(0) - amounts[order] / 2
+        smooth += np.interp(grid.numpy(), nodes.numpy(), below.numpy(), left=0.0, right=float(amounts.sum()))
+    at, order = at.sort()
+    sums = torch.nn.functional.pad(mass[order].cumsum(0), (1, 0))
+    below, upto = (smooth + sums[torch.searchsorted(at, grid, right=side)].numpy() for side in (False, True))
+    goal = p * (float(mass.sum()) + sum(float(amounts.sum()) for _, amounts in curves))
+    k = min(int(np.searchsorted(upto, goal)), len(grid) - 1)
+    if k == 0 or goal > below[k]:
+        return float(grid[k])
+    return float(np.interp(goal, [upto[k - 1], below[k]], grid[k - 1 : k + 1].numpy()))
+
+
+def _first(values: Tensor, otherwise: float) -> Tensor | float:
+    return values.min() if len(values) else otherwise
+
+
+def _require_share(p: float) -> None:
+    if not 0 < p < 1:
+        raise ValueError(f"expected a share p between 0 and 1, got {p}")

@@ -1,0 +1,33 @@
+"""What torch functions made of kernels share: tensors as the kernels take them, and the end of differentiation."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splat.backend.device import by_triton
+
+THIRD = "expected at most two derivatives of the kernels, got a third; render with backend='reference' for more"
+
+
+class _Last(torch.autograd.Function):
+    """The first `count` tensors, on the graph of them all, with a derivative that is an error."""
+
+    @staticmethod
+    def forward(ctx, refusal: str, count: int, *tensors: Tensor):
+        ctx.refusal = refusal
+        return tensors[:count]
+
+    @staticmethod
+    def backward(ctx, *outputs: Tensor):
+        raise NotImplementedError(ctx.refusal)
+
+
+def last_derivative(values: tuple[Tensor, ...], *sources: Tensor, refusal: str = THIRD) -> tuple[Tensor, ...]:
+    """Derivatives by a kernel: on the graph of what they came from, so that the next is refused, not taken for 0."""
+    return _Last.apply(refusal, len(values), *values, *sources)  # pyright: ignore[reportReturnType]
+
+
+def to_backend(tensor: Tensor) -> Any:
+    """A tensor as the kernels where it is take it: as an array on the CPU."""
+    return tensor.detach() if by_triton(tensor) else tensor.detach().numpy()

@@ -1,0 +1,416 @@
+"""SIMD vectors for Numba: a value that holds one register of floats and reads like a float.
+
+Numba's loop vectoriser does not see through the compositing loops (5-12 times slower), so the kernels say what is meant:
+a `Vector` of `lanes(dtype)` floats with the arithmetic operators and comparisons of Python.  Kernels are written once, for
+any width and type: the array that a vector is loaded from decides its dtype, and the machine decides its width.
+
+    load(a, i), store(a, i, v)      lanes a[i], a[i+1], ... of a one-dimensional array (any alignment)
+    broadcast(a, x)                 the number x in every lane; in arithmetic with a vector it is broadcast by itself
+    iota(a)                         0, 1, 2, ...; here and above, a names the dtype
+    x + y, x - y, x * y, x / y, -x  may be contracted to fused multiply-adds by the compiler
+    fma(x, y, z)                    x y + z with one rounding, always: for values that decide a comparison
+    minimum(x, y), maximum(x, y), sqrt(x)
+    x < y ..., m & n                masks;  select(m, x, y), of numbers too;  any_lane(m)
+    exp2(x)                         for -126 <= x <= 126 (float32), -1022 <= x <= 1022 (float64); relative error: EXP2_ERROR
+    store_sums(a, i, (v0, ...))     the sum over the lanes of each vector to a[i], a[i+1], ...
+    prefetch(a, i)                  hint that a[i] will be read soon; no effect on results
+
+Requires C-contiguous arrays; indices are not checked.
+"""
+
+# pyright: reportOptionalCall=false
+# (numba declares its decorators as None until they are set up)
+
+import operator
+import os
+from collections.abc import Callable
+from typing import Any
+
+import llvmlite.binding
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic as numba_intrinsic
+from numba.extending import lower_builtin, lower_cast, models, register_model
+
+from splat.backend.cpu.kernel_cache import keep_kernels
+
+
+def intrinsic(definition: Callable) -> Callable[..., Any]:
+    """Numba's `intrinsic`, typed as what kernels see of it: a function without the leading typing context."""
+    return numba_intrinsic(definition)  # pyright: ignore[reportReturnType]
+
+
+def _register_bits() -> int:
+    """Width of the machine's vector registers; LANDSCAPE_VECTOR_BITS overrides it (for tests of other widths)."""
+    if chosen := os.environ.get("LANDSCAPE_VECTOR_BITS"):
+        if chosen not in ("128", "256", "512"):
+            raise ValueError(f"expected LANDSCAPE_VECTOR_BITS to be 128, 256 or 512, got {chosen!r}")
+        return int(chosen)
+    features = llvmlite.binding.get_host_cpu_features()
+    if features.get("avx512f") and features.get("avx512dq"):
+        return 512
+    return 256 if features.get("avx2") else 128
+
+
+REGISTER_BITS = _register_bits()
+keep_kernels(REGISTER_BITS)
+I32, I64 = ir.IntType(32), ir.IntType(64)
+
+
+def lanes_of(dtype: np.dtype | type) -> int:
+    """Number of lanes of a vector of dtype on this machine."""
+    return REGISTER_BITS // (8 * np.dtype(dtype).itemsize)
+
+
+class VectorType(types.Type):
+    """Numba's type of a vector: lanes of float32 or float64, one register where `lanes` does not say otherwise."""
+
+    def __init__(self, dtype: types.Float, lanes: int | None = None):
+        self.dtype, self.bits = dtype, dtype.bitwidth
+        self.lanes = REGISTER_BITS // self.bits if lanes is None else lanes
+        super().__init__(name=f"Vector({dtype} x {self.lanes})")
+
+    @property
+    def scalar_ir(self) -> ir.Type:
+        return ir.FloatType() if self.bits == 32 else ir.DoubleType()
+
+    @property
+    def llvm(self) -> ir.VectorType:
+        return ir.VectorType(self.scalar_ir, self.lanes)
+
+    @property
+    def integers_ir(self) -> ir.VectorType:
+        return ir.VectorType(ir.IntType(self.bits), self.lanes)
+
+    def constant(self, value: float) -> ir.Constant:
+        return ir.Constant(self.llvm, [float(np.float32(value)) if self.bits == 32 else float(value)] * self.lanes)
+
+
+class MaskType(types.Type):
+    """Numba's type of a comparison's result: one bit a lane."""
+
+    def __init__(self, lanes: int):
+        self.lanes = lanes
+        super().__init__(name=f"Mask({lanes})")
+
+
+@register_model(VectorType)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager, vector):
+        super().__init__(manager, vector, vector.llvm)
+
+
+@register_model(MaskType)
+class _MaskModel(models.PrimitiveModel):
+    def __init__(self, manager, mask):
+        super().__init__(manager, mask, ir.VectorType(ir.IntType(1), mask.lanes))
+
+
+def _splat(builder, vector, scalar):
+    undefined = ir.Constant(vector.llvm, ir.Undefined)
+    first = builder.insert_element(undefined, scalar, I32(0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(I32, vector.lanes), [0] * vector.lanes))
+
+
+def _call(builder, name, result, arguments):
+    function = ir.FunctionType(result, [argument.type for argument in arguments])
+    return builder.call(cgutils.get_or_insert_function(builder.module, function, name), arguments)
+
+
+def _suffix(vector) -> str:
+    return f"v{vector.lanes}f{vector.bits}"
+
+
+@lower_cast(types.Number, VectorType)
+def _number_to_vector(context, builder, number, vector, value):
+    return _splat(builder, vector, context.cast(builder, value, number, vector.dtype))
+
+
+# --- operators --------------------------------------------------------------------------------------------------------
+
+
+def _common(arguments) -> VectorType | None:
+    """The vector type that arguments of vectors and numbers share."""
+    vectors = {argument for argument in arguments if isinstance(argument, VectorType)}
+    fits = all(isinstance(argument, VectorType | types.Number | types.Literal) for argument in arguments)
+    return vectors.pop() if len(vectors) == 1 and fits else None
+
+
+def _register(function, emit, to_mask: bool = False) -> None:
+    class Template(AbstractTemplate):
+        key = function
+
+        def generic(self, args, kws):
+            vector = _common(args)
+            if vector is not None and not kws:
+                return signature(MaskType(vector.lanes) if to_mask else vector, *[vector] * len(args))
+            return None
+
+    infer_global(function)(Template)
+
+    @lower_builtin(function, VectorType, VectorType)
+    def lower(context, builder, sig, args):
+        return emit(builder, *args)
+
+
+def _arithmetic(instruction):
+    return lambda builder, x, y: getattr(builder, instruction)(x, y, flags=("contract",))
+
+
+def _comparison(symbol):
+    return lambda builder, x, y: builder.fcmp_ordered(symbol, x, y)
+
+
+for _function, _instruction in (
+    (operator.add, "fadd"),
+    (operator.iadd, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.isub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.imul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    _register(_function, _arithmetic(_instruction))
+for _function, _symbol in ((operator.ge, ">="), (operator.gt, ">"), (operator.le, "<="), (operator.lt, "<")):
+    _register(_function, _comparison(_symbol), to_mask=True)
+
+
+@infer_global(operator.neg)
+class _Negation(AbstractTemplate):
+    def generic(self, args, kws):
+        return signature(args[0], args[0]) if isinstance(args[0], VectorType) else None
+
+
+@lower_builtin(operator.neg, VectorType)
+def _negate(context, builder, sig, args):
+    return builder.fneg(args[0])
+
+
+@infer_global(operator.and_)
+class _Conjunction(AbstractTemplate):
+    def generic(self, args, kws):
+        return signature(args[0], *args) if isinstance(args[0], MaskType) and args[0] == args[1] else None
+
+
+@lower_builtin(operator.and_, MaskType, MaskType)
+def _conjunction(context, builder, sig, args):
+    return builder.and_(*args)
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+def _address(context, builder, array, value, index, index_type):
+    data = context.make_array(array)(context, builder, value).data
+    return builder.gep(data, [context.cast(builder, index, index_type, types.intp)])
+
+
+@intrinsic
+def load(typing, array, index):
+    vector = VectorType(array.dtype)
+
+    def generate(context, builder, sig, args):
+        address = _address(context, builder, sig.args[0], args[0], args[1], sig.args[1])
+        value = builder.load(builder.bitcast(address, vector.llvm.as_pointer()))
+        value.align = vector.bits // 8
+        return value
+
+    return vector(array, index), generate
+
+
+@intrinsic
+def store(typing, array, index, value):
+    vector = value if isinstance(value, VectorType) else VectorType(array.dtype)
+
+    def generate(context, builder, sig, args):
+        address = _address(context, builder, sig.args[0], args[0], args[1], sig.args[1])
+        done = builder.store(args[2], builder.bitcast(address, vector.llvm.as_pointer()))
+        done.align = vector.bits // 8
+        return context.get_dummy_value()
+
+    return types.void(array, index, vector), generate
+
+
+@intrinsic
+def prefetch(typing, array, index):
+    def generate(context, builder, sig, args):
+        address = builder.bitcast(
+            _address(context, builder, sig.args[0], args[0], args[1], sig.args[1]), ir.IntType(8).as_pointer()
+        )
+        _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, I32(0), I32(3), I32(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, index), generate
+
+
+@intrinsic
+def store_sums(typing, array, index, vectors):
+    """Sum each vector of a tuple over its lanes, in a fixed tree, and store the sums side by side."""
+    vector = VectorType(array.dtype)
+
+    def generate(context, builder, sig, args):
+        address = _address(context, builder, sig.args[0], args[0], args[1], sig.args[1])
+        values = cgutils.unpack_tuple(builder, args[2])
+        for start in range(0, len(values), 4):
+            group = values[start : start + 4]
+            sums = _sums_of_four(builder, vector, group + [vector.constant(0)] * (4 - len(group)))
+            for j in range(len(group)):
+                builder.store(builder.extract_element(sums, I32(j)), builder.gep(address, [I64(start + j)]))
+        return context.get_dummy_value()
+
+    return types.void(array, index, vectors), generate
+
+
+def _sums_of_four(builder, vector, values):
+    """A vector whose first four elements are the sums of four vectors: a transpose-and-add tree, 3 adds for 4 sums."""
+
+    def shuffle(x, y, index):
+        return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(I32, len(index)), index))
+
+    n = vector.lanes
+    while n > 4:  # halve the vectors first, so that the tree works on the narrowest registers
+        low, high = list(range(n // 2)), list(range(n // 2, n))
+        values = [builder.fadd(shuffle(v, v, low), shuffle(v, v, high)) for v in values]
+        n //= 2
+    if n == 2:
+        pairs = [builder.fadd(shuffle(v, w, [0, 2]), shuffle(v, w, [1, 3])) for v, w in (values[:2], values[2:])]
+        return shuffle(pairs[0], pairs[1], [0, 1, 2, 3])
+    pairs = [
+        builder.fadd(shuffle(v, w, [0, 4, 1, 5]), shuffle(v, w, [2, 6, 3, 7])) for v, w in (values[:2], values[2:])
+    ]
+    return builder.fadd(shuffle(pairs[0], pairs[1], [0, 1, 4, 5]), shuffle(pairs[0], pairs[1], [2, 3, 6, 7]))
+
+
+# --- functions of vectors ---------------------------------------------------------------------------------------------
+
+
+@intrinsic
+def lanes(typing, array):
+    """The number of lanes of a vector of the array's dtype, a compile-time constant."""
+    count = VectorType(array.dtype).lanes
+    return types.int64(array), lambda context, builder, sig, args: I64(count)
+
+
+@intrinsic
+def broadcast(typing, array, number):
+    vector = VectorType(array.dtype)
+    return vector(array, vector), lambda context, builder, sig, args: args[1]
+
+
+@intrinsic
+def iota(typing, array):
+    vector = VectorType(array.dtype)
+
+    def generate(context, builder, sig, args):
+        return ir.Constant(vector.llvm, [float(i) for i in range(vector.lanes)])
+
+    return vector(array), generate
+
+
+@intrinsic
+def fma(typing, x, y, z):
+    vector = _common((x, y, z))
+    if vector is None:
+        return None
+
+    def generate(context, builder, sig, args):
+        return _call(builder, f"llvm.fma.{_suffix(vector)}", vector.llvm, list(args))
+
+    return vector(vector, vector, vector), generate
+
+
+@intrinsic
+def minimum(typing, x, y):
+    vector = _common((x, y))
+    if vector is None:
+        return None
+
+    def generate(context, builder, sig, args):
+        return builder.select(builder.fcmp_ordered("<", *args), *args)
+
+    return vector(vector, vector), generate
+
+
+@intrinsic
+def maximum(typing, x, y):
+    vector = _common((x, y))
+    if vector is None:
+        return None
+
+    def generate(context, builder, sig, args):
+        return builder.select(builder.fcmp_ordered(">", *args), *args)
+
+    return vector(vector, vector), generate
+
+
+@intrinsic
+def select(typing, mask, x, y):
+    vector = typing.unify_types(x, y) if isinstance(mask, types.Boolean) else _common((x, y))
+    if vector is None:
+        return None
+    return vector(mask, vector, vector), lambda context, builder, sig, args: builder.select(*args)
+
+
+@intrinsic
+def sqrt(typing, x):
+    def generate(context, builder, sig, args):
+        return _call(builder, f"llvm.sqrt.{_suffix(x)}", x.llvm, list(args))
+
+    return x(x), generate
+
+
+@intrinsic
+def any_lane(typing, mask):
+    def generate(context, builder, sig, args):
+        bits = ir.IntType(mask.lanes)
+        return builder.icmp_unsigned("!=", builder.bitcast(args[0], bits), ir.Constant(bits, 0))
+
+    return types.boolean(mask), generate
+
+
+def _exp2_polynomial(bits: int) -> tuple[np.ndarray, float]:
+    """Coefficients of 2^f on |f| <= 1/2, close to minimax in relative error, 2^0 = 1 exactly; and the error reached."""
+    degree = 5 if bits == 32 else 11
+    nodes = np.cos(np.pi * (np.arange(200) + 0.5) / 200) / 2
+    powers = np.stack([nodes**k for k in range(1, degree + 1)], axis=1) / np.exp2(nodes)[:, None]
+    rest = np.linalg.lstsq(powers, 1 - np.exp2(-nodes), rcond=None)[0]
+    coefficients = np.concatenate([[1.0], rest])
+    grid = np.linspace(-0.5, 0.5, 10001)
+    return coefficients, float(np.abs(np.polyval(coefficients[::-1], grid) / np.exp2(grid) - 1).max())
+
+
+EXP2 = {bits: _exp2_polynomial(bits) for bits in (32, 64)}
+EXP2_ERROR = {bits: error for bits, (_, error) in EXP2.items()}
+
+
+@intrinsic
+def exp2(typing, x):
+    # Adding 1.5 x 2^(mantissa bits) rounds to the nearest integer and leaves it in the low bits of the sum.
+    shift = 23 if x.bits == 32 else 52
+    magic = x.constant(1.5 * 2.0**shift)
+
+    def generate(context, builder, sig, args):
+        shifted = builder.fadd(args[0], magic)
+        fraction = builder.fsub(args[0], builder.fsub(shifted, magic))
+        coefficients = EXP2[x.bits][0]
+        value = x.constant(coefficients[-1])
+        for c in coefficients[-2::-1]:
+            value = _call(builder, f"llvm.fma.{_suffix(x)}", x.llvm, [value, fraction, x.constant(c)])
+        whole = builder.bitcast(shifted, x.integers_ir)
+        exponent = builder.shl(whole, ir.Constant(x.integers_ir, [shift] * x.lanes))
+        return builder.bitcast(builder.add(builder.bitcast(value, x.integers_ir), exponent), x.llvm)
+
+    return x(x), generate
+
+
+@intrinsic
+def fetch_and_increment(typing, counter):
+    """counter[0] before adding 1 to it, atomically; counter is an int64 array.  Hands out tiles to threads."""
+
+    def generate(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", data, I64(1), "monotonic")
+
+    return types.int64(counter), generate

@@ -1,0 +1,50 @@
+"""The blocks of a Hessian that belong to one Gaussian each: 11 x 11 of its geometry and opacity, and the diagonal of its SH."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from splat.model.gaussians import Gaussians
+
+GEOMETRY_COLUMNS = {
+    "means": slice(0, 3), "log_scales": slice(3, 6), "quats": slice(6, 10), "opacity_logits": slice(10, 11),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class PerGaussianBlocks:
+    """The diagonal blocks of a Hessian that belong to one Gaussian each.
+
+    geometry: over the attributes in GEOMETRY_COLUMNS; sh: the diagonal of the SH block.
+    """
+
+    geometry: Float[Tensor, "n 11 11"]
+    sh: Float[Tensor, "n k 3"]
+
+    def __add__(self, other: "PerGaussianBlocks") -> "PerGaussianBlocks":
+        return PerGaussianBlocks(self.geometry + other.geometry, self.sh + other.sh)
+
+    def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
+        """Trace of each attribute's block, summed in double precision; without the radial directions of unit quats.
+
+        scale: D, of D P B P D instead of P B P, where P leaves these directions out.
+        """
+        diagonals = self.diagonals if quats is None else self.diagonals_across(quats)
+        if scale is not None:
+            units = scale.attributes
+            diagonals = {name: part * units[name].double().view_as(part).square() for name, part in diagonals.items()}
+        return {name: float(part.sum()) for name, part in diagonals.items()}
+
+    @property
+    def diagonals(self) -> dict[str, Float64[Tensor, "n ..."]]:
+        """The diagonal, attribute by attribute."""
+        diagonal = self.geometry.double().diagonal(dim1=1, dim2=2)
+        return {**{name: diagonal[:, columns] for name, columns in GEOMETRY_COLUMNS.items()}, "sh": self.sh.double()}
+
+    def diagonals_across(self, quats: Float[Tensor, "n 4"]) -> dict[str, Float64[Tensor, "n ..."]]:
+        """That of P B P, where P leaves out the radial directions of unit quats."""
+        q, columns, diagonals = quats.double(), GEOMETRY_COLUMNS["quats"], self.diagonals
+        along = (self.geometry[:, columns, columns].double() @ q[:, :, None])[:, :, 0]
+        turns = diagonals["quats"] - 2 * q * along + q.square() * (q * along).sum(dim=1, keepdim=True)
+        return {**diagonals, "quats": turns}

@@ -1,0 +1,82 @@
+"""A pinhole camera.
+
+World to camera: `x_cam = R (x_world - centre)`, +x right, +y down, +z forward (OpenCV, COLMAP).  Pixels: the centre of
+pixel (column i, row j) lies at (i + 0.5, j + 0.5); focal lengths and principal point are in pixels.
+"""
+
+from dataclasses import dataclass, replace
+from math import isfinite
+
+import scipy
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """rotation: world to camera, float64; centre: camera centre in world units, float64; the rest in pixels."""
+
+    rotation: Float[Tensor, "3 3"]
+    centre: Float[Tensor, "3"]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        error = (self.rotation @ self.rotation.T - torch.eye(3, dtype=self.rotation.dtype)).abs().max().item()
+        if not error < 1e-4 or torch.linalg.det(self.rotation) < 0:
+            raise ValueError(
+                f"expected a rotation matrix, got one with |R R^T - 1| = {error:.1e}: {self.rotation.tolist()}"
+            )
+        if not (self.fx > 0 and self.fy > 0 and self.width > 0 and self.height > 0):
+            raise ValueError(
+                f"expected positive focal lengths and image size, got {self.fx}, {self.fy}, {self.width}, {self.height}"
+            )
+        numbers = (*self.centre.tolist(), self.fx, self.fy, self.cx, self.cy)
+        if not all(map(isfinite, numbers)):
+            raise ValueError(f"expected a finite centre, focal lengths and principal point, got {numbers}")
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same camera with its image resampled to width x height pixels."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
+
+    @property
+    def forward(self) -> Float[Tensor, "3"]:
+        """The viewing direction (unit, world frame): R^T e_z."""
+        return self.rotation[2]
+
+
+def look_at(centre: Float[Tensor, "3"], target: Float[Tensor, "3"], down: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """World-to-camera rotation at a centre that looks at a target, held level: +x is perpendicular to `down`.
+
+    Raises ValueError where the target is the centre, or straight above or below it.
+    """
+    forward = (target - centre) / (target - centre).norm()
+    right = torch.linalg.cross(down, forward)
+    if not right.norm() > 1e-9 * down.norm():
+        raise ValueError(
+            f"expected a target away from the centre, not along {down.tolist()} from it, got {target.tolist()}"
+        )
+    right = right / right.norm()
+    return torch.stack([right, torch.linalg.cross(forward, right), forward])
+
+
+def rotation_about(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The rotation by |vector| radians about it."""
+    return torch.from_numpy(scipy.spatial.transform.Rotation.from_rotvec(vector.numpy()).as_matrix()).to(vector.dtype)
+
+
+def slerp(first: Float[Tensor, "3 3"], second: Float[Tensor, "3 3"], t: float) -> Float[Tensor, "3 3"]:
+    """first (first^T second)^t: the shorter geodesic on SO(3), first at 0, second at 1, any real t.
+
+    Half a turn apart both ways are equally short; which one is taken is SciPy's choice, always the same.
+    """
+    vector = scipy.spatial.transform.Rotation.from_matrix((first.T @ second).numpy()).as_rotvec()
+    return first @ rotation_about(t * torch.from_numpy(vector))

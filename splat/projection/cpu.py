@@ -1,0 +1,111 @@
+"""Projection and SH as kernels: stored parameters of Gaussians -> splats of a view, and the adjoint: training's passes.
+
+Values are computed in double precision, so that needles (condition number to 1e6) keep their conics in float32.  Splats are
+(n, 9): `raster/packing.py`.  The second order is in `projection_linear.py`.
+"""
+
+from math import exp
+
+import numpy as np
+
+from splat.backend.cpu.jit import formula, kernel
+from splat.backend.cpu.threads import over_range
+from splat.model.gaussians import Gaussians
+from splat.projection.formulas import (
+    Lens,
+    basis,
+    colour_adjoint,
+    direction_of,
+    geometry,
+    geometry_adjoint,
+    offset_from,
+    to_camera,
+)
+from splat.projection.reference import require_sizes
+
+
+def attribute_arrays(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
+    """The five attributes as NumPy views."""
+    return tuple(value.detach().numpy() for value in gaussians.attributes.values())
+
+
+@formula
+def sigmoid(x):
+    return 1.0 / (1.0 + exp(-x)) if x >= 0 else exp(x) / (1.0 + exp(x))
+
+
+@formula
+def point(array, i):
+    return np.float64(array[i, 0]), np.float64(array[i, 1]), np.float64(array[i, 2])
+
+
+@formula
+def quaternion(array, i):
+    return np.float64(array[i, 0]), np.float64(array[i, 1]), np.float64(array[i, 2]), np.float64(array[i, 3])
+
+
+@kernel
+def project_splats(start, stop, lens, means, log_scales, quats, logits, sh, splats, depths, drawn):
+    """Fill splats (n, 9), depths and drawn; a Gaussian behind the near plane gets an opacity of 0."""
+    bands = sh.shape[1]
+    for i in range(start, stop):
+        mean = point(means, i)
+        depths[i] = to_camera(lens, offset_from(lens, mean))[2]
+        drawn[i] = depths[i] > lens.near
+        for j in range(9):
+            splats[i, j] = 0
+        if drawn[i]:
+            values = geometry(lens, mean, point(log_scales, i), quaternion(quats, i))
+            for j in range(5):
+                splats[i, j] = values[j]
+            splats[i, 5] = sigmoid(np.float64(logits[i]))
+            harmonic = basis(direction_of(lens, mean)[0])
+            for c in range(3):
+                colour = 0.5
+                for k in range(bands):
+                    colour += harmonic[k] * sh[i, k, c]
+                splats[i, 6 + c] = max(colour, 0.0)
+
+
+@kernel
+def project_adjoint(
+    start, stop, lens, means, log_scales, quats, sh, splats, drawn, bar, d_means, d_log_scales, d_quats, d_logits, d_sh
+):
+    """The adjoints of the stored parameters, given that of the splats, bar (n, 9); outputs start at 0."""
+    bands = sh.shape[1]
+    for i in range(start, stop):
+        moves = False
+        for j in range(9):
+            moves |= bar[i, j] != 0
+        if drawn[i] and moves:
+            mean = point(means, i)
+            bars = (
+                np.float64(bar[i, 0]), np.float64(bar[i, 1]), np.float64(bar[i, 2]),
+                np.float64(bar[i, 3]), np.float64(bar[i, 4]),
+            )  # fmt: skip
+            m, s, q = geometry_adjoint(lens, mean, point(log_scales, i), quaternion(quats, i), bars)
+            harmonic = basis(direction_of(lens, mean)[0])
+            weight = np.zeros(16)
+            for k in range(bands):
+                for c in range(3):
+                    colour_bar = bar[i, 6 + c] if splats[i, 6 + c] > 0 else 0.0
+                    d_sh[i, k, c] = harmonic[k] * colour_bar
+                    weight[k] += sh[i, k, c] * colour_bar
+            along = colour_adjoint(lens, mean, weight, bands)
+            for j in range(3):
+                d_means[i, j] = m[j] + along[j]
+                d_log_scales[i, j] = s[j]
+            for j in range(4):
+                d_quats[i, j] = q[j]
+            opacity = np.float64(splats[i, 5])
+            d_logits[i] = opacity * (1.0 - opacity) * bar[i, 5]
+
+
+def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Splats (n, 9) in double precision, depths (n,) and which are drawn (n,)."""
+    arrays = attribute_arrays(gaussians)
+    n, dtype = len(gaussians), arrays[0].dtype
+    splats, depths, drawn = np.empty((n, 9)), np.empty(n, dtype), np.empty(n, np.bool_)
+    over_range(n, project_splats, lens, *arrays, splats, depths, drawn)
+    require_sizes(lens, arrays[1], depths, drawn)
+    return splats, depths, drawn

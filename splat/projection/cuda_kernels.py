@@ -1,0 +1,407 @@
+"""Projection and SH on the GPU: kernels over blocks of Gaussians.
+
+The formulas are those of `projection_formulas.py` and `raster/whitening.py`, run by `traced.py`.  What is held per Gaussian in
+sight is as in `projection_linear.Held`, with the Gaussians along the last axis, so that neighbouring threads read neighbouring
+numbers.  A block of vectors (p, K) is laid out like the flat vector; `start_of` says where an attribute begins there.
+
+Values and the tangents of the linearisation are in double precision, products with vectors in that of the parameters.
+"""
+
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
+# (in a kernel names mean tensors)
+
+import triton.language as tl
+
+from splat.backend.gpu.compile import jit, sized
+from splat.backend.gpu.traced import digest, tangent_of, traced, variable
+from splat.projection.formulas import (
+    Lens,
+    add_symmetric,
+    basis,
+    colour_adjoint,
+    direction_of,
+    geometry,
+    geometry_adjoint,
+    offset_from,
+    to_camera,
+)
+from splat.projection.whitening import plain, whitened, whitened_adjoint, whitening
+
+LENS = tl.constexpr(20)  # numbers of a lens: rotation 9, centre 3, then the others in order, the near plane last
+
+
+def lens_from(numbers):
+    return Lens(numbers[:9], numbers[9:12], *numbers[12:])
+
+
+@traced
+def depth_of(lens, mean):
+    camera = lens_from(lens)
+    return to_camera(camera, offset_from(camera, mean))[2]
+
+
+@traced
+def splat_of(lens, mean, log_scales, quat):
+    """Mean x, y and conic, and the sixteen harmonics at the view direction."""
+    camera = lens_from(lens)
+    return geometry(camera, mean, log_scales, quat), basis(direction_of(camera, mean)[0])
+
+
+@traced
+def adjoint_of(lens, mean, log_scales, quat, bar, weight, bands):
+    """The adjoints of mean, log-scales and quaternion: of the five numbers in bar, and of weight . harmonics in the mean."""
+    camera = lens_from(lens)
+    m, s, q = geometry_adjoint(camera, mean, log_scales, quat, bar)
+    along = colour_adjoint(camera, mean, weight, bands)
+    return (m[0] + along[0], m[1] + along[1], m[2] + along[2], *s, *q)
+
+
+@traced
+def linearized_geometry(lens, mean, log_scales, quat, splat, bar, lane):
+    """The whitened Jacobian (5 rows) and the Hessian of bar . geometry (10 rows), one direction at each place of `lane`."""
+    camera = lens_from(lens)
+    numbers = (*mean, *log_scales, *quat)
+    variables = [variable(number, lane, i) for i, number in enumerate(numbers)]
+    x, s, q = variables[:3], variables[3:6], variables[6:]
+    jacobian = whitened(whitening(splat), [tangent_of(value) for value in geometry(camera, x, s, q)])
+    m, t, r = geometry_adjoint(camera, x, s, q, bar)
+    return jacobian, [tangent_of(row) for row in (*m, *t, *r)]
+
+
+@traced
+def linearized_colour(lens, mean, weight, bands, lane):
+    """The harmonics at the view direction, their slopes in the mean, and the Hessian of weight . harmonics (3 rows)."""
+    camera = lens_from(lens)
+    x = [variable(number, lane, i) for i, number in enumerate(mean)]
+    slopes = [tangent_of(harmonic) for harmonic in basis(direction_of(camera, x)[0])]
+    along = [tangent_of(row) for row in colour_adjoint(camera, x, weight, bands)]
+    return basis(direction_of(camera, mean)[0]), slopes, along
+
+
+@traced
+def plain_tangent(splat, five):
+    return plain(whitening(splat), five)
+
+
+@traced
+def whitened_bar(splat, five):
+    return whitened_adjoint(whitening(splat), five)
+
+
+@traced
+def curved(packed, u, h):
+    """h + C u: `add_symmetric`."""
+    total = list(h)
+    add_symmetric(packed, u, total)
+    return total
+
+
+FORMULAS = digest()
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+@jit
+def start_of(attribute: tl.constexpr, n):
+    """Where an attribute begins in the flat vector: 0 means, 1 log-scales, 2 quaternions, 3 opacity logits, 4 SH."""
+    return n * (11 if attribute == 4 else 10 if attribute == 3 else 3 * attribute)
+
+
+@jit
+def places(BLOCK: tl.constexpr, WIDTH: tl.constexpr):
+    """A program's Gaussians and, for each, WIDTH directions or vectors: one layout for all that it computes."""
+    lane = tl.arange(0, BLOCK * WIDTH)
+    return tl.program_id(0).to(tl.int64) * BLOCK + lane // WIDTH, lane % WIDTH
+
+
+@jit
+def numbers(pointer, count: tl.constexpr):
+    """The first numbers at a pointer."""
+    found = ()
+    for j in tl.static_range(count):
+        found = found + (tl.load(pointer + j),)
+    return found
+
+
+@jit
+def row(pointer, i, width: tl.constexpr, count: tl.constexpr, mask):
+    """The first numbers of row i of an array of so many columns, in double precision."""
+    found = ()
+    for j in tl.static_range(count):
+        found = found + (tl.load(pointer + i * width + j, mask, other=1.0).to(tl.float64),)
+    return found
+
+
+@jit
+def columns(pointer, e, m, count: tl.constexpr, mask):
+    """What is held at place e of so many arrays of m, one after the other."""
+    found = ()
+    for j in tl.static_range(count):
+        found = found + (tl.load(pointer + j * m + e, mask, other=0.0),)
+    return found
+
+
+@jit
+def sigmoid(x):
+    smaller = tl.exp(-tl.abs(x))
+    return tl.where(x >= 0, 1.0, smaller) / (1.0 + smaller)
+
+
+# --- values and adjoint -----------------------------------------------------------------------------------------------
+
+
+@sized("n")
+def project_splats(
+    flat, lens, splats, depths, drawn, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+):  # fmt: skip
+    """Splats (n, 9), depths and drawn; a Gaussian behind the near plane gets zeros."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = i < n
+    camera = numbers(lens, LENS)
+    mean = row(flat, i, 3, 3, here)
+    depth = depth_of(camera, mean).to(depths.dtype.element_ty)
+    ahead = here & (depth.to(tl.float64) > camera[LENS - 1])
+    tl.store(depths + i, depth, here)
+    tl.store(drawn + i, ahead, here)
+    logit = tl.load(flat + start_of(3, n) + i, here, other=0.0).to(tl.float64)
+    found, harmonic = splat_of(
+        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here)
+    )
+    for j in tl.static_range(5):
+        tl.store(splats + i * 9 + j, tl.where(ahead, found[j], 0.0), here)
+    tl.store(splats + i * 9 + 5, tl.where(ahead, sigmoid(logit), 0.0), here)
+    for c in tl.static_range(3):
+        colour = logit * 0.0 + 0.5
+        for b in tl.static_range(BANDS):
+            sh = tl.load(flat + start_of(4, n) + (i * BANDS + b) * 3 + c, here, other=0.0)
+            colour += harmonic[b] * sh.to(tl.float64)
+        tl.store(splats + i * 9 + 6 + c, tl.where(ahead, tl.maximum(colour, 0.0), 0.0), here)
+
+
+@jit
+def colour_bars(bar, splats, i, mask):
+    """The adjoints of the three colours before their clamp at 0, and 1 where that does not hold."""
+    found, visible = (), ()
+    for c in tl.static_range(3):
+        lit = tl.where(tl.load(splats + i * 9 + 6 + c, mask, other=0.0) > 0, 1.0, 0.0).to(tl.float64)
+        visible = visible + (lit,)
+        found = found + (lit * tl.load(bar + i * 9 + 6 + c, mask, other=0.0),)
+    return found, visible
+
+
+@jit
+def harmonic_weights(flat, colour_bar, i, n, BANDS: tl.constexpr, mask):
+    """sum_c sh[k, c] colour_bar[c], sixteen of them."""
+    found = ()
+    for b in tl.static_range(16):
+        weight = colour_bar[0] * 0.0
+        if b < BANDS:
+            for c in tl.static_range(3):
+                sh = tl.load(flat + start_of(4, n) + (i * BANDS + b) * 3 + c, mask, other=0.0)
+                weight += sh.to(tl.float64) * colour_bar[c]
+        found = found + (weight,)
+    return found
+
+
+@sized("n")
+def project_adjoint(
+    flat, lens, splats, drawn, bar, gradient, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+):  # fmt: skip
+    """The gradient in the flat vector, given the adjoint of the splats, bar (n, 9)."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = i < n
+    ahead = here & (tl.load(drawn + i, here, other=0) != 0)
+    camera = numbers(lens, LENS)
+    mean = row(flat, i, 3, 3, here)
+    colour_bar, _visible = colour_bars(bar, splats, i, here)
+    weight = harmonic_weights(flat, colour_bar, i, n, BANDS, here)
+    pulled = adjoint_of(
+        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here),
+        row(bar, i, 9, 5, here), weight, BANDS,
+    )  # fmt: skip
+    for j in tl.static_range(3):
+        tl.store(gradient + i * 3 + j, tl.where(ahead, pulled[j], 0.0), here)
+        tl.store(gradient + start_of(1, n) + i * 3 + j, tl.where(ahead, pulled[3 + j], 0.0), here)
+    for j in tl.static_range(4):
+        tl.store(gradient + start_of(2, n) + i * 4 + j, tl.where(ahead, pulled[6 + j], 0.0), here)
+    opacity = tl.load(splats + i * 9 + 5, here, other=0.0)
+    logit_bar = opacity * (1.0 - opacity) * tl.load(bar + i * 9 + 5, here, other=0.0)
+    tl.store(gradient + start_of(3, n) + i, tl.where(ahead, logit_bar, 0.0), here)
+    _found, harmonic = splat_of(
+        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here)
+    )
+    for b in tl.static_range(BANDS):
+        for c in tl.static_range(3):
+            value = tl.where(ahead, harmonic[b] * colour_bar[c], 0.0)
+            tl.store(gradient + start_of(4, n) + (i * BANDS + b) * 3 + c, value, here)
+
+
+# --- the linearisation ------------------------------------------------------------------------------------------------
+
+
+@sized("n", "m")
+def linearize_geometry(
+    flat, lens, splats, bar, index, jacobian, curvature, n, m, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+):  # fmt: skip
+    """What is held of the geometry of the Gaussians at index (m,), one direction a lane."""
+    e, lane = places(BLOCK, 16)
+    here = e < m
+    i = tl.load(index + e, here, other=0)
+    rows, bends = linearized_geometry(
+        numbers(lens, LENS), row(flat, i, 3, 3, here), row(flat + start_of(1, n), i, 3, 3, here),
+        row(flat + start_of(2, n), i, 4, 4, here), row(splats, i, 9, 5, here), row(bar, i, 9, 5, here), lane,
+    )  # fmt: skip
+    for r in tl.static_range(5):
+        tl.store(jacobian + (r * 10 + lane) * m + e, rows[r], here & (lane < 10))
+    for j in tl.static_range(10):
+        tl.store(curvature + (j * (j + 1) // 2 + lane) * m + e, bends[j], here & (lane <= j))
+
+
+@sized("n", "m")
+def linearize_colour(
+    flat, lens, splats, bar, index, curvature, harmonic, slope, colour_bar, visible, colour_slope, n, m,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+):  # fmt: skip
+    """What is held of the colours, one direction a lane; what they add to the curvature is added."""
+    e, lane = places(BLOCK, 16)
+    here = e < m
+    i = tl.load(index + e, here, other=0)
+    bars, lit = colour_bars(bar, splats, i, here)
+    weight = harmonic_weights(flat, bars, i, n, BANDS, here)
+    values, slopes, along = linearized_colour(numbers(lens, LENS), row(flat, i, 3, 3, here), weight, BANDS, lane)
+    for j in tl.static_range(3):
+        at, held = curvature + (j * (j + 1) // 2 + lane) * m + e, here & (lane <= j)
+        tl.store(at, tl.load(at, held, other=0.0) + along[j], held)
+    for k in tl.static_range(16):
+        tl.store(harmonic + k * m + e, values[k], here & (lane == 0))
+        tl.store(slope + (k * 3 + lane) * m + e, slopes[k], here & (lane < 3))
+    for c in tl.static_range(3):
+        tl.store(colour_bar + c * m + e, bars[c], here & (lane == 0))
+        tl.store(visible + c * m + e, lit[c], here & (lane == 0))
+        total = slopes[0] * 0.0
+        for b in tl.static_range(BANDS):
+            sh = tl.load(flat + start_of(4, n) + (i * BANDS + b) * 3 + c, here, other=0.0)
+            total += sh.to(tl.float64) * slopes[b]
+        tl.store(colour_slope + (c * 3 + lane) * m + e, total, here & (lane < 3))
+
+
+@sized("start", "count", "m")
+def plain_jacobian(splats, index, jacobian, out, start, count, m, BLOCK: tl.constexpr, FORMULAS: tl.constexpr):
+    """The geometry's Jacobian in plain coordinates: five rows of out (count, 9, 11), of the Gaussians at places from start."""
+    e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = e < count
+    splat = row(splats, tl.load(index + start + e, here, other=0), 9, 5, here)
+    for j in tl.static_range(10):
+        five = ()
+        for r in tl.static_range(5):
+            five = five + (tl.load(jacobian + (r * 10 + j) * m + start + e, here, other=0.0).to(tl.float64),)
+        tangent = plain_tangent(splat, five)
+        for r in tl.static_range(5):
+            tl.store(out + (e * 9 + r) * 11 + j, tangent[r], here)
+
+
+# --- products with a block of vectors: Gaussians by rows, vectors by columns ------------------------------------------
+
+
+@jit
+def tangents_at(block, i, k, K, n, here):
+    """The ten tangents of mean, log-scales and quaternion."""
+    found = ()
+    for j in tl.static_range(3):
+        found = found + (tl.load(block + (i * 3 + j) * K + k, here, other=0.0),)
+    for j in tl.static_range(3):
+        found = found + (tl.load(block + (start_of(1, n) + i * 3 + j) * K + k, here, other=0.0),)
+    for j in tl.static_range(4):
+        found = found + (tl.load(block + (start_of(2, n) + i * 4 + j) * K + k, here, other=0.0),)
+    return found
+
+
+@sized("n", "m", "K")
+def push_forward(
+    block, splats, index, jacobian, harmonic, visible, colour_slope, out, n, m, K,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr, FORMULAS: tl.constexpr,
+):  # fmt: skip
+    """P' u: rows of out (n, K, 9)."""
+    e, k = places(BLOCK, VECTORS)
+    k += tl.program_id(1) * VECTORS
+    held, here = e < m, (e < m) & (k < K)
+    i = tl.load(index + e, held, other=0)
+    u = tangents_at(block, i, k, K, n, here)
+    whitened_tangent = ()
+    for r in tl.static_range(5):
+        total = u[0] * 0.0
+        for j in tl.static_range(10):
+            total += tl.load(jacobian + (r * 10 + j) * m + e, held, other=0.0) * u[j]
+        whitened_tangent = whitened_tangent + (total.to(tl.float64),)
+    tangent = plain_tangent(row(splats, i, 9, 5, held), whitened_tangent)
+    at = out + (i * K + k) * 9
+    for r in tl.static_range(5):
+        tl.store(at + r, tangent[r], here)
+    opacity = tl.load(splats + i * 9 + 5, held, other=0.0)
+    logit = tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
+    tl.store(at + 5, opacity * (1.0 - opacity) * logit, here)
+    for c in tl.static_range(3):
+        total = u[0] * 0.0
+        for j in tl.static_range(3):
+            total += tl.load(colour_slope + (c * 3 + j) * m + e, held, other=0.0) * u[j]
+        for b in range(BANDS):
+            sh = tl.load(block + (start_of(4, n) + (i * BANDS + b) * 3 + c) * K + k, here, other=0.0)
+            total += tl.load(harmonic + b * m + e, held, other=0.0) * sh
+        tl.store(at + 6 + c, tl.load(visible + c * m + e, held, other=0.0) * total, here)
+
+
+@sized("n", "m", "K")
+def pull_back(
+    cotangents, block, splats, opacity_bar, index, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope,
+    out, n, m, K, SECOND_ORDER: tl.constexpr,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr, FORMULAS: tl.constexpr,
+):  # fmt: skip
+    """P'^T of cotangents (n, K, 9), plus (a . P'') u where SECOND_ORDER: rows of out (p, K)."""
+    e, k = places(BLOCK, VECTORS)
+    k += tl.program_id(1) * VECTORS
+    held, here = e < m, (e < m) & (k < K)
+    i = tl.load(index + e, held, other=0)
+    number = out.dtype.element_ty
+    bars = row(cotangents, i * K + k, 9, 9, here)
+    turned = whitened_bar(row(splats, i, 9, 5, held), bars)
+    h = ()
+    for j in tl.static_range(10):
+        total = tl.load(jacobian + j * m + e, held, other=0.0) * turned[0].to(number)
+        for r in tl.static_range(1, 5):
+            total += tl.load(jacobian + (r * 10 + j) * m + e, held, other=0.0) * turned[r].to(number)
+        for c in tl.static_range(3):
+            if j < 3:
+                lit = tl.load(visible + c * m + e, held, other=0.0) * bars[6 + c].to(number)
+                total += tl.load(colour_slope + (c * 3 + j) * m + e, held, other=0.0) * lit
+        h = h + (total,)
+    opacity = tl.load(splats + i * 9 + 5, held, other=0.0)
+    logit_bar = opacity * (1.0 - opacity) * bars[5]
+    u = tangents_at(block, i, k, K, n, here)
+    if SECOND_ORDER:
+        h = curved(columns(curvature, e, m, 55, held), u, h)
+        bend = opacity * (1.0 - opacity) * (1.0 - 2.0 * opacity) * tl.load(opacity_bar + i * 9, held, other=0.0)
+        logit_bar += bend * tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
+    first, second, third = h[0], h[1], h[2]
+    for b in range(BANDS):
+        at = (start_of(4, n) + (i * BANDS + b) * 3) * K + k
+        s = columns(slope + b * 3 * m, e, m, 3, held)
+        along = s[0] * u[0] + s[1] * u[1] + s[2] * u[2]
+        weight = u[0] * 0.0
+        for c in tl.static_range(3):
+            lit = tl.load(visible + c * m + e, held, other=0.0) * bars[6 + c].to(number)
+            value = tl.load(harmonic + b * m + e, held, other=0.0) * lit
+            if SECOND_ORDER:
+                coloured = tl.load(colour_bar + c * m + e, held, other=0.0)
+                weight += coloured * tl.load(block + at + c * K, here, other=0.0)
+                value += coloured * along
+            tl.store(out + at + c * K, value, here)
+        first, second, third = first + s[0] * weight, second + s[1] * weight, third + s[2] * weight
+    tl.store(out + i * 3 * K + k, first, here)
+    tl.store(out + (i * 3 + 1) * K + k, second, here)
+    tl.store(out + (i * 3 + 2) * K + k, third, here)
+    for j in tl.static_range(3):
+        tl.store(out + (start_of(1, n) + i * 3 + j) * K + k, h[3 + j], here)
+    for j in tl.static_range(4):
+        tl.store(out + (start_of(2, n) + i * 4 + j) * K + k, h[6 + j], here)
+    tl.store(out + (start_of(3, n) + i) * K + k, logit_bar, here)

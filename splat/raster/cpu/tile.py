@@ -1,0 +1,206 @@
+"""The arrays of the compositing kernels on the CPU, and how a tile of them is read and written.
+
+A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  Every entry (a splat in a tile) writes its nine
+sums to its own slot, splat-major, so that no sum depends on the order in which threads finish.  Every kernel
+(`compositing.py`, `tangents.py`, `blocks.py`) takes tiles from a counter until none is left (`threads.over_tiles`).  Arrays
+are flat: `params`
+holds PARAMS floats a splat, `tangents` K x TANGENTS floats a splat, a plane stride x height floats.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from splat.backend.cpu.jit import formula
+from splat.backend.cpu.planes import TILE_ROWS
+from splat.backend.cpu.simd import (
+    any_lane,
+    broadcast,
+    fetch_and_increment,
+    fma,
+    iota,
+    lanes,
+    load,
+    maximum,
+    select,
+    store,
+    store_sums,
+)
+from splat.raster.formulas import along_row, column_terms, row_terms
+
+NEVER = 1e30  # the stop index of a pixel that does not stop
+AHEAD = 6  # entries between a prefetch and its use
+
+PARAMS = 16  # one cache line in float32: mean x, y (pixel index units), the whitening, LO = log2 o; _REST: of a rounded number
+MX, MX_REST, MY, MY_REST, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT = range(13)
+CAPPED = 1 << 16  # in an entry's rows: its splat's alpha can reach the cap
+TANGENTS = 12  # q' = Q0 + QU u + QV v + QUU u^2 + QUV u v + QVV v^2, colour'
+DRED, DGREEN, DBLUE = 6, 7, 8
+SUMS = 9  # S, Su, Sv, Suu, Suv, Svv, G (3)
+
+
+class Lists(NamedTuple):
+    """Which splats touch which tiles. An entry is a splat in a tile; the entries of a tile are in order of depth.
+
+    start: (tiles + 1,) first entry of each tile; splat: (entries,); rows: (entries,) first row | last row << 8 within the
+    tile, and CAPPED; slots: (entries,) where an entry's sums go, splat-major; order: the tiles as they are handed out.
+    """
+
+    start: np.ndarray
+    splat: np.ndarray
+    rows: np.ndarray
+    slots: np.ndarray
+    order: np.ndarray
+
+
+class Frame(NamedTuple):
+    """What all pixels share: tiles in a row, floats in a row of a plane, floats in a plane, cap, floor, background (3,).
+
+    row_offsets: 0, ..., TILE_ROWS - 1, each `lanes` times: read as vectors, they cost the kernels less than a conversion.
+    """
+
+    columns: int
+    stride: int
+    size: int
+    cap: float
+    floor: float
+    background: np.ndarray
+    row_offsets: np.ndarray
+
+
+class Pixels(NamedTuple):
+    """What `forward` leaves in each pixel: planes (red, green, blue, alpha), the final T, the entry at which it stopped."""
+
+    planes: np.ndarray
+    transmittance: np.ndarray
+    stop: np.ndarray
+
+
+@formula
+def next_tile(counter, lists):
+    """The next tile that no thread has taken, or -1."""
+    turn = fetch_and_increment(counter)
+    return lists.order[turn] if turn < lists.order.size else np.int64(-1)
+
+
+@formula
+def corner_of(tile, lanes, columns, stride):
+    """Column and row of a tile's first pixel, and its index in a plane."""
+    x0, y0 = (tile % columns) * lanes, (tile // columns) * TILE_ROWS
+    return x0, y0, y0 * stride + x0
+
+
+@formula
+def row_range(packed):
+    """First row and one past the last row of an entry."""
+    return packed & 255, ((packed >> 8) & 255) + 1
+
+
+@formula
+def alpha_terms(params, o, x0, y0):
+    """u of a tile's columns, and what gives v and log2 alpha of its rows: v of row 0, its step, log2 o - u^2, cut.
+
+    The offset of the tile's corner is in double precision: far from the mean, v of a needle is a small difference.
+    """
+    along, across = params[o + ALONG], params[o + ACROSS]
+    shear = np.float64(params[o + SHEAR]) + params[o + SHEAR_REST]
+    dx = x0 - np.float64(params[o + MX]) - params[o + MX_REST]
+    dy = y0 - np.float64(params[o + MY]) - params[o + MY_REST]
+    u = fma(iota(params), along, along * dx)
+    v = fma(iota(params), across * shear, across * (shear * dx + dy))
+    terms = (v, broadcast(params, across), fma(-u, u, params[o + LO]), broadcast(params, params[o + CUT]))
+    return u, terms
+
+
+@formula
+def row_v(frame, L, y, terms):
+    """v of a tile's row y."""
+    return fma(load(frame.row_offsets, L * y), terms[1], terms[0])
+
+
+@formula
+def tangent_terms(tangents, j, u):
+    A, B, C = along_row(
+        (tangents[j], tangents[j + 1], tangents[j + 2], tangents[j + 3], tangents[j + 4], tangents[j + 5]), u
+    )
+    return A, B, broadcast(tangents, C)
+
+
+@formula
+def broadcast3(array, i):
+    return broadcast(array, array[i]), broadcast(array, array[i + 1]), broadcast(array, array[i + 2])
+
+
+@formula
+def load3(array, i, step):
+    return load(array, i), load(array, i + step), load(array, i + 2 * step)
+
+
+@formula
+def store3(array, i, step, values):
+    store(array, i, values[0])
+    store(array, i + step, values[1])
+    store(array, i + 2 * step, values[2])
+
+
+@formula
+def load_cotangent(planes, p, size):
+    """(g, g_A) of a row."""
+    g = load3(planes, p, size)
+    return g[0], g[1], g[2], load(planes, p + 3 * size)
+
+
+@formula
+def reached(lists, tile, pixels, corner, stride):
+    """The first entry of a tile, and how many of its entries some pixel reaches before it stops."""
+    furthest = load(pixels.stop, corner)
+    for y in range(1, TILE_ROWS):
+        furthest = maximum(furthest, load(pixels.stop, corner + y * stride))
+    row = np.empty(lanes(pixels.stop), pixels.stop.dtype)
+    store(row, 0, furthest)
+    first = np.int64(lists.start[tile])
+    return first, np.int64(min(lists.start[tile + 1] - first, row.max()))
+
+
+@formula
+def dark(planes, first_plane, count, corner, size, stride):
+    """Whether `count` planes are exactly 0 all over a tile: a cotangent that leaves nothing to do."""
+    lit, one = broadcast(planes, 0.0), broadcast(planes, 1.0)
+    for plane in range(first_plane, first_plane + count):
+        for y in range(TILE_ROWS):
+            value = load(planes, plane * size + corner + y * stride)
+            lit = select((value >= 0.0) & (value <= 0.0), lit, one)  # NaN is neither
+    return not any_lane(lit > 0.0)
+
+
+@formula
+def clear_entries(lists, first, count, width, sums):
+    """Zeros for the sums, `width` an entry, of a tile's entries."""
+    for e in range(first, first + count):
+        at = np.int64(lists.slots[e]) * width
+        for j in range(width):
+            sums[at + j] = 0
+
+
+@formula
+def no_moments(params):
+    zero = broadcast(params, 0.0)
+    return zero, zero, zero, zero, zero, zero
+
+
+@formula
+def add_row(moments, v, s, w, h):
+    t = row_terms(v, s, w, h)
+    return (
+        moments[0] + t[0],
+        moments[1] + t[1],
+        moments[2] + t[2],
+        moments[3] + t[3],
+        moments[4] + t[4],
+        moments[5] + t[5],
+    )
+
+
+@formula
+def store_moments(sums, slot, moments, u):
+    store_sums(sums, slot * SUMS, column_terms(moments, u))

@@ -1,0 +1,402 @@
+"""The compositing kernels on the GPU: `formulas.py`, whose glossary and formulas hold here, in Triton.
+
+A program is one warp.  It has one tile of 16 x 16 pixels, eight a thread, and goes through the tile's entries one by one:
+
+- the sums of an entry over a tile cost a warp the same instructions whatever the tile's size, and several warps to a tile
+  would have to wait for one another at every entry; with one there is no barrier and no shared memory
+- a thread's eight pixels are independent, which hides the latency that more warps would
+- an entry's numbers are the same for all threads: the loads are uniform, from one cache line of 64 bytes a splat, and the index
+  of the next entry is loaded one entry ahead
+- K tangents are the first axis of every array, in registers: one code for every K, and an entry's primal quantities are
+  computed once for all.  K = 2 takes all 255 registers; K = 4 would spill (`cuda.TOGETHER`)
+- sums as products with a matrix of ones are for the tensor cores, which round to 10 bits; in full precision they would take
+  more instructions than the exchanges of `nine_sums`
+
+In deterministic mode every entry writes its sums to its own slot, to be added in a fixed order (`cuda_packing.sum_slots`); in
+the other, entries add them atomically to their splat, in whatever order they come.
+
+Decisions are those of the CPU up to the last bits of l and alpha: the exponential is the hardware's (2 units in the last
+place), u and v are rounded at other places (`exponent_terms`).
+
+What an entry costs, counted in the machine code for sm_90 in single precision, for all 256 pixels of its tile; operations are
+counted from the formulas a pixel as `analysis/bench/speed/scene.py` does; bytes come from and go to memory or a cache:
+
+                     instructions a warp   operations a pixel   bytes an entry             bytes a pixel of the image
+    forward          169                   17                   4 + 64                     24
+    backward         362                   30                   8 + 64 + 36               24
+    tangent K = 1    235                   25                   4 + 64 + 48                4 + 20
+    tangent K = 2    335                   36                   4 + 64 + 96                4 + 40
+    curvature K = 1  518                   46                   8 + 64 + 48 + 36          24 + 20
+    curvature K = 2  827                   70                   8 + 64 + 96 + 72          24 + 40
+
+Deterministic mode reads the 36 bytes (a tangent) of an entry once more.  Around that a splat costs 72 + 64 bytes to pack,
+72 + 48 a tangent to pack, 72 for the totals and 3 x 72 to turn them into a gradient, 5 x 72 into the gradient's tangent.
+
+The loops of gsplat 1.5.3 (by nvcc 13.5, for the same processor) take 31 instructions forward and 39 backward for each of a
+tile's eight warps, 52 and 236 where an entry reaches a pixel of the warp.  On 500,000 Gaussians at 1600 x 1060 (200 tiles of
+the synthetic scene) those here are 0.48 of its instructions forward and 0.38 backward, on fern after 2,000 steps 0.30 and 0.23:
+there are fewer entries (0.82 and 0.50), and it adds up nine sums by 45 exchanges in every warp.
+"""
+
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
+# (Triton tells type checkers little of its language)
+
+import triton.language as tl
+
+from splat.backend.gpu.compile import fma, jit, twins
+from splat.raster import formulas
+from splat.raster.cuda.packing import (
+    ACROSS,
+    ALONG,
+    ALPHA_MAX,
+    BACKGROUND,
+    CAP,
+    CUT,
+    FLOOR,
+    LO,
+    RED,
+    SHEAR,
+    SHEAR_REST,
+    U,
+    V,
+    X,
+    Y,
+)
+
+NEVER = tl.constexpr(2**31 - 1)  # the stop index of a pixel that does not stop
+CHUNK = tl.constexpr(16)  # entries between two looks whether all pixels of a tile have stopped
+
+alpha_row, quadratic, along_row, plus, behind_all = twins(
+    formulas.alpha_row, formulas.quadratic, formulas.along_row, formulas.plus, formulas.behind_all
+)
+step_back, step_tangent, step_curvature, row_terms, column_terms = twins(
+    formulas.step_back,
+    formulas.step_tangent,
+    formulas.step_curvature,
+    formulas.row_terms,
+    formulas.column_terms,
+)
+
+
+# --- what the kernels share -------------------------------------------------------------------------------------------
+
+
+@jit
+def pixels_of(tile, columns, width, height, WIDTH, HEIGHT):
+    """A tile's first pixel, its pixels' offsets from there, their indices in a plane, and whether they are in the image."""
+    x0, y0 = tile % columns * WIDTH, tile // columns * HEIGHT
+    x, y = tl.arange(0, WIDTH)[None, None, :], tl.arange(0, HEIGHT)[None, :, None]
+    inside = (x0 + x < width) & (y0 + y < height)
+    return x0, y0, x, y, (y0 + y) * width + (x0 + x), inside
+
+
+@jit
+def exponent_terms(params, x0, y0, x, y):
+    """u of a tile's columns, v of its pixels, and what log2 alpha is made of: `alpha_terms` and `row_v` of the CPU.
+
+    Between pixels offsets are exact, so what the first fma leaves of a needle's v has its digits.
+    """
+    along, across, shear = tl.load(params + ALONG), tl.load(params + ACROSS), tl.load(params + SHEAR)
+    dx, dy = x0 - tl.load(params + X), y0 - tl.load(params + Y)
+    u = fma(x, along, fma(along, dx, tl.load(params + U)))
+    corner = fma(across, fma(tl.load(params + SHEAR_REST), dx, fma(shear, dx, dy)), tl.load(params + V))
+    v = fma(y, across, fma(x, across * shear, corner))
+    return u, v, (v, across, fma(-u, u, tl.load(params + LO)), tl.load(params + CUT))
+
+
+@jit
+def load3(array, at):
+    return tl.load(array + at), tl.load(array + at + 1), tl.load(array + at + 2)
+
+
+@jit
+def load_planes(planes, p, size, inside):
+    """Four planes of a tile, 0 outside the image."""
+    return (
+        tl.load(planes + p, inside, other=0.0),
+        tl.load(planes + size + p, inside, other=0.0),
+        tl.load(planes + 2 * size + p, inside, other=0.0),
+        tl.load(planes + 3 * size + p, inside, other=0.0),
+    )
+
+
+@jit
+def store_planes(planes, p, size, image, alpha, inside):
+    tl.store(planes + p, image[0], inside)
+    tl.store(planes + size + p, image[1], inside)
+    tl.store(planes + 2 * size + p, image[2], inside)
+    tl.store(planes + 3 * size + p, alpha, inside)
+
+
+@jit
+def any_lit(g):
+    """Whether a cotangent's four planes are not all exactly 0 in a tile; NaN is not 0."""
+    lit = (g[0] != 0) | (g[1] != 0) | (g[2] != 0) | (g[3] != 0)
+    return tl.max(tl.max(tl.max(lit.to(tl.int32), 2), 1), 0) > 0
+
+
+@jit
+def side_by_side(one, other, lane, axis: tl.constexpr):
+    """The sums of two arrays over an axis of length 2, one at either place of it."""
+    first = (lane >> (5 - axis)) % 2 == 0
+    return tl.where(first, tl.sum(one, axis, True), tl.sum(other, axis, True))
+
+
+@jit
+def nine_sums(v, u, s, w, h, K: tl.constexpr, HEIGHT: tl.constexpr):
+    """The nine sums over a tile, (K, 16): sum j at `place_of_sums` j.
+
+    A thread adds up its rows.  Then the threads of a warp, five axes of length 2, halve the number of sums with every exchange:
+    20 exchanges for nine sums instead of 45.
+    """
+    rows = row_terms(v, s, w, h)
+    columns = (
+        tl.sum(tl.reshape(rows[0], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[1], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[2], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[3], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[4], (K, HEIGHT // 2, 2, 16)), 1),
+        tl.sum(tl.reshape(rows[5], (K, HEIGHT // 2, 2, 16)), 1),
+    )
+    nine = column_terms(columns, u)
+    lane = tl.reshape(tl.arange(0, 32), (1, 2, 2, 2, 2, 2))
+    a = side_by_side(threads(nine[0], K), threads(nine[1], K), lane, 1)
+    b = side_by_side(threads(nine[2], K), threads(nine[3], K), lane, 1)
+    c = side_by_side(threads(nine[4], K), threads(nine[5], K), lane, 1)
+    d = side_by_side(threads(nine[6], K), threads(nine[7], K), lane, 1)
+    ninth = tl.sum(tl.sum(tl.sum(threads(nine[8], K), 1, True), 2, True), 3, True)
+    eight = side_by_side(side_by_side(a, b, lane, 2), side_by_side(c, d, lane, 2), lane, 3)
+    return tl.reshape(tl.sum(side_by_side(eight, ninth, lane, 4), 5), (K, 16))
+
+
+@jit
+def threads(x, K: tl.constexpr):
+    return tl.reshape(x, (K, 2, 2, 2, 2, 2))
+
+
+@jit
+def place_of_sums():
+    """Which sum lies at each of the 16 places that `nine_sums` fills, (1, 16), and where it is no copy."""
+    place = tl.arange(0, 16)[None, :]
+    even = place % 2 == 0
+    return tl.where(even, place // 8 + place // 4 % 2 * 2 + place // 2 % 2 * 4, 8), even | (place == 1)
+
+
+@jit
+def put_sums(sums, at, total, K: tl.constexpr, ATOMIC: tl.constexpr):
+    """Write or add an entry's sums, K times nine from at * K * 9."""
+    j, kept = place_of_sums()
+    k = tl.arange(0, K)[:, None]
+    place = sums + (at.to(tl.int64) * K + k) * 9 + j
+    if ATOMIC:
+        tl.atomic_add(place, total, kept & (k < K), sem="relaxed")
+    else:
+        tl.store(place, total, kept & (k < K))
+
+
+@jit
+def clear_slots(slots, first, count, sums, WIDTH: tl.constexpr):
+    """Zeros for the sums, WIDTH an entry, of a tile's entries."""
+    j = tl.arange(0, 16)
+    for e in range(first, first + count):
+        at = tl.load(slots + e).to(tl.int64) * WIDTH
+        for start in range(0, WIDTH, 16):
+            tl.store(sums + at + start + j, tl.zeros((16,), sums.dtype.element_ty), start + j < WIDTH)
+
+
+# --- forward and backward ---------------------------------------------------------------------------------------------
+
+
+@jit
+def forward(
+    order, start, splat_of, packed, frame, planes, transmittance, stop, reached, columns, width, height,
+    WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
+):  # fmt: skip
+    """Render planes (4, h, w), the final T and the entry at which each pixel stopped; how many entries each tile reached."""
+    real: tl.constexpr = packed.dtype.element_ty
+    tile = tl.load(order + tl.program_id(0))
+    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
+    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    cap, floor = tl.load(frame + ALPHA_MAX).to(real), tl.load(frame + FLOOR).to(real)
+    first = tl.load(start + tile)
+    count = tl.load(start + tile + 1) - first
+    T = tl.where(inside, 1.0, -1.0).to(real)  # negative once stopped
+    stopped = tl.where(inside, NEVER, 0)
+    zero = tl.zeros((1, HEIGHT, WIDTH), real)
+    red, green, blue = zero, zero, zero
+    following = tl.load(splat_of + first, count > 0, other=0)
+    done = 0
+    while done < count:
+        for k in range(done, tl.minimum(done + CHUNK, count)):
+            splat = packed + following.to(tl.int64) * 16
+            following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
+            _u, v, terms = exponent_terms(splat, x0, y0, x, y)
+            alpha, _uncapped = alpha_row(v, terms, T > 0, cap)
+            w, after = alpha * T, fma(-alpha, T, T)
+            ends = (after < floor) & (T > 0)
+            w, T = tl.where(ends, 0.0, w), tl.where(ends, -T, after)
+            stopped = tl.where(ends, k, stopped)
+            red, green, blue = plus((red, green, blue), w, load3(splat, RED))
+        running = tl.max(tl.max(tl.max(T, 2), 1), 0)
+        done = tl.where(running > 0, done + CHUNK, count)
+    T = tl.abs(T)
+    image = plus((red, green, blue), T, load_background(frame, real))
+    store_planes(planes, p, width * height, image, 1.0 - T, inside)
+    tl.store(transmittance + p, T, inside)
+    tl.store(stop + p, stopped, inside)
+    furthest = tl.max(tl.max(tl.max(stopped, 2), 1), 0)
+    tl.store(reached + tile, tl.minimum(count, furthest))
+
+
+@jit
+def backward(
+    order, start, reached, splat_of, slots, packed, frame, transmittance, stop, cotangent, sums, columns, width, height,
+    WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
+):  # fmt: skip
+    """The nine sums of every entry or, added up, of every splat, from the cotangent of the planes."""
+    real: tl.constexpr = packed.dtype.element_ty
+    tile = tl.load(order + tl.program_id(0))
+    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
+    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
+    first, count = tl.load(start + tile), tl.load(reached + tile)
+    T, g = tl.load(transmittance + p, inside, other=1.0), load_planes(cotangent, p, size, inside)
+    stopped = tl.load(stop + p, inside, other=0)
+    R = T * behind_all(g, load_background(frame, real))
+    if not any_lit(g):
+        if not ATOMIC:
+            clear_slots(slots, first, count, sums, 9)
+        count = 0
+    following = tl.load(splat_of + first + count - 1, count > 0, other=0)
+    for back in range(0, count):
+        k, s_index = count - 1 - back, following
+        following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
+        splat = packed + s_index.to(tl.int64) * 16
+        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
+        T, after, w, beta, _r, we = step_back(alpha, T, R, g, load3(splat, RED))
+        s = tl.where(uncapped <= tl.load(splat + CAP), we - beta * R, 0.0)
+        R = after
+        at = s_index if ATOMIC else tl.load(slots + first + k)
+        put_sums(sums, at, nine_sums(v, u, s, w, g, 1, HEIGHT), 1, ATOMIC)
+
+
+@jit
+def load_background(frame, real: tl.constexpr):
+    background = load3(frame, BACKGROUND)
+    return background[0].to(real), background[1].to(real), background[2].to(real)
+
+
+# --- second order -----------------------------------------------------------------------------------------------------
+
+
+@jit
+def tangents_of(tangents, splat, k, K):
+    """K tangents of a splat: the coefficients of q', and of its colour."""
+    at = tangents + (splat.to(tl.int64) * K + k) * 12
+    q = (tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3), tl.load(at + 4), tl.load(at + 5))
+    return q, load3(at, 6)
+
+
+@jit
+def any_moved(moved, splat_of, first, count, K: tl.constexpr):
+    """Whether any of K tangents moves a splat of a tile's entries; a look at the first few, unless few splats are moved."""
+    k, lane = tl.arange(0, K)[:, None], tl.arange(0, 32)[None, :]
+    done, found = 0, 0
+    while done < count:
+        e = done + lane
+        splat = tl.load(splat_of + first + e, e < count, other=0).to(tl.int64)
+        some = tl.load(moved + splat * K + k, e < count, other=0)
+        found = tl.max(tl.max(some.to(tl.int32), 1), 0)
+        done = tl.where(found > 0, count, done + 32)
+    return found > 0
+
+
+@jit
+def tangent(
+    order, start, reached, splat_of, packed, frame, stop, tangents, moved, planes, transmittances, moves, columns, width,
+    height, K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
+):  # fmt: skip
+    """J u for K tangents: their planes (K, 4, h, w) and the tangents of the final transmittance (K, h, w).
+
+    moved: (n, K), which splats the tangents move; moves: whether they move any in a tile.  Where none, all is 0.
+    """
+    real: tl.constexpr = packed.dtype.element_ty
+    tile = tl.load(order + tl.program_id(0))
+    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
+    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
+    first, count = tl.load(start + tile), tl.load(reached + tile)
+    stopped = tl.load(stop + p, inside, other=0)
+    i = tl.arange(0, K)[:, None, None]
+    T = tl.full((1, HEIGHT, WIDTH), 1.0, real)
+    dT = tl.zeros((K, HEIGHT, WIDTH), real)
+    red, green, blue = dT, dT, dT
+    some = any_moved(moved, splat_of, first, count, K)
+    tl.store(moves + tile, some.to(tl.int32))
+    count = tl.where(some, count, 0)
+    following = tl.load(splat_of + first, count > 0, other=0)
+    for k in range(0, count):
+        s_index = following
+        following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
+        splat = packed + s_index.to(tl.int64) * 16
+        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
+        w = alpha * T
+        T = fma(-alpha, T, T)
+        q, dcolour = tangents_of(tangents, s_index, i, K)
+        w_dq = tl.where(uncapped <= tl.load(splat + CAP), w, 0.0) * quadratic(v, along_row(q, u))
+        dT, image = step_tangent(dT, (red, green, blue), alpha, w, w_dq, load3(splat, RED), dcolour)
+        red, green, blue = image
+    at = i * 4 * size + p
+    image = plus((red, green, blue), dT, load_background(frame, real))
+    store_planes(planes, at, size, image, -dT, inside & (i < K))
+    tl.store(transmittances + i * size + p, dT, inside & (i < K))
+
+
+@jit
+def curvature(
+    order, start, reached, splat_of, slots, packed, frame, transmittance, stop, cotangent, tangents, moves, transmittances,
+    cotangents, sums, columns, width, height,
+    K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
+):  # fmt: skip
+    """The nine sums of the tangent of `backward`, K times nine an entry or, added up, a splat.
+
+    cotangent: g, 4 planes; cotangents: g' of every tangent, (K, 4, h, w); moves, transmittances: as `tangent` left them.
+    """
+    real: tl.constexpr = packed.dtype.element_ty
+    tile = tl.load(order + tl.program_id(0))
+    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
+    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
+    first, count = tl.load(start + tile), tl.load(reached + tile)
+    stopped = tl.load(stop + p, inside, other=0)
+    i = tl.arange(0, K)[:, None, None]
+    T, g = tl.load(transmittance + p, inside, other=1.0), load_planes(cotangent, p, size, inside)
+    dT = tl.load(transmittances + i * size + p, inside & (i < K), other=0.0)
+    dg = load_planes(cotangents, i * 4 * size + p, size, inside & (i < K))
+    background = load_background(frame, real)
+    behind = behind_all(g, background)
+    R = T * behind
+    dR = dT * behind + T * behind_all(dg, background)
+    tau = dT / T
+    if not ((any_lit(g) & (tl.load(moves + tile) != 0)) | any_lit(dg)):
+        if not ATOMIC:
+            clear_slots(slots, first, count, sums, 9 * K)
+        count = 0
+    following = tl.load(splat_of + first + count - 1, count > 0, other=0)
+    for back in range(0, count):
+        k, s_index = count - 1 - back, following
+        following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
+        splat = packed + s_index.to(tl.int64) * 16
+        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
+        free = uncapped <= tl.load(splat + CAP)
+        colour = load3(splat, RED)
+        T, after, w, beta, r, _we = step_back(alpha, T, R, g, colour)
+        q, dcolour = tangents_of(tangents, s_index, i, K)
+        dq = tl.where(free, quadratic(v, along_row(q, u)), 0.0)
+        tau, dR, ds, h = step_curvature(tau, dR, (dg[0], dg[1], dg[2]), w, beta, r * R, dq, g, colour, dcolour)
+        R = after
+        at = s_index if ATOMIC else tl.load(slots + first + k)
+        put_sums(sums, at, nine_sums(v, u, tl.where(free, ds, 0.0), w, h, K, HEIGHT), K, ATOMIC)

@@ -1,0 +1,192 @@
+"""A scene from photographs: structure from motion with pycolmap.
+
+    features     SIFT in every photograph
+    cameras      one for photographs of one size and, where the files say it, one make and focal length: SIMPLE_RADIAL, a
+                 focal length and one term of distortion, which few photographs determine
+    matches      every pair of photographs
+    mapping      incremental; of several models the one with the most photographs is kept
+    images       undistorted to PINHOLE
+
+The scene is a folder with `images` and `sparse/0`, as 3DGS's own tools want it, which appears when it is complete.
+"""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import pycolmap
+from PIL import ExifTags, Image
+
+from splat.scenes.images import IMAGE_SUFFIXES, image_files, image_header, image_pixels
+from splat.scenes.layers import FORMATS
+from splat.scenes.scene import load_scene
+from splat.scenes.sfm.triangulation import SEED, matching, quiet, verification
+
+Stage = Literal["features", "matches", "mapping", "images"]
+Progress = Callable[[Stage, int, int], None]  # stage, photographs done, photographs in all
+FEWEST = 3  # two to train on and one to test
+CAMERA = "SIMPLE_RADIAL"
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """What became of the photographs.
+
+    left_out: names of those that the model could not place; models: how many photographs every model has, the kept one
+    first, then those with photographs that it has not; error: mean reprojection error, px.
+    """
+
+    placed: int
+    left_out: tuple[str, ...]
+    models: tuple[int, ...]
+    points: int
+    error: float
+
+
+def scene_from_photos(photos: Path, out: Path, on_progress: Progress = lambda *_: None) -> Mapped:
+    """Make the scene `out`, which must not exist yet, of the image files in a folder.
+
+    ValueError where the photographs are too few or make no model; nothing is left behind then.
+    """
+    files = _photographs(photos)
+    if out.exists():
+        raise FileExistsError(
+            f"expected a folder that does not exist yet, got {out}; remove it or choose another --out"
+        )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    building = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    try:
+        with quiet():
+            models = _models(files, building / "work", on_progress)
+            scene = building / "scene"
+            _write_images(models[0], photos, building / "work", scene, on_progress)
+        load_scene(scene)
+        os.replace(scene, out)
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    placed, *others = ({model.images[i].name for i in model.reg_image_ids()} for model in models)
+    return Mapped(
+        placed=len(placed),
+        left_out=tuple(path.name for path in files if path.name not in placed),
+        models=(len(placed), *(len(other) for other in others if other - placed)),
+        points=models[0].num_points3D(),
+        error=models[0].compute_mean_reprojection_error(),
+    )
+
+
+def _photographs(folder: Path) -> list[Path]:
+    """The image files, all of which can be read."""
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"expected a folder of photographs, {folder} {'is not a folder' if folder.exists() else 'does not exist'}; "
+            "name the one that holds them"
+        )
+    files = image_files(folder)
+    if len(files) < FEWEST:
+        raise ValueError(
+            f"expected at least {FEWEST} photographs ({', '.join(IMAGE_SUFFIXES)}) in {folder}, got {len(files)}; "
+            "take more, or name the folder that holds them"
+        )
+    for path in files:
+        image_header(path)
+        image_pixels(path)  # COLMAP takes what it can of a file that was cut off, and leaves the rest grey
+    return files
+
+
+def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[pycolmap.Reconstruction]:
+    """The models that the photographs make, the one with the most photographs first."""
+    database, photos, models = work / "database.db", work / "photos", work / "models"
+    photos.mkdir(parents=True)
+    models.mkdir()
+    own_names = {f"{i:06d}{path.suffix}": path.name for i, path in enumerate(files)}
+    for path, name in zip(files, own_names):  # the list of pairs that COLMAP reads has no names with spaces
+        (photos / name).symlink_to(path.resolve())
+    names = list(own_names)
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = CAMERA
+    pycolmap.Database.open(database).close()
+    for group in _by_camera(files):
+        group_names = [names[i] for i in group]
+        pycolmap.import_images(database, photos, pycolmap.CameraMode.SINGLE, group_names, reader)
+    features = pycolmap.FeatureExtractionOptions()
+    features.use_gpu = False
+    together = os.cpu_count() or 1
+    for i in range(0, len(names), together):
+        on_progress("features", i, len(names))
+        pycolmap.extract_features(database, photos, names[i : i + together], extraction_options=features)
+    on_progress("features", len(names), len(names))
+    _match(database, names, work / "pairs.txt", on_progress)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = SEED
+    placed = iter(range(3, len(names) + 1))  # a model begins with a pair; a later one begins again
+    on_progress("mapping", 0, len(names))
+    found = pycolmap.incremental_mapping(
+        database,
+        photos,
+        models,
+        options,
+        initial_image_pair_callback=lambda: on_progress("mapping", 2, len(names)),
+        next_image_callback=lambda: on_progress("mapping", next(placed, len(names)), len(names)),
+    )
+    if not found:
+        raise ValueError(_why_there_is_no_model(database, len(names)))
+    for model in found.values():
+        for image in model.images.values():
+            image.name = own_names[image.name]
+    return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def _by_camera(files: Sequence[Path]) -> list[list[int]]:
+    """The places of photographs that may share a camera."""
+    groups: dict[tuple, list[int]] = {}
+    for i, path in enumerate(files):
+        with Image.open(path, formats=FORMATS) as file:
+            exif = file.getexif()
+            focal = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
+            key = file.size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), focal
+        groups.setdefault(key, []).append(i)
+    return list(groups.values())
+
+
+def _match(database: Path, names: Sequence[str], pairs: Path, on_progress: Progress) -> None:
+    """Every photograph with all before it, one after the other, so that progress shows and Ctrl-C is heard."""
+    options = pycolmap.ImportedPairingOptions()
+    options.match_list_path = pairs
+    on_progress("matches", 1, len(names))
+    for i, name in enumerate(names[1:], start=1):
+        pairs.write_text("".join(f"{earlier} {name}\n" for earlier in names[:i]))
+        pycolmap.match_image_pairs(
+            database, matching_options=matching(), pairing_options=options, verification_options=verification()
+        )
+        on_progress("matches", i + 1, len(names))
+
+
+def _why_there_is_no_model(path: Path, photos: int) -> str:
+    database = pycolmap.Database.open(path)
+    try:
+        features = database.num_keypoints() / photos
+        pairs = sum(inliers > 0 for inliers in database.read_two_view_geometry_num_inliers()[1])
+    finally:
+        database.close()
+    return (
+        f"expected photographs of one scene from different places, could not place any: of {photos} photographs with "
+        f"{features:.0f} features each, {pairs} of {photos * (photos - 1) // 2} pairs match; take sharp photographs that "
+        "overlap by more than half, walking round the scene rather than turning on the spot"
+    )
+
+
+def _write_images(model: pycolmap.Reconstruction, photos: Path, work: Path, scene: Path, on_progress: Progress) -> None:
+    """Pinhole images and their model."""
+    total = model.num_reg_images()
+    on_progress("images", 0, total)
+    (work / "kept").mkdir()
+    model.write_binary(work / "kept")
+    pycolmap.undistort_images(work / "undistorted", work / "kept", photos)
+    (scene / "sparse").mkdir(parents=True)
+    (work / "undistorted/sparse").rename(scene / "sparse/0")
+    (work / "undistorted/images").rename(scene / "images")
+    on_progress("images", total, total)

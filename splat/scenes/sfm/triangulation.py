@@ -1,0 +1,123 @@
+"""Points from some views alone, whose poses are known: nothing of the views held out goes into the start of a training.
+
+    features     SIFT with affine shapes and pooling over scales, in the pictures as the training sees them
+    matches      of every pair of views
+    points       triangulated with COLMAP's thresholds (reprojection error 4 px, angle 1.5 degrees), poses and lenses held
+
+as FSGS and CoR-GS make them (their `tools/colmap_llff.py`, before dense stereo), except that points which only two
+views see are kept, for of three views hardly any other is left; and that matching is not guided by epipolar geometry a
+second time, for where two views are all that see a point, nothing refutes the wrong matches which that adds.
+"""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+from PIL import Image
+
+from splat.model.camera import Camera
+from splat.scenes.formats.colmap import points_of
+from splat.scenes.view import Points, View
+
+SEED = 0  # of RANSAC: the same views give the same points
+
+
+def triangulated_points(views: Sequence[View]) -> Points:
+    """The points that at least two of these views show.  ValueError where there are fewer than two views, or no point."""
+    if len(views) < 2:
+        raise ValueError(f"expected at least 2 views to triangulate from, got {len(views)}; start from random points")
+    with tempfile.TemporaryDirectory() as folder, quiet():
+        database, pictures, output = (Path(folder) / name for name in ("database.db", "images", "output"))
+        pictures.mkdir()
+        output.mkdir()
+        posed = _posed_without_points(views)
+        _write_database(posed, database)
+        for image, view in zip(_in_order(posed), views, strict=True):
+            pixels = (view.image * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+            Image.fromarray(pixels).save(pictures / image.name)
+        features = pycolmap.FeatureExtractionOptions()
+        features.use_gpu = False
+        features.sift.estimate_affine_shape = True
+        features.sift.domain_size_pooling = True
+        pycolmap.extract_features(database, pictures, extraction_options=features)
+        pycolmap.match_exhaustive(database, matching_options=matching(), verification_options=verification())
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed = SEED
+        options.triangulation.ignore_two_view_tracks = False
+        model = pycolmap.triangulate_points(posed, database, pictures, output, options=options)
+    points = points_of(model, _in_order(model))
+    if points is None:
+        raise ValueError(
+            f"expected places that two of the {len(views)} training views show, found none that match; "
+            "choose views that overlap more, or start from random points"
+        )
+    return Points(points.xyz, points.rgb, points.observations, tuple(view.name for view in views))
+
+
+def matching() -> pycolmap.FeatureMatchingOptions:
+    """Matching on the processor, so that a machine with a GPU finds the same."""
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    return options
+
+
+def verification() -> pycolmap.TwoViewGeometryOptions:
+    """RANSAC from a fixed seed."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = SEED
+    return options
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without COLMAP's own log, but for what ends the process."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def _posed_without_points(views: Sequence[View]) -> pycolmap.Reconstruction:
+    """Image i + 1 with a camera of its own for view i; names are numbers, whatever the views are called."""
+    model = pycolmap.Reconstruction()
+    for i, view in enumerate(views, start=1):
+        model.add_camera_with_trivial_rig(_lens(view.camera, i))
+        rotation, centre = view.camera.rotation.numpy(), view.camera.centre.numpy()
+        pose = pycolmap.Rigid3d(np.concatenate([rotation, -(rotation @ centre)[:, None]], axis=1))
+        model.add_image_with_trivial_frame(pycolmap.Image(f"{i:06d}.png", np.zeros((0, 2)), i, i), pose)
+    return model
+
+
+def _lens(camera: Camera, camera_id: int) -> pycolmap.Camera:
+    params = [camera.fx, camera.fy, camera.cx, camera.cy]
+    lens = pycolmap.Camera(
+        camera_id=camera_id, model="PINHOLE", width=camera.width, height=camera.height, params=params
+    )
+    lens.has_prior_focal_length = True  # known, so that pairs are verified with essential matrices
+    return lens
+
+
+def _write_database(model: pycolmap.Reconstruction, path: Path) -> None:
+    """The same ids as in the model, which `triangulate_points` joins them by."""
+    database = pycolmap.Database.open(path)
+    try:
+        for camera in model.cameras.values():
+            database.write_camera(camera, use_camera_id=True)
+        for rig in model.rigs.values():
+            database.write_rig(rig, use_rig_id=True)
+        for frame in model.frames.values():
+            database.write_frame(frame, use_frame_id=True)
+        for image in _in_order(model):
+            database.write_image(image, use_image_id=True)
+    finally:
+        database.close()
+
+
+def _in_order(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [model.images[i] for i in sorted(model.images)]

@@ -1,0 +1,173 @@
+"""Adaptive density control of 3DGS (Kerbl et al. 2023, Sec. 5.2, and its published code).
+
+At an interval, after `start` and before `stop`, a Gaussian whose mean screen-space gradient is above the threshold
+
+    is cloned  if its largest scale is at most clone_scale x extent: an exact copy beside it, opacity included;
+    is split   if it is larger: replaced by two drawn from it, mean ~ N(mean, R S S R^T), scales / 1.6, all else copied.
+
+Then Gaussians that are nearly transparent are removed, and, once opacities have been reset, those larger than
+prune_scale x extent.  (The published code also means to remove what is large on screen, but zeroes the radii before it
+looks at them, so that it never does.)  Opacities are lowered to reset_opacity every `reset_every` steps before `stop`;
+on a white background, which the first Gaussians are quick to stand in for, also at the step `start`.
+
+The screen-space gradient is the norm of dL / d(mean) in normalised device coordinates, in which the image is 2 wide and
+2 high, averaged over the renders in which the Gaussian's 3-sigma box meets the image.  Splat means here are in pixels,
+so that gradient is (w/2 dL/dx, h/2 dL/dy).  extent: radius of the cameras' bounding sphere, world units.
+"""
+
+from dataclasses import dataclass
+from math import floor, log
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splat.model.camera import Camera
+from splat.model.gaussians import Gaussians
+from splat.projection.reference import Splats, on_screen, rotation_matrices
+
+SPLIT_INTO = 2
+SPLIT_SHRINK = 0.8 * SPLIT_INTO
+
+
+@dataclass(frozen=True)
+class DensifySettings:
+    """When and what to densify, in a run of T steps: after min(start, start_share T), before min(stop, stop_share T).
+
+    The interval is `every`, but at most every_share T.  3DGS trains for 30,000 steps, where the shares change nothing;
+    with them short runs densify too, and have half of their steps to settle.
+
+    gradient_threshold: of the mean screen-space gradient, in normalised device coordinates.  clone_scale, prune_scale: in units
+    of the extent.  min_opacity: below it a Gaussian is removed; reset_opacity: what a reset lowers opacities to.
+    """
+
+    enabled: bool = True
+    start: int = 500
+    stop: int = 15000
+    start_share: float = 0.25
+    stop_share: float = 0.5
+    every: int = 100
+    every_share: float = 0.05
+    gradient_threshold: float = 2e-4
+    clone_scale: float = 0.01
+    prune_scale: float = 0.1
+    min_opacity: float = 0.005
+    reset_every: int = 3000
+    reset_opacity: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or self.reset_every < 1:
+            raise ValueError(f"expected every and reset_every of at least 1, got {self.every} and {self.reset_every}")
+        if min(self.start, self.stop) < 0:
+            raise ValueError(f"expected start and stop of at least 0, got {self.start} and {self.stop}")
+        shares = self.start_share, self.stop_share, self.every_share
+        if not all(0 <= share <= 1 for share in shares):
+            raise ValueError(f"expected start_share, stop_share and every_share in [0, 1], got {shares}")
+        if not (self.gradient_threshold > 0 and self.clone_scale > 0 and self.prune_scale > 0):
+            raise ValueError(f"expected gradient_threshold, clone_scale and prune_scale above 0, got {self}")
+        if not 0 <= self.min_opacity < self.reset_opacity < 1:
+            raise ValueError(
+                "expected 0 <= min_opacity < reset_opacity < 1 (else a reset would remove every Gaussian), "
+                f"got {self.min_opacity} and {self.reset_opacity}"
+            )
+
+    def collects(self, step: int, iterations: int) -> bool:
+        """Whether density control is under way, and wants the screen-space gradient, at a step (1, 2, ...)."""
+        return self.enabled and step < min(self.stop, self.stop_share * iterations)
+
+    def begins(self, iterations: int) -> int:
+        """The last step before Gaussians are cloned, split and removed."""
+        return floor(min(self.start, self.start_share * iterations))
+
+    def densifies(self, step: int, iterations: int) -> bool:
+        begun = step > self.begins(iterations)
+        interval = max(1, min(self.every, round(self.every_share * iterations)))
+        return begun and step % interval == 0 and self.collects(step, iterations)
+
+    def resets_opacity(self, step: int, iterations: int, *, white: bool) -> bool:
+        """white: whether that is what the views are seen against."""
+        due = step % self.reset_every == 0 or (white and step == self.begins(iterations))
+        return due and self.collects(step, iterations)
+
+    def prunes_large(self, step: int) -> bool:
+        """3DGS removes large Gaussians only after the first opacity reset."""
+        return step > self.reset_every
+
+
+@dataclass(eq=False)
+class ScreenGradients:
+    """Sum of the screen-space gradient's norms and number of renders that they come from, per Gaussian."""
+
+    total: Float[Tensor, " n"]
+    renders: Float[Tensor, " n"]
+
+    @classmethod
+    def zero(cls, n: int, dtype: torch.dtype, device: torch.device | None = None) -> "ScreenGradients":
+        return cls(*(torch.zeros(n, dtype=dtype, device=device) for _ in range(2)))
+
+    @torch.no_grad()
+    def add(self, gradient: Float[Tensor, "n 2"], splats: Splats, camera: Camera) -> None:
+        """Take in dL / d(splats.means) of one render."""
+        half_size = torch.tensor([camera.width / 2, camera.height / 2], dtype=gradient.dtype)
+        half_size = half_size.to(gradient.device, non_blocking=True)
+        visible = on_screen(splats, camera)
+        self.total += torch.where(visible, (gradient * half_size).norm(dim=1), 0)
+        self.renders += visible
+
+    @property
+    def mean(self) -> Float[Tensor, " n"]:
+        """Zero for Gaussians that no render showed."""
+        return self.total / self.renders.clamp_min(1)
+
+
+@dataclass(frozen=True, eq=False)
+class Densified:
+    """gaussians: the new set; parents: which old Gaussian each comes from; fresh: which are new, not carried over."""
+
+    gaussians: Gaussians
+    parents: Int[Tensor, " n"]
+    fresh: Bool[Tensor, " n"]
+    cloned: int
+    split: int
+    pruned: int
+
+
+@torch.no_grad()
+def densify(
+    gaussians: Gaussians,
+    gradients: Float[Tensor, " m"],
+    extent: float,
+    settings: DensifySettings,
+    generator: torch.Generator,
+    *,
+    prune_large: bool,
+) -> Densified:
+    """Clone, split and prune.  gradients: `ScreenGradients.mean`.  Kept Gaussians come first, in their order."""
+    high = gradients > settings.gradient_threshold
+    small = gaussians.log_scales.amax(dim=1) <= log(settings.clone_scale * extent)
+    keep, clone, split = (mask.nonzero()[:, 0] for mask in (~(high & ~small), high & small, high & ~small))
+    parents = torch.cat([keep, clone, split.repeat_interleave(SPLIT_INTO)])
+    result = gaussians.select(parents)
+    fresh = torch.arange(len(parents), device=parents.device) >= len(keep)
+    draw_from_parents(result, len(keep) + len(clone), generator)
+
+    remain = result.opacity_logits.sigmoid() >= settings.min_opacity
+    if prune_large:
+        remain &= result.log_scales.amax(dim=1) <= log(settings.prune_scale * extent)
+    return Densified(
+        result.select(remain), parents[remain], fresh[remain], len(clone), len(split), int((~remain).sum())
+    )
+
+
+def draw_from_parents(gaussians: Gaussians, start: int, generator: torch.Generator) -> None:
+    """Turn the exact copies from `start` on into draws from the Gaussians they copy, smaller by 1.6; in place."""
+    means, log_scales = gaussians.means[start:], gaussians.log_scales[start:]
+    noise = torch.randn(means.shape, dtype=means.dtype, generator=generator).to(means.device) * log_scales.exp()
+    means += (rotation_matrices(gaussians.quats[start:]) @ noise[:, :, None])[:, :, 0]
+    log_scales -= log(SPLIT_SHRINK)
+
+
+@torch.no_grad()
+def reset_opacities(gaussians: Gaussians, opacity: float) -> None:
+    """Lower every opacity to at most this, in place."""
+    gaussians.opacity_logits.clamp_max_(log(opacity / (1 - opacity)))

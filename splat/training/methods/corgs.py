@@ -1,0 +1,172 @@
+"""CoR-GS (Zhang et al., ECCV 2024): two fields on the same views, each held to what the other confirms.
+
+Both start from the same Gaussians and see the same view at every step; they drift apart because each draws its own splits.
+The training's own Gaussians are the one field, which is also the result; the regularizer holds the other, the partner, as
+a second training with its own optimiser, density control and generator.
+
+co-pruning      every `prune_every` steps after `prune_start`, after density control: a Gaussian of either field stays only if
+                the other has one within `distance` of it, between the means; both fields are looked at before either changes
+co-regularisation   after `pseudo_start` steps, at every step, for both fields:
+
+    L = L_recon + weight l(I(P), I'(P))     I, I' the two fields' images, the other's constant; l the loss of training
+
+P, the pseudo-view, is a random training camera m: its intrinsics, the rotation half way to that of the camera that is
+nearest to it, n, and the centre t_m + noise r N(0, 1), r the cameras' mean distance from their centroid.
+
+The published code (jiaw-z/CoR-GS) has the whole weight from the first step of the co-regularisation on: it works out FSGS's
+ramp over 500 steps and does not apply it.  It differs from this in that it
+
+    draws the centre of P from the box of the cameras and looks at a common focus, for which it needs a depth range;
+    co-regularises at the steps 2000 to 10,000, here from 2001 to the end;
+    resets opacities at the steps 2001, 5001, 8001, ..., and raises the SH degree every 500: here both are those of 3DGS.
+
+distance 5 is the published threshold, in the units of COLMAP's reconstructions; it has to be chosen for scenes of another
+size.  A step costs two of 3DGS and two renders at the pseudo-view.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf
+from typing import Any, Literal
+
+import scipy
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splat.losses.autograd import consistency_loss
+from splat.model.camera import Camera, slerp
+from splat.model.gaussians import Gaussians
+from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
+from splat.render.render import render
+from splat.scenes.view import View
+from splat.training.densify import Densified
+from splat.training.state import Method, Regularizer, Step, ThreeDGS, Training
+
+
+@dataclass(frozen=True)
+class CoRGS(Method):
+    """distance: world units; noise: in units of the cameras' mean distance from their centroid.
+
+    prune_every, prune_start, pseudo_start: steps; weight: of the co-regularisation.  prune_every 0 leaves out
+    the co-pruning, weight 0 the co-regularisation.
+    """
+
+    name: Literal["cor-gs"] = "cor-gs"
+    prune_every: int = 500
+    prune_start: int = 500
+    distance: float = 5.0
+    pseudo_start: int = 2000
+    weight: float = 1.0
+    noise: float = 0.1
+
+    def __post_init__(self) -> None:
+        if min(self.prune_every, self.prune_start, self.pseudo_start) < 0:
+            raise ValueError(
+                "expected prune_every, prune_start and pseudo_start of at least 0, got "
+                f"{self.prune_every}, {self.prune_start} and {self.pseudo_start}"
+            )
+        if not (0 < self.distance < inf and 0 <= self.weight < inf and 0 <= self.noise < inf):
+            raise ValueError(
+                "expected a finite distance above 0, weight and noise of at least 0, got "
+                f"{self.distance}, {self.weight} and {self.noise}"
+            )
+
+    def regularizer(self, seed: int) -> "CoRegularizer":
+        return CoRegularizer(self, seed)
+
+
+class CoRegularizer(Regularizer):
+    """partner: the other field's training, None before the first step.  history: how many Gaussians co-pruning removed."""
+
+    def __init__(self, settings: CoRGS, seed: int):
+        super().__init__(seed)
+        self.settings = settings
+        self.partner: Training | None = None
+
+    def begin(self, training: Training, views: Sequence[View]) -> None:
+        if self.partner is None:
+            seed = int(torch.randint(2**63 - 1, (), generator=self.generator))
+            config = replace(training.config, seed=seed, method=ThreeDGS())
+            self.partner = Training.start(training.gaussians, training.extent, config)
+        self.partner.move(training.gaussians.flat.device)  # one that was restored is on the CPU
+
+    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
+        """The first field's; the partner makes its whole step here."""
+        settings, partner, config = self.settings, self.partner, step.config
+        assert partner is not None
+        partner.raise_sh_degree(step.gaussians.sh_degree)
+        other = loss_and_gradient(partner.gaussians, step.camera, step.loss, step.background, config.render)
+        own, theirs = base.gradient, other.gradient
+        if settings.weight and step.number > settings.pseudo_start:
+            pose = pseudo_view([view.camera for view in step.views], settings.noise, self.generator)
+            pulls = disagreement(step, partner.gaussians, pose)
+            own, theirs = own + settings.weight * pulls[0], theirs + settings.weight * pulls[1]
+        partner.descend(theirs, step.number)
+        partner.control_density(step.number, step.camera, other)
+        partner.step = step.number
+        return own
+
+    def after(self, step: Step) -> None:
+        settings, training, partner = self.settings, step.training, self.partner
+        assert partner is not None
+        if not settings.prune_every or step.number <= settings.prune_start or step.number % settings.prune_every:
+            return
+        own, theirs = training.gaussians, partner.gaussians
+        keep = confirmed(own, theirs, settings.distance), confirmed(theirs, own, settings.distance)
+        if not keep[0].any():  # then there is no pair at all, and none of the partner stays either
+            raise ValueError(
+                f"expected Gaussians of the two fields within {settings.distance} of each other, got none at step "
+                f"{step.number}; raise distance, which is in world units"
+            )
+        self.history.append(
+            {"step": step.number, "pruned": int((~keep[0]).sum()), "partner_pruned": int((~keep[1]).sum())}
+        )
+        for each, stays in zip((training, partner), keep, strict=True):
+            if not stays.all():
+                each.follow(_pruned(each.gaussians, stays))
+
+    def state(self) -> dict[str, Any]:
+        return {**super().state(), "partner": self.partner}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        super().restore(state)
+        if not isinstance(state["partner"], Training | None):
+            raise ValueError("'partner' is no training")
+        self.partner = state["partner"]
+
+
+def pseudo_view(cameras: Sequence[Camera], noise: float, generator: torch.Generator) -> Camera:
+    """Between a random camera and the one whose centre is nearest to it; a single camera keeps its rotation."""
+    m = int(torch.randint(len(cameras), (), generator=generator))
+    jitter = noise * torch.randn(3, generator=generator, dtype=torch.float64)
+    camera, centres = cameras[m], torch.stack([each.centre for each in cameras])
+    apart = (centres - camera.centre).norm(dim=1)
+    apart[m] = inf
+    radius = (centres - centres.mean(dim=0)).norm(dim=1).mean()
+    rotation = slerp(camera.rotation, cameras[int(apart.argmin())].rotation, 0.5)
+    return replace(camera, rotation=rotation, centre=camera.centre + radius * jitter)
+
+
+def disagreement(step: Step, partner: Gaussians, pose: Camera) -> tuple[Float[Tensor, " p"], Float[Tensor, " q"]]:
+    """The gradients of the loss between the two fields' images, in the one's parameters and in the other's."""
+    fields = step.gaussians, partner
+    flats = [field.flat.detach().requires_grad_() for field in fields]
+    images = [
+        render(field.with_flat(flat), pose, step.background, step.config.render).image
+        for field, flat in zip(fields, flats, strict=True)
+    ]
+    return torch.autograd.grad(consistency_loss(images[0], images[1], step.config.loss), flats)  # pyright: ignore
+
+
+def confirmed(gaussians: Gaussians, others: Gaussians, distance: float) -> Bool[Tensor, " n"]:
+    """Which Gaussians have one of the others within this distance."""
+    own, theirs = (each.means.cpu().double().numpy() for each in (gaussians, others))
+    nearest, _ = scipy.spatial.KDTree(theirs).query(own)
+    return torch.as_tensor(nearest <= distance).to(gaussians.flat.device)
+
+
+def _pruned(gaussians: Gaussians, stays: Bool[Tensor, " n"]) -> Densified:
+    kept = stays.nonzero()[:, 0]
+    fresh = torch.zeros_like(kept, dtype=torch.bool)
+    return Densified(gaussians.select(kept), kept, fresh, cloned=0, split=0, pruned=len(stays) - len(kept))

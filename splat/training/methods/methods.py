@@ -1,0 +1,24 @@
+"""The methods of training by name.
+
+3dgs            nothing is added
+stablegs        images of probed Gaussians, and their agreement from probed viewpoints
+sam             the gradient at the worst place near by in the space of parameters
+dropgaussian    a growing random share of the Gaussians is left out of each training render
+dropoutgs       the image without a random share of the Gaussians agrees with that of all
+fsgs            new Gaussians between distant neighbours; depth correlates with the user's depth maps
+dngaussian      depth has the shape of the user's depth maps, globally and in small patches
+cor-gs          two fields: each keeps the Gaussians that the other confirms, and agrees with it between the views
+"""
+
+from splat.training.methods.corgs import CoRGS
+from splat.training.methods.dngaussian import DNGaussian
+from splat.training.methods.dropgaussian import DropGaussian
+from splat.training.methods.dropoutgs import DropoutGS
+from splat.training.methods.fsgs import FSGS
+from splat.training.methods.sam import SAM
+from splat.training.methods.stablegs.stablegs import StableGS
+from splat.training.state import Method, ThreeDGS
+
+METHODS: dict[str, type[Method]] = {
+    method.name: method for method in (ThreeDGS, StableGS, SAM, DropGaussian, DropoutGS, FSGS, DNGaussian, CoRGS)
+}

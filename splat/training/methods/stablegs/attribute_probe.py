@@ -1,0 +1,251 @@
+"""Attribute-space probes of StableGS: steps in all five attributes at once, towards where the loss rises or breaks.
+
+    tau     of an attribute: sqrt(max(tr H, 0) / dim), the root of the mean curvature; dim is N_active d, the number of its
+            parameters that curvature can come from, or the d of one Gaussian (the paper's letter), d = 3 for quats: the
+            trace is that on the unit quaternions, without their radial directions (`splat/curvature/traces.py`), since H_quats
+            scales with 1 / |q|^2
+    rho     c / (tau + eps), at most the attribute's cap                                                       Eq. (5)
+    g, v    the gradient of the sampled view's loss; the unit vector from the camera's centre to the mean
+    means   + rho u,  u the direction of gamma g_depth + (1 - gamma) g_lateral,  g_depth = (g.v) v             Eqs. (7), (8)
+    quats   q x exp(omega), omega ~ N(0, rho_i^2 1), rho_i = rho min((kappa - 1) / kappa_full, 1), in radians  Eqs. (9), (10)
+    scales  log_scales + delta, delta ~ N(0, rho^2 1)                                                          Eq. (11)
+    opacity logit + rho sign(g)                                                                                Eq. (12)
+    sh      + w_l e, e ~ N(0, 1) for each coefficient and channel, w_l = rho (1 + l / l_max), rho if l_max = 0 Eq. (13)
+
+x is the Hamilton product, exp(omega) = (cos(|omega| / 2), sin(|omega| / 2) omega / |omega|), kappa the condition number of
+the splat in the sampled view, with its blur.  A Gaussian that the sampled view does not show has no g and no kappa: its
+mean, quaternion and opacity stay.  Scales and SH are drawn for all Gaussians, as Eqs. (11) and (13) have it, so that
+other poses that show the probed copy find them probed.
+
+The step is a constant, as in SAM: with Theta' = Theta + step (Eq. (14)), dTheta' / dTheta is the identity, but for the
+quaternions, where it is the right multiplication by exp(omega), an orthogonal matrix.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf, isfinite, isqrt, sqrt
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from splat.model.camera import Camera
+from splat.model.gaussians import ATTRIBUTES, Gaussians
+from splat.projection.reference import NEEDLE, Splats, condition, on_screen
+
+Attribute = Literal["means", "log_scales", "quats", "opacity_logits", "sh"]
+DRAWN = ("quats", "log_scales", "sh")
+
+
+@dataclass(frozen=True)
+class Constants:
+    """c of Eq. (5) for each attribute; 0 switches its probe off."""
+
+    means: float = 0.01
+    log_scales: float = 0.01
+    quats: float = 0.01
+    opacity_logits: float = 0.01
+    sh: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not all(0 <= getattr(self, name) < inf for name in ATTRIBUTES):
+            raise ValueError(f"expected finite constants of at least 0, got {self}")
+
+
+@dataclass(frozen=True)
+class Caps:
+    """The largest rho of each attribute; inf for none.  Without them rho is 1e4 wherever a trace is not positive.
+
+    means: in units of the scene's extent (`splat/training/densify.py`): fern's 0.1 world units; log_scales: 0.2 is a fifth
+    in size;
+    quats: radians; opacity_logits: 0.5 is at most 0.125 in opacity; sh: 0.05 is 0.1 in colour at SH degree 3.
+    """
+
+    means: float = 0.035
+    log_scales: float = 0.2
+    quats: float = 0.05
+    opacity_logits: float = 0.5
+    sh: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not all(getattr(self, name) > 0 for name in ATTRIBUTES):
+            raise ValueError(f"expected caps above 0, got {self}; switch a probe off by leaving it out of attributes")
+
+
+@dataclass(frozen=True)
+class ProbeSettings:
+    """attributes: which are probed; c, caps: of rho, for each; eps: of Eq. (5); kappa_full: the 100 of Eq. (10).
+
+    dimension: what a trace is divided by, "active": N_active d, "attribute": d.  gamma: how far means move along the viewing
+    ray, 1: along it alone, 0.5: along the gradient itself.
+    """
+
+    attributes: tuple[Attribute, ...] = ("means", "log_scales", "quats", "opacity_logits", "sh")
+    c: Constants = field(default_factory=Constants)
+    caps: Caps = field(default_factory=Caps)
+    dimension: Literal["active", "attribute"] = "attribute"
+    eps: float = 1e-6
+    gamma: float = 0.7
+    kappa_full: float = NEEDLE
+
+    def __post_init__(self) -> None:
+        unknown = set(self.attributes) - set(ATTRIBUTES)
+        if unknown or len(set(self.attributes)) < len(self.attributes):
+            raise ValueError(f"expected attributes among {', '.join(ATTRIBUTES)}, each once, got {self.attributes}")
+        if self.dimension not in ("active", "attribute"):
+            raise ValueError(f"expected dimension 'active' or 'attribute', got {self.dimension!r}")
+        if not 0 < self.eps < inf:
+            raise ValueError(f"expected a finite eps above 0 (tau may be 0), got {self.eps}")
+        if not 0 <= self.gamma <= 1:
+            raise ValueError(f"expected gamma in [0, 1] (1: depth alone, 0.5: the gradient itself), got {self.gamma}")
+        if not 0 < self.kappa_full < inf:
+            raise ValueError(f"expected a finite kappa_full above 0, got {self.kappa_full}")
+
+    @property
+    def on(self) -> tuple[Attribute, ...]:
+        """The attributes that are probed: those named whose c is not 0.  Only their traces are needed."""
+        return tuple(name for name in self.attributes if getattr(self.c, name) > 0)
+
+
+@dataclass(frozen=True)
+class Magnitude:
+    """How far an attribute is probed and why: its trace as given, tau, rho of Eq. (5) uncapped, and rho under its cap."""
+
+    trace: float
+    tau: float
+    uncapped: float
+    rho: float
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.trace) and all(0 <= value < inf for value in (self.tau, self.uncapped, self.rho))):
+            raise ValueError(f"expected a finite trace, and finite tau and rho of at least 0, got {self}")
+
+    @property
+    def capped(self) -> bool:
+        return self.rho < self.uncapped
+
+    @property
+    def negative(self) -> bool:
+        """Whether the trace was below 0, so that tau counts as 0."""
+        return self.trace < 0
+
+
+def magnitudes(
+    traces: Mapping[str, float], active: int, sh_degree: int, extent: float, settings: ProbeSettings = ProbeSettings()
+) -> dict[str, Magnitude]:
+    """The magnitude of each attribute that is on.
+
+    traces: of their Hessian blocks (of quats on the unit sphere), summed over `active` Gaussians; extent: of the scene, world
+    units, to which the cap of the means is relative.  ValueError where a trace is missing or not finite.
+    """
+    if active < 1 or not 0 < extent < inf:
+        raise ValueError(f"expected at least 1 active Gaussian and a finite extent above 0, got {active} and {extent}")
+    each = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 3 * (sh_degree + 1) ** 2}
+    result = {}
+    for name in settings.on:
+        c, cap = getattr(settings.c, name), getattr(settings.caps, name)
+        trace = traces.get(name)
+        if trace is None or not isfinite(trace):
+            raise ValueError(f"expected a finite trace of {name}, got {trace}; lower the rates or leave {name} out")
+        dim = each[name] * (active if settings.dimension == "active" else 1)
+        tau = sqrt(max(trace, 0.0) / dim)
+        rho = c / (tau + settings.eps)
+        result[name] = Magnitude(trace, tau, rho, min(rho, cap * extent if name == "means" else cap))
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Probed:
+    """The probed copy of a set of Gaussians (Eq. (14)), off the autograd graph.  turns: exp(omega), unit."""
+
+    gaussians: Gaussians
+    turns: Float[Tensor, "n 4"]
+
+    def pull(self, gradient: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
+        """The gradient in the parameters, given that at the probed ones (overwritten): (q x e).p = q.(p x conjugate e)."""
+        pulled = self.gaussians.with_flat(gradient)
+        pulled.quats.copy_(hamilton(pulled.quats, self.turns * self.turns.new_tensor([1, -1, -1, -1])))
+        return gradient
+
+
+@torch.no_grad()
+def probe_attributes(
+    gaussians: Gaussians,
+    gradient: Float[Tensor, " p"],
+    camera: Camera,
+    splats: Splats,
+    magnitudes: Mapping[str, Magnitude],
+    settings: ProbeSettings,
+    generator: torch.Generator,
+) -> Probed:
+    """The Gaussians after a step of each attribute by its magnitude; those without one stay.
+
+    gradient, splats: of the sampled view's loss and render.  Whatever is probed, the generator gives one number for each
+    attribute that is drawn, which seeds that attribute's own generator: no probe changes the draws of another, nor
+    what the generator gives next.
+    """
+    probed = gaussians.with_flat(torch.zeros_like(gaussians.flat))  # first the step, then what it leads to
+    step, slope = probed.attributes, gaussians.with_flat(gradient).attributes
+    rho = {name: magnitude.rho for name, magnitude in magnitudes.items()}
+    seeds = torch.randint(2**63 - 1, (len(DRAWN),), generator=generator).tolist()
+    own = {name: torch.Generator(probed.flat.device).manual_seed(seed) for name, seed in zip(DRAWN, seeds, strict=True)}
+    omega = torch.zeros_like(probed.means)
+    if "means" in rho:
+        rays = gaussians.means.double() - camera.centre.to(probed.flat.device)
+        step["means"].copy_(rho["means"] * depth_biased(slope["means"], rays, settings.gamma))
+    if "log_scales" in rho:
+        step["log_scales"].normal_(0, rho["log_scales"], generator=own["log_scales"])
+    if "quats" in rho:
+        share = ((condition(splats.conics) - 1) / settings.kappa_full).clamp(0, 1) * on_screen(splats, camera)
+        omega.normal_(0, rho["quats"], generator=own["quats"]).mul_(share[:, None])
+    if "opacity_logits" in rho:
+        step["opacity_logits"].copy_(rho["opacity_logits"] * slope["opacity_logits"].sign())
+    if "sh" in rho:
+        weights = [1 + isqrt(k) / max(gaussians.sh_degree, 1) for k in range(step["sh"].shape[1])]
+        step["sh"].normal_(0, rho["sh"], generator=own["sh"]).mul_(step["sh"].new_tensor(weights)[:, None])
+    turns = exponential(omega)
+    probed.flat.add_(gaussians.flat)
+    probed.quats.copy_(hamilton(gaussians.quats, turns))
+    return Probed(probed, turns)
+
+
+def depth_biased(gradient: Float[Tensor, "n 3"], rays: Float64[Tensor, "n 3"], gamma: float) -> Float64[Tensor, "n 3"]:
+    """The direction of gamma g_depth + (1 - gamma) g_lateral, 0 where that is 0.
+
+    In double precision, where the square of no single-precision gradient underflows.
+    """
+    v = _unit(rays)
+    depth = (gradient * v).sum(dim=1, keepdim=True) * v
+    return _unit(gamma * depth + (1 - gamma) * (gradient - depth))
+
+
+def _unit(x: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3"]:
+    length = x.norm(dim=1, keepdim=True)
+    return torch.where(length > 0, x / length, 0)
+
+
+def exponential(omega: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """The unit quaternions w x y z of turns by |omega| radians about omega."""
+    angle = omega.norm(dim=1, keepdim=True)
+    return torch.cat([(angle / 2).cos(), omega * torch.sinc(angle / (2 * torch.pi)) / 2], dim=1)
+
+
+def hamilton(p: Float[Tensor, "n 4"], q: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+    """The product p x q of quaternions w x y z: of rotations, q first.
+
+    >>> i, j = torch.eye(4)[1:3]
+    >>> hamilton(i[None], j[None]).tolist()  # k
+    [[0.0, 0.0, 0.0, 1.0]]
+    """
+    a, b, c, d = p.unbind(-1)
+    w, x, y, z = q.unbind(-1)
+    return torch.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        dim=-1,
+    )

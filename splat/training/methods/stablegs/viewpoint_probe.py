@@ -1,0 +1,149 @@
+"""Viewpoint-space probes of StableGS (Sec. 3.4, Eqs. (17)-(19)): one composite pose near each training view.
+
+R_m      world to camera      x_cam = R_m (x_world - t_m)      t_m      camera centre      e_z      the viewing direction
+
+interpolation   n the nearest other training view, one t ~ U(t_min, t_max) for both:
+                R = Slerp(R_m, R_n, t) = R_m (R_m^T R_n)^t,   c = (1 - t) t_m + t t_n;   without it R = R_m, c = t_m
+parallax        c += delta p,   delta ~ N(0, (parallax_sigma r)^2), r the cameras' mean distance from their centroid;
+                p = R_m^T (cos phi, sin phi, 0), phi ~ U(0, 2 pi): perpendicular to the viewing direction R_m^T e_z
+                (the paper's `R e_z` reads R as camera to world)
+in a 360 capture the parallax is a spherical shell instead: c = target + orbit u, u ~ Uniform(S^2), R looks at the target,
+                held level.  It replaces the interpolated pose, so that interpolation does nothing beside it.  The paper's
+                sphere is whole: about an object that is seen from above only, more than half of it lies below all cameras
+edge rotation   R <- exp(theta R R_m^T n) R,   theta ~ N(0, theta_sigma^2), n = (n_x, n_y, 0) the axis in view m's camera
+                frame, from its occlusion edges.  The same as R exp(theta R_m^T n): the paper's line, with n in the world
+axis            "normal": across the edges, the paper's; turning about it moves the image along them.  "tangent": along
+                the edges; turning about it moves the image across them.  A turn alone makes no parallax
+
+Randomness: every pose takes the same seven numbers from the generator, in the same order, whatever modes are on.  So a
+mode's draw does not change when another is switched, and an ablation compares like with like.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import cos, pi, radians, sin
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splat.model.camera import Camera, look_at, rotation_about, slerp
+from splat.model.capture import CaptureGeometry
+
+
+@dataclass(frozen=True)
+class ViewpointSettings:
+    """Modes and magnitudes of the probes.
+
+    edge_rotation, interpolation, parallax: whether each mode is on (in a 360 capture, parallax replaces interpolation).
+    capture: "forward" or "360" (the spherical shell in place of the parallax); "auto" tells by the cameras.
+    t_min, t_max: range of the interpolation, 0 the view, 1 its neighbour; below 0 and above 1 it extrapolates.
+    theta_sigma: of the edge rotation, degrees.  parallax_sigma: in units of the cameras' mean distance from their centroid.
+    axis: what the edge rotation turns about: the edges' normal or their tangent.
+    """
+
+    edge_rotation: bool = True
+    interpolation: bool = True
+    parallax: bool = True
+    capture: Literal["auto", "forward", "360"] = "auto"
+    t_min: float = -0.2
+    t_max: float = 1.2
+    theta_sigma: float = 2.0
+    parallax_sigma: float = 0.1
+    axis: Literal["normal", "tangent"] = "normal"
+
+    def __post_init__(self) -> None:
+        if not -1 <= self.t_min <= self.t_max <= 2:
+            raise ValueError(
+                f"expected -1 <= t_min <= t_max <= 2, got {self.t_min} and {self.t_max}; 0 is the view, 1 its neighbour"
+            )
+        if not (0 <= self.theta_sigma <= 60 and 0 <= self.parallax_sigma < float("inf")):
+            raise ValueError(
+                "expected theta_sigma of 0 to 60 degrees and a finite parallax_sigma of at least 0, got "
+                f"{self.theta_sigma} and {self.parallax_sigma}; to leave a mode out, switch it off"
+            )
+        if self.capture not in ("auto", "forward", "360") or self.axis not in ("normal", "tangent"):
+            raise ValueError(
+                "expected capture 'auto', 'forward' or '360' and axis 'normal' or 'tangent', got "
+                f"{self.capture!r} and {self.axis!r}"
+            )
+
+
+def composite_pose(
+    cameras: Sequence[Camera],
+    m: int,
+    normal: Float[Tensor, "2"],
+    geometry: CaptureGeometry,
+    settings: ViewpointSettings = ViewpointSettings(),
+    *,
+    generator: torch.Generator,
+) -> Camera:
+    """The probe of training view m: its intrinsics and size at the pose of Eqs. (17)-(19).
+
+    normal: of view m's edges, in its pixels, from `dominant_edge`; zero where it has none, and then nothing turns.
+    geometry: `capture_geometry(cameras)`.  A single camera has no neighbour and radius 0: only edge rotation moves it.
+    Raises ValueError where a 360 capture is asked for but the cameras have no common target.
+    """
+    view = cameras[m]
+    t, phi = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    gauss = torch.randn(5, generator=generator, dtype=torch.float64)
+    theta, delta = gauss[:2].tolist()
+    if settings.parallax and _surrounding(settings, geometry):
+        rotation, centre = _on_shell(geometry, gauss[2:])
+    else:
+        rotation, centre = view.rotation, view.centre
+        neighbour = nearest_camera(cameras, m) if settings.interpolation else None
+        if neighbour is not None:
+            t = settings.t_min + (settings.t_max - settings.t_min) * t
+            rotation = slerp(rotation, cameras[neighbour].rotation, t)
+            centre = (1 - t) * centre + t * cameras[neighbour].centre
+        if settings.parallax:
+            sideways = torch.tensor([cos(2 * pi * phi), sin(2 * pi * phi), 0], dtype=rotation.dtype) @ view.rotation
+            centre = centre + delta * settings.parallax_sigma * geometry.radius * sideways
+    if settings.edge_rotation:
+        angle = theta * radians(settings.theta_sigma)
+        axis = rotation @ view.rotation.T @ edge_axis(normal, view, settings.axis)
+        rotation = rotation_about(angle * axis) @ rotation
+    return replace(view, rotation=rotation, centre=centre)
+
+
+def nearest_camera(cameras: Sequence[Camera], m: int) -> int | None:
+    """The other camera whose optical axis is nearest to m's in angle; of parallel ones that whose centre is nearest.
+
+    None for a single camera.
+    """
+    axis, centre = cameras[m].forward, cameras[m].centre
+
+    def distance(n: int) -> tuple[float, float]:
+        # the chord is accurate where the cosine is not; rounded, so that round-off does not decide between ties
+        return round(float((cameras[n].forward - axis).norm()), 9), float((cameras[n].centre - centre).norm())
+
+    return min((n for n in range(len(cameras)) if n != m % len(cameras)), key=distance, default=None)
+
+
+def edge_axis(
+    normal: Float[Tensor, "2"], camera: Camera, axis: Literal["normal", "tangent"] = "normal"
+) -> Float[Tensor, "3"]:
+    """A pixel normal (or the tangent beside it) as a unit axis (x, y, 0) in the camera's frame; zero stays zero.
+
+    A gradient per pixel is one per unit of x / z after multiplication by the focal length.
+    """
+    x, y = float(normal[0]) * camera.fx, float(normal[1]) * camera.fy
+    lifted = (x, y, 0.0) if axis == "normal" else (-y, x, 0.0)
+    return torch.nn.functional.normalize(torch.tensor(lifted, dtype=camera.rotation.dtype), dim=0)
+
+
+def _surrounding(settings: ViewpointSettings, geometry: CaptureGeometry) -> bool:
+    return geometry.surrounding if settings.capture == "auto" else settings.capture == "360"
+
+
+def _on_shell(geometry: CaptureGeometry, gauss: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+    """Rotation and centre on the sphere about the target, in the direction of an isotropic Gaussian draw."""
+    if geometry.target is None or geometry.orbit is None:
+        raise ValueError(
+            "expected cameras that look at a common place for a 360 capture, got parallel or diverging ones; "
+            "use capture 'forward'"
+        )
+    centre = geometry.target + geometry.orbit * gauss / gauss.norm()
+    return look_at(centre, geometry.target, geometry.down), centre

@@ -1,0 +1,99 @@
+"""How well Gaussians show views that they were not trained on.
+
+Where views have masks, only what is inside counts, as on DTU since pixelNeRF (RegNeRF, DNGaussian and CoR-GS, in its
+`metrics_dtu.py`): PSNR is over the pixels inside; for SSIM and LPIPS, whose windows reach across the edge, both images are
+white outside.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splat.losses.reference import psnr, ssim
+from splat.model.gaussians import Gaussians
+from splat.model.settings import RenderSettings
+from splat.render.render import render
+from splat.scenes.view import View
+from splat.training.score.perceptual import Perceptual
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """psnr: dB, peak 1; ssim: mean structural similarity (`splat/losses/reference.py`); lpips:
+    `splat/training/score/perceptual.py`, or None.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of every view; their means are what papers report.  masked: whether they are of what is inside masks."""
+
+    views: tuple[ViewScore, ...]
+    masked: bool = False
+
+    @property
+    def psnr(self) -> float:
+        return fmean(view.psnr for view in self.views)
+
+    @property
+    def ssim(self) -> float:
+        return fmean(view.ssim for view in self.views)
+
+    @property
+    def lpips(self) -> float | None:
+        known = [view.lpips for view in self.views if view.lpips is not None]
+        return fmean(known) if len(known) == len(self.views) else None
+
+
+@torch.no_grad()
+def evaluate(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    background: Float[Tensor, "3"] | None = None,
+    settings: RenderSettings = RenderSettings(),
+    *,
+    lpips: Perceptual | None = None,
+    on_image: Callable[[str, Float[Tensor, "3 h w"]], None] | None = None,
+) -> Evaluation:
+    """Render every view and score it; on_image(name, image) receives each image as it is rendered."""
+    if not views:
+        raise ValueError("expected at least one view to evaluate on, got none")
+    masked = have_masks(views)
+    scores = []
+    for view in views:
+        image = render(gaussians, view.camera, background, settings).image.to(view.image.device)
+        scores.append(score(image, view, lpips))
+        if on_image is not None:
+            on_image(view.name, image)
+    return Evaluation(tuple(scores), masked)
+
+
+def have_masks(views: Sequence[View]) -> bool:
+    """Whether the views have masks.  ValueError where only some do: their scores would have no mean."""
+    without = [view.name for view in views if view.mask is None]
+    if 0 < len(without) < len(views):
+        raise ValueError(
+            f"expected a mask for each of {len(views)} views that are scored together or for none, got "
+            f"{len(views) - len(without)}, and none for {without[0]}; add those that are missing"
+        )
+    return bool(views) and not without
+
+
+def score(image: Float[Tensor, "3 h w"], view: View, lpips: Perceptual | None = None) -> ViewScore:
+    """How much an image is like the view's picture, inside its mask."""
+    image, target = image.clamp(0, 1), view.image
+    if view.mask is None:
+        ratio = psnr(image, target)
+    else:
+        ratio = psnr(image[:, None, view.mask], target[:, None, view.mask])
+        image, target = (torch.where(view.mask, picture, 1.0) for picture in (image, target))
+    return ViewScore(view.name, ratio, ssim(image, target), lpips(image, target) if lpips else None)

@@ -1,0 +1,170 @@
+"""The Gaussians that a training starts from.
+
+points      points: the scene's, from structure from motion, those seen by at least two of the training views.  All of
+                the scene's photographs helped to place them, the test views too
+            triangulated: from the training views alone, their poses given (`splat/scenes/sfm/triangulation.py`)
+            random: a random pixel of a random training view at a depth uniform between near and far, kept where at
+                least two views see it and no view is transparent there (alpha 0), in that pixel's colour.  near, far:
+                the scene files' depth range, else half and one and a half times the camera's distance to the place that
+                all cameras look at.  Gaussians of the background's colour in front of it would have no gradient: they
+                stay, and hide the object from other viewpoints
+            scene: points where the scene has any, else random
+means       the points                          quats   the identity
+log_scales  isotropic: log of the root mean square distance to the three nearest neighbours (3DGS)
+opacity     0.1                                 sh      band 0 gives the point's colour, the others 0
+"""
+
+from collections.abc import Sequence
+from math import log, sqrt
+from typing import Literal
+
+import numpy as np
+import scipy
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splat.model.camera import Camera
+from splat.model.capture import common_target
+from splat.model.gaussians import Gaussians
+from splat.model.harmonics import Y00
+from splat.scenes.scene import Scene
+from splat.scenes.sfm.triangulation import triangulated_points
+from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
+
+Source = Literal["scene", "points", "triangulated", "random"]
+OPACITY = 0.1
+NEIGHBOURS = 3
+SMALLEST_SCALE = sqrt(1e-7)  # of the median scale: for points that coincide with three others
+NEAR, FAR = 0.5, 1.5  # of the distance to the cameras' common target; Blender's 4 gives its usual 2 and 6
+MAX_DRAWS = 200  # per random point wanted
+SEEN_BY = 2  # views at least, or all if they are fewer
+
+
+def initial_gaussians(
+    scene: Scene,
+    views: Sequence[View],
+    sh_degree: int = 3,
+    *,
+    generator: torch.Generator,
+    random_points: int = 10_000,
+    source: Source = "scene",
+) -> Gaussians:
+    """From the points of the source.  Same generator state, same Gaussians."""
+    if source == "points" and scene.points is None:
+        raise ValueError(f"expected a scene with points, {scene.root} has none; start from triangulated or random ones")
+    if source == "triangulated":
+        return gaussians_from_points(triangulated_points(views), views, sh_degree)
+    if source != "random" and scene.points is not None:
+        return gaussians_from_points(scene.points, views, sh_degree)
+    ranges = [frame.depth_range for frame in scene.select([view.name for view in views])]
+    points = points_in_common_volume(views, random_points, generator, ranges)
+    return gaussians_from_points(points, views, sh_degree)
+
+
+def gaussians_from_points(points: Points, views: Sequence[View | Frame], sh_degree: int = 3) -> Gaussians:
+    """float32 Gaussians at the points that SEEN_BY of the views see."""
+    needed = min(SEEN_BY, len(views))
+    seen = points.sightings(views) >= needed
+    kept, n = points.xyz[seen], int(seen.sum())
+    if n <= NEIGHBOURS:
+        raise ValueError(
+            f"expected more than {NEIGHBOURS} points seen by at least {needed} of the {len(views)} training views, "
+            f"got {n} of {len(points)}; choose views that overlap more, or more of them"
+        )
+    scales = _neighbour_distances(kept)
+    sh = torch.zeros(n, (sh_degree + 1) ** 2, 3, dtype=torch.float64)
+    sh[:, 0] = (points.rgb[seen].double() - 0.5) / Y00
+    attributes = {
+        "means": kept,
+        "log_scales": scales.log()[:, None].expand(n, 3),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).expand(n, 4),
+        "opacity_logits": torch.full((n,), log(OPACITY / (1 - OPACITY)), dtype=torch.float64),
+        "sh": sh,
+    }
+    return Gaussians.pack(attributes).to(torch.float32)
+
+
+def _neighbour_distances(xyz: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Root mean square distance to the three nearest other points."""
+    distances, _ = scipy.spatial.KDTree(xyz.numpy()).query(xyz.numpy(), k=NEIGHBOURS + 1)
+    scales = torch.from_numpy(np.sqrt(np.square(distances[:, 1:]).mean(axis=1)))
+    median = float(scales.median())
+    if not median > 0:
+        raise ValueError(f"expected distinct points, got {len(xyz)} of which most coincide with {NEIGHBOURS} others")
+    return scales.clamp_min(SMALLEST_SCALE * median)
+
+
+def points_in_common_volume(
+    views: Sequence[View],
+    n: int,
+    generator: torch.Generator,
+    depth_ranges: Sequence[tuple[float, float] | None] | None = None,
+) -> Points:
+    """n random points that SEEN_BY of the views see, and none as transparent.
+
+    depth_ranges: (near, far) of each view, world units; None derives it from where the cameras look.
+    """
+    if n < 1:
+        raise ValueError(f"expected at least 1 random point, got {n}")
+    given = depth_ranges or [None] * len(views)
+    ranges = [own or _range_around_target(views, view.camera) for view, own in zip(views, given, strict=True)]
+    needed, kept, draws = min(SEEN_BY, len(views)), [], 0
+    while (found := sum(len(xyz) for xyz, _ in kept)) < n:
+        if draws >= MAX_DRAWS * n:
+            raise ValueError(
+                f"expected {needed} of {len(views)} views to see the same places, got {found} such places in {draws} "
+                "random draws; choose views that overlap more"
+            )
+        xyz, rgb = _random_batch(views, ranges, n, generator)
+        sightings = torch.stack([inside_image(v.camera, xyz, r) for v, r in zip(views, ranges)]).sum(dim=0)
+        fit = sightings >= needed
+        for view in views:
+            fit &= ~_transparent(view, xyz)
+        kept.append((xyz[fit], rgb[fit]))
+        draws += n
+    return Points(torch.cat([xyz for xyz, _ in kept])[:n], torch.cat([rgb for _, rgb in kept])[:n])
+
+
+def _transparent(view: View, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Which points fall on a pixel of the view whose alpha is 0."""
+    found = torch.zeros(len(xyz), dtype=torch.bool)
+    if view.alpha is not None:
+        inside = inside_image(view.camera, xyz)
+        u, v = pixel_coordinates(view.camera, xyz[inside])[0].long().unbind(-1)
+        found[inside] = view.alpha[v, u] == 0
+    return found
+
+
+def _random_batch(
+    views: Sequence[View], ranges: Sequence[tuple[float, float]], n: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Random pixels of random views, lifted to random depths, with the pixels' colours."""
+    which = torch.randint(len(views), (n,), generator=generator)
+    uniform = torch.rand(n, 3, generator=generator, dtype=torch.float64)
+    xyz, rgb = torch.empty(n, 3, dtype=torch.float64), torch.empty(n, 3)
+    for i, (view, (near, far)) in enumerate(zip(views, ranges)):
+        camera, mine = view.camera, which == i
+        u, v = (uniform[mine, :2] * torch.tensor([camera.width, camera.height])).unbind(-1)
+        z = near + (far - near) * uniform[mine, 2]
+        local = torch.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], dim=-1)
+        xyz[mine] = camera.centre + local @ camera.rotation
+        rgb[mine] = view.image[:, v.long(), u.long()].T
+    return xyz, rgb
+
+
+def _range_around_target(views: Sequence[View], camera: Camera) -> tuple[float, float]:
+    """Depths round the point that is nearest to all optical axes."""
+    if len(views) == 1:
+        raise ValueError(
+            "expected at least 2 training views for random points, got 1: one alone does not say how far away the scene is; "
+            "take more views, or start from points (COLMAP), or give depth ranges (poses_bounds.npy)"
+        )
+    target = common_target([view.camera for view in views])
+    if target is not None:
+        depth = float((target - camera.centre) @ camera.forward)
+        return NEAR * depth, FAR * depth
+    raise ValueError(
+        f"expected {len(views)} cameras that look at a common place, got parallel or diverging ones: the scene's depth "
+        "is unknown; give the scene points (COLMAP), or depth ranges (poses_bounds.npy)"
+    )

@@ -1,0 +1,362 @@
+"""The command: what it writes, and one sentence and exit code 2 for every bad input."""
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from PIL import Image
+
+from analysis.commands.cli import main
+from analysis.train.command import render_name
+from splat.losses.reference import psnr
+from splat.model.gaussians import ATTRIBUTES
+from splat.render.render import render
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint
+from splat.training.methods.methods import METHODS
+from splat.training.methods.stablegs.stablegs import StableGS
+
+ROOT = Path(__file__).parents[3]
+SETTINGS = SyntheticSettings(gaussians=60, views=5, width=24, height=18)
+ITERATIONS = 12
+
+
+@pytest.fixture(scope="session")
+def original(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "still"
+    write_transforms_scene(synthetic_scene(SETTINGS).scene, folder)
+    return folder
+
+
+@pytest.fixture
+def scene(original, tmp_path) -> Path:
+    """A scene that the test may break."""
+    return shutil.copytree(original, tmp_path / "still")
+
+
+def arguments(scene: Path, out: Path, *more: str) -> list[str]:
+    run = ["--views", "3", "--iterations", str(ITERATIONS), "--checkpoint-every", "5"]
+    return ["train", str(scene), "--out", str(out), *run, *more]
+
+
+@pytest.fixture(scope="session")
+def finished(original, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "finished"
+    assert main(arguments(original, out)) == 0
+    return out
+
+
+def one_sentence(capsys, *expected: str) -> None:
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    message = captured.err.strip()
+    assert message.startswith("landscape: ") and "\n" not in message, captured.err
+    for part in expected:
+        assert part in message, message
+
+
+def refuse(capsys, arguments: list[str], *expected: str) -> None:
+    """Exit code 2, one sentence, and nothing written where the run would be."""
+    out = Path(arguments[arguments.index("--out") + 1])
+    before = sorted(out.parent.iterdir())
+    capsys.readouterr()
+    assert main(arguments) == 2
+    one_sentence(capsys, *expected)
+    assert sorted(out.parent.iterdir()) == before
+
+
+def test_a_run_leaves_a_checkpoint_renders_and_metrics_that_agree(finished, original):
+    assert sorted(p.name for p in finished.iterdir()) == ["checkpoint.pt", "metrics.json", "seconds.json", "test"]
+    loaded = load_checkpoint(finished / "checkpoint.pt")
+    assert loaded.training.step == ITERATIONS
+    assert loaded.scene.find(finished / "checkpoint.pt") == original.resolve()
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert (metrics["step"], metrics["gaussians"]) == (ITERATIONS, len(loaded.training.gaussians))
+    views = loaded.load_scene(finished / "checkpoint.pt").load(loaded.scene.test)
+    assert set(metrics["test"]["views"]) == {view.name for view in views} and len(metrics["train"]["views"]) == 3
+    for view in views:
+        with torch.no_grad():
+            image = render(loaded.training.gaussians, view.camera).image
+        assert metrics["test"]["views"][view.name]["psnr"] == psnr(image, view.image)
+        with Image.open(finished / "test" / render_name(view.name)) as file:
+            pixels = np.asarray(file).transpose(2, 0, 1) / 255
+        assert np.abs(pixels - image.clamp(0, 1).numpy()).max() <= 0.5 / 255 + 1e-6
+
+
+def test_renders_are_named_after_their_views():
+    assert render_name("train/r_3") == "train_r_3.png"
+    assert render_name("images/IMG_4026.JPG") == "images_IMG_4026.png"
+    assert render_name("../../escape") == ".._.._escape.png"
+
+
+def test_the_table_shows_each_held_out_view_and_what_to_do_next(original, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(arguments(original, out)) == 0
+    captured = capsys.readouterr()
+    metrics = json.loads((out / "metrics.json").read_text())
+    for name, score in metrics["test"]["views"].items():
+        row = next(line for line in captured.out.splitlines() if name in line)
+        assert f"{score['psnr']:.2f}" in row and f"{score['ssim']:.4f}" in row
+    assert f"next: landscape probe {out / 'checkpoint.pt'}" in captured.out
+    assert f"renders of the held-out views: {out / 'test'}; scores: {out / 'metrics.json'}" in captured.out
+    assert "3 views to train on" in captured.err and f"{ITERATIONS}/{ITERATIONS}" in captured.err
+
+
+def test_the_same_command_gives_the_same_checkpoint_bit_for_bit(finished, original):
+    again = finished.with_name("again")
+    assert main(arguments(original, again)) == 0
+    assert (again / "checkpoint.pt").read_bytes() == (finished / "checkpoint.pt").read_bytes()
+
+
+def test_a_run_killed_at_an_arbitrary_moment_and_resumed_is_the_run_that_was_not(original, tmp_path):
+    longer = ["--iterations", "60", "--checkpoint-every", "1"]  # so that the kill comes well before the end
+    out, whole = tmp_path / "killed", tmp_path / "whole"
+    command = [sys.executable, "-m", "analysis.commands.cli", *arguments(original, out, *longer)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 100
+    while not (out / "checkpoint.pt").exists() or load_checkpoint(out / "checkpoint.pt").training.step < 3:
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()[1]
+        time.sleep(0.002)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    assert 3 <= load_checkpoint(out / "checkpoint.pt").training.step < 60
+    assert main(arguments(original, out, *longer, "--resume")) == main(arguments(original, whole, *longer)) == 0
+    assert (out / "checkpoint.pt").read_bytes() == (whole / "checkpoint.pt").read_bytes()
+    assert (out / "metrics.json").exists() and not list(out.glob(".*"))
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "a scheduler's"])
+def test_a_signal_saves_a_checkpoint_and_says_how_to_continue(finished, original, capsys, monkeypatch, kind):
+    out = finished.with_name(f"stopped by {kind.name}")
+    command = arguments(original, out, "--checkpoint-every", "1000")
+
+    def press(gaussians, camera, background, settings, *, presses=[], **others):  # noqa: B006
+        presses.append(1)
+        if len(presses) == 4:
+            os.kill(os.getpid(), kind)
+        return render(gaussians, camera, background, settings, **others)
+
+    before = [signal.getsignal(each) or signal.SIG_DFL for each in (signal.SIGINT, signal.SIGTERM)]
+    with monkeypatch.context() as patch:
+        patch.setattr("splat.render.loss_and_gradient.render", press)
+        assert main(command) == 130
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"stopped after step 4; to continue: landscape {shlex.join(command)} --resume" in said
+    assert load_checkpoint(out / "checkpoint.pt").training.step == 4 and not (out / "metrics.json").exists()
+    assert main([*command, "--resume"]) == 0
+    assert (out / "checkpoint.pt").read_bytes() == (finished / "checkpoint.pt").read_bytes()
+
+
+def test_resuming_a_finished_run_scores_it_again_and_changes_nothing_else(original, tmp_path):
+    out = tmp_path / "run"
+    assert main(arguments(original, out)) == 0
+    before = (out / "checkpoint.pt").read_bytes()
+    (out / "metrics.json").unlink()
+    assert main(arguments(original, out, "--resume")) == 0
+    assert (out / "checkpoint.pt").read_bytes() == before and (out / "metrics.json").exists()
+
+
+def test_resuming_with_other_settings_is_refused_by_name(finished, original, capsys):
+    refuse(capsys, arguments(original, finished, "--resume", "--seed", "7"), "seed = 0, got 7", "--resume")
+    refuse(capsys, arguments(original, finished, "--resume", "--ssim-weight", "0.5"), "loss.ssim_weight = 0.2, got 0.5")
+    refuse(capsys, arguments(original, finished, "--resume", "--downscale", "2"), "downscale = 1.0, got 2.0")
+
+
+def test_resuming_where_there_is_no_run_is_refused(original, tmp_path, capsys):
+    refuse(capsys, arguments(original, tmp_path / "run", "--resume"), "expected a run to resume", "--resume")
+
+
+def test_a_folder_that_exists_is_not_touched(original, tmp_path, capsys):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "precious").write_text("data")
+    refuse(capsys, arguments(original, out), f"but {out} exists", "--resume")
+    assert [p.name for p in out.iterdir()] == ["precious"]
+
+
+def test_a_missing_or_empty_scene_is_refused(tmp_path, capsys):
+    refuse(capsys, arguments(tmp_path / "nothing", tmp_path / "run"), "nothing", "does not exist")
+    (tmp_path / "empty").mkdir()
+    refuse(capsys, arguments(tmp_path / "empty", tmp_path / "run"), "camera poses", "empty folder")
+
+
+def test_photographs_without_poses_are_refused(scene, tmp_path, capsys):
+    (scene / "transforms.json").unlink()
+    refuse(capsys, arguments(scene, tmp_path / "run"), "camera poses", "COLMAP")
+
+
+def test_an_image_of_another_size_than_its_camera_is_refused(scene, tmp_path, capsys):
+    path = sorted((scene / "images").iterdir())[1]
+    Image.new("RGB", (24, 24)).save(path)
+    refuse(capsys, arguments(scene, tmp_path / "run"), path.name, "24 x 18", "24 x 24")
+
+
+def test_an_image_that_is_missing_or_damaged_is_refused(scene, tmp_path, capsys):
+    path = sorted((scene / "images").iterdir())[1]
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    refuse(capsys, arguments(scene, tmp_path / "run"), path.name)
+    path.unlink()
+    refuse(capsys, arguments(scene, tmp_path / "run"), path.name, "missing")
+
+
+def test_more_views_than_the_scene_has_are_refused(original, tmp_path, capsys):
+    refuse(capsys, arguments(original, tmp_path / "run", "--views", "30"), "at most 4 training views", "got 30")
+    refuse(capsys, arguments(original, tmp_path / "run", "--views", "0"), "at least 1 training view, got 0")
+    refuse(capsys, arguments(original, tmp_path / "run", "--views", "1"), "at least two views")
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--iterations", "0", "at least 1 iteration"),
+        ("--sh-degree", "4", "sh_degree"),
+        ("--downscale", "0.5", "downscale of at least 1"),
+        ("--ssim-weight", "2", "ssim_weight"),
+        ("--checkpoint-every", "0", "checkpoint_every"),
+        ("--seed", "-1", "seed"),
+        ("--images", "elsewhere", "elsewhere"),
+    ],
+)
+def test_options_out_of_range_are_refused(original, tmp_path, capsys, option, value, message):
+    refuse(capsys, arguments(original, tmp_path / "run", option, value), message)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--set", "densify.every=50", "--set", "densify.every=60"], "expected each KEY once"),
+        (["--no-densify", "--set", "densify.enabled=true"], "--set densify.enabled=true beside the option --densify"),
+        (["--seed", "3", "--set", "seed=4"], "--set seed=4 beside the option --seed, which is 3; leave one out"),
+    ],
+)
+def test_a_setting_given_twice_is_refused(original, tmp_path, capsys, options, message):
+    refuse(capsys, arguments(original, tmp_path / "run", *options), message)
+
+
+def test_a_checkpoint_that_is_not_one_is_refused_on_resuming(finished, original, tmp_path, capsys):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "checkpoint.pt").write_bytes(b"not a checkpoint")
+    refuse(capsys, arguments(original, out, "--resume"), "not one or is damaged")
+    (out / "checkpoint.pt").write_bytes((finished / "checkpoint.pt").read_bytes()[:5000])
+    refuse(capsys, arguments(original, out, "--resume"), "not one or is damaged")
+
+
+def test_a_checkpoint_whose_scene_has_moved_or_changed_says_so_and_takes_another_folder(scene, tmp_path, capsys):
+    path = tmp_path / "run" / "checkpoint.pt"
+    assert main(arguments(scene, path.parent)) == 0
+    loaded = load_checkpoint(path)
+    moved = scene.rename(tmp_path / "moved")
+    with pytest.raises(FileNotFoundError, match="--scene"):
+        loaded.load_scene(path)
+    assert loaded.load_scene(path, moved).names == loaded.load_scene(path, moved).names
+    transforms = json.loads((moved / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        frame.update(w=12, h=9, fl_x=frame["fl_x"] / 2, fl_y=frame["fl_y"] / 2, cx=6, cy=4.5)
+        Image.new("RGB", (12, 9)).save(moved / frame["file_path"])
+    (moved / "transforms.json").write_text(json.dumps(transforms))
+    with pytest.raises(ValueError, match="at 24 x 18 px, as in the training, got 12 x 9"):
+        loaded.load_scene(path, moved)
+
+
+@pytest.mark.parametrize(
+    "wrong", [["trian"], ["train"], ["train", "scene", "--views", "three"], ["train", "scene", "--wings", "2"], []]
+)
+def test_arguments_that_cannot_be_read_exit_with_2(wrong):
+    with pytest.raises(SystemExit) as caught:
+        main(wrong)
+    assert caught.value.code == 2
+
+
+@pytest.mark.parametrize(
+    "command", ["sfm", "train", "sweep", "probe", "slice", "compare", "demo", "trajectory", "bench"]
+)
+def test_help_says_what_an_option_that_is_left_out_stands_for(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "(default: None)" not in said and "(default: )" not in said
+    if command == "train":
+        assert all(method in said for method in METHODS)
+
+
+def test_what_the_system_refuses_is_said_with_the_path(original, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(arguments(original, tmp_path / "file" / "run")) == 2
+    one_sentence(capsys, f"landscape: cannot use {tmp_path / 'file'}", ": Not a directory")
+
+
+def test_the_process_of_a_command_says_all_that_it_printed_and_ends_with_its_exit_code():
+    program = "from analysis import cli\ncli.main = lambda: print('the last words') or 3\ncli.command()"
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, env=buffered, capture_output=True, text=True, timeout=60
+    )
+    assert (result.returncode, result.stdout) == (3, "the last words\n"), result.stderr
+
+
+def test_help_needs_no_torch():
+    program = (
+        "import sys, analysis.commands.cli\n"
+        "try: analysis.commands.cli.main(['train', '--help'])\nfinally: print('torch' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0 and result.stdout.splitlines()[-1] == "False", result.stderr
+
+
+def test_the_held_out_views_of_a_scene_without_any_are_not_scored(tmp_path, capsys, original, monkeypatch):
+    from splat.scenes.splits import Split
+
+    monkeypatch.setattr(
+        "analysis.train.command.split_scene", lambda scene, views: Split(scene.names[:3], (), "explicit")
+    )
+    assert main(arguments(original, tmp_path / "run")) == 0
+    assert "nothing was tested" in capsys.readouterr().out
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["test"] is None
+
+
+def test_random_backgrounds_and_other_losses_train(original, tmp_path):
+    out = tmp_path / "run"
+    more = [
+        "--background",
+        "random",
+        "--pixel-loss",
+        "charbonnier",
+        "--no-densify",
+        "--sh-degree",
+        "0",
+        "--views",
+        "all",
+    ]
+    assert main(arguments(original, out, *more)) == 0
+    config = load_checkpoint(out / "checkpoint.pt").training.config
+    assert config.random_background and config.loss.pixel == "charbonnier" and not config.densify.enabled
+    assert config.sh_degree == 0
+
+
+def test_a_method_and_its_settings_are_named_on_the_command_line(original, tmp_path, capsys):
+    out = tmp_path / "stable"
+    settings = ["--set", "warm_up=2", "--set", "every=2", "--set", "viewpoints=one"]
+    assert main(arguments(original, out, "--method", "stablegs", *settings)) == 0
+    method = load_checkpoint(out / "checkpoint.pt").training.config.method
+    assert method == StableGS(warm_up=2, every=2, viewpoints="one")
+    history = pd.read_csv(out / "history.csv")
+    assert set(history["attribute"]) == set(ATTRIBUTES) and min(history["step"].tolist()) == 3
+    capsys.readouterr()
+    assert main(arguments(original, tmp_path / "other", "--method", "magic")) == 2
+    assert "expected a method among 3dgs, stablegs" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

@@ -1,0 +1,44 @@
+"""Pictures drawn by other processes."""
+
+from time import monotonic
+
+import pytest
+
+from analysis.console.drawing import draw, drawing
+
+STUCK = """
+import subprocess, sys
+subprocess.run([sys.executable, "-c", "import time; print('asleep', file=open('asleep', 'w')); time.sleep(20)"])
+"""
+
+
+@pytest.fixture
+def figures(tmp_path, monkeypatch):
+    """A package `figures` where `python -m` looks first."""
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "__init__.py").touch()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "figures"
+
+
+def test_an_interruption_ends_the_drawing_with_the_processes_that_it_has_started(figures):
+    (figures / "stuck.py").write_text(STUCK)
+    deadline = monotonic() + 15
+    with drawing("stuck"):
+        while not (figures.parent / "asleep").exists():
+            assert monotonic() < deadline
+        start = monotonic()
+    assert monotonic() - start < 10
+
+
+def test_drawing_says_the_same_now_and_later(figures):
+    (figures / "warns.py").write_text("import warnings\nwarnings.warn('no fonts')")
+    with drawing("warns") as drawn:
+        later = drawn(figures)
+    assert draw("warns", figures) == later == ["no fonts"]
+    (figures / "fails.py").write_text("raise SystemExit('no ink')")
+    words = rf"draw again with: .*fails {figures}\nno ink"
+    with pytest.raises(RuntimeError, match=words), drawing("fails") as drawn:
+        drawn(figures)
+    with pytest.raises(RuntimeError, match=words):
+        draw("fails", figures)

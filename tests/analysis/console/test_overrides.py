@@ -1,0 +1,84 @@
+"""Settings changed by name, from text and from plain values."""
+
+from dataclasses import replace
+
+import pytest
+
+from analysis.console.overrides import assignments, overridden
+from splat.training.methods.stablegs.stablegs import StableGS
+from splat.training.state import TrainConfig
+
+METHOD = StableGS()
+STABLE = TrainConfig(method=METHOD)
+
+
+def test_each_type_is_read_from_text_and_from_a_plain_value():
+    method = METHOD
+    for key, text, value, expected in [
+        ("warm_up", "10", 10, replace(method, warm_up=10)),
+        ("vsp_weight", "0", 0, replace(method, vsp_weight=0.0)),
+        ("viewpoints", "one", "one", replace(method, viewpoints="one")),
+        ("method.probe.gamma", "0.5", 0.5, replace(method, probe=replace(method.probe, gamma=0.5))),
+        (
+            "probe.attributes",
+            "means, sh",
+            ["means", "sh"],
+            replace(method, probe=replace(method.probe, attributes=("means", "sh"))),
+        ),
+        ("probe.attributes", "", [], replace(method, probe=replace(method.probe, attributes=()))),
+        ("viewpoint.parallax", "False", False, replace(method, viewpoint=replace(method.viewpoint, parallax=False))),
+    ]:
+        for given in (text, value):
+            changed = overridden(STABLE, {key: given})
+            assert changed == replace(STABLE, method=expected), key
+    changed = overridden(STABLE, {"vsp_weight": 0}).method
+    assert isinstance(changed, StableGS) and type(changed.vsp_weight) is float
+    assert overridden(STABLE, {"background": "0,0.5,1"}).background == (0.0, 0.5, 1.0)
+    assert overridden(STABLE, {"render.contour_sigma": "3"}).render.contour_sigma == 3.0
+    assert overridden(STABLE, {"render.contour_sigma": "none"}).render.contour_sigma is None
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("warmup", "1", "of the training .*iterations.* or of the method stablegs .*warm_up.*, got 'warmup'"),
+        ("probe.gama", "1", "expected a setting among .*gamma.*, got 'gama' in 'probe.gama'"),
+        ("name", "sam", "expected a setting of the training"),
+        ("densify", "1", "name of a single setting, as in densify.enabled"),
+        ("seed.x", "1", "'seed' to be the last name"),
+        ("warm_up", "1.5", "expected a whole number for warm_up, got '1.5'"),
+        ("warm_up", 1.5, "expected a whole number for warm_up, got 1.5"),
+        ("warm_up", True, "expected a whole number"),
+        ("vsp_weight", "much", "expected a number for vsp_weight, got 'much'"),
+        ("viewpoints", "two", "expected all or one for viewpoints"),
+        ("viewpoint.parallax", "1", "expected true or false"),
+        ("background", "0,1", "expected a list of a number for background"),
+        ("probe.attributes", "colour", "expected means or"),
+        ("iterations", "none", "expected a whole number"),
+        ("every", "0", "every >= 1"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_what_was_expected(key, value, message):
+    with pytest.raises(ValueError, match=message):
+        overridden(STABLE, {key: value})
+
+
+def test_a_method_without_settings_is_said_to_have_none():
+    with pytest.raises(ValueError, match=r"or of the method 3dgs \(which has none\), got 'vsp_weight'"):
+        overridden(TrainConfig(), {"vsp_weight": 0})
+
+
+def test_an_assignment_has_a_key_and_an_equals_sign():
+    assert assignments(["a=1", " b.c = x=y "]) == {"a": "1", "b.c": "x=y"}
+    for text in ("a", "=1", ""):
+        with pytest.raises(ValueError, match="expected KEY=VALUE"):
+            assignments([text])
+    with pytest.raises(ValueError, match="expected each KEY once, got --set a twice"):
+        assignments(["a=1", " a = 2"])
+
+
+def test_an_unknown_name_is_answered_with_those_of_all_single_settings():
+    with pytest.raises(ValueError, match="got 'densify_start'") as refused:
+        overridden(STABLE, {"densify_start": "50"})
+    for name in ("densify.start", "render.near", "warm_up", "probe.gamma"):
+        assert f"{name}," in str(refused.value)

@@ -1,0 +1,277 @@
+import math
+import re
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.records.findings import verdict
+from analysis.records.records import read_record, record_folder, write_record
+from analysis.records.report import interactive_surface, write_report
+from tests.recorded import depth_section, synthetic
+
+PIXEL = bytes.fromhex("89504e470d0a1a0a") + b"not looked into"
+
+
+class Page(HTMLParser):
+    """Every address that a browser would fetch, the visible text by element, and the number of scripts."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.addresses, self.texts, self.scripts, self.tags, self.open = [], [], 0, [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.open.append(tag)
+        self.scripts += tag == "script"
+        self.addresses += [
+            value for key, value in attrs if key in {"src", "href", "srcset", "data", "action", "poster"}
+        ]
+        if tag in {"meta", "link", "img", "br"}:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        while self.open and self.open.pop() != tag:
+            pass
+
+    def handle_data(self, data):
+        if not {"script", "style"} & set(self.open):
+            self.texts.append(data)
+
+    @property
+    def text(self):
+        return re.sub(r"\s+", " ", " ".join(self.texts))
+
+
+def page(folder, data, arrays, picture=None):
+    with record_folder(folder) as partial:
+        write_record(partial, data, arrays)
+        if picture:
+            (partial / f"{picture}.png").write_bytes(PIXEL)
+        path = write_report(partial)
+        assert [p.name for p in partial.glob("*.tmp")] == []
+    return (folder / path.name).read_text(encoding="utf-8")
+
+
+def test_a_surface_that_is_known_already_is_not_made_again(tmp_path):
+    with record_folder(tmp_path / "probe") as partial:
+        write_record(partial, *synthetic())
+        text = write_report(partial, "<p>a surface that is known</p>").read_text(encoding="utf-8")
+    assert text.count("<p>a surface that is known</p>") == 1 and 'id="surface"' not in text and "Plotly" in text
+
+
+def sentences(data, level=None):
+    return " | ".join(line.text for line in verdict(data) if level in {None, line.level})
+
+
+def test_the_page_fetches_nothing_and_carries_its_pictures(tmp_path):
+    text = page(tmp_path / "probe", *synthetic(), picture="traces")
+    parsed = Page(text)
+    assert len(parsed.addresses) == 1 and parsed.addresses[0].startswith("data:image/png;base64,")
+    assert "default-src 'none'" in text and "link" not in parsed.tags
+    assert "connect-src" not in text and "@import" not in text.partition("</style>")[0]
+    assert len(text) < 6e6
+
+
+def test_plotly_is_carried_once_and_only_where_there_is_a_slice(tmp_path):
+    data, arrays = synthetic()
+    with_slice = page(tmp_path / "a", data, arrays)
+    assert with_slice.count("* plotly.js v") == 1 and 'id="surface"' in with_slice
+    data["slice"] = None
+    del arrays["slice"]
+    without = page(tmp_path / "b", data, arrays)
+    assert "* plotly.js v" not in without and Page(without).scripts == 0
+    assert "No slice of the loss was recorded" in Page(without).text
+
+
+def test_every_number_of_the_tables_is_on_the_page_with_its_error(tmp_path):
+    data, arrays = synthetic()
+    text = Page(page(tmp_path / "probe", data, arrays)).text
+    for expected in (
+        "(3.991 ± 0.093) × 10⁵",
+        "−308.2 ± 8.0",
+        "(3.1000 ± 0.0012) × 10⁴",
+        "−220.0 ± 3.0",
+        "10,091",
+        "rademacher",
+    ):
+        assert expected in text
+
+
+def test_the_page_says_what_lies_in_depth_and_how_far_that_is_from_the_papers_factor(tmp_path):
+    data, arrays = synthetic()
+    assert "along the rays" not in Page(page(tmp_path / "without", data, arrays)).text
+    text = Page(page(tmp_path / "with", data | {"depth": depth_section()}, arrays)).text
+    for expected in (
+        "the gradient of the positions is 0.00680 times what it is in a direction across them",
+        "(root mean square; the paper says about 100)",
+        "curvature 3.80 × 10⁻⁵ times (between 3.70 × 10⁻⁵ and 3.90 × 10⁻⁵)",
+        "what steps as long across them do: 0.280 ± 0.020 at 0.1 px.",
+        "They changed the order of the splats in up to 75% of the renders",
+        "20.40 ± 0.30",
+        "75% and 50%",
+        "23,054 pairs",
+    ):
+        assert expected in text
+
+
+def test_of_depth_only_what_was_determined_is_said():
+    data, _ = synthetic()
+    undetermined = depth_section(None) | {"rises": []}
+    assert "along the rays" not in sentences(data | {"depth": undetermined})
+    open_ratio = depth_section() | {"curvature_ratio": {"value": None, "low": None, "high": None, "note": "why"}}
+    said = sentences(data | {"depth": open_ratio})
+    assert "(root mean square; the paper says about 100)." in said
+
+
+def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
+    data, arrays = synthetic()
+    data["slice"]["directions"][0]["name"] = '<a href="http://example.org">e₁</a>'
+    with record_folder(tmp_path / "probe") as partial:
+        write_record(partial, data, arrays)
+    figure = interactive_surface(read_record(tmp_path / "probe"))
+    assert figure is not None
+    title = figure.to_dict()["layout"]["scene"]["xaxis"]["title"]["text"]
+    assert "<" not in title and "&lt;a href" in title
+    surfaces: Any = list(figure.select_traces())
+    heights = np.asarray(surfaces[0].z)  # plotly's rows run along y
+    np.testing.assert_array_equal(heights.T, arrays["slice"]["loss"] - data["slice"]["center_loss"])
+
+
+def test_text_of_the_record_cannot_become_markup(tmp_path):
+    evil = '</script><script>alert(1)</script><img src="http://example.org/x.png">'
+    data, arrays = synthetic()
+    data["provenance"] |= {"scene": evil, "settings": {evil: [evil]}}
+    data["notes"] = [evil]
+    data["slice"]["directions"][0]["name"] = evil
+    data["checks"]["symmetry"]["note"] = evil
+    data["traces"]["means"]["method"] = evil
+    clean, hostile = Page(page(tmp_path / "a", *synthetic())), Page(page(tmp_path / "b", data, arrays))
+    assert hostile.scripts == clean.scripts
+    assert "img" not in hostile.tags and hostile.addresses == []
+    assert "alert(1)" in hostile.text
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e9])
+def test_records_of_extreme_size_and_without_numbers_make_a_page(tmp_path, scale):
+    data, arrays = synthetic(scale)
+    data["traces"]["means"] |= {"value": None, "standard_error": None, "low": None, "high": None, "tau": math.nan}
+    data["eigenvalues"]["min"] |= {"value": math.nan}
+    arrays["slice"]["loss"][:3] = math.nan
+    text = Page(page(tmp_path / "probe", data, arrays)).text
+    assert "not a number" in text and "The ends of the spectrum were not determined" in text
+
+
+def test_the_verdict_names_the_attribute_that_carries_the_curvature():
+    data, _ = synthetic()
+    assert "Position carries most of the curvature" in sentences(data) and "98%" in sentences(data)
+    data["traces"]["quats"] |= {"value": -3.9e5, "standard_error": 4e4}
+    assert "Its error does not separate it from rotation" in sentences(data)
+    data["traces"]["quats"] |= {"value": -8e5, "standard_error": 4e3}
+    assert "Rotation carries most" in sentences(data) and "separate" not in sentences(data)
+
+
+def test_most_of_the_curvature_is_more_than_half_of_it_and_whom_the_error_does_not_separate_is_named():
+    data, _ = synthetic()
+    data["traces"]["means"] |= {"value": 4.1e5, "standard_error": 1e4}
+    data["traces"]["quats"] |= {"value": 4e5, "standard_error": 4e4}
+    data["traces"]["sh"] |= {"value": -3.8e5, "standard_error": 4e4}
+    said = sentences(data)
+    assert "Position carries the largest part of the curvature" in said and "carries most" not in said
+    assert "does not separate it from rotation and colour (SH)." in said
+
+
+@pytest.mark.parametrize(
+    ("low", "residual", "words"),
+    [
+        (-220.0, 3.0, "The Hessian is indefinite"),
+        (-2.0, 3.0, "not decided by the residuals"),
+        (5.0, 3.0, "No direction of negative curvature was found"),
+    ],
+)
+def test_the_verdict_calls_indefinite_what_the_residual_proves(low, residual, words):
+    data, _ = synthetic()
+    data["eigenvalues"]["min"] |= {"value": low, "residual": residual}
+    assert words in sentences(data)
+
+
+def test_an_end_that_the_budget_did_not_reach_is_a_bound_and_the_verdict_says_so():
+    data, _ = synthetic()
+    data["eigenvalues"]["min"] |= {"reason": "tolerance"}
+    assert "farther out" not in sentences(data)
+    data["eigenvalues"]["min"] |= {"reason": "time budget"}
+    assert "The search for the smallest eigenvalue ended at its time budget" in sentences(data, "caution")
+    data["eigenvalues"]["max"] |= {"reason": "matvec budget"}
+    assert "The search for the largest eigenvalue ended at its matvec budget" in sentences(data, "caution")
+
+
+def test_a_number_without_its_error_is_never_shown_as_exact(tmp_path):
+    data, arrays = synthetic()
+    data["traces"]["means"] |= {"value": 4e5, "standard_error": None, "sign": "undetermined"}
+    assert "4.00 × 10⁵ ± ?" in sentences(data)
+    assert "4.00 × 10⁵ ± ?" in Page(page(tmp_path / "probe", data, arrays)).text
+
+
+def test_a_failed_check_comes_first_and_in_red(tmp_path):
+    data, arrays = synthetic()
+    assert sentences(data, "failure") == ""
+    data["checks"]["symmetry"] |= {"value": 0.5, "passed": False}
+    first = verdict(data)[0]
+    assert first.level == "failure" and "symmetry failed: 0.500" in first.text
+    assert 'class="failure">The check of symmetry failed' in page(tmp_path / "probe", data, arrays)
+
+
+def test_the_verdict_says_what_was_skipped_and_what_could_not_run():
+    said = sentences(synthetic()[0])
+    assert "217 of 10,091 Gaussians touch no pixel" in said
+    assert "degree 0 of 3" in said and "326 of the slice's 357 rendered points" in said
+    assert "finite difference could not run (every direction crosses a sort)" in said
+
+
+def test_the_verdict_says_how_much_of_the_slice_is_interpolated_and_how_well():
+    data, _ = synthetic()
+    data["slice"] |= {"evaluated_points": 80, "crossed_points": 70, "interpolation_error": 0.004, "holdout_points": 30}
+    said = sentences(data)
+    assert "Of the slice's 357 points 80 are renders" in said
+    assert "an error at 30 random points of at most 0.4% of the range of the loss" in said
+    assert "70 of the slice's 80 rendered points" in said
+    data["slice"]["interpolation_error"] = None
+    assert "30 random points without bound" in sentences(data)
+
+
+def test_an_unbounded_ratio_is_given_by_its_bound():
+    data, _ = synthetic()
+    data["anisotropy"]["saddle"] = {"value": None, "low": 40.0, "high": None, "note": "the small end is not resolved"}
+    assert "at least 40.0 times as curved as the steepest down (the small end is not resolved)" in sentences(data)
+    data["anisotropy"]["saddle"]["low"] = 0.0  # which says nothing
+    assert "times as curved" not in sentences(data)
+    assert "is not determined (the small end is not resolved)" in sentences(data)
+
+
+def test_the_ends_of_a_narrow_interval_are_told_apart():
+    data, _ = synthetic()
+    data["anisotropy"]["saddle"] |= {"value": 2.602, "low": 2.6012, "high": 2.6034}
+    assert "(between 2.601 and 2.603)" in sentences(data)
+
+
+def test_a_share_and_its_bracket_have_the_same_unit():
+    data, _ = synthetic()
+    data["anisotropy"]["share"] = {"value": 0.008, "low": 0.00627, "high": 0.00954, "note": ""}
+    assert "holds 0.80% of all absolute curvature (between 0.63% and 0.95%)." in sentences(data)
+
+
+def test_needles_are_counted_and_notes_are_sentences():
+    data, _ = synthetic()
+    data["eigenvalues"]["max"]["lives_on"] = {"needles": 0.78, "needle_count": 1, "participation": 1.8}
+    data["notes"] = ["the slice was left out"]
+    said = sentences(data)
+    assert "1 of 9,874 Gaussians in sight has a condition number above 100 and holds 78% of the steepest" in said
+    data["eigenvalues"]["max"]["lives_on"] |= {"needles": 0.004, "needle_count": 2}
+    assert "2 of 9,874 Gaussians in sight have a condition number above 100 and hold under 1% of the" in sentences(data)
+    data["eigenvalues"]["max"]["lives_on"] |= {"needles": 0.0, "needle_count": 0}
+    assert "None of 9,874 Gaussians in sight has a condition number above 100; the steepest direction" in sentences(
+        data
+    )
+    assert "The slice was left out." in said

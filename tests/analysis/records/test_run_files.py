@@ -1,0 +1,72 @@
+"""A damaged file of a run is named, with what to do, by everything that reads it."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from analysis.console.options import TrainOptions
+from analysis.records.run_files import read_scores
+from analysis.runs.sweep.sweep_file import Cell
+from analysis.runs.sweep.sweep_results import results
+from analysis.train.training_time import TrainingTime
+
+SCORES = {"psnr": 20.0, "ssim": 0.5, "lpips": None}
+METRICS = {"gaussians": 9, "train": SCORES | {"psnr": "Infinity"}, "test": None}
+SECONDS = {"step": 3, "wall": 1.5, "cpu": 2, "threads": 2}
+
+
+def swept(run: Path) -> float:
+    """The training views' PSNR, as a sweep reads it."""
+    cell = Cell("still", "3dgs", TrainOptions(Path("still"), out=run))
+    return results([cell], {cell.name: "done"})["train_psnr"].item()
+
+
+@pytest.mark.parametrize(
+    ("text", "got"),
+    [
+        ("", "a damaged file (Expecting value"),
+        ('{"test":', "a damaged file (Expecting"),
+        ("[1]", "[1] instead of an object"),
+        (json.dumps(METRICS | {"train": 3}), "3 as train;"),
+        (json.dumps(METRICS | {"test": SCORES | {"ssim": "good"}}), "'good' as test.ssim;"),
+        (json.dumps({"train": SCORES}), "None as gaussians;"),
+        (json.dumps(METRICS | {"seconds": {"wall": "long"}}), "'long' as seconds.wall;"),
+    ],
+)
+def test_damaged_scores_are_named_with_what_to_do(tmp_path, text, got):
+    path = tmp_path / "metrics.json"
+    path.write_text(text)
+    for read in (read_scores, swept):
+        with pytest.raises(
+            ValueError, match=re.escape(f"expected the scores of landscape train in {path}, got {got}")
+        ) as e:
+            read(tmp_path)
+        assert str(e.value).endswith("remove it and repeat the training's command with --resume, which scores again")
+
+
+def test_scores_that_are_whole_are_read(tmp_path):
+    (tmp_path / "metrics.json").write_text(json.dumps(METRICS))
+    assert read_scores(tmp_path) == METRICS | {"train": SCORES | {"psnr": float("inf")}} and swept(tmp_path) == float(
+        "inf"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "got"),
+    [
+        ("", "a damaged file (Expecting value"),
+        ("3", "3 instead of an object"),
+        (json.dumps({"foo": 1}), "None as step;"),
+        (json.dumps(SECONDS | {"wall": "long"}), "'long' as wall;"),
+    ],
+)
+def test_damaged_seconds_are_named_with_what_to_do(tmp_path, text, got):
+    path = tmp_path / "seconds.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=re.escape(f"expected the seconds of a training in {path}, got {got}")) as e:
+        TrainingTime.read(tmp_path)
+    assert str(e.value).endswith("remove it: nothing but the time until its last checkpoint is lost")
+    path.write_text(json.dumps(SECONDS | {"later": 1}))
+    assert TrainingTime.read(tmp_path) == TrainingTime(3, 1.5, 2, 2)

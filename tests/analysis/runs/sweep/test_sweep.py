@@ -1,0 +1,308 @@
+"""Sweeps: what a file stands for, what is refused, and that stopping, crashing and starting again lose and repeat nothing."""
+
+import json
+import math
+import os
+import re
+import shutil
+import signal
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+import tyro
+
+from analysis.commands.cli import main
+from analysis.console.options import TrainOptions
+from analysis.records.provenance import usable_cores
+from analysis.records.records import record_folder, write_record
+from analysis.runs.sweep.sweep import _Cells, locked, missing, probe_arguments
+from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
+from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
+from analysis.runs.sweep.sweep_results import results
+from analysis.train.training_time import TrainingTime
+from splat.render.render import render
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint
+from tests.recorded import synthetic
+
+FILE = """
+out = "out"
+iterations = 6
+checkpoint_every = 5
+seeds = [1, 0]
+
+[scenes.still]
+path = "still"
+views = 3
+iterations = 12
+
+[methods.3dgs]
+[methods."asp only"]
+method = "stablegs"
+densify = false
+checkpoint_every = 10
+set = { vsp_weight = 0, warm_up = 5, every = 20, probe.attributes = ["means", "sh"], viewpoint.parallax = false }
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A scene and the file of a sweep beside it."""
+    folder = tmp_path_factory.mktemp("sweep")
+    settings = SyntheticSettings(gaussians=60, views=5, width=24, height=18)
+    write_transforms_scene(synthetic_scene(settings).scene, folder / "still")
+    (folder / "sweep.toml").write_text(FILE)
+    return folder
+
+
+def written(folder: Path, old: str, new: str, name: str = "changed.toml") -> Path:
+    """The file with a part of it changed."""
+    assert old in FILE
+    path = folder / name
+    path.write_text(FILE.replace(old, new))
+    return path
+
+
+def when(condition, act) -> threading.Thread:
+    """Act as soon as the condition holds."""
+
+    def watch() -> None:
+        deadline = time.monotonic() + 120
+        while not condition() and time.monotonic() < deadline:
+            time.sleep(0.005)
+        act()
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    return thread
+
+
+@pytest.fixture(scope="module")
+def finished(folder) -> Sweep:
+    """Two cells, run at once; the first had been stopped after three steps."""
+    sweep = read_sweep(written(folder, "[1, 0]", "[1]", "finished.toml"))
+    steps = []
+
+    def press(*given, **others):
+        steps.append(1)
+        if len(steps) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return render(*given, **others)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("splat.render.loss_and_gradient.render", press)
+        assert main(arguments(sweep.cells[0].training)) == 130
+    assert load_checkpoint(sweep.cells[0].out / "checkpoint.pt").training.step == 3
+    assert main(["sweep", str(sweep.file), "--jobs", "2"]) == 0
+    return sweep
+
+
+@pytest.fixture
+def no_commands(monkeypatch):
+    """A list of the stages that would run, each a success, instead of running them."""
+    ran: list[tuple[str, str]] = []
+
+    def command(self, cell, stage) -> int:
+        ran.append((cell.name, stage))
+        return 0
+
+    monkeypatch.setattr(_Cells, "_command", command)
+    return ran
+
+
+def test_all_methods_of_a_seed_come_before_the_next_seed(folder):
+    names = [cell.name for cell in read_sweep(folder / "sweep.toml").cells]
+    assert names == ["still/3dgs/1", "still/asp only/1", "still/3dgs/0", "still/asp only/0"]
+
+
+def test_the_narrower_of_two_settings_goes_first_and_paths_are_those_of_the_file(folder):
+    plain, asp, *_ = (cell.training for cell in read_sweep(folder / "sweep.toml").cells)
+    assert plain == TrainOptions(
+        folder / "still", folder / "out/still/3dgs/1", views=3, iterations=12, seed=1, checkpoint_every=5
+    )
+    assert (asp.method, asp.iterations, asp.checkpoint_every, asp.densify) == ("stablegs", 12, 10, False)
+    changes = ("vsp_weight=0", "warm_up=5", "every=20", "probe.attributes=means,sh", "viewpoint.parallax=false")
+    assert asp.set == changes
+    assert read_sweep(folder / "sweep.toml", Path("elsewhere")).cells[0].out == Path("elsewhere/still/3dgs/1")
+
+
+def test_a_cell_is_the_command_that_a_user_would_type(folder):
+    for cell in read_sweep(folder / "sweep.toml").cells:
+        assert tyro.cli(TrainOptions, args=arguments(cell.training)[1:]) == cell.training
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('path = "still"', "", "expected the folder of the scene as scenes.still.path"),
+        ("views = 3", 'views = "few"', "expected a whole number or all or none for scenes.still.views, got 'few'"),
+        ("views = 3", "view = 3", "expected a key among path, .*, got scenes.still.view"),
+        ("views = 3", "seed = 3", "expected a key among path, .*, got scenes.still.seed"),
+        ("iterations = 6", "iterations = 0.5", "expected a whole number for iterations, got 0.5"),
+        ("iterations = 6", "iteration = 6", "expected a key among out, seeds, .*, got iteration"),
+        ("seeds = [1, 0]", "seeds = [1, 1]", r"expected different seeds, at least one, got seeds = \[1, 1\]"),
+        ("seeds = [1, 0]", "seeds = [0.5]", "expected a whole number for seeds, got 0.5"),
+        ('out = "out"', "", "expected the folder of the results"),
+        ("[scenes.still]", "[scenes]", "expected a table .scenes.path., got path = 'still'"),
+        ('"asp only"', '"../asp"', "as it names a folder, got '../asp'"),
+        ("set = {", "sets = {", "expected a key among method, .*, got methods.asp only.sets"),
+        ('method = "stablegs"', "method = 3 4", "expected a sweep in TOML in .*at line"),
+        ("densify = false", "densify = 0", "expected true or false for methods.asp only.densify, got 0"),
+    ],
+)
+def test_a_file_with_a_mistake_is_refused_by_the_key(folder, old, new, message):
+    with pytest.raises(ValueError, match=message):
+        read_sweep(written(folder, old, new))
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"expected a sweep in TOML at .*gone\.toml, found no such file"):
+        read_sweep(tmp_path / "gone.toml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("vsp_weight = 0", "vsp_wait = 0", "still/asp only/1: expected a setting of .*vsp_weight.*, got 'vsp_wait'"),
+        ('method = "stablegs"', 'method = "magic"', "still/asp only/1: expected a method among .*, got 'magic'"),
+        ("views = 3", "views = 30", "still/3dgs/1: .*at most 4 training views.*got 30"),
+        ('path = "still"', 'path = "gone"', "still/3dgs/1: .*gone"),
+    ],
+)
+def test_no_cell_starts_where_one_cannot(folder, no_commands, capsys, old, new, message):
+    assert main(["sweep", str(written(folder, old, new)), "--out", str(folder / "never")]) == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert no_commands == [] and not (folder / "never").exists()
+
+
+def test_ctrl_c_stops_a_sweep_after_its_cells_have_saved(folder, tmp_path, capsys):
+    run = tmp_path / "still/3dgs/1"
+    thread = when((run / "seconds.json").exists, lambda: os.kill(os.getpid(), signal.SIGINT))
+    before = signal.getsignal(signal.SIGINT)
+    endless = written(folder, "iterations = 12", "iterations = 1000000")
+    assert main(["sweep", str(endless), "--out", str(tmp_path)]) == 130
+    thread.join()
+    assert signal.getsignal(signal.SIGINT) is before
+    assert pd.read_csv(tmp_path / "results.csv")["status"].tolist() == ["under way", "to do", "to do", "to do"]
+    step = load_checkpoint(run / "checkpoint.pt").training.step
+    assert f"stopped after step {step}; to continue: landscape train" in run.with_name("1.log").read_text()
+    assert "0 of 4 cells done" in capsys.readouterr().out
+
+
+def test_a_cell_that_was_stopped_ends_with_the_same_bits_as_one_that_was_not(finished, tmp_path):
+    cell = finished.cells[0]
+    whole = cell.out.with_name("whole")
+    assert main(arguments(replace(cell.training, out=whole))) == 0
+    assert (whole / "checkpoint.pt").read_bytes() == (cell.out / "checkpoint.pt").read_bytes()
+
+
+def test_what_is_done_is_not_done_again(finished, folder, no_commands):
+    before = (folder / "out/results.csv").read_bytes(), (folder / "out/summary.csv").read_bytes()
+    assert main(["sweep", str(finished.file)]) == 0 and no_commands == []
+    assert before == ((folder / "out/results.csv").read_bytes(), (folder / "out/summary.csv").read_bytes())
+
+
+def test_what_is_done_with_other_settings_is_refused_by_name(finished, folder, no_commands, capsys):
+    for old, new, message in [
+        ("iterations = 12", "iterations = 13", "iterations = 12, got 13; remove"),
+        ("warm_up = 5", "warm_up = 6", "method.warm_up = 5, got 6; remove"),
+        ("views = 3", "views = 2", "still/3dgs/1: expected the settings"),
+    ]:
+        assert main(["sweep", str(written(folder, old, new))]) == 2
+        assert message in " ".join(capsys.readouterr().err.split())
+    assert no_commands == []
+
+
+def test_a_cell_that_fails_does_not_end_the_sweep(finished, folder, tmp_path, monkeypatch, capsys):
+    def command(self, cell, stage) -> int:
+        ran.append((cell.name, stage))
+        if cell.method == "3dgs":
+            return -9
+        if stage == "train":  # its files appear whole, as those of a training do
+            cell.out.parent.mkdir(parents=True, exist_ok=True)
+            Path(shutil.copytree(finished.cells[1].out, tmp_path / "copy")).rename(cell.out)
+        return 0
+
+    ran = []
+    monkeypatch.setattr(_Cells, "_command", command)
+    words = ["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path / "out"), "--probe"]
+    assert main(words) == 1
+    failed, good = ("still/3dgs/1", "still/3dgs/0"), ("still/asp only/1", "still/asp only/0")
+    assert sorted(ran) == sorted([(name, "train") for name in failed + good] + [(name, "probe") for name in good])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "still/3dgs/1: train ended with exit code -9; see" in said and "the same command continues" in said
+    statuses = pd.read_csv(tmp_path / "out/results.csv").set_index(["method", "seed"])["status"]
+    assert statuses.loc[("3dgs", 1)] == "failed" and statuses.loc[("asp only", 1)] == "done"
+
+
+def test_damaged_scores_end_a_sweep_before_it_starts(finished, folder, tmp_path, no_commands, capsys):
+    path = Path(shutil.copytree(folder / "out", tmp_path / "out")) / "still/3dgs/1/metrics.json"
+    path.write_text("")
+    assert main(["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert f"in {path}, got a damaged file" in " ".join(capsys.readouterr().err.split()) and no_commands == []
+
+
+def test_two_sweeps_do_not_work_in_one_folder(folder, tmp_path, no_commands, capsys):
+    with locked(tmp_path):
+        assert main(["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path)]) == 2
+    assert "expected no other sweep at work in" in " ".join(capsys.readouterr().err.split()) and no_commands == []
+
+
+def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, folder):
+    controlled = "probe = true\nsplit_control = true\nfamily_seconds = 7"
+    with_probe = read_sweep(finished.file, probe=True)
+    control = read_sweep(written(folder, "seeds = [1, 0]", f"{controlled}\nseeds = [1]"))
+    cell = with_probe.cells[0]
+    assert missing(cell, finished) == [] and missing(cell, with_probe) == missing(cell, control) == ["probe"]
+    data, arrays = synthetic()
+    data["provenance"]["iteration"] = 12
+    with record_folder(cell.out / "probe") as partial:
+        write_record(partial, data, arrays)
+    try:
+        assert missing(cell, with_probe) == [] and missing(cell, control) == ["probe"]
+        assert probe_arguments(cell, control)[2:] == ["--split-control", "--family-seconds", "7.0"]
+        row = results([cell], {cell.name: "done"}).iloc[0]
+        assert row["trace_means"] == data["traces"]["means"]["value"] and row["lambda_min_error"] == 3.0
+        assert (row["saddle_low"], row["saddle_high"]) == (139.0, 143.0) and row["share"] is None
+    finally:
+        shutil.rmtree(cell.out / "probe")
+
+
+def test_the_results_are_the_runs_own_metrics(finished, folder):
+    rows = pd.read_csv(folder / "out/results.csv")
+    assert rows["status"].tolist() == ["done"] * 2 and rows["seed"].tolist() == [1, 1]
+    for cell, row in zip(finished.cells, rows.to_dict("records"), strict=True):
+        metrics = json.loads((cell.out / "metrics.json").read_text())
+        assert (row["psnr"], row["train_ssim"]) == (metrics["test"]["psnr"], metrics["train"]["ssim"])
+        assert row["gaussians"] == len(load_checkpoint(cell.out / "checkpoint.pt").training.gaussians)
+        assert row["wall_seconds"] == metrics["seconds"]["wall"] > 0 and metrics["seconds"]["step"] == 12
+    share = max(1, int(os.environ.get("OMP_NUM_THREADS", usable_cores())) // 2)
+    began = share if torch.get_num_threads() == share else math.nan  # the first began in this process
+    assert rows["threads"].tolist() == pytest.approx([began, share], nan_ok=True)
+
+
+def test_the_time_left_follows_the_pace_of_each_method(folder, tmp_path):
+    sweep = read_sweep(folder / "sweep.toml", tmp_path)
+    progress = SweepProgress(sweep, {cell.name: ["train"] for cell in sweep.cells}, jobs=2)
+    assert progress.seconds([TrainingTime()] * 4) is None
+    known = [TrainingTime(step=12, wall=6.0), TrainingTime(step=4, wall=8.0), TrainingTime(), TrainingTime()]
+    assert progress.seconds(known) == pytest.approx((8 * 2 + 12 * 0.5 + 12 * 2) / 2)
+    assert progress.seconds([TrainingTime(step=12, wall=6.0)] + [TrainingTime()] * 3) == pytest.approx(3 * 12 * 0.5 / 2)
+
+
+def test_the_time_left_goes_with_the_last_probe(folder, tmp_path, monkeypatch):
+    sweep = read_sweep(folder / "sweep.toml", tmp_path)
+    to_do: dict[str, list[Stage]] = {cell.name: ["probe"] for cell in sweep.cells}
+    progress = SweepProgress(sweep, to_do, jobs=1)
+    monkeypatch.setattr(TrainingTime, "read", lambda run: TrainingTime(step=12, wall=6.0))
+    progress.took("probe", 60.0)
+    assert progress.left() == "0:04:00"
+    for stages in to_do.values():
+        stages.pop()
+    assert progress.left() == "0:00:00"

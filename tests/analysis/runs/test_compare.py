@@ -1,0 +1,259 @@
+"""Comparisons: what is refused, what is said, and that the table, the file and the page carry the records' own numbers."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from analysis.commands.cli import main
+from analysis.records.family_table import bracketed
+from analysis.records.quantities import measured, quantity
+from analysis.records.records import read_record, record_folder, write_record
+from splat.losses.reference import LossSettings
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from tests.figures.test_trajectory_figure import rows
+from tests.recorded import depth_section, synthetic
+
+ITERATIONS = 4
+FACTOR = {"value": 2.5, "low": 2.0, "high": 3.1, "note": ""}
+
+
+def record(folder: Path, scale: float, **changes) -> None:
+    """A record in place of a probe, with the split control."""
+    data, arrays = synthetic(scale)
+    data["provenance"] |= {"iteration": ITERATIONS} | changes
+    effects = [{"operator": "hessian", "block": block, "index": "saddle", **FACTOR} for block in ("all", "means")]
+    data["split_control"] = {
+        "gaussians": 20182,
+        "rms": 0.01 * scale,
+        "largest": 0.1,
+        "psnr": 40.0 / scale,
+        "effects": effects,
+    }
+    end = {"value": 4.0, "residual": 0.1, "reason": "tolerance"}
+    about = {"operator": "hessian", "block": "means", "metric": "parameters", "unit": "parameter units", "split": False}
+    index = {"value": 7.0 * scale, "low": 6.0 * scale, "high": 9.0 * scale, "note": ""}
+    names = ("literal", "saddle", "share", "effective_rank", "mass_quantile")
+    family = {"gaussians": 10091, "dim": 30273, "rank": 30000, "lambda_max": end, "lambda_min": end}
+    family |= {"indices": dict.fromkeys(names, index)}
+    data["families"] = [about | family, about | family | {"split": True, "gaussians": 20000}]
+    with record_folder(folder) as partial:
+        write_record(partial, data, arrays)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """Two trainings of the same scene, with records in place of probes."""
+    folder = tmp_path_factory.mktemp("compare")
+    settings = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
+    write_transforms_scene(synthetic_scene(settings).scene, folder / "still")
+    run = ["train", str(folder / "still"), "--iterations", str(ITERATIONS), "--out"]
+    assert main([*run, str(folder / "runs/plain/0")]) == 0
+    assert main([*run, str(folder / "runs/sam/0"), "--method", "sam"]) == 0
+    for name, scale in (("plain", 1.0), ("sam", 0.5)):
+        record(folder / "runs" / name / "0/probe", scale)
+    return folder / "runs"
+
+
+@pytest.fixture
+def runs(trained, tmp_path) -> list[str]:
+    """Copies that a test may break."""
+    shutil.copytree(trained.parent, tmp_path / "all")
+    return [str(tmp_path / "all/runs" / name / "0") for name in ("plain", "sam")]
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    monkeypatch.setattr("analysis.runs.compare.draw", lambda module, target: [])
+
+
+def changed(run: str, **config) -> None:
+    """The run's checkpoint with other settings."""
+    path = Path(run) / "checkpoint.pt"
+    loaded = load_checkpoint(path)
+    loaded.training.config = replace(loaded.training.config, **config)
+    save_checkpoint(path, loaded.training, loaded.scene)
+
+
+def other_units(run: str) -> dict:
+    """A family of the run in other units."""
+    return read_record(Path(run) / "probe").data["families"][0] | {"unit": "steps of the optimiser"}
+
+
+def refused(capsys, words: list[str], *expected: str) -> None:
+    assert main(["compare", *words]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    for part in expected:
+        assert part in " ".join(captured.err.split())
+
+
+def test_depth_over_lateral_is_compared_where_a_probe_has_it(runs, tmp_path, no_pictures, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "140")
+    assert main(["compare", *runs, "--out", str(tmp_path / "without")]) == 0
+    assert "depth / lateral" not in capsys.readouterr().out
+    path = Path(runs[0]) / "probe/probe.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"depth": depth_section()}))
+    assert main(["compare", *runs, "--out", str(tmp_path / "with")]) == 0
+    lines = {line.strip().split("  ")[0]: line for line in capsys.readouterr().out.splitlines() if "depth" in line}
+    for name, value in (
+        ("gradient", "0.00680"),
+        ("curvature", "3.80"),
+        ("rise at 0.1 px", "0.280"),
+    ):
+        assert value in lines[f"depth / lateral {name}"] and lines[f"depth / lateral {name}"].rstrip().endswith("–")
+    table = pd.read_csv(tmp_path / "with/compare.csv").set_index(["section", "quantity", "run"])
+    rise = table.loc[("depth over lateral", "rise at 0.1 px", "plain/0")]
+    assert [float(rise[key]) for key in ("value", "low", "high")] == pytest.approx([0.28, 0.24, 0.32])
+    assert "Depth over lateral" in (tmp_path / "with/compare.html").read_text()
+
+
+def test_the_file_holds_the_numbers_of_the_records_and_metrics(trained, tmp_path, no_pictures):
+    folders = [trained / "plain/0", trained / "sam/0"]
+    assert main(["compare", *map(str, folders), "--out", str(tmp_path)]) == 0
+    table = pd.read_csv(tmp_path / "compare.csv", dtype={"value": str}).set_index(["section", "quantity", "run"])
+    for label, scale in (("plain/0", 1.0), ("sam/0", 0.5)):
+        data, _ = synthetic(scale)
+        metrics = json.loads((trained / label / "metrics.json").read_text())
+        trace, top = data["traces"]["quats"], data["eigenvalues"]["max"]
+        expected = {
+            ("trace", "rotation"): [trace[key] for key in ("value", "low", "high")],
+            ("spectrum", "largest eigenvalue"): [top["value"] + sign * top["residual"] for sign in (0, -1, 1)],
+            ("anisotropy", "saddle"): [data["anisotropy"]["saddle"][key] for key in ("value", "low", "high")],
+            ("anisotropy", "saddle, split control"): [2.5, 2.0, 3.1],
+            ("families", "Hessian, position: saddle"): [7 * scale, 6 * scale, 9 * scale],
+            ("families", "Hessian, position: saddle, split control"): [2.5, 2.0, 3.1],
+        }
+        for key, numbers in expected.items():
+            assert table.loc[(*key, label)][["value", "low", "high"]].astype(float).tolist() == pytest.approx(
+                numbers
+            ), key
+        assert float(table.loc[("held-out views", "PSNR (dB)", label)]["value"]) == metrics["test"]["psnr"]
+        assert float(table.loc[("run", "seconds of training", label)]["value"]) == metrics["seconds"]["wall"]
+
+
+def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(trained, tmp_path, capsys, no_pictures):
+    assert main(["compare", str(trained / "plain/0"), str(trained / "sam/0"), "--out", str(tmp_path)]) == 0
+    said, page = capsys.readouterr().out, (tmp_path / "compare.html").read_text()
+    assert "http" not in page.replace("http-equiv", "") and "<script" not in page
+    assert "which hardly changes the image" in page
+    for scale in (1.0, 0.5):
+        data, _ = synthetic(scale)
+        trace, saddle = data["traces"]["means"], bracketed(data["anisotropy"]["saddle"])
+        for text in (measured(trace["value"], trace["standard_error"]), saddle.value, "× 2.50", "2.00 … 3.10"):
+            assert text in said and text in page
+        assert (
+            f"by {quantity(0.01 * scale)} (root mean square; {quantity(40 / scale)} dB), and 182 of the halves" in page
+        )
+        assert bracketed({"value": 7 * scale, "low": 6 * scale, "high": 9 * scale, "note": ""}).bracket in page
+
+
+def test_pictures_are_drawn_from_the_records_and_lie_in_the_page(trained, tmp_path):
+    assert main(["compare", str(trained / "plain/0"), str(trained / "sam/0"), "--out", str(tmp_path)]) == 0
+    drawn = sorted(path.stem for path in tmp_path.glob("*.png"))
+    assert drawn == ["compare_densities", "compare_sections", "compare_slices", "compare_traces"]
+    assert (tmp_path / "compare.html").read_text().count("data:image/png;base64,") == 4
+
+
+def test_other_functions_are_not_compared(runs, capsys):
+    changed(runs[1], loss=LossSettings(ssim_weight=0.5))
+    refused(
+        capsys, runs, "expected runs with the same loss", "ssim_weight=0.2", "in plain/0", "ssim_weight=0.5", "in sam/0"
+    )
+    changed(runs[1], loss=LossSettings(), background=(1.0, 1.0, 1.0))
+    refused(capsys, runs, "expected runs with the same background")
+    path = Path(runs[0]) / "checkpoint.pt"
+    loaded = load_checkpoint(path)
+    save_checkpoint(path, loaded.training, replace(loaded.scene, sizes=[[8, 6]] * 3))
+    refused(capsys, runs, "expected runs with the same sizes of the views")
+    save_checkpoint(path, loaded.training, replace(loaded.scene, train=loaded.scene.train[::-1]))
+    refused(capsys, runs, "expected runs with the same training views")
+    assert not (Path(runs[0]).parents[1] / "compare").exists()
+
+
+def test_trajectories_of_other_functions_are_not_drawn_into_one_picture(runs, capsys, monkeypatch):
+    monkeypatch.setattr("analysis.runs.trajectories.draw", lambda module, target: [])
+    for run in runs:
+        rows().to_csv(Path(run) / "trajectory.csv", index=False)
+    assert main(["trajectory", *runs]) == 0
+    changed(runs[1], loss=LossSettings("l2"))
+    assert main(["trajectory", *runs]) == 2
+    assert "expected runs with the same loss" in capsys.readouterr().err
+
+
+def test_a_run_without_a_record_of_its_checkpoint_is_refused_with_the_command_or_probed(
+    runs, capsys, monkeypatch, no_pictures
+):
+    for run in runs:
+        shutil.rmtree(Path(run) / "probe")
+    record(Path(runs[1]) / "probe", 1.0, iteration=ITERATIONS - 1)  # of an earlier step
+    commands = [f"landscape probe {run}/checkpoint.pt" for run in runs]
+    refused(capsys, runs, "expected probed runs", "; ".join(commands), "--probe")
+    asked = []
+
+    def probe(options, command) -> int:
+        asked.append(" ".join(command))
+        record(options.checkpoint.parent / "probe", 1.0)
+        return 0
+
+    monkeypatch.setattr("analysis.probe.command.run_probe", probe)
+    assert main(["compare", *runs, "--probe"]) == 0 and asked == [f"{command} --device auto" for command in commands]
+    assert (Path(runs[0]).parents[1] / "compare/compare.csv").exists()
+
+
+def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
+    assert main(["compare", *runs]) == 0
+    assert "not the same" not in capsys.readouterr().out
+    data, arrays = synthetic()
+    data["provenance"] |= {
+        "iteration": ITERATIONS,
+        "dtype": "float64",
+        "settings": {"eigen": {"rtol": 0.5}, "quick": True},
+    }
+    data["checks"]["symmetry"]["passed"] = False
+    with record_folder(Path(runs[1]) / "probe") as partial:
+        write_record(partial, data, arrays)
+    (Path(runs[1]) / "metrics.json").unlink()
+    changed(runs[1], seed=3)
+    assert main(["compare", *runs]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    for part in (
+        "The seed is not the same",
+        "The precision is not the same",
+        "The probes were run with different settings (those of plain/0, sam/0): eigen.rtol None, 0.5; quick None, True.",
+        "sam/0: the check of symmetry failed",
+        "sam/0 was not scored",
+        "sam/0: The search for the smallest eigenvalue ended at its time budget: the end may lie farther out.",
+        f"landscape probe {runs[1]}/checkpoint.pt --split-control",
+    ):
+        assert part in said and part in " ".join(
+            (Path(runs[0]).parents[1] / "compare/compare.html").read_text().split()
+        )
+
+
+def test_families_that_only_one_run_has_are_in_no_other_units(runs, capsys, no_pictures):
+    words, folder = "The units of the families are not the same.", Path(runs[1]) / "probe"
+    data, arrays = synthetic()
+    data["provenance"] |= {"iteration": ITERATIONS}
+    for changes, said in (({"families": []}, False), ({"families": [other_units(runs[0])]}, True)):
+        with record_folder(folder) as partial:
+            write_record(partial, data | changes, arrays)
+        assert main(["compare", *runs]) == 0
+        assert (words in capsys.readouterr().out) == said
+
+
+def test_damaged_scores_are_named(runs, capsys):
+    path = Path(runs[1]) / "metrics.json"
+    path.write_text('{"test":')
+    refused(capsys, runs, f"expected the scores of landscape train in {path}, got a damaged file")
+
+
+def test_at_least_two_different_runs_are_asked_for(runs, capsys):
+    refused(capsys, runs[:1], "expected at least two runs")
+    refused(capsys, [runs[0], runs[0]], "expected at least two runs, each once")
+    refused(capsys, [runs[0], runs[0] + "/probe"], "expected a checkpoint written by landscape train")

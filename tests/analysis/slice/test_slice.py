@@ -1,0 +1,403 @@
+"""Slicing a checkpoint: losses that are renders, directions that are what they are called, interruptions, refusals."""
+
+import math
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from analysis.commands.cli import main
+from analysis.probe.command import scene_objective
+from analysis.probe.record import loss_name
+from analysis.records.records import Record, read_record, record_folder, write_record
+from analysis.slice.command import _finite_curvature
+from figures.make_all import recorded_figures
+from splat.curvature.hessian import SceneHessian
+from splat.curvature.objective import SceneObjective
+from splat.losses.reference import LossSettings
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.densify import ScreenGradients
+from splat.training.optim.adam import Adam
+from tests.recorded import synthetic, synthetic_line
+
+ROOT = Path(__file__).parents[3]
+SCENE = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
+POINTS = ["--points", "9", "--all-points"]
+EPS = np.finfo(np.float64).eps
+
+
+def save_double(checkpoint: Path, out: Path, change=lambda gaussians: None) -> None:
+    """The checkpoint in double precision, changed in place."""
+    loaded = load_checkpoint(checkpoint)
+    gaussians = loaded.training.gaussians.to(torch.float64)
+    change(gaussians)
+    state = Adam.zero(gaussians), ScreenGradients.zero(len(gaussians), torch.float64)
+    training = replace(loaded.training, gaussians=gaussians, adam=state[0], screen_gradients=state[1])
+    save_checkpoint(out, training, loaded.scene)
+
+
+def behind(gaussians) -> None:
+    """One Gaussian out of every view's sight."""
+    gaussians.means[0] += 1e4
+
+
+def turned(gaussians) -> None:
+    """Other parameters with a quaternion of the other sign and another length."""
+    gaussians.flat.add_(0.01 * torch.randn(gaussians.flat.shape, generator=torch.Generator().manual_seed(5)))
+    gaussians.quats[3] *= -2.5
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("slice")
+    write_transforms_scene(synthetic_scene(SCENE).scene, folder / "still")
+    train = ["train", str(folder / "still"), "--out", str(folder / "run"), "--iterations", "30", "--sh-degree", "1"]
+    assert main([*train, "--no-densify"]) == 0
+    out = folder / "run"
+    save_double(out / "checkpoint.pt", out / "double.pt")
+    save_double(out / "checkpoint.pt", out / "behind.pt", behind)
+    save_double(out / "checkpoint.pt", out / "turned.pt", turned)
+    return out
+
+
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch):
+    """For tests of the numbers alone."""
+    monkeypatch.setattr("analysis.console.recording.draw", lambda module, target: [])
+
+
+@pytest.fixture(scope="module")
+def objective(run) -> SceneObjective:
+    return objective_of(run / "double.pt")
+
+
+def objective_of(path: Path) -> SceneObjective:
+    checkpoint = load_checkpoint(path)
+    return scene_objective(checkpoint, checkpoint.load_scene(path))
+
+
+def sliced(out: Path, checkpoint: Path, *options: str) -> Record:
+    assert main(["slice", str(checkpoint), "--out", str(out), *options]) == 0
+    assert [path.name for path in out.parent.glob(".*")] == []
+    return read_record(out)
+
+
+def check_renders(record: Record, objective: SceneObjective) -> None:
+    """Every evaluated point of a float64 slice is the loss there, and the model is the second-order one."""
+    arrays, vectors = record.arrays["slice"], torch.from_numpy(record.arrays["directions"]["vectors"])
+    axes = [torch.from_numpy(arrays[name]) for name in "xy" if name in arrays]
+    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, len(axes))
+    at = points @ vectors.T + objective.active.flat
+    known = np.flatnonzero(arrays["evaluated"].ravel())
+    truth = [objective.loss(at[i]) for i in known]
+    assert arrays["loss"].ravel()[known].tolist() == pytest.approx(truth, rel=1e-12)
+    span = SceneHessian(objective, keep_null=True).apply(vectors).T @ vectors
+    slope = vectors.T @ objective.gradient
+    model = (
+        truth[0] * 0 + objective.loss(objective.active.flat) + points @ slope + ((points @ span) * points).sum(1) / 2
+    )
+    assert arrays["model"].ravel().tolist() == pytest.approx(model.tolist(), rel=1e-9)
+    for direction, curvature, first in zip(record.data["slice"]["directions"], span.diagonal(), slope, strict=True):
+        assert direction["curvature"] == pytest.approx(float(curvature), rel=1e-9)
+        assert direction["slope"] == pytest.approx(float(first), rel=1e-9, abs=1e-15)
+
+
+@pytest.fixture(scope="module")
+def eigen(run, tmp_path_factory) -> Record:
+    """Along the eigenvectors, computed: no probe lies beside the checkpoint."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("analysis.console.recording.draw", lambda module, target: [])
+        return sliced(tmp_path_factory.mktemp("eigen") / "slice", run / "double.pt", *POINTS)
+
+
+def test_the_default_is_the_plane_of_the_two_largest_eigenvalues(eigen, objective):
+    check_renders(eigen, objective)
+    H = SceneHessian(objective).apply(torch.eye(objective.active.flat.numel(), dtype=torch.float64))
+    true = torch.linalg.eigvalsh((H + H.T) / 2)
+    first, second = eigen.data["slice"]["directions"]
+    assert abs(first["curvature"] - float(true[-1])) <= first["residual"] <= 1e-3 * first["curvature"]
+    assert abs(second["curvature"] - float(true[-2])) <= second["residual"] <= 1e-3 * second["curvature"]
+    x = eigen.arrays["slice"]["x"]
+    assert (x[0], x[4], x[-1]) == pytest.approx((-3 * first["unit"], 0.0, 3 * first["unit"]), rel=4 * EPS, abs=0.0)
+    assert first["unit"] == pytest.approx(math.sqrt(2e-3 * eigen.data["slice"]["center_loss"] / first["curvature"]))
+    assert eigen.data["counts"]["renders"] == 3 * (81 + 1) and eigen.data["finite_probe"] is None
+
+
+def probed(folder: Path, value: float, vectors: np.ndarray, loss: LossSettings) -> None:
+    """The record of a probe with these eigenvectors, beside a checkpoint whose loss has this value."""
+    data, _ = synthetic()
+    data["objective"] |= {"loss": loss_name(loss), "operator": "hessian", "value": value}
+    with record_folder(folder / "probe") as partial:
+        write_record(partial, data, {"eigenvectors": {"largest": vectors}})
+
+
+def test_eigenvectors_of_the_probe_beside_the_checkpoint_are_taken_where_they_are_its_own(run, eigen, tmp_path):
+    path, scene = tmp_path / "run" / "double.pt", ["--scene", str(run.parent / "still")]
+    path.parent.mkdir()
+    shutil.copy(run / "double.pt", path)
+    loss = load_checkpoint(path).training.config.loss
+    vectors, value = eigen.arrays["directions"]["vectors"], eigen.data["slice"]["center_loss"]
+    probed(path.parent, value, vectors[:, ::-1].copy(), loss)  # told apart from those that Lanczos finds
+    taken = sliced(tmp_path / "taken", path, *scene, *POINTS)
+    assert np.array_equal(taken.arrays["directions"]["vectors"], vectors[:, ::-1])
+    assert taken.data["counts"]["products"] == 6  # of two vectors: to confirm them, for their curvatures, for the model
+    turned = vectors @ np.array([[0.8, -0.6], [0.6, 0.8]])
+    for number, (recorded, of) in enumerate([(vectors, 1.001 * value), (turned, value), (vectors[:-1], value)]):
+        probed(path.parent, of, recorded, loss)
+        computed = sliced(tmp_path / str(number), path, *scene, *POINTS)
+        assert computed.data["counts"]["products"] > 6
+        for found, exact in zip(computed.data["slice"]["directions"], eigen.data["slice"]["directions"], strict=True):
+            assert abs(found["curvature"] - exact["curvature"]) <= found["residual"] + exact["residual"]
+
+
+def test_random_directions_are_as_long_as_each_attribute_of_each_gaussian(run, objective, tmp_path):
+    record = sliced(tmp_path / "slice", run / "double.pt", "--along", "random", "--radius", "2e-3", *POINTS)
+    check_renders(record, objective)
+    active, vectors = objective.active, torch.from_numpy(record.arrays["directions"]["vectors"])
+    for column in vectors.T:
+        for name, rows in active.blocks.items():
+            lengths = column[rows].view(len(active), -1).norm(dim=1)
+            assert torch.allclose(lengths, active.flat[rows].view(len(active), -1).norm(dim=1), rtol=1e-12), name
+    assert record.arrays["slice"]["y"][-1] == 2e-3
+    again = sliced(tmp_path / "again", run / "double.pt", "--along", "random", *POINTS)
+    assert again.arrays["slice"]["y"][-1] == 1e-3
+    other = sliced(tmp_path / "other", run / "double.pt", "--along", "random", *POINTS, "--seed", "1")
+    assert np.array_equal(again.arrays["directions"]["vectors"], vectors)
+    assert not np.allclose(other.arrays["directions"]["vectors"], vectors)
+
+
+def test_along_the_gradient_the_slope_is_its_length_and_finite_steps_are_second_differences(run, objective, tmp_path):
+    record = sliced(tmp_path / "slice", run / "double.pt", "--along", "gradient", "--points", "21")
+    check_renders(record, objective)
+    (direction,) = record.data["slice"]["directions"]
+    assert direction["slope"] == pytest.approx(float(objective.gradient.norm()), rel=1e-9)
+    assert direction["length"] == pytest.approx(1) and record.data["slice"]["cosine"] is None
+    probe, v = record.data["finite_probe"], torch.from_numpy(record.arrays["directions"]["vectors"][:, 0])
+    assert probe["infinitesimal"] == pytest.approx(direction["curvature"], rel=1e-12)
+    assert probe["steps"][-1] == pytest.approx(record.arrays["slice"]["x"][-1]) == 1e4 * probe["steps"][0]
+    center = objective.active.flat
+    for step, value, bound in zip(probe["steps"], probe["curvatures"], probe["round_off"], strict=True):
+        ends = objective.loss(center + step * v), objective.loss(center - step * v)
+        assert abs((sum(ends) - 2 * objective.loss(center)) / step**2 - value) <= bound
+    assert record.data["counts"]["renders"] == 3 * (record.data["slice"]["evaluations"] + probe["evaluations"])
+
+
+def test_what_finite_steps_see_is_said_as_the_range_over_those_that_round_off_does_not_hide():
+    probe = synthetic_line()[0]["finite_probe"]
+    said = _finite_curvature(probe)
+    assert "from 41.0 to 70.0, at the 3 of 4 steps that round-off does not hide (±1.00 × 10⁻⁵ to ±0.00100)" in said
+    assert said.endswith(", 2 of them with another order of splats")
+    hidden = probe | {"curvatures": [None] * 4, "round_off": [None] * 4, "crossed": None}
+    assert _finite_curvature(hidden) == "at finite steps: round-off hides the curvature at all 4 steps"
+
+
+def test_a_line_leads_to_the_other_checkpoint_and_what_is_in_sight_there_alone(run, tmp_path):
+    for start, end in (("behind", "double"), ("double", "turned")):
+        record = sliced(tmp_path / start, run / f"{start}.pt", str(run / f"{end}.pt"), "--points", "9", "--all-points")
+        x, loss = record.arrays["slice"]["x"], record.arrays["slice"]["loss"]
+        assert x.tolist() == [-0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5]
+        for at, name in ((0.0, start), (1.0, end)):
+            objective = objective_of(run / f"{name}.pt")
+            truth = objective.loss(objective.active.flat)
+            assert float(loss[x == at][0]) == pytest.approx(truth, rel=1e-12)
+        assert record.arrays["directions"]["vectors"].shape == (
+            len(load_checkpoint(run / "double.pt").training.gaussians.flat),
+            1,
+        )
+    gaussians = load_checkpoint(run / "double.pt").training.gaussians
+    way = gaussians.with_flat(torch.from_numpy(record.arrays["directions"]["vectors"][:, 0])).quats
+    assert way.norm(dim=1).max() <= math.sqrt(2)  # unit quaternions that turn the same way, the shorter one
+
+
+def test_of_two_kinds_the_second_is_put_at_a_right_angle_and_keeps_its_length(run, objective, tmp_path):
+    options = ["--along", "gradient", "--along", "eigenvectors", "--radius", "0.01", "--radius", "2", *POINTS]
+    record = sliced(tmp_path / "slice", run / "double.pt", *options)
+    check_renders(record, objective)
+    vectors = record.arrays["directions"]["vectors"]
+    gradient = objective.gradient.numpy() / float(objective.gradient.norm())
+    assert vectors[:, 0] == pytest.approx(gradient, abs=1e-12)
+    assert vectors.T @ vectors == pytest.approx(np.eye(2), abs=1e-12)
+    assert abs(record.data["slice"]["cosine"]) > 1e-6  # so that there was something to do
+    first, second = record.data["slice"]["directions"]
+    assert (first["kind"], second["kind"], second["name"]) == ("gradient", "eigenvectors", "e₁⊥")
+    assert second["residual"] is None
+    assert record.arrays["slice"]["x"][-1] == 0.01
+    assert record.arrays["slice"]["y"][-1] == pytest.approx(2 * second["unit"])
+
+
+def test_an_adaptive_slice_says_what_it_rendered_and_stays_below_the_most(run, objective, tmp_path, capsys):
+    record = sliced(tmp_path / "slice", run / "double.pt", "--max-renders", "80", "--tolerance", "1e-6")
+    check_renders(record, objective)
+    about = record.data["slice"]
+    assert about["evaluations"] <= 80 and about["points"] == 41 * 41 and about["reason"] == "evaluation budget"
+    said = capsys.readouterr()
+    assert "evaluation budget" in said.out and f"{about['evaluated_points']} are renders" in said.out
+    assert str(tmp_path / "slice") in said.out and "slice.json" in said.out
+
+
+def test_workers_change_no_number(run, tmp_path):
+    one, three = (
+        sliced(tmp_path / workers, run / "checkpoint.pt", "--points", "15", "--workers", workers) for workers in "13"
+    )
+    for group, arrays in one.arrays.items():
+        for name, array in arrays.items():
+            assert np.array_equal(array, three.arrays[group][name]), name
+
+
+BLOCKED = """
+import sys, threading, time
+import landscape.slices.grid_evaluations as grid
+from analysis.cli import main
+from splat.curvature import SceneObjective
+grid.SAVE_EVERY, evaluate, calls = 0.0, SceneObjective.evaluate, []
+def blocked(self, flat):
+    calls.append(flat)
+    if len(calls) > 60:
+        print("there", flush=True)
+        time.sleep(1000)
+    return evaluate(self, flat)
+SceneObjective.evaluate = blocked
+main(sys.argv[1:])
+"""
+
+
+def test_a_killed_slice_leaves_the_old_record_whole_and_continues(run, eigen, tmp_path, monkeypatch):
+    out = tmp_path / "slice"
+    shutil.copytree(eigen.folder, out)
+    before = (out / "slice.json").read_bytes()
+    command = ["slice", str(run / "double.pt"), "--out", str(out), "--points", "11", "--all-points", "--workers", "1"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", BLOCKED, *command],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None and process.stdout.readline() == "there\n"
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    process.stdout.close()
+    assert (out / "slice.json").read_bytes() == before
+    calls, evaluate = [], SceneObjective.evaluate
+    monkeypatch.setattr(SceneObjective, "evaluate", lambda self, flat: calls.append(flat) or evaluate(self, flat))
+    record = sliced(out, run / "double.pt", *command[4:])
+    whole = sliced(tmp_path / "whole", run / "double.pt", *command[4:])
+    assert np.array_equal(record.arrays["slice"]["loss"], whole.arrays["slice"]["loss"])
+    assert np.array_equal(record.arrays["directions"]["vectors"], whole.arrays["directions"]["vectors"])
+    assert record.data["counts"]["products"] == 6 < whole.data["counts"]["products"]  # its eigenvectors were kept too
+    # of the 60 evaluations before it was killed, a few were of the centre; the rest of the 121 are made now
+    assert len(calls) - 2 * 121 <= -50 + 2 * 5
+
+
+def test_an_interrupted_slice_keeps_the_old_record(run, eigen, tmp_path, monkeypatch, capsys):
+    out = shutil.copytree(eigen.folder, tmp_path / "slice")
+    before = (out / "slice.json").read_bytes()
+
+    def interrupt(module, target):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("analysis.console.recording.draw", interrupt)
+    assert main(["slice", str(run / "double.pt"), "--out", str(out), "--points", "5", "--all-points"]) == 130
+    assert (out / "slice.json").read_bytes() == before
+
+
+def test_an_interrupted_slice_says_how_it_is_continued(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("landscape.slices.grid_evaluations.SAVE_EVERY", 0.0)
+    evaluate, calls = SceneObjective.evaluate, []
+
+    def interrupted(self, flat):
+        calls.append(flat)
+        if len(calls) > 30:
+            raise KeyboardInterrupt
+        return evaluate(self, flat)
+
+    monkeypatch.setattr(SceneObjective, "evaluate", interrupted)
+    words = ["slice", str(run / "double.pt"), "--out", str(tmp_path / "slice"), "--all-points", "--workers", "1"]
+    assert main([*words, "--points", "11"]) == 130
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"what was rendered is kept; to continue: landscape {shlex.join([*words, '--points', '11'])}" in said
+
+
+def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
+    def fail(module, target):
+        raise RuntimeError("drawing failed: no fonts")
+
+    monkeypatch.setattr("analysis.console.recording.draw", fail)
+    record = sliced(tmp_path / "slice", run / "double.pt", "--along", "gradient", *POINTS)
+    assert "drawing failed: no fonts" in record.data["notes"]
+
+
+def test_the_pictures_are_those_of_a_plane_or_of_a_line(run, eigen, tmp_path, monkeypatch):
+    from analysis.console.drawing import draw
+
+    monkeypatch.setattr("analysis.console.recording.draw", draw)
+    sliced(tmp_path / "line", run / "double.pt", "--along", "gradient", *POINTS)
+    assert [path.name for path in (tmp_path / "line").glob("*.png")] == ["slice1d.png"]
+    assert recorded_figures(eigen) == ("slice2d", "surface")
+
+
+def few(run: Path, tmp_path: Path) -> str:
+    """A checkpoint with other Gaussians."""
+    loaded = load_checkpoint(run / "double.pt")
+    gaussians = loaded.training.gaussians.select(torch.arange(9))
+    state = Adam.zero(gaussians), ScreenGradients.zero(len(gaussians), torch.float64)
+    save_checkpoint(
+        tmp_path / "few.pt",
+        replace(loaded.training, gaussians=gaussians, adam=state[0], screen_gradients=state[1]),
+        loaded.scene,
+    )
+    return str(tmp_path / "few.pt")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--points", "4"], ["odd number"]),
+        (["--radius", "0"], ["radii", "above 0"]),
+        (["--radius", "1", "--radius", "1", "--radius", "1"], ["at most 2 radii"]),
+        (["--tolerance", "2"], ["tolerance between 0 and 1"]),
+        (["--max-renders", "10"], ["at least 52"]),
+        (["--max-renders", "60", "--all-points"], ["leave one out"]),
+        (["--workers", "0"], ["workers"]),
+        (["--along", "line"], ["no other checkpoint", "name it"]),
+        (["--along", "gradient", "--dimension", "2"], ["dimension 2", "--along twice"]),
+        (["--along", "gradient", "--along", "random", "--dimension", "1"], ["--along once"]),
+        (["--along", "gradient", "--along", "random", "--along", "eigenvectors"], ["one or two directions"]),
+        (["--along", "gradient", "--along", "gradient"], ["--along gradient twice", "leave one out", "--dimension 2"]),
+        (["--seed", "-1"], ["seed in [0, 2^63), got -1"]),
+        (["--along", "random", "--radius", "100"], ["too long"]),
+        (["OTHER", "--along", "gradient"], ["one more checkpoint", "--along line"]),
+        (["FEW"], ["15 Gaussians with SH degree", "got 9", "after densification"]),
+        (["SAME"], ["differ"]),
+        (["NOWHERE"], ["nowhere.pt", "no such file"]),
+    ],
+)
+def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys, options, words):
+    named = {"OTHER": str(run / "turned.pt"), "SAME": str(run / "double.pt"), "NOWHERE": str(tmp_path / "nowhere.pt")}
+    if "FEW" in options:
+        named["FEW"] = few(run, tmp_path)
+    out = tmp_path / "out" / "slice"
+    arguments = [str(run / "double.pt"), *(named.get(option, option) for option in options), "--out", str(out)]
+    assert main(["slice", *arguments]) == 2
+    said = capsys.readouterr()
+    message = said.err.strip().splitlines()[-1]
+    assert message.startswith("landscape: ") and "Traceback" not in said.err and said.out == ""
+    for part in words:
+        assert part in message, message
+    assert not out.parent.exists() or list(out.parent.iterdir()) == []
+
+
+def test_a_folder_of_something_else_is_not_replaced(run, tmp_path, capsys):
+    (tmp_path / "thesis.txt").write_text("years of work")
+    assert main(["slice", str(run / "double.pt"), "--out", str(tmp_path)]) == 2
+    assert "without slice.json" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]

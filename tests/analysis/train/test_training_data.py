@@ -1,0 +1,176 @@
+"""What `landscape train` takes beside the photographs: masks, depth maps, where to start; and LPIPS."""
+
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from analysis.commands.cli import main
+from analysis.console.options import TrainOptions
+from analysis.train.command import _beginnings_after, planned
+from splat.scenes.scene import load_scene
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint
+from splat.training.methods.corgs import CoRGS
+
+SIZE = (24, 18)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "still"
+    settings = SyntheticSettings(gaussians=60, views=5, width=SIZE[0], height=SIZE[1])
+    write_transforms_scene(synthetic_scene(settings).scene, folder)
+    return folder
+
+
+def train(scene: Path, out: Path, *more: str) -> int:
+    return main(["train", str(scene), "--out", str(out), "--views", "3", "--iterations", "1", *more])
+
+
+def images(scene: Path) -> list[Path]:
+    return sorted((scene / "images").iterdir())
+
+
+def metrics(out: Path) -> dict:
+    return json.loads((out / "metrics.json").read_text())
+
+
+@pytest.fixture
+def lpips(monkeypatch) -> None:
+    """A stand-in for the package: the mean absolute difference."""
+
+    class Network(torch.nn.Module):
+        def __init__(self, **_: object) -> None:
+            super().__init__()
+
+        def forward(self, image: Tensor, target: Tensor) -> Tensor:
+            return (image - target).abs().mean()
+
+    module = ModuleType("lpips")
+    module.LPIPS = Network  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "lpips", module)
+
+
+@pytest.mark.parametrize(("views", "number"), [(None, 2), (3, 3), ("all", 4)])
+def test_the_number_of_training_views_is_the_protocols_where_nobody_says_one(
+    original, tmp_path, monkeypatch, views, number
+):
+    monkeypatch.setattr("analysis.train.command.usual_views", lambda scene: 2)
+    _, split, *_ = planned(TrainOptions(original, views=views), tmp_path / "run")
+    assert len(split.train) == number
+
+
+def test_without_lpips_the_metric_is_left_out_in_one_sentence_and_null_in_the_record(
+    original, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    assert train(original, tmp_path / "run") == 0
+    said = capsys.readouterr().out
+    assert sum("LPIPS" in line for line in said.splitlines()) == 1 and "LPIPS is left out: " in said
+    for part in (metrics(tmp_path / "run")[key] for key in ("train", "test")):
+        assert part["lpips"] is None and all(view["lpips"] is None for view in part["views"].values())
+
+
+@pytest.mark.usefixtures("lpips")
+def test_with_lpips_it_stands_beside_psnr_and_ssim(original, tmp_path, capsys):
+    assert train(original, tmp_path / "run") == 0
+    said, scores = capsys.readouterr().out, metrics(tmp_path / "run")
+    assert "LPIPS" in said and "left out" not in said
+    with_lpips = scores["test"]["views"]
+    for view in load_scene(original).load(list(with_lpips)):
+        name = view.name.removeprefix("images/")
+        with Image.open(tmp_path / "run/test" / f"images_{name}") as file:
+            pixels = torch.from_numpy(np.array(file)).permute(2, 0, 1) / 255
+        wanted = float((pixels - view.image).abs().mean())
+        assert with_lpips[view.name]["lpips"] == pytest.approx(wanted, abs=0.5 / 255)
+        assert f"{with_lpips[view.name]['lpips']:.4f}" in said
+
+
+def test_scores_are_taken_inside_masks_where_there_are_any(original, tmp_path, capsys):
+    assert train(original, tmp_path / "whole") == 0
+    for path in images(original):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        inside = np.zeros((SIZE[1], SIZE[0]), dtype=np.uint8)
+        inside[4:12, 6:20] = 255
+        Image.fromarray(inside).save(tmp_path / "masks" / path.name)
+    capsys.readouterr()
+    assert train(original, tmp_path / "inside", "--masks", str(tmp_path / "masks")) == 0
+    assert "inside their masks" in capsys.readouterr().out
+    whole, inside = metrics(tmp_path / "whole"), metrics(tmp_path / "inside")
+    for part in ("train", "test"):
+        assert inside[part]["masked"] and not whole[part]["masked"] and inside[part]["psnr"] != whole[part]["psnr"]
+    kept = [(tmp_path / run / "checkpoint.pt").read_bytes() for run in ("whole", "inside")]
+    assert kept[0] == kept[1]  # masks are for the scores alone
+
+
+def test_masks_for_some_of_the_views_are_refused_before_the_training(original, tmp_path, capsys):
+    (tmp_path / "masks").mkdir()
+    Image.new("L", SIZE, 255).save(tmp_path / "masks" / images(original)[1].name)
+    assert train(original, tmp_path / "run", "--masks", str(tmp_path / "masks")) == 2
+    assert "expected a mask for each of 3 views" in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+def test_depth_maps_must_be_there_for_every_training_view(original, tmp_path, capsys):
+    (tmp_path / "depth").mkdir()
+    for i, path in enumerate(images(original)):
+        np.save(tmp_path / "depth" / f"{path.stem}.npy", np.arange(18 * 24).reshape(18, 24) + i)
+    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "depth")) == 0
+    chosen = load_checkpoint(tmp_path / "run/checkpoint.pt").scene.train[1]
+    missing = f"{Path(chosen).stem}.npy"
+    (tmp_path / "depth" / missing).unlink()
+    capsys.readouterr()
+    assert train(original, tmp_path / "again", "--depths", str(tmp_path / "depth")) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"got none for {chosen}; save it as {missing}" in said and not (tmp_path / "again").exists()
+
+
+def test_a_method_that_lacks_its_depth_maps_is_refused_before_there_is_a_folder(original, tmp_path, capsys):
+    assert train(original, tmp_path / "run", "--method", "fsgs") == 2
+    assert "expected a depth map of every training view for the method fsgs" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_method_that_begins_after_the_last_step_is_pointed_out(original, tmp_path, capsys):
+    assert train(original, tmp_path / "late", "--method", "stablegs") == 0
+    assert "stablegs: what begins after step warm_up = 1000 is not reached in" in capsys.readouterr().err
+    assert train(original, tmp_path / "early", "--method", "stablegs", "--set", "warm_up=0") == 0
+    assert "begins after" not in capsys.readouterr().err
+    assert _beginnings_after(3000, CoRGS()) == ""
+    said = _beginnings_after(500, CoRGS())
+    assert (
+        "cor-gs: what begins after step prune_start = 500 and pseudo_start = 2000 is not reached in 500 steps" in said
+    )
+    assert said.endswith("or --set prune_start=250")
+
+
+def test_the_start_can_be_chosen(original, tmp_path, capsys, monkeypatch):
+    scene = load_scene(original)
+    assert scene.points is not None
+    monkeypatch.setattr("splat.training.start.triangulated_points", lambda views: scene.points)
+    runs = {}
+    for source in ("points", "triangulated", "random"):
+        assert train(original, tmp_path / source, "--start", source) == 0
+        runs[source] = len(load_checkpoint(tmp_path / source / "checkpoint.pt").training.gaussians)
+        assert load_checkpoint(tmp_path / source / "checkpoint.pt").scene.start == source
+    assert runs["points"] == runs["triangulated"] < runs["random"] == 10_000
+    assert train(original, tmp_path / "random", "--start", "points", "--resume") == 2
+    assert "start = random, got points" in capsys.readouterr().err
+
+
+def test_a_run_resumes_with_the_depth_maps_that_it_was_started_with(original, tmp_path, capsys):
+    for folder in ("depth", "other"):
+        (tmp_path / folder).mkdir()
+        for path in images(original):
+            np.save(tmp_path / folder / f"{path.stem}.npy", np.arange(18 * 24).reshape(18, 24))
+    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "depth")) == 0
+    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "depth"), "--resume") == 0
+    assert train(original, tmp_path / "run", "--depths", str(tmp_path / "other"), "--resume") == 2
+    assert f"depths = {tmp_path / 'depth'}, got {tmp_path / 'other'}" in capsys.readouterr().err

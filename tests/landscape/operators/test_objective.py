@@ -1,0 +1,74 @@
+import pytest
+import torch
+
+from landscape.operators.objective import ObjectiveHessian
+
+
+def loss(x):
+    """A smooth function of five variables that leaves the last one out."""
+    return torch.exp(x[0] * x[1]) + torch.sin(x[2]) * x[0] ** 2 + (x[3] - x[1]) ** 4
+
+
+POINT = torch.tensor([0.3, -0.7, 1.1, 0.4, 2.0], dtype=torch.float64)
+
+
+def test_it_is_the_dense_hessian_of_autograd():
+    dense = torch.autograd.functional.hessian(loss, POINT)
+    H = ObjectiveHessian(loss, POINT)
+    assert torch.allclose(H.apply(torch.eye(5, dtype=torch.float64)), dense, rtol=0, atol=1e-14)
+
+
+def test_its_gradient_and_value_are_those_of_the_loss():
+    H = ObjectiveHessian(loss, POINT)
+    assert H.value == float(loss(POINT))
+    x = POINT.clone().requires_grad_()
+    assert torch.equal(H.gradient, torch.autograd.grad(loss(x), x)[0])
+    assert not H.gradient.requires_grad
+
+
+def test_float32_agrees_with_float64_to_its_round_off():
+    V = torch.randn(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    exact = ObjectiveHessian(loss, POINT).apply(V)
+    single = ObjectiveHessian(loss, POINT.float()).apply(V.float())
+    assert single.dtype == torch.float32
+    assert (single - exact).norm() < 20 * torch.finfo(torch.float32).eps * exact.norm()
+
+
+@pytest.mark.parametrize("flat", [lambda x: 3 * x.sum(), lambda x: 2 + 0 * x.sum(), lambda x: (x - 0.1).abs().sum()])
+def test_an_objective_without_curvature_has_a_zero_hessian(flat):
+    assert not ObjectiveHessian(flat, POINT).apply(torch.eye(5, dtype=torch.float64)).any()
+
+
+@pytest.mark.parametrize("number", [lambda x: float(loss(x).detach()), lambda x: loss(x).detach().numpy()[()]])
+def test_a_loss_that_is_no_tensor_is_refused(number):
+    with pytest.raises(ValueError, match=r"one scalar tensor as loss, got float(64)?; keep to torch"):
+        ObjectiveHessian(number, POINT)
+
+
+WEIGHTS = torch.ones(5, dtype=torch.float64, requires_grad=True)
+
+
+@pytest.mark.parametrize(
+    "cut",
+    [
+        lambda x: loss(x).detach(),
+        torch.no_grad()(loss),
+        lambda x: torch.tensor(2.0),
+        lambda x: torch.tensor(float(loss(x)), requires_grad=True),
+        lambda x: (WEIGHTS * x.detach() ** 2).sum(),  # it has a graph, in which the point is not
+    ],
+)
+def test_a_loss_that_is_cut_off_from_the_point_is_refused_and_not_taken_for_a_flat_one(cut):
+    with pytest.raises(ValueError, match=r"computed from the point.*\.detach\(\).*no_grad"):
+        ObjectiveHessian(cut, POINT)
+
+
+def test_bad_points_and_losses_are_refused():
+    with pytest.raises(ValueError, match="one flat vector of floats"):
+        ObjectiveHessian(loss, POINT[:, None])
+    with pytest.raises(ValueError, match="one flat vector of floats"):
+        ObjectiveHessian(loss, POINT.long())
+    with pytest.raises(ValueError, match=r"one scalar tensor as loss, got torch.float64 of shape \(5,\)$"):
+        ObjectiveHessian(lambda x: x, POINT)
+    with pytest.raises(ValueError, match="finite scalar loss"):
+        ObjectiveHessian(lambda x: (x - 3).log().sum(), POINT)

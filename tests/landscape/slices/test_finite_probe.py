@@ -1,0 +1,123 @@
+import numpy as np
+import pytest
+import torch
+
+from landscape.operators.operator import DenseOperator
+from landscape.slices.finite_probe import NOISE_POINTS, ORDER, STEPS, evaluation_noise, finite_probe
+from tests.oracles import symmetric_matrix
+
+N = 5
+A = torch.from_numpy(symmetric_matrix(np.linspace(-1, 3, N), seed=0))
+CENTER = torch.linspace(1, 2, N, dtype=torch.float64)
+V = torch.linspace(-1, 0.5, N, dtype=torch.float64)
+QUARTIC = 0.7
+
+
+def quartic(theta):
+    """Curvature A at CENTER, and a fourth derivative of 24 * QUARTIC along V / |V|^2."""
+    step = theta.double() - CENTER
+    return 2 + step @ A @ step / 2 + QUARTIC * float(step @ V / (V @ V)) ** 4
+
+
+def probed(loss, center=CENTER, steps=STEPS, **more):
+    return finite_probe(loss, center, V.to(center.dtype), DenseOperator(A), steps, **more)
+
+
+def test_a_finite_step_sees_the_fourth_derivative_and_says_how_much_of_it():
+    found = probed(quartic)
+    exact = float(V @ A @ V)
+    assert found.infinitesimal == pytest.approx(exact, rel=1e-14)
+    # c(d) = v.Av + 2 QUARTIC d^2, a step of d V being one of d along V / |V|^2
+    expected = exact + 2 * QUARTIC * found.steps.square()
+    assert ((found.curvatures - expected).abs() <= found.round_off).all()
+    told = (found.truncation - 2 * QUARTIC * found.steps.square()).abs()
+    assert (told <= 2 * found.round_off).all()
+    assert found.best is not None and abs(float(found.curvatures[found.best]) - exact) < 1e-5
+    assert found.crossed is None and found.evaluations == 2 * len(STEPS) + 1 + NOISE_POINTS
+
+
+@pytest.mark.parametrize("sigma", [1e-9, 1e-6])
+def test_noise_is_measured_and_bounds_the_round_off(sigma):
+    random = np.random.default_rng(0)
+    found = probed(lambda theta: float(quartic(theta)) + sigma * random.standard_normal())
+    # 20 differences, as good as 8 independent ones: within a factor of 3 in all but one of 1,000 cases
+    assert sigma / 3 < found.noise < 3 * sigma
+    expected = float(V @ A @ V) + 2 * QUARTIC * found.steps.square()
+    # the bound is four standard errors for the true noise
+    assert ((found.curvatures - expected).abs() <= found.round_off * sigma / min(found.noise, sigma)).all()
+    assert torch.allclose(found.round_off * found.steps.square(), torch.tensor(4 * 6**0.5 * found.noise).double())
+
+
+def test_the_measured_noise_is_unbiased():
+    values = np.random.default_rng(1).standard_normal((2000, NOISE_POINTS)) + 3 * np.arange(NOISE_POINTS) ** 3
+    squares = np.array([evaluation_noise(row) ** 2 for row in values])
+    assert abs(squares.mean() - 1) < 4 * squares.std() / len(squares) ** 0.5
+
+
+def test_noise_is_at_least_the_resolution_of_what_the_objective_returns():
+    found = probed(lambda theta: torch.tensor(3.0))
+    assert found.noise == 3 * torch.finfo(torch.float32).eps and not found.curvatures.any()
+    assert probed(lambda theta: 3.0).noise == 3 * torch.finfo(torch.float64).eps
+
+
+def test_the_round_off_of_float32_parameters_is_within_its_bound():
+    found = probed(quartic, center=CENTER.float())
+    v, center = V.float().double(), CENTER.float().double()
+    shift = float((center - CENTER) @ V / (V @ V))
+    exact = float(v @ A @ v) + 2 * QUARTIC * (found.steps.square() + 6 * shift**2)
+    error = (found.curvatures - exact).abs()
+    assert (error <= found.round_off).all()
+    # the rounding of theta + d v is what is left: without it the bound would not hold
+    assert (error > 4 * 6**0.5 * found.noise / found.steps.square()).any()
+
+
+def test_across_a_kink_the_probe_sees_two_slopes_and_the_signature_says_so():
+    def kinked(theta):
+        along = float((theta - CENTER) @ V / (V @ V))
+        return 1 + abs(along - 0.01), along > 0.01
+
+    found = probed(kinked, steps=(0.001, 0.1, 1.0))
+    assert found.crossed is not None and found.crossed.tolist() == [False, True, True] and found.best == 0
+    assert probed(kinked, steps=(0.1, 1.0)).best is None
+    # |d - a| + |d + a| - 2 a = 2 (d - a) for d > a
+    assert found.curvatures[1:].tolist() == pytest.approx([2 * 0.09 / 0.01, 2 * 0.99], rel=1e-10)
+    assert abs(float(found.curvatures[0])) <= float(found.round_off[0])
+
+
+def test_the_record_is_plain_and_what_is_not_finite_is_none():
+    def wall(theta):
+        return float("inf") if float((theta - CENTER) @ V / (V @ V)) > 0.5 else quartic(theta)
+
+    record = probed(wall, steps=(0.01, 0.1, 1.0)).record()
+    assert record["steps"] == [0.01, 0.1, 1.0] and record["crossed"] is None and record["best"] == 0
+    assert isinstance(record["curvatures"], list) and record["curvatures"][2] is None
+
+
+def test_progress_counts_the_evaluations():
+    seen = []
+    found = probed(quartic, steps=(0.1, 1.0), progress=lambda *state: seen.append(state[:2]))
+    assert seen == [(i + 1, found.evaluations) for i in range(found.evaluations)]
+
+
+def test_bad_probes_are_refused():
+    with pytest.raises(ValueError, match="direction of its length"):
+        finite_probe(quartic, CENTER, V[:3], DenseOperator(A))
+    with pytest.raises(ValueError, match="direction that is not zero"):
+        finite_probe(quartic, CENTER, 0 * V, DenseOperator(A))
+    for steps in ((1.0,), (0.0, 1.0), (1.0, 0.5)):
+        with pytest.raises(ValueError, match="positive steps that increase"):
+            probed(quartic, steps=steps)
+    with pytest.raises(ValueError, match="finite objective at the centre"):
+        probed(lambda theta: float("nan"))
+    seen = []
+    with pytest.raises(ValueError, match=f"more than {ORDER} noise points, got {ORDER}"):
+        finite_probe(lambda theta: seen.append(theta) or 0.0, CENTER, V, DenseOperator(A), noise_points=ORDER)
+    assert not seen
+
+
+@pytest.mark.parametrize("rounded", [float, np.float32, lambda value: value.item()], ids=["float", "numpy", "item"])
+def test_values_that_were_float32_before_bound_the_round_off_as_such(rounded):
+    found = probed(lambda theta: rounded(quartic(theta).float()))
+    assert found.noise >= torch.finfo(torch.float32).eps * found.center_loss
+    expected = float(V @ A @ V) + 2 * QUARTIC * found.steps.square()
+    assert ((found.curvatures - expected).abs() <= found.round_off).all()

@@ -1,0 +1,152 @@
+from math import inf, isclose
+
+import pytest
+import torch
+
+from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
+from landscape.eigen.pairs import EigenEnds, Eigenpairs
+from landscape.eigen.power import PowerSettings, power_ends
+from landscape.operators.operator import DenseOperator
+from landscape.spectrum.anisotropy import anisotropy, effective_rank, literal, mass_quantile, saddle, share
+from landscape.spectrum.density import spectral_density
+from tests.landscape.spectra import ROUNDING, N, eigenvalues, generator, operator
+
+
+def ends(top, bottom, residuals=(0.0, 0.0)):
+    """Ends with these values and residuals."""
+    pairs = []
+    for value, residual in zip((top, bottom), residuals, strict=True):
+        numbers = torch.tensor([[value], [residual], [inf]], dtype=torch.float64)
+        pairs.append(Eigenpairs(numbers[0], torch.ones(1, 1).double(), numbers[1], numbers[2], "tolerance"))
+    return EigenEnds(pairs[0], pairs[1], "by hand", 0, inf, 0.0)
+
+
+def test_literal_and_saddle_are_their_definitions():
+    assert literal(ends(4.0, -0.1)).value == pytest.approx(-40.0)
+    assert saddle(ends(4.0, -0.1)).value == pytest.approx(40.0)
+    assert literal(ends(4.0, 0.1)).value == pytest.approx(40.0)
+    assert literal(ends(-1.0, -4.0)).value == pytest.approx(0.25)
+
+
+def test_brackets_are_the_extreme_quotients_of_the_intervals():
+    index = literal(ends(4.0, -0.1, residuals=(0.4, 0.02)))
+    assert (index.low, index.high) == pytest.approx((-4.4 / 0.08, -3.6 / 0.12))
+    index = saddle(ends(4.0, -0.1, residuals=(0.4, 0.02)))
+    assert (index.low, index.high) == pytest.approx((3.6 / 0.12, 4.4 / 0.08))
+
+
+def test_an_unresolved_small_end_bounds_the_index_from_below_only():
+    unresolved = ends(4.0, 0.01, residuals=(0.4, 0.02))
+    index = literal(unresolved)
+    assert index.low == pytest.approx(3.6 / 0.03) and index.high == inf and "not resolved" in index.note
+    assert index.value == pytest.approx(400)
+    index = saddle(unresolved)
+    assert index.value is None and index.low == pytest.approx(3.6 / 0.03) and str(index).startswith(">= 120")
+
+
+def test_a_small_end_that_is_zero_to_round_off_bounds_the_index_by_the_dtype():
+    index = literal(ends(4.0, 0.0))
+    assert index.value is None and isclose(index.low, 1 / torch.finfo(torch.float64).eps, rel_tol=1e-6)
+
+
+def test_semi_definite_operators_have_no_saddle_and_the_words_say_so():
+    assert "positive semi-definite" in str(saddle(ends(4.0, 0.1)))
+    assert "negative semi-definite" in str(saddle(ends(-0.1, -4.0)))
+    assert saddle(ends(4.0, 0.1)).record() == {
+        "value": None,
+        "low": None,
+        "high": None,
+        "note": "no negative curvature: the operator is positive semi-definite",
+    }
+
+
+@pytest.mark.parametrize("name", ["indefinite", "both tails", "power law", "clustered", "rank-deficient"])
+def test_every_bracket_holds_the_truth(name):
+    H = operator(name)
+    true = eigenvalues(H)
+    magnitude = true.abs().sum()
+    found = extreme_eigenpairs(H, generator(), EigenSettings(rtol=1e-4))
+    family = anisotropy(found, spectral_density(H, generator(), matvecs=128, starts=8))
+    assert family.share is not None and family.effective_rank is not None
+    assert family.share.low <= float(true[-1] / magnitude) <= family.share.high
+    assert family.effective_rank.low <= float(magnitude**2 / true.square().sum()) <= family.effective_rank.high
+    small = float(
+        true.abs().sort().values[int(torch.searchsorted(true.abs().sort().values.cumsum(0), 0.05 * magnitude))]
+    )
+    assert family.mass_quantile is not None
+    quantile = float(true[-1]) / small
+    assert family.mass_quantile.low * (1 - ROUNDING) <= quantile <= family.mass_quantile.high * (1 + ROUNDING)
+    if name == "rank-deficient":
+        assert family.literal.high == inf and family.literal.low > 1e10 and family.saddle.value is None
+        return
+    assert family.literal.low <= float(true[-1] / true[0]) <= family.literal.high
+    if name == "power law":
+        assert family.saddle.value is None
+    else:
+        assert family.saddle.low <= float(true[-1] / -true[0]) <= family.saddle.high
+
+
+def test_a_multiple_of_the_identity_has_full_effective_rank_and_even_share():
+    H = DenseOperator(-3 * torch.eye(N, dtype=torch.float64))
+    found, density = extreme_eigenpairs(H, generator()), spectral_density(H, generator())
+    rank = effective_rank(found, density)
+    assert (rank.low, rank.value, rank.high) == pytest.approx((N, N, N))
+    assert share(found, density).value == pytest.approx(-1 / N)
+    quotient = mass_quantile(found, density)
+    assert quotient.value == pytest.approx(-1) and quotient.low <= -1 <= quotient.high <= 0
+
+
+def test_the_zero_operator_has_no_index():
+    H = operator("zero")
+    found, density = extreme_eigenpairs(H, generator()), spectral_density(H, generator())
+    family = anisotropy(found, density)
+    for index in (family.literal, family.saddle, family.share, family.effective_rank, family.mass_quantile):
+        assert index is not None and index.value is None
+
+
+def test_the_papers_power_iteration_gives_the_literal_index():
+    H = operator("both tails")
+    true = eigenvalues(H)
+    index = literal(power_ends(H, generator(), PowerSettings(rtol=1e-3, max_matvecs=3000)))
+    assert index.value == pytest.approx(float(true[-1] / true[0]), rel=2e-3)
+    assert index.low <= float(true[-1] / true[0]) <= index.high
+
+
+def test_splitting_a_direction_in_two_halves_changes_the_literal_index_but_not_the_share():
+    """One direction split into two coincident halves: theta = a + b, so that each new row is the old one."""
+    split = torch.cat([torch.eye(N, dtype=torch.float64)] * 2, dim=1)
+    H = operator("both tails")
+    doubled = DenseOperator(split.T @ H.matrix @ split)
+    true, twice = eigenvalues(H), eigenvalues(doubled)
+    before = anisotropy(extreme_eigenpairs(H, generator()), spectral_density(H, generator(), 8))
+    after = anisotropy(extreme_eigenpairs(doubled, generator()), spectral_density(doubled, generator(), 8))
+    assert before.share is not None and after.share is not None
+    assert after.share.low <= float(twice[-1] / twice.abs().sum()) <= after.share.high
+    assert float(twice[-1] / twice.abs().sum()) == pytest.approx(float(true[-1] / true.abs().sum()))
+    assert before.record().keys() == {"literal", "saddle", "share", "effective_rank", "mass_quantile"}
+
+
+def test_without_a_density_only_the_ends_indices_are_given():
+    assert anisotropy(ends(4.0, -0.1)).record().keys() == {"literal", "saddle"}
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_an_end_that_the_budget_left_behind_is_not_claimed(seed):
+    """Most eigenvalues are next to 0, and a small negative one hides behind the large ones: its Ritz value is still near 0."""
+    values = torch.cat([torch.tensor([-0.02]), torch.linspace(-1e-4, 1e-4, 1900), torch.logspace(0, 1, 99)]).double()
+    H, generator = DenseOperator(torch.diag(values)), torch.Generator().manual_seed(seed)
+    ends = extreme_eigenpairs(H, generator, EigenSettings(max_matvecs=12))
+    assert ends.smallest.reason == "matvec budget"
+    assert float(ends.smallest.values[0]) - float(ends.smallest.residuals[0]) > -0.02  # the residual does not tell
+    found, down, truth = literal(ends), saddle(ends), 10 / -0.02
+    assert found.low <= abs(truth) if "for |A|" in found.note else found.low <= truth <= found.high
+    assert down.low <= abs(truth) <= down.high
+
+
+def test_an_end_that_was_not_looked_for_is_asked_for():
+    H = operator("both tails")
+    top = extreme_eigenpairs(H, generator(), EigenSettings(largest=1, smallest=0))
+    with pytest.raises(ValueError, match="eigenpair at each end, got 1 of the largest and 0 of the smallest"):
+        literal(top)
+    with pytest.raises(ValueError, match="eigenpair at each end"):
+        anisotropy(top, spectral_density(H, generator(), 24))

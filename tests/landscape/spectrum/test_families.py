@@ -1,0 +1,89 @@
+import pytest
+import torch
+
+from landscape.eigen.eigen import EigenSettings
+from landscape.operators.operator import CountingOperator, DenseOperator, ProjectedOperator
+from landscape.spectrum.density import ActiveSpace
+from landscape.spectrum.families import FamilySettings, Lead, families, family
+from tests.landscape.spectra import ROUNDING, N, eigenvalues, generator, operator
+
+BLOCKS = {"a": slice(0, 50), "b": slice(50, N), "none": slice(N, N)}
+
+
+def blocked(name="both tails"):
+    return DenseOperator(operator(name).matrix, BLOCKS)
+
+
+@pytest.mark.parametrize("name", ["both tails", "power law", "rank-deficient"])
+def test_every_parts_brackets_hold_the_indices_of_its_own_dense_block(name):
+    H = blocked(name)
+    found = families(H, generator(), FamilySettings(starts=4))
+    assert list(found) == ["all", "a", "b"]
+    for part, rows in {"all": slice(0, N), "a": BLOCKS["a"], "b": BLOCKS["b"]}.items():
+        true = eigenvalues(DenseOperator(H.matrix[rows, rows]))
+        total, indices = float(true.abs().sum()), found[part].indices
+        assert indices.share is not None and indices.effective_rank is not None and indices.mass_quantile is not None
+        assert indices.share.low <= float(true[-1]) / total <= indices.share.high
+        assert indices.effective_rank.low <= total**2 / float(true.square().sum()) <= indices.effective_rank.high
+        magnitudes = true.abs().sort().values
+        small = float(magnitudes[int(torch.searchsorted(magnitudes.cumsum(0), 0.05 * total))])
+        quantile = float(true[-1]) / small
+        assert indices.mass_quantile.low * (1 - ROUNDING) <= quantile <= indices.mass_quantile.high * (1 + ROUNDING)
+        assert found[part].rank == rows.stop - rows.start
+
+
+def test_an_unresolved_small_end_is_a_lower_bound_in_every_part():
+    H = blocked("rank-deficient")
+    for part in families(H, generator()).values():
+        assert str(part.indices.saddle).startswith(("undefined", ">="))
+        assert part.indices.literal.low > 100 and part.indices.literal.high == float("inf")
+
+
+def test_a_part_has_the_same_numbers_whatever_comes_after_it():
+    first, alone = families(blocked(), generator()), families(blocked(), generator(), parts=["all", "a"])
+    assert list(first) == ["all", "a", "b"] and list(alone) == ["all", "a"]
+    assert torch.equal(alone["a"].density.nodes, first["a"].density.nodes)
+    assert first["a"].record()["matvecs"] == first["a"].ends.matvecs + first["a"].density.matvecs
+
+
+def test_the_budget_is_kept_part_by_part():
+    H = CountingOperator(blocked("indefinite"))
+    settings = FamilySettings(EigenSettings(rtol=1e-9, max_matvecs=20), starts=2, steps=5)
+    families(H, generator(), settings)
+    assert H.matvecs <= 3 * (20 + 10)
+
+
+def test_a_known_null_space_is_not_counted():
+    basis = torch.linalg.qr(torch.randn(N, 30, generator=generator(2), dtype=torch.float64)).Q
+    H = ProjectedOperator(blocked("multiple"), lambda V: basis @ (basis.T @ V))
+    found = family(H, generator(), active=ActiveSpace(H.project, 30))
+    assert found.rank == found.density.dim == 30
+    true = torch.linalg.eigvalsh(basis.T @ blocked("multiple").matrix @ basis)
+    rank = float(true.abs().sum().square() / true.square().sum())
+    assert found.indices.effective_rank is not None
+    assert found.indices.effective_rank.low <= rank <= found.indices.effective_rank.high <= 30
+
+
+def test_a_part_of_one_row_has_one_eigenvalue():
+    H = DenseOperator(torch.diag(torch.tensor([3.0, 2.0, 1.0]).double()), {"one": slice(0, 1), "two": slice(1, 3)})
+    found = families(H, generator())
+    assert found["one"].indices.literal.value == pytest.approx(1.0)
+    assert found["two"].indices.literal.value == pytest.approx(2.0)
+
+
+def test_progress_names_the_part_and_unknown_parts_are_refused():
+    seen = []
+    families(blocked(), generator(), parts=["b"], progress=lambda done, most, state: seen.append(state))
+    assert seen and all(state.startswith("b: ") for state in seen)
+    with pytest.raises(ValueError, match="parts out of all, a, b, none, got 'c'"):
+        families(blocked(), generator(), parts=["c"])
+
+
+def test_a_part_is_led_to_its_ends_and_the_others_have_the_numbers_that_they_have_without():
+    H = DenseOperator(torch.diag(torch.linspace(-1, 3, N, dtype=torch.float64)), BLOCKS)
+    lead = Lead(torch.eye(N, dtype=torch.float64)[:, [0, N - 1]])
+    led, alone = families(H, generator(), leads={"all": lead}), families(H, generator())
+    assert led["all"].ends.matvecs < alone["all"].ends.matvecs
+    assert float(led["all"].ends.smallest.values[0]) == pytest.approx(-1, rel=1e-2)
+    for part in ("a", "b"):
+        assert led[part].record() == alone[part].record()

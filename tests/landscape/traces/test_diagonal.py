@@ -1,0 +1,100 @@
+from math import sqrt
+
+import numpy as np
+import pytest
+import torch
+
+from landscape.operators.operator import CountingOperator, DenseOperator
+from landscape.traces.diagonal import _controlled, estimate_diagonal
+from tests.landscape.spectra import Buffered, generator
+from tests.landscape.traces.test_control import BLOCKS, PART, REST, H, N, Partly
+from tests.oracles import symmetric_matrix
+
+INDEFINITE = torch.from_numpy(symmetric_matrix(np.linspace(-0.5, 1, N), seed=0))
+GROUPS = torch.arange(N) % 4
+
+
+def test_every_entry_is_within_its_errors_and_they_are_those_of_theory():
+    probes = 4000
+    operator = CountingOperator(DenseOperator(INDEFINITE))
+    estimate = estimate_diagonal(operator, generator(), probes, batch=100)
+    # four standard errors of the largest of 40: 5
+    assert ((estimate.values - INDEFINITE.diagonal()).abs() < 5 * estimate.standard_errors).all()
+    theory = (INDEFINITE.square().sum(dim=1) - INDEFINITE.diagonal().square()) / probes
+    # a variance from m samples of kurtosis below 3 is within 5 sqrt(2 / m)
+    assert ((estimate.standard_errors.square() / theory - 1).abs() < 5 * sqrt(2 / probes)).all()
+    assert estimate.matvecs == operator.matvecs == probes
+
+
+def test_a_diagonal_matrix_is_exact():
+    diagonal = torch.linspace(-1, 2, N, dtype=torch.float64)
+    estimate = estimate_diagonal(DenseOperator(torch.diag(diagonal)), generator(), 4)
+    assert torch.allclose(estimate.values, diagonal, rtol=0, atol=1e-15)
+    assert float(estimate.standard_errors.max()) < 1e-15
+
+
+def test_a_known_part_leaves_the_mean_and_takes_most_of_the_error():
+    seeds = 400
+    runs = torch.stack([estimate_diagonal(Partly(), generator(seed), 8).values for seed in range(seeds)])
+    assert ((runs.mean(dim=0) - H.diagonal()).abs() < 5 * runs.std(dim=0) / sqrt(seeds)).all()
+    plain = estimate_diagonal(DenseOperator(H), generator(), 200)
+    known = estimate_diagonal(Partly(PART + REST), generator(), 200)
+    assert float(known.standard_errors.mean()) < float(plain.standard_errors.mean()) / 4
+
+
+def test_no_probe_has_a_part_in_its_own_slope():
+    A, B = torch.randn(2, 5, 6, dtype=torch.float64, generator=generator())
+    for i in range(6):
+        a, b = (torch.cat([X[:, :i], X[:, i + 1 :]], dim=1) for X in (A, B))
+        a, b = a - a.mean(dim=1, keepdim=True), b - b.mean(dim=1, keepdim=True)
+        slope = (a * b).sum() / b.square().sum()
+        assert torch.allclose(_controlled(A, B)[:, i], A[:, i] - slope * B[:, i], rtol=0, atol=1e-12)
+
+
+def test_sensitivities_are_sums_of_moduli_within_their_errors():
+    truth = torch.zeros(4, dtype=torch.float64).index_add(0, GROUPS, INDEFINITE.diagonal().abs())
+    sums = estimate_diagonal(DenseOperator(INDEFINITE), generator(), 400, batch=50).sensitivity(GROUPS, 4)
+    assert ((sums.values - truth).abs() < 4 * sums.standard_errors + sums.bias).all()
+    assert (sums.bias > 0).all() and (sums.bias < sums.values).all()
+
+
+def test_the_bias_of_a_sum_of_moduli_is_the_one_of_theory_where_the_diagonal_is_zero():
+    hollow = INDEFINITE - torch.diag(INDEFINITE.diagonal())
+    seeds, one = 200, torch.zeros(N, dtype=torch.int64)
+    runs = [estimate_diagonal(DenseOperator(hollow), generator(seed), 32) for seed in range(seeds)]
+    excess = torch.stack([run.sensitivity(one, 1).values[0] for run in runs])
+    # E |x| = sqrt(2 / pi) s of a normal x, to the 1 / (4 probes) that its kurtosis makes (Edgeworth)
+    expected = sqrt(2 / torch.pi) * (hollow.square().sum(dim=1) / 32).sqrt().sum()
+    assert abs(float(excess.mean() - expected)) < 4 * float(excess.std()) / sqrt(seeds) + float(expected) / (4 * 32)
+    assert all((run.sensitivity(one, 1).bias <= sqrt(2 / torch.pi) * run.standard_errors.sum()).all() for run in runs)
+
+
+def test_a_block_of_a_diagonal_is_its_rows():
+    estimate = estimate_diagonal(DenseOperator(INDEFINITE, BLOCKS), generator(), 8)
+    block = estimate.block("b")
+    assert torch.equal(block.values, estimate.values[25:]) and block.blocks == {"b": slice(0, 15)}
+    assert torch.equal(block.samples.mean(dim=1), block.values)
+
+
+def test_bad_input_is_refused():
+    estimate = estimate_diagonal(DenseOperator(INDEFINITE), generator(), 4)
+    with pytest.raises(ValueError, match=r"a group in 0\.\.3 for each of 40 rows"):
+        estimate.sensitivity(GROUPS[:-1], 4)
+    with pytest.raises(ValueError, match=r"a group in 0\.\.2"):
+        estimate.sensitivity(GROUPS, 3)
+    with pytest.raises(ValueError, match="at least 3 probes, got 2"):
+        estimate_diagonal(DenseOperator(INDEFINITE), generator(), 2)
+
+    class Broken(DenseOperator):
+        def apply(self, V):
+            return super().apply(V) / 0
+
+    with pytest.raises(ValueError, match="expected finite products H V"):
+        estimate_diagonal(Broken(INDEFINITE), generator())
+
+
+def test_an_operator_may_give_the_same_memory_at_every_call():
+    matrix = torch.from_numpy(symmetric_matrix(1 / np.arange(1, 121.0) ** 1.5, seed=1))
+    plain, buffered = (estimate_diagonal(H, generator(), 32) for H in (DenseOperator(matrix), Buffered(matrix)))
+    assert plain.method == buffered.method == "sketch"
+    assert torch.allclose(plain.values, buffered.values, rtol=1e-9)

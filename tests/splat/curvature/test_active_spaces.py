@@ -1,0 +1,70 @@
+"""Per attribute: what is exactly flat is left out and counted, and the indices are those of the dense blocks."""
+
+from collections import Counter
+
+import pytest
+import torch
+
+from analysis.measures.units import optimiser_units
+from landscape import ScaledOperator, families
+from splat.curvature.active_spaces import active_spaces
+from splat.curvature.hessian import SceneHessian
+from splat.curvature.objective import SceneObjective
+from splat.losses.reference import LossSettings
+from splat.training.state import LearningRates
+from tests.splat.tiny import tiny_gaussians, tiny_views
+
+
+@pytest.fixture(scope="module")
+def objective() -> SceneObjective:
+    return SceneObjective(
+        tiny_gaussians(6, sh_degree=2, dtype=torch.float64), tiny_views(torch.float64), LossSettings("l2")
+    )
+
+
+@pytest.mark.parametrize("metric", ["parameters", "optimiser"])
+@pytest.mark.parametrize("gauss_newton", [False, True])
+def test_projectors_have_their_ranks_and_leave_nothing_out_that_is_curved(
+    objective: SceneObjective, gauss_newton: bool, metric: str
+) -> None:
+    hessian = SceneHessian(objective, gauss_newton=gauss_newton)
+    scale = None if metric == "parameters" else optimiser_units(objective, LearningRates(), extent=3.0)
+    operator = hessian if scale is None else ScaledOperator(hessian, scale)
+    H = operator.apply(torch.eye(hessian.dim, dtype=torch.float64))
+    spaces = active_spaces(hessian, scale)
+    assert list(spaces) == ["all", *hessian.blocks]
+    for name, space in spaces.items():
+        rows = hessian.blocks.get(name, slice(0, hessian.dim))
+        P = space.project(torch.eye(rows.stop - rows.start, dtype=torch.float64))
+        block = H[rows, rows]
+        assert float(P.diagonal().sum()) == pytest.approx(space.rank, abs=1e-6)
+        assert float((P - P.T).norm()) <= 1e-10 and float((P @ P - P).norm()) <= 1e-10
+        assert float((P @ block - block).norm()) <= 1e-10 * float(block.norm())
+    n = len(objective.active)
+    assert [spaces[name].rank for name in ("means", "log_scales", "quats", "opacity_logits")] == [3 * n] * 3 + [n]
+    assert spaces["sh"].rank < 27 * n  # three views see 9 of 27 coefficients a channel and Gaussian at most
+
+
+@pytest.mark.parametrize("gauss_newton", [False, True])
+def test_the_indices_of_every_attribute_are_those_of_its_dense_block(
+    objective: SceneObjective, gauss_newton: bool
+) -> None:
+    hessian = SceneHessian(objective, gauss_newton=gauss_newton)
+    H = hessian.apply(torch.eye(hessian.dim, dtype=torch.float64))
+    runs, misses, spaces = 6, Counter(), active_spaces(hessian)
+    for seed in range(runs):
+        for name, part in families(hessian, torch.Generator().manual_seed(seed), active=spaces).items():
+            rows = hessian.blocks.get(name, slice(0, hessian.dim))
+            true = torch.linalg.eigvalsh((H[rows, rows] + H[rows, rows].T) / 2)
+            total = float(true.abs().sum())
+            share, rank = part.indices.share, part.indices.effective_rank
+            assert share is not None and rank is not None and rank.high <= part.rank
+            largest, spread = float(true[-1]) / total, total**2 / float(true.square().sum())
+            misses[name, "share"] += not share.low <= largest * (1 + 1e-9) <= share.high * (1 + 2e-9)
+            misses[name, "rank"] += not rank.low <= spread * (1 + 1e-9) <= rank.high * (1 + 2e-9)
+    # 95% brackets: four misses of six have a probability of 9e-5
+    assert max(misses.values()) < 4, misses
+
+
+def test_with_the_null_space_kept_nothing_is_left_out(objective: SceneObjective) -> None:
+    assert active_spaces(SceneHessian(objective, keep_null=True)) == {}

@@ -1,0 +1,223 @@
+"""A view held still, against the specification, dense matrices and finite differences."""
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from splat.backend.cpu.simd import lanes_of
+from splat.curvature.linearize import LinearizedView
+from splat.losses.cpu.loss import ViewLoss
+from splat.losses.reference import LossSettings, photometric_loss
+from splat.model.gaussians import Gaussians
+from splat.model.settings import SMOOTH, RenderSettings
+from splat.render.render import render
+from splat.scenes.view import View
+from tests.oracles import central_difference
+from tests.splat.held_scenes import BACKGROUND, gradient_and_products, mean_loss, two_views
+from tests.splat.random_scenes import (
+    DERIVATIVE,
+    DTYPES,
+    IMAGE,
+    NUMPY,
+    errors_by_block,
+    random_gaussians,
+    random_like,
+    relative_error,
+)
+
+LOSSES = [
+    LossSettings(),
+    LossSettings("charbonnier"),
+    LossSettings("l2", ssim_weight=0.5, literal=True),
+    LossSettings("l2", ssim_weight=0),
+]
+each_loss = pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: f"{loss.pixel} {loss.ssim_weight}")
+each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
+OPAQUE = RenderSettings(contour_sigma=3.0)
+
+
+def hold(
+    gaussians: Gaussians,
+    view: View,
+    loss: LossSettings,
+    dtype: torch.dtype = torch.float64,
+    settings: RenderSettings = RenderSettings(),
+) -> LinearizedView:
+    target = ViewLoss.of(view.image.to(dtype), loss, dtype)
+    return LinearizedView(gaussians.to(dtype), view.camera, target, BACKGROUND, settings)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@each_loss
+def test_value_gradient_and_hessian_products_are_those_of_the_specification(loss, degree):
+    gaussians, view = random_gaussians(40, degree, logit=1.0), two_views()[0]
+    U = random_like((gaussians.flat.numel(), 3), 1)
+    gradient, products = gradient_and_products(gaussians, [view], loss, U)
+    held = hold(gaussians, view, loss)
+    assert held.value == pytest.approx(float(mean_loss(gaussians, [view], loss)), rel=1e-13)
+    assert max(errors_by_block(held.gradient, gradient, gaussians.blocks).values()) < 1e-12
+    for k in (1, 3):
+        errors = errors_by_block(held.hvp(U[:, :k]), products[:, :k], gaussians.blocks)
+        assert max(errors.values()) < 1e-12, errors
+
+
+@pytest.mark.parametrize(
+    ("settings", "logit"), [(OPAQUE, 4.0), (SMOOTH, 0.0), (RenderSettings(gradient_through_cap=True), 6.0)]
+)
+def test_every_kind_of_threshold_is_held_as_the_specification_holds_it(settings, logit):
+    gaussians, view = random_gaussians(60, 1, logit=logit, spread=0.8), two_views()[1]
+    loss = LossSettings("charbonnier")
+    U = random_like((gaussians.flat.numel(), 2), 1)
+    gradient, products = gradient_and_products(gaussians, [view], loss, U, settings)
+    held = hold(gaussians, view, loss, settings=settings)
+    assert max(errors_by_block(held.gradient, gradient, gaussians.blocks).values()) < 1e-12
+    assert max(errors_by_block(held.hvp(U), products, gaussians.blocks).values()) < 1e-12
+
+
+def test_float32_keeps_its_digits_through_the_whole_chain():
+    # no thresholds and no kinks: both precisions make the same decisions
+    loss, settings = LossSettings("l2"), SMOOTH
+    gaussians, view = random_gaussians(40, 3, logit=-1.0), two_views()[0]
+    U = random_like((gaussians.flat.numel(), 3), 1).float().double()
+    gradient, products = gradient_and_products(gaussians, [view], loss, U, settings)
+    held = hold(gaussians, view, loss, torch.float32, settings)
+    image = render(gaussians, view.camera, BACKGROUND, settings, backend="reference").image
+    assert relative_error(held.image, image) < IMAGE[torch.float32]
+    assert max(errors_by_block(held.gradient, gradient, gaussians.blocks).values()) < DERIVATIVE[torch.float32]
+    assert max(errors_by_block(held.hvp(U.float()), products, gaussians.blocks).values()) < DERIVATIVE[torch.float32]
+
+
+def image_and_alpha(gaussians: Gaussians, view: View, flat: Tensor) -> Tensor:
+    rendering = render(gaussians.with_flat(flat), view.camera, BACKGROUND, backend="reference")
+    return torch.cat([rendering.image, rendering.alpha[None]])
+
+
+@each_loss
+def test_gauss_newton_is_the_dense_product_of_its_three_factors(loss):
+    gaussians, view = random_gaussians(4, 1, logit=1.0, spread=0.4), two_views(10, 8)[0]
+    held, identity = hold(gaussians, view, loss), torch.eye(gaussians.flat.numel(), dtype=torch.float64)
+    J = torch.autograd.functional.jacobian(lambda flat: image_and_alpha(gaussians, view, flat), gaussians.flat)
+    assert relative_error(held.jvp(identity), J.movedim(-1, 0)) < 1e-12  # pyright: ignore
+    cotangents = random_like((2, 4, 8, 10), 1)
+    assert relative_error(held.vjp(cotangents), torch.einsum("chwp,kchw->pk", J, cotangents)) < 1e-12
+    J = J[:3].reshape(-1, len(identity))
+    middle = torch.autograd.functional.hessian(
+        lambda image: photometric_loss(image, view.image.double(), loss), held.image
+    ).reshape(len(J), len(J))  # pyright: ignore
+    assert relative_error(held.ggn(identity), J.T @ middle @ J) < 1e-12
+
+
+@each_loss
+def test_the_hessian_is_that_of_dense_autograd_column_by_column(loss):
+    gaussians, view = random_gaussians(3, 1, logit=1.0, spread=0.4), two_views(14, 11)[0]
+    identity = torch.eye(gaussians.flat.numel(), dtype=torch.float64)
+    _, dense = gradient_and_products(gaussians, [view], loss, identity)
+    H = hold(gaussians, view, loss).hvp(identity)
+    scale = dense.norm()
+    for column, expected in zip(H.T, dense.T, strict=True):
+        assert (column - expected).norm() < 1e-13 * scale
+    assert (H - H.T).norm() < 1e-13 * scale
+
+
+def test_products_agree_with_finite_differences_of_the_kernels_own_gradient():
+    loss, settings = LossSettings("charbonnier", eps=0.1), SMOOTH
+    gaussians, view = random_gaussians(20, 2, logit=-1.0, spread=0.7), two_views()[0]
+    direction = 0.1 * random_like(gaussians.flat.shape, 1)
+
+    def at(t: float) -> LinearizedView:
+        return hold(gaussians.with_flat(gaussians.flat + t * direction), view, loss, settings=settings)
+
+    held, step = at(0.0), 3e-3
+    slope = central_difference(lambda t: np.array(at(t).value), step)
+    assert float(held.gradient @ direction) == pytest.approx(float(slope), rel=1e-8)
+    bend = central_difference(lambda t: at(t).gradient.numpy(), step)
+    assert relative_error(held.hvp(direction[:, None])[:, 0], bend) < 1e-7
+
+
+@each_dtype
+def test_products_are_symmetric_to_round_off(dtype):
+    gaussians, view = random_gaussians(60, 3, logit=2.0), two_views()[0]
+    held = hold(gaussians, view, LossSettings("charbonnier"), dtype)
+    U = random_like((gaussians.flat.numel(), 2), 1).to(dtype)
+    for product in (held.hvp(U), held.ggn(U)):
+        one, other = (U[:, 1] * product[:, 0]).double(), (U[:, 0] * product[:, 1]).double()
+        # a random sum of terms with relative errors of a few eps each
+        bound = 30 * float(np.finfo(NUMPY[dtype]).eps) * float(one.norm() + other.norm())
+        assert abs(float(one.sum() - other.sum())) < bound
+
+
+def test_a_columns_product_does_not_depend_on_its_neighbours():
+    gaussians, view = random_gaussians(40, 1, logit=3.0), two_views()[0]
+    held = hold(gaussians, view, LossSettings(), torch.float32)
+    U = random_like((gaussians.flat.numel(), 4), 1).float()
+    block = held.hvp(U)
+    for k in range(4):
+        assert relative_error(block[:, k], held.hvp(U[:, k : k + 1])[:, 0]) < DERIVATIVE[torch.float32]
+
+
+def test_a_product_repeats_to_the_last_bit():
+    gaussians, view = random_gaussians(40, 1, logit=3.0), two_views()[0]
+    held = hold(gaussians, view, LossSettings(), torch.float32)
+    U = random_like((gaussians.flat.numel(), 3), 1).float()
+    first = held.hvp(U)
+    assert torch.equal(first, held.hvp(U)) and torch.equal(held.ggn(U), held.ggn(U))
+    assert torch.equal(first, hold(gaussians, view, LossSettings(), torch.float32).hvp(U))
+
+
+def test_what_a_product_takes_is_free_before_its_result_is_made():
+    gaussians, view = random_gaussians(4000, 3), two_views()[0]
+    held = hold(gaussians, view, LossSettings(), torch.float32)
+    U = random_like((gaussians.flat.numel(), 4), 8).float()
+    result = held.hvp(U)  # the first one makes what is kept
+    tracemalloc.start()
+    held.hvp(U)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    cotangents = 8 * 9 * U.shape[1] * len(gaussians)  # of the splats, in float64: what the result is made of
+    assert result.nbytes + cotangents <= peak <= result.nbytes + 1.5 * cotangents
+
+
+def test_what_no_pixel_sees_has_no_derivative():
+    gaussians = random_gaussians(12, 1, logit=2.0)
+    gaussians.means[3, 2] = -5.0
+    gaussians.opacity_logits[5] = -9.0
+    held = hold(gaussians, two_views()[0], LossSettings("l2"))
+    U = random_like((gaussians.flat.numel(), 2), 1)
+    for product in (held.gradient[:, None], held.hvp(U), held.ggn(U)):
+        for name, value in gaussians.with_flat(product[:, 0].contiguous()).attributes.items():
+            assert not value[3].any() and not value[5].any(), name
+    assert held.touched <= 10
+
+
+def test_a_gaussian_that_is_not_finite_is_named():
+    gaussians = random_gaussians(5)
+    gaussians.log_scales[2, 1] = float("nan")
+    with pytest.raises(ValueError, match=r"expected finite log_scales, got .*nan.* at Gaussian 2"):
+        hold(gaussians, two_views()[0], LossSettings())
+
+
+def test_entries_behind_opaque_fronts_are_those_that_a_view_without_stops_has_more():
+    gaussians, view, loss = random_gaussians(40, 0), two_views()[0], LossSettings()
+    gaussians.means[:4] = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)  # four walls over the whole image
+    gaussians.log_scales[:4], gaussians.opacity_logits[:4] = 3.0, 8.0
+    gaussians.means[4:, 2] = 9.0
+    held = hold(gaussians, view, loss)
+    endless = hold(gaussians, view, loss, settings=RenderSettings(transmittance_min=0.0))
+    assert held.entries_behind > 0 == endless.entries_behind
+    assert held.entries + held.entries_behind == endless.entries
+
+
+def test_tiles_are_dark_where_the_picture_is_met_exactly_and_the_loss_does_not_couple_pixels():
+    gaussians, view = random_gaussians(40, 1, logit=1.0), two_views(45, 37)[0]
+    # behind the others one that fills the picture: no tile is empty, however many pixels wide the machine's registers are
+    gaussians.means[0], gaussians.log_scales[0] = torch.tensor([0.0, 0.0, 9.0], dtype=torch.float64), 3.0
+    met = hold(gaussians, view, LossSettings()).image[:, :16]  # a row of tiles
+    view = replace(view, image=torch.cat([met, view.image[:, 16:].double()], dim=1))
+    alone, coupled = (hold(gaussians, view, LossSettings(ssim_weight=weight)) for weight in (0.0, 0.2))
+    first_row = -(-45 // lanes_of(np.float64))
+    assert (np.diff(alone._raster.lists.start)[:first_row] > 0).all()
+    assert alone.dark_tiles == first_row and coupled.dark_tiles == 0

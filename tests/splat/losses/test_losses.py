@@ -1,0 +1,335 @@
+"""Losses: the specification against windows and kornia, the kernels against the specification."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import kornia.metrics
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import correlate1d
+from torch import Tensor
+
+from splat.losses.autograd import consistency_loss, view_loss
+from splat.losses.cpu.loss import ViewLoss
+from splat.losses.reference import WINDOW, LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map, window
+from tests.oracles import similarity_by_windows
+from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, random_like, relative_error
+
+SIZES = [(53, 75), (7, 9), (1, 40), (40, 1)]
+SETTINGS = [
+    LossSettings(),
+    LossSettings("charbonnier"),
+    LossSettings("l2", literal=True),
+    LossSettings("l2", ssim_weight=0),
+    LossSettings("charbonnier", ssim_weight=0, eps=0.1),
+    LossSettings("l1", ssim_weight=1.0),
+]
+each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
+each_size = pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+each_loss = pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: f"{s.pixel} {s.ssim_weight} {s.literal}")
+
+
+def image_and_target(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Rounded to float32; a part of the image equals its target, so that residuals of 0 occur."""
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(3, *size, generator=generator)
+    image = (target + 0.1 * random_like((3, *size), 1).float()).clamp(0, 1)
+    image[:, : size[0] // 4] = target[:, : size[0] // 4]
+    return image.double(), target.double()
+
+
+@dataclass(frozen=True)
+class Truth:
+    image: Tensor
+    target: Tensor
+    v: Tensor
+    value: Tensor
+    gradient: Tensor
+    product: Tensor
+
+
+@cache
+def truth(size: tuple[int, int], settings: LossSettings) -> Truth:
+    image, target = image_and_target(size)
+    v = random_like((2, *image.shape), 2).float().double()
+    x = image.clone().requires_grad_()
+    value = photometric_loss(x, target, settings)
+    (gradient,) = torch.autograd.grad(value, x, create_graph=True)
+    products = [
+        torch.autograd.grad((gradient * each).sum(), x, retain_graph=True)[0] if gradient.requires_grad else 0 * each
+        for each in v
+    ]
+    return Truth(image, target, v, value.detach(), gradient.detach(), torch.stack(products))
+
+
+def test_similarity_is_that_of_the_windows_written_out():
+    for size in SIZES:
+        image, target = image_and_target(size)
+        assert relative_error(ssim_map(image, target), similarity_by_windows(image.numpy(), target.numpy())) < 1e-12
+
+
+def test_similarity_is_kornias_away_from_the_border():
+    image, target = image_and_target((40, 31))
+    peer = kornia.metrics.ssim(image[None], target[None], 11, eps=0.0, padding="valid")[0]
+    assert relative_error(ssim_map(image, target)[:, 5:-5, 5:-5], peer) < 1e-12
+
+
+def test_psnr_is_kornias():
+    image, target = image_and_target((40, 31))
+    assert psnr(image, target) == pytest.approx(float(kornia.metrics.psnr(image, target, 1.0)), rel=1e-12)
+
+
+def test_metrics_clip_what_a_picture_file_could_not_hold():
+    image, target = image_and_target((20, 20))
+    bright = image.clone()
+    bright[0, 3, 3] = 7.0
+    clipped = bright.clamp(0, 1)
+    assert psnr(bright, target) == psnr(clipped, target) and ssim(bright, target) == ssim(clipped, target)
+
+
+def test_the_photometric_loss_weighs_its_parts_as_written():
+    image, target = image_and_target((20, 30))
+    r = (image - target).numpy()
+    structural = 1 - similarity_by_windows(image.numpy(), target.numpy()).mean()
+    pixel: dict[PixelLoss, float] = {
+        "l1": np.abs(r).mean(),
+        "l2": (r**2).mean(),
+        "charbonnier": np.sqrt(r**2 + 0.03**2).mean(),
+    }
+    for kind, value in pixel.items():
+        settings = LossSettings(kind, ssim_weight=0.3, eps=0.03)
+        assert float(photometric_loss(image, target, settings)) == pytest.approx(
+            0.7 * value + 0.3 * structural, rel=1e-12
+        )
+        literal = photometric_loss(image, target, replace(settings, literal=True))
+        assert float(literal) == pytest.approx(value + 0.3 * structural, rel=1e-12)
+
+
+@each_dtype
+@each_loss
+@each_size
+def test_kernels_give_the_specifications_value_gradient_and_products(size, settings, dtype):
+    expected = truth(size, settings)
+    loss = ViewLoss.of(expected.target.to(dtype), settings, dtype)
+    held = loss.linearize(loss.padded(expected.image.to(dtype)))
+    assert held.value == pytest.approx(float(expected.value), rel=IMAGE[dtype], abs=IMAGE[dtype])
+    assert loss.value(loss.padded(expected.image.to(dtype))) == held.value
+    assert relative_error(loss.cropped(held.gradient), expected.gradient) < DERIVATIVE[dtype]
+    tangents = np.stack([loss.padded(v.to(dtype)) for v in expected.v])
+    products = held.hvp(tangents)
+    for product, each in zip(products, expected.product, strict=True):
+        assert relative_error(loss.cropped(product), each) < DERIVATIVE[dtype]
+
+
+@each_dtype
+@each_loss
+@each_size
+def test_quadratic_forms_are_those_of_the_specifications_products_and_of_the_diagonal(size, settings, dtype):
+    expected = truth(size, settings)
+    exact, loss = (ViewLoss.of(expected.target.to(each), settings, each) for each in (torch.float64, dtype))
+    diagonal = exact.cropped(exact.linearize(exact.padded(expected.image)).diagonal)
+    held = loss.linearize(loss.padded(expected.image.to(dtype)))
+    full, pixelwise = held.curvatures(np.stack([loss.padded(v.to(dtype)) for v in expected.v]))
+    for found, products in ((full, expected.product), (pixelwise, diagonal * expected.v)):
+        terms = (expected.v * products).flatten(1)
+        assert ((found - terms.sum(dim=1)).abs() <= DERIVATIVE[dtype] * terms.abs().sum(dim=1)).all()
+
+
+@each_dtype
+@each_size
+@pytest.mark.parametrize("contrast", [1.0, 0.001])
+def test_the_windows_mean_and_variance_of_a_target_are_scipys(size, contrast, dtype):
+    """In every pixel; at a low contrast the difference of the squares would lose the variance, eps (mean / std)^2 of it."""
+    target = (0.7 + contrast * (image_and_target(size)[1] - 0.5)).float()
+    taps = window(torch.float64).numpy()
+
+    def blur(field: np.ndarray) -> np.ndarray:
+        return correlate1d(correlate1d(field, taps, axis=1, mode="constant"), taps, axis=2, mode="constant")
+
+    picture = target.double().numpy()
+    mean, square = blur(picture), blur(picture**2)
+    moments = ViewLoss.of(target, LossSettings(), dtype)._target_moments[:, :, : size[0], : size[1]]
+    assert relative_error(moments[0], mean) < IMAGE[dtype]
+    variance = square - mean**2
+    ratio = np.sqrt(square / variance)
+    rounding = torch.finfo(dtype).eps * (1 + ratio) + torch.finfo(torch.float64).eps * ratio**2  # the kernel's, scipy's
+    assert (np.abs(moments[1] / variance - 1) < 2 * WINDOW * rounding).all()  # two sums over a window's length
+
+
+def test_near_a_fit_of_a_smooth_picture_ssim_keeps_its_digits_in_float32():
+    """Variances far beneath the squared means: the usual formula loses two digits more (2e-5 instead of 3e-7)."""
+    y, x = torch.meshgrid(torch.linspace(0, 3, 60), torch.linspace(0, 2, 80), indexing="ij")
+    target = torch.stack([0.7 + 0.2 * torch.sin(x + c) * torch.cos(y) for c in range(3)])
+    generator = torch.Generator().manual_seed(0)
+    image = target + 0.01 * torch.randn(target.shape, generator=generator)
+    v = torch.randn(3, 60, 80, generator=generator)
+    found = []
+    for dtype in DTYPES:
+        loss = ViewLoss.of(target, LossSettings(ssim_weight=1.0), dtype)
+        held = loss.linearize(loss.padded(image.to(dtype)))
+        product = held.hvp(np.concatenate([loss.padded(v.to(dtype)), loss.padded(v.to(dtype))[:1]])[None])[0]
+        found.append((torch.tensor(held.value), *map(loss.cropped, (held.gradient, product, held.diagonal))))
+    bound = 2 * WINDOW * torch.finfo(torch.float32).eps  # two sums over a window's length, one after the other
+    assert [relative_error(single, double) < bound for single, double in zip(*found, strict=True)] == [True] * 4
+
+
+@each_dtype
+@each_loss
+def test_padding_and_alpha_have_no_derivative(settings, dtype):
+    size = (7, 9)
+    expected = truth(size, settings)
+    loss = ViewLoss.of(expected.target.to(dtype), settings, dtype)
+    held = loss.linearize(loss.padded(expected.image.to(dtype)))
+    for planes in (held.gradient, held.hvp(loss.padded(expected.v[0].to(dtype))[None])[0]):
+        assert planes.shape[0] == 4 and not planes[3].any()
+        assert not planes[:, size[0] :].any() and not planes[:, :, size[1] :].any()
+
+
+@each_loss
+def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_vectors(settings, monkeypatch):
+    monkeypatch.setattr("splat.losses.cpu.loss.RINGS", 1 << 16)  # so that two vectors are two sweeps
+    expected = truth((37, 53), settings)
+    x, y = expected.image.clone().requires_grad_(), expected.target.clone().requires_grad_()
+
+    def everything() -> list[np.ndarray]:
+        loss = ViewLoss.of(expected.target, settings, torch.float64)
+        held = loss.linearize(loss.padded(expected.image))
+        tangents = np.stack([loss.padded(v) for v in expected.v])
+        over = np.concatenate([tangents, tangents[:, :1]], axis=1)  # four planes, as the products have
+        held.hvp(over, out=over)
+        consistency = consistency_loss(x, y, settings)
+        both = [each.numpy() for each in (consistency.detach(), *torch.autograd.grad(consistency, (x, y)))]
+        return [
+            np.array(held.value),
+            held.gradient,
+            held.hvp(tangents),
+            over,
+            held.diagonal,
+            *map(Tensor.numpy, held.curvatures(tangents)),
+            *both,
+        ]
+
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            results.append(everything())
+    finally:
+        torch.set_num_threads(before)
+    assert (results[0][2] == results[0][3]).all() and results[0][2].any() == (
+        settings.pixel != "l1" or settings.ssim_weight > 0
+    )
+    for others in results[1:]:
+        assert all((one == other).all() for one, other in zip(results[0], others, strict=True))
+
+
+@each_loss
+@pytest.mark.parametrize("size", [(17, 21), (1, 40)], ids=["17x21", "1x40"])
+def test_the_diagonal_is_that_of_the_dense_hessian(size, settings):
+    expected = truth(size, settings)
+    loss = ViewLoss.of(expected.target, settings, torch.float64)
+    held = loss.linearize(loss.padded(expected.image))
+    count = expected.image.numel()
+    every = [loss.padded(row.view(3, *size)) for row in torch.eye(count, dtype=torch.float64)]
+    columns = [loss.cropped(product).reshape(-1) for product in held.hvp(np.stack(every))]
+    dense = torch.stack(columns, dim=1)
+    assert relative_error(dense, dense.T) < 1e-12
+    assert relative_error(loss.cropped(held.diagonal).reshape(-1), dense.diagonal()) < 1e-12
+
+
+@each_loss
+def test_autograd_reaches_the_kernels_twice(settings):
+    image, target = image_and_target((9, 6))
+    image = (target + 0.1 + 0.2 * (image - target).abs()).requires_grad_()  # no kink within the step
+    loss = ViewLoss.of(target, settings, torch.float64)
+    assert torch.autograd.gradcheck(lambda x: 100 * view_loss(x, loss), (image,))
+    assert torch.autograd.gradgradcheck(lambda x: 100 * view_loss(x, loss), (image,))
+
+
+def test_a_third_derivative_by_the_kernels_is_refused():
+    image, target = image_and_target((9, 6))
+    x, loss = image.clone().requires_grad_(), ViewLoss.of(target, LossSettings(), torch.float64)
+    value = view_loss(x, loss)
+    for _ in range(2):
+        (gradient,) = torch.autograd.grad(value, x, create_graph=True)
+        value = (gradient**2).sum()
+    with pytest.raises(NotImplementedError, match="expected at most two derivatives of the kernels, got a third"):
+        torch.autograd.grad(value, x)
+
+
+@cache
+def truth_of_both(size: tuple[int, int], settings: LossSettings) -> tuple[Tensor, Tensor, Tensor]:
+    """The specification's value and its gradients in both images."""
+    x, y = (picture.requires_grad_() for picture in image_and_target(size))
+    value = photometric_loss(x, y, settings)
+    in_x, in_y = torch.autograd.grad(value, (x, y))
+    return value.detach(), in_x, in_y
+
+
+@each_dtype
+@each_loss
+@each_size
+def test_the_consistency_of_two_images_has_the_specifications_value_and_gradients(size, settings, dtype):
+    value, *gradients = truth_of_both(size, settings)
+    x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target(size))
+    found = consistency_loss(x, y, settings)
+    assert found.item() == pytest.approx(value.item(), rel=IMAGE[dtype], abs=IMAGE[dtype])
+    assert consistency_loss(x.detach(), y.detach(), settings) == found
+    for got, expected in zip(torch.autograd.grad(found, (x, y)), gradients, strict=True):
+        assert got.dtype == dtype and relative_error(got, expected) < DERIVATIVE[dtype]
+
+
+@each_dtype
+@each_loss
+def test_consistency_is_symmetric_to_the_bit(settings, dtype):
+    x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target((37, 53)))
+    one, other = consistency_loss(x, y, settings), consistency_loss(y, x, settings)
+    assert one == other
+    for first, second in zip(torch.autograd.grad(one, (x, y)), torch.autograd.grad(other, (x, y)), strict=True):
+        assert torch.equal(first, second) and first.any()
+
+
+@each_loss
+def test_an_image_that_depends_on_nothing_gets_no_gradient_of_consistency(settings):
+    x, y = image_and_target((17, 21))
+    x.requires_grad_()
+    both = torch.autograd.grad(consistency_loss(x, y.clone().requires_grad_(), settings), x)[0]
+    assert torch.equal(torch.autograd.grad(3 * consistency_loss(x, y, settings), x)[0], 3 * both)
+    assert torch.equal(torch.autograd.grad(3 * consistency_loss(y, x, settings), x)[0], 3 * both)
+
+
+def test_a_second_derivative_of_consistency_is_refused():
+    x, y = (picture.requires_grad_() for picture in image_and_target((9, 6)))
+    gradients = torch.autograd.grad(consistency_loss(x, y, LossSettings()), (x, y), create_graph=True)
+    for gradient in gradients:
+        with pytest.raises(NotImplementedError, match="expected one derivative of the consistency of two images"):
+            torch.autograd.grad((gradient**2).sum(), x, retain_graph=True)
+
+
+def test_consistency_of_images_of_two_sizes_is_refused():
+    with pytest.raises(ValueError, match="expected two images of one shape and dtype, got"):
+        consistency_loss(torch.rand(3, 8, 9), torch.rand(3, 9, 8), LossSettings())
+
+
+def test_l1_has_no_slope_at_its_kink():
+    image, target = image_and_target((8, 8))
+    loss = ViewLoss.of(target, LossSettings("l1", ssim_weight=0), torch.float64)
+    gradient = loss.cropped(loss.linearize(loss.padded(image)).gradient)
+    assert ((gradient == 0) == (image == target)).all() and (image == target).any()
+    assert torch.equal(gradient, torch.sign(image - target) / image.numel())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"pixel": "l3"}, "expected the pixel loss 'l1', 'charbonnier' or 'l2', got 'l3'"),
+        ({"ssim_weight": 1.5}, "expected 0 <= ssim_weight <= 1"),
+        ({"eps": 0.0}, "eps > 0"),
+        ({"eps": float("nan")}, "eps > 0"),
+    ],
+)
+def test_wrong_settings_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        LossSettings(**wrong)

@@ -1,0 +1,84 @@
+"""Pinhole cameras."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from splat.model.camera import Camera, look_at
+from splat.projection.reference import project
+from tests.splat.random_scenes import random_camera, random_gaussians, relative_error
+
+
+def test_forward_is_the_direction_that_projects_onto_the_principal_point():
+    camera, gaussians = random_camera(), random_gaussians(1)
+    gaussians.means[0] = camera.centre + 2.5 * camera.forward
+    splats = project(gaussians, camera)
+    assert splats.means[0].tolist() == pytest.approx([camera.cx, camera.cy], rel=1e-13)
+    assert splats.depths[0].item() == pytest.approx(2.5, rel=1e-13)
+
+
+def test_x_is_to_the_right_and_y_is_down():
+    camera, gaussians = random_camera(), random_gaussians(2)
+    gaussians.means[0] = camera.centre + camera.forward + 0.1 * camera.rotation[0]
+    gaussians.means[1] = camera.centre + camera.forward + 0.1 * camera.rotation[1]
+    right, down = project(gaussians, camera).means.tolist()
+    assert right == pytest.approx([camera.cx + 0.1 * camera.fx, camera.cy])
+    assert down == pytest.approx([camera.cx, camera.cy + 0.1 * camera.fy])
+
+
+def test_a_resized_camera_sees_the_same_at_another_resolution():
+    camera, gaussians = random_camera(48, 40), random_gaussians(20)
+    smaller = camera.resized(24, 10)
+    assert (smaller.width, smaller.height) == (24, 10)
+    scale = torch.tensor([24 / 48, 10 / 40], dtype=torch.float64)
+    assert relative_error(project(gaussians, smaller).means, project(gaussians, camera).means * scale) < 1e-13
+    corner = torch.tensor([48.0, 40.0]) * scale  # the image's far corner stays its corner
+    assert corner.tolist() == [smaller.width, smaller.height]
+
+
+@pytest.mark.parametrize(
+    "rotation",
+    [2 * torch.eye(3), -torch.eye(3), torch.diag(torch.tensor([1.0, 1.0, -1.0])), torch.full((3, 3), float("nan"))],
+    ids=["scaled", "inverted", "mirrored", "nan"],
+)
+def test_a_matrix_that_is_no_rotation_is_refused(rotation):
+    with pytest.raises(ValueError, match="expected a rotation matrix"):
+        replace(random_camera(), rotation=rotation.double())
+
+
+@pytest.mark.parametrize("wrong", [{"fx": 0.0}, {"fy": -1.0}, {"width": 0}, {"height": -3}, {"fx": float("nan")}])
+def test_sizes_and_focal_lengths_are_positive(wrong):
+    with pytest.raises(ValueError, match="expected positive focal lengths and image size"):
+        replace(random_camera(), **wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"cx": float("nan")}, {"cy": -float("inf")}, {"fx": float("inf")}, {"centre": torch.tensor([0, 0, float("nan")])}],
+    ids=["cx", "cy", "fx", "centre"],
+)
+def test_a_camera_without_finite_numbers_is_refused(wrong):
+    with pytest.raises(ValueError, match="expected a finite centre, focal lengths and principal point"):
+        replace(random_camera(), **wrong)
+
+
+def test_a_camera_cannot_be_changed():
+    camera: Camera = random_camera()
+    with pytest.raises(AttributeError):
+        camera.fx = 3.0  # pyright: ignore
+
+
+def test_a_camera_that_looks_at_a_target_sees_it_on_its_axis_and_is_held_level():
+    centre, target, down = torch.randn(3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    rotation = look_at(centre, target, down)
+    assert (rotation @ (target - centre)).tolist() == pytest.approx([0, 0, (target - centre).norm().item()], abs=1e-14)
+    assert float(rotation[0] @ down) == pytest.approx(0, abs=1e-14) and float(rotation[1] @ down) > 0
+    assert torch.linalg.det(rotation).item() == pytest.approx(1, rel=1e-14)
+
+
+@pytest.mark.parametrize("factor", [0.0, 2.0, -1.0])
+def test_nothing_is_level_that_looks_straight_up_or_down(factor: float):
+    centre, down = torch.tensor([[1.0, 2.0, 3.0], [0.2, 0.9, -0.1]], dtype=torch.float64)
+    with pytest.raises(ValueError, match="expected a target away from the centre"):
+        look_at(centre, centre + factor * down, down)

@@ -1,0 +1,136 @@
+"""Projection on the GPU (without one, by `tests.ptx`), against the specification and the CPU's tests' own truth."""
+
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("triton", reason="the kernels for GPUs need triton")
+
+from splat.model.gaussians import Gaussians
+from splat.model.settings import RenderSettings
+from splat.projection.cuda import CudaProjection, project, project_adjoint
+from splat.projection.formulas import lens_of
+from splat.projection.reference import project as specified
+from tests.splat.projection.test_projection import SETTINGS, SPLAT_BLOCKS, N, camera_and_gaussians, truth
+from tests.splat.random_scenes import (
+    DERIVATIVE,
+    DTYPES,
+    IMAGE,
+    errors_by_block,
+    random_camera,
+    random_gaussians,
+    random_like,
+    relative_error,
+)
+
+each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
+
+
+def on(device: torch.device, degree: int, dtype: torch.dtype) -> tuple[Gaussians, tuple]:
+    camera, gaussians = camera_and_gaussians(degree)
+    gaussians = Gaussians(gaussians.flat.to(device, dtype), degree)
+    lens = lens_of(camera, SETTINGS)
+    return gaussians, (lens, *project(gaussians, lens))
+
+
+@each_dtype
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_splats_and_their_adjoint_are_those_of_the_specification(degree, dtype, device):
+    gaussians, (lens, splats, depths, drawn) = on(device, degree, dtype)
+    expected, camera = truth(degree), camera_and_gaussians(degree)[0]
+    errors = errors_by_block(splats.T.cpu(), expected.splats.T, SPLAT_BLOCKS)
+    assert max(errors.values()) < IMAGE[dtype]
+    whole = specified(camera_and_gaussians(degree)[1], camera, SETTINGS)
+    assert torch.equal(drawn.cpu(), whole.drawn) and depths.dtype == dtype
+    assert relative_error(depths.cpu()[whole.drawn], whole.depths[whole.drawn]) < IMAGE[dtype]
+    gradient = project_adjoint(gaussians, lens, splats, drawn, expected.bar.to(device))
+    assert max(errors_by_block(gradient.cpu(), expected.gradient, gaussians.blocks).values()) < DERIVATIVE[dtype]
+
+
+def held(device: torch.device, degree: int, dtype: torch.dtype) -> tuple[CudaProjection, Gaussians]:
+    gaussians, (lens, splats, _, drawn) = on(device, degree, dtype)
+    return CudaProjection(gaussians, lens, splats, truth(degree).bar.to(device), drawn.nonzero()[:, 0]), gaussians
+
+
+@pytest.mark.parametrize(("degree", "dtype"), [(1, torch.float64), (3, torch.float32), (3, torch.float64)])
+def test_products_and_blocks_are_those_of_the_specification(degree, dtype, device):
+    projection, gaussians = held(device, degree, dtype)
+    expected = truth(degree)
+    U, C = expected.U.to(device, dtype), expected.C.to(device)
+    pushed, pulled = projection.jvp(U).cpu(), projection.pull(C, U).cpu()
+    errors = errors_by_block(pushed.permute(2, 0, 1), expected.pushed.permute(2, 0, 1), SPLAT_BLOCKS)
+    assert max(errors.values()) < DERIVATIVE[dtype], errors
+    assert max(errors_by_block(pulled, expected.pulled, gaussians.blocks).values()) < DERIVATIVE[dtype]
+    first_order = projection.pull(C, None).double().cpu()
+    there, back = pushed * expected.C, first_order * expected.U
+    assert abs(float(there.sum() - back.sum())) < 30 * torch.finfo(dtype).eps * float(there.norm() + back.norm())
+    blocks_agree_with_products(projection, gaussians, dtype, device)
+
+
+def blocks_agree_with_products(
+    projection: CudaProjection, gaussians: Gaussians, dtype: torch.dtype, device: torch.device
+) -> None:
+    """P'^T own P' + bar . P'' applied by its blocks, and by pushing forward, own, and pulling back."""
+    index = projection.held.index
+    own = random_like((len(index), 9, 9), 5).to(device)
+    own = own + own.mT
+    own[:, 6:, 6:] = torch.diag_embed(own[:, 6:, 6:].diagonal(dim1=1, dim2=2))
+    geometry, _ = projection.blocks(own, second_order=True)
+    U = torch.zeros(gaussians.flat.numel(), 1, dtype=dtype, device=device)
+    rows = torch.cat([torch.arange(len(gaussians.flat))[r].view(N, -1) for r in list(gaussians.blocks.values())[:4]], 1)
+    U[rows.to(device)] = random_like((*rows.shape, 1), 6).to(device, dtype)
+    moved = projection.jvp(U)
+    cotangents = torch.zeros_like(moved)
+    cotangents[index] = (own @ moved[index].mT).mT
+    expected = projection.pull(cotangents, U)[rows.to(device)]
+    found = geometry @ U[rows.to(device)]
+    assert relative_error(found.cpu(), expected.cpu()) < DERIVATIVE[dtype]
+
+
+def test_the_diagonal_of_the_colours_blocks_is_that_of_products(device):
+    projection, gaussians = held(device, 1, torch.float64)
+    index = torch.as_tensor(projection.held.index)
+    own = random_like((len(index), 9, 9), 5).to(device)
+    _, sh = projection.blocks(own, second_order=False)
+    everywhere = torch.zeros(N, 9, 9, dtype=torch.float64, device=device).index_copy(0, index, own)
+    start = gaussians.blocks["sh"].start
+    for b, c in ((0, 0), (2, 1), (3, 2)):
+        rows = start + (torch.arange(N, device=device) * 4 + b) * 3 + c
+        U = torch.zeros(gaussians.flat.numel(), 1, dtype=torch.float64, device=device)
+        U[rows] = 1.0
+        back = projection.pull((everywhere @ projection.jvp(U).mT).mT, None)
+        assert relative_error(sh[:, b, c].cpu(), back[rows, 0].cpu()) < 1e-12
+
+
+def test_more_vectors_than_a_program_takes_are_pushed_and_pulled_alike(device):
+    projection, gaussians = held(device, 0, torch.float64)
+    U, C = (random_like(shape, 7).to(device) for shape in ((gaussians.flat.numel(), 11), (N, 11, 9)))
+    pushed, pulled = projection.jvp(U), projection.pull(C, U)
+    for k in (0, 7, 8, 10):
+        assert torch.equal(pushed[:, k], projection.jvp(U[:, k : k + 1])[:, 0])
+        assert torch.equal(pulled[:, k], projection.pull(C[:, k : k + 1], U[:, k : k + 1])[:, 0])
+
+
+def test_a_splat_too_large_for_its_derivatives_is_named_on_the_gpu(device):
+    camera, gaussians = random_camera(focal=50.0), random_gaussians(5).to(torch.float32)
+    gaussians.log_scales[3, 1] = 40.0
+    gaussians.means[3] = torch.tensor([0.0, 0.0, 4.0])
+    moved = Gaussians(gaussians.flat.to(device), 0)
+    with pytest.raises(ValueError, match=r"expected log_scales of at most 3\d\.\d at depth .* at Gaussian 3 \(1 of 5"):
+        project(moved, lens_of(camera, RenderSettings()))
+
+
+def needles(n: int) -> Tensor:
+    gaussians = random_gaussians(n, spread=0.3)
+    length = torch.linspace(-4, 2.8, n, dtype=torch.float64)
+    gaussians.log_scales[:] = torch.stack([length, torch.full_like(length, -7), torch.full_like(length, -6)], dim=1)
+    return gaussians.flat.float()
+
+
+def test_conics_of_needles_in_float32_are_those_of_float64(device):
+    flat, lens = needles(200).to(device), lens_of(random_camera(504, 378, focal=400.0), RenderSettings())
+    single, double = (project(Gaussians(flat.to(dtype), 0), lens)[0] for dtype in DTYPES)
+    a, b, c = (double - single)[:, 2:5].abs().T / torch.stack(
+        [double[:, 2], (double[:, 2] * double[:, 4]).sqrt(), double[:, 4]]
+    )
+    assert max(float(part.max()) for part in (a, b, c)) < 1e-6

@@ -1,0 +1,136 @@
+"""Rendering as a torch function: the kernels against plain torch, to the second derivative."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from splat.model.camera import Camera
+from splat.model.gaussians import Gaussians
+from splat.model.settings import SMOOTH, RenderSettings
+from splat.render.render import Backend, render, render_depth
+from tests.splat.held_scenes import BACKGROUND
+from tests.splat.random_scenes import (
+    DERIVATIVE,
+    IMAGE,
+    errors_by_block,
+    random_camera,
+    random_gaussians,
+    random_like,
+    relative_error,
+)
+
+SIZES = [(48, 40), (1, 40), (40, 1), (7, 9)]
+
+
+def everything(gaussians: Gaussians, camera: Camera, backend: Backend, settings: RenderSettings) -> dict[str, Tensor]:
+    """Image, alpha, depth, the gradient of a functional of all three, and its Hessian times a vector."""
+    h, w = camera.height, camera.width
+    dtype = gaussians.flat.dtype
+    weights, direction = random_like((5, h, w), 1).to(dtype), random_like(gaussians.flat.shape, 2).to(dtype)
+    flat = gaussians.flat.clone().requires_grad_()
+    shown = render(gaussians.with_flat(flat), camera, BACKGROUND, settings, depth=True, backend=backend)
+    assert shown.depth is not None
+    value = (
+        (shown.image**2 * weights[:3]).sum() + (shown.alpha * weights[3]).sum() + (shown.depth**2 * weights[4]).sum()
+    )
+    (gradient,) = torch.autograd.grad(value, flat, create_graph=True)
+    (product,) = torch.autograd.grad((gradient * direction).sum(), flat)
+    names = ("image", "alpha", "depth", "gradient", "product")
+    values = (shown.image, shown.alpha, shown.depth, gradient, product)
+    return {name: value.detach() for name, value in zip(names, values, strict=True)}
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+@pytest.mark.parametrize("settings", [RenderSettings(), SMOOTH], ids=["default", "smooth"])
+def test_kernels_and_plain_torch_agree_to_the_second_derivative(size, settings):
+    gaussians, camera = random_gaussians(40, 3, logit=1.0), random_camera(*size, focal=30.0)
+    got, expected = (everything(gaussians, camera, backend, settings) for backend in ("kernels", "reference"))
+    for name in ("image", "alpha", "depth"):
+        assert relative_error(got[name], expected[name]) < IMAGE[torch.float64], name
+    for name in ("gradient", "product"):
+        errors = errors_by_block(got[name], expected[name], gaussians.blocks)
+        assert max(errors.values()) < DERIVATIVE[torch.float64], (name, errors)
+
+
+def test_float32_renders_and_differentiates_within_its_tolerance():
+    gaussians, camera = random_gaussians(40, 3, logit=-1.0), random_camera(focal=30.0)
+    got = everything(gaussians.to(torch.float32), camera, "kernels", SMOOTH)
+    expected = everything(gaussians, camera, "reference", SMOOTH)
+    for name in ("image", "alpha", "depth"):
+        assert got[name].dtype == torch.float32 and relative_error(got[name], expected[name]) < IMAGE[torch.float32]
+    for name in ("gradient", "product"):
+        assert max(errors_by_block(got[name], expected[name], gaussians.blocks).values()) < DERIVATIVE[torch.float32]
+
+
+def test_depth_without_colours_is_that_of_a_whole_render():
+    gaussians, camera = random_gaussians(40, 3, logit=1.0), random_camera(focal=30.0)
+    whole = render(gaussians, camera, BACKGROUND, SMOOTH, depth=True)
+    depth, alpha = render_depth(gaussians, camera, SMOOTH)
+    assert torch.equal(depth, whole.depth) and torch.equal(alpha, whole.alpha)  # pyright: ignore[reportArgumentType]
+
+
+def test_torchs_own_checks_of_first_and_second_derivatives_pass():
+    gaussians, camera = random_gaussians(3, 1, spread=0.3), random_camera(16, 12, focal=16.0)
+
+    def values(flat: Tensor) -> Tensor:
+        shown = render(gaussians.with_flat(flat), camera, BACKGROUND, SMOOTH)
+        return torch.cat([shown.image, shown.alpha[None]])[:, ::4, ::5]
+
+    flat = gaussians.flat.clone().requires_grad_()
+    assert torch.autograd.gradcheck(values, (flat,))
+    assert torch.autograd.gradgradcheck(lambda flat: (values(flat) ** 2).sum(), (flat,))
+
+
+def test_a_third_derivative_by_the_kernels_is_refused():
+    gaussians, camera = random_gaussians(3), random_camera(16, 12, focal=16.0)
+    flat = gaussians.flat.clone().requires_grad_()
+    value = (render(gaussians.with_flat(flat), camera).image ** 2).sum()
+    for _ in range(2):
+        (gradient,) = torch.autograd.grad(value, flat, create_graph=True)
+        value = (gradient**2).sum()
+    with pytest.raises(NotImplementedError, match="expected at most two derivatives of the kernels, got a third"):
+        torch.autograd.grad(value, flat)
+
+
+def test_screen_space_gradients_are_reachable_for_densification():
+    gaussians, camera = random_gaussians(20, logit=1.0), random_camera(focal=30.0)
+    weights, gradients = random_like((3, camera.height, camera.width), 1), {}
+    for backend in ("kernels", "reference"):
+        flat = gaussians.flat.clone().requires_grad_()
+        shown = render(gaussians.with_flat(flat), camera, backend=backend)
+        (gradients[backend],) = torch.autograd.grad((shown.image * weights).sum(), shown.splats.means)
+    assert relative_error(gradients["kernels"], gradients["reference"]) < 1e-12
+
+
+def test_a_camera_that_sees_nothing_shows_the_background():
+    gaussians, camera = random_gaussians(4), random_camera(16, 12)
+    gaussians.means[:, 2] = -9.0
+    for backend in ("kernels", "reference"):
+        shown = render(gaussians, camera, BACKGROUND, depth=True, backend=backend)
+        assert (shown.image == BACKGROUND[:, None, None]).all() and shown.depth is not None
+        assert not shown.alpha.any() and not shown.depth.any() and not shown.splats.drawn.any()
+    assert not render(gaussians, camera).image.any()  # black where no background is named
+    assert render(gaussians, camera).depth is None
+
+
+def test_order_within_the_set_does_not_matter_unless_depths_are_equal():
+    gaussians, camera = random_gaussians(50, logit=2.0), random_camera(focal=30.0)
+    image = render(gaussians, camera).image
+    mixed = torch.randperm(50, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(render(gaussians.select(mixed), camera).image, image)
+    twins = gaussians.select(torch.tensor([7, 7]))
+    twins.sh[1] = -twins.sh[0]
+    facing = Camera(
+        torch.eye(3, dtype=torch.float64), gaussians.means[7] - 2.0 * torch.eye(3)[2], 30.0, 30.0, 8.0, 6.0, 16, 12
+    )
+    one, other = (render(twins.select(torch.tensor(order)), facing).image for order in ([0, 1], [1, 0]))
+    assert (one - other).abs().max() > 0.01  # the first of the set is in front
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logits", "sh"])
+def test_a_parameter_that_is_not_finite_is_named(name):
+    gaussians = random_gaussians(6, 1)
+    gaussians.attributes[name][4] = float("nan")
+    for backend in ("kernels", "reference"):
+        with pytest.raises(ValueError, match=f"expected finite {name}, got .*nan.* at Gaussian 4"):
+            render(gaussians, random_camera(16, 12), backend=backend)

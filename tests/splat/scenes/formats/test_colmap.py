@@ -1,0 +1,183 @@
+"""COLMAP models: written by pycolmap, binary and text, and the real fern."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+
+from splat.scenes.formats.colmap import SMALLEST_RECORD
+from splat.scenes.scene import load_scene
+from splat.scenes.view import pixel_coordinates
+from tests.splat.scenes import folders
+from tests.splat.scenes.folders import CENTRE, FOCAL, NAMES, RGB, SEEN, SIZE, XYZ, intrinsics, require_poses
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["bin", "txt"])
+@pytest.mark.parametrize("at", ["sparse/0", "sparse", "."])
+def test_colmap_cameras_points_and_tracks_come_back(tmp_path: Path, text: bool, at: str) -> None:
+    folders.write_colmap(tmp_path / "s", text, at)
+    scene = load_scene(tmp_path / "s")
+    assert scene.kind == "colmap" and scene.names == NAMES and scene.points is not None
+    require_poses(scene)
+    assert intrinsics(scene) == [(*FOCAL, *CENTRE, *SIZE)] * 3
+    order = np.lexsort(scene.points.xyz.numpy().T)
+    wanted = np.lexsort(XYZ.T)
+    np.testing.assert_array_equal(scene.points.xyz.numpy()[order], XYZ[wanted])
+    np.testing.assert_array_equal((scene.points.rgb.numpy()[order] * 255).round(), RGB[wanted])
+    seen = [sorted(scene.points.observations[scene.points.observations[:, 0] == p, 1].tolist()) for p in order]  # type: ignore[index]
+    assert seen == [list(SEEN[p]) for p in wanted]
+
+
+def test_without_its_points_a_colmap_scene_is_the_same_else(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path / "s", False, ".")
+    scene = load_scene(tmp_path / "s", points=False)
+    assert scene.points is None and scene.names == NAMES
+    require_poses(scene)
+
+
+def test_a_colmap_model_from_before_rigs_loads_the_same(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path)
+    for name in ("rigs.bin", "frames.bin"):
+        (tmp_path / "sparse/0" / name).unlink()
+    require_poses(load_scene(tmp_path))
+
+
+def test_a_track_that_meets_an_image_twice_counts_it_once(tmp_path: Path) -> None:
+    model = folders.reconstruction()
+    image = pycolmap.Image("0.png", np.array([[1.0, 1.0], [2.0, 1.0]]), 1, 4)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    track = pycolmap.Track([pycolmap.TrackElement(4, 0), pycolmap.TrackElement(4, 1)])
+    model.add_point3D(np.array([9.0, 9.0, 9.0]), track, RGB[0])
+    folders.write_colmap(tmp_path, model=model)
+    folders.write_pictures(tmp_path / "images", ("0.png",))
+    scene = load_scene(tmp_path)
+    assert scene.points is not None and scene.names == ("0.png", *NAMES)  # by name, not by number
+    last = int((scene.points.xyz[:, 0] == 9).nonzero())
+    assert scene.points.sightings(scene.frames)[last] == 1
+
+
+def test_images_without_a_pose_are_left_out_and_a_model_without_poses_is_refused(tmp_path: Path) -> None:
+    model = folders.reconstruction()
+    model.deregister_frame(3)
+    folders.write_colmap(tmp_path / "two", model=model)
+    assert load_scene(tmp_path / "two").names == NAMES[:2]
+    model.deregister_frame(1)
+    model.deregister_frame(2)
+    folders.write_colmap(tmp_path / "none", model=model)
+    with pytest.raises(ValueError, match="expected images with poses"):
+        load_scene(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    "renamed",
+    [
+        ("image000.png", "image001.png", "image002.png"),
+        ("a.jpg", "b.jpg", "c.jpg"),
+        ("a.jpg", "b.jpg", "c.jpg", "0.jpg"),
+    ],
+)
+def test_renamed_images_of_a_colmap_model_are_found(tmp_path: Path, renamed: tuple[str, ...]) -> None:
+    folders.write_colmap(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    folders.write_pictures(tmp_path / "images_2", renamed, (12, 9))
+    scene = load_scene(tmp_path)
+    assert scene.names == NAMES
+    half = [value / 2 for value in (*FOCAL, *CENTRE)]
+    assert intrinsics(scene) == [(*half, 12, 9)] * 3
+    first = np.array(Image.open(tmp_path / "images_2" / renamed[0])) / 255
+    np.testing.assert_allclose(scene.load(["a.png"])[0].image.permute(1, 2, 0).numpy(), first, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_damaged_colmap_file_is_refused_before_it_can_end_the_process(tmp_path: Path, name: str) -> None:
+    folders.write_colmap(tmp_path)
+    byte_short = (2).to_bytes(8, "little") + bytes(2 * SMALLEST_RECORD[name] - 1)
+    for content in (b"no COLMAP file at all", byte_short):
+        (tmp_path / f"sparse/0/{name}.bin").write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name}.bin promises"):
+            load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["images", "points3D"])
+def test_a_colmap_model_cut_short_inside_is_refused(tmp_path: Path, name: str) -> None:
+    folders.write_colmap(tmp_path)
+    path = tmp_path / f"sparse/0/{name}.bin"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=f"{name}.bin promises"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "place"), [("images", 8 + 64 + len("a.png") + 1), ("points3D", 8 + 43)])
+def test_a_list_longer_than_its_file_is_refused_before_colmap_reads_on_behind_the_end(
+    tmp_path: Path, name: str, place: int
+) -> None:
+    folders.write_colmap(tmp_path)
+    path = tmp_path / f"sparse/0/{name}.bin"
+    content = bytearray(path.read_bytes())
+    assert 0 < int.from_bytes(content[place : place + 8], "little") < 10
+    content[place + 6] = 1  # 2^48 more
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"{name}.bin promises"):
+        load_scene(tmp_path)
+
+
+def test_a_camera_without_pixels_is_refused(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path, text=True)
+    path = tmp_path / "sparse/0/cameras.txt"
+    path.write_text(path.read_text().replace("PINHOLE 24 18", "PINHOLE 0 18"))
+    with pytest.raises(ValueError, match=r"'a\.png' at the 0 x 18 px of its camera"):
+        load_scene(tmp_path)
+
+
+def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path)
+    path = tmp_path / "sparse/0/images.bin"
+    path.write_bytes(path.read_bytes().replace(b"b.png", b"\x80.png"))
+    with pytest.raises(ValueError, match="expected a COLMAP model, cannot read"):
+        load_scene(tmp_path)
+
+
+def test_a_fisheye_colmap_model_is_refused_with_the_command_that_mends_it(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path, model=folders.reconstruction("OPENCV_FISHEYE", (*FOCAL, *CENTRE, 0.1, 0, 0, 0)))
+    with pytest.raises(ValueError, match=r"OPENCV_FISHEYE for image 'a.png'.*colmap image_undistorter --image_path"):
+        load_scene(tmp_path)
+
+
+def test_the_points_of_fern_fall_where_colmap_projects_and_observes_them(fern: Path) -> None:
+    model = pycolmap.Reconstruction(fern / "sparse/0")
+    errors = []
+    for frame in load_scene(fern).frames:
+        image = model.find_image_with_name(frame.name)
+        assert image is not None
+        slots = [slot for slot in image.points2D if slot.has_point3D()]
+        xyz = np.array([model.points3D[slot.point3D_id].xyz for slot in slots])
+        pixels, depth = pixel_coordinates(frame.camera, torch.from_numpy(xyz))
+        assert bool((depth > 0).all())
+        colmap = np.array([image.project_point(point) for point in xyz[:50]])
+        np.testing.assert_allclose(pixels[:50].numpy(), colmap, atol=1e-9)
+        errors.append(np.linalg.norm(pixels.numpy() - [slot.xy for slot in slots], axis=1))
+    assert np.concatenate(errors).mean() < 1.5
+
+
+def test_the_points_of_fern_have_the_colour_of_the_photographs_there_and_not_half_a_pixel_away(fern: Path) -> None:
+    scene = load_scene(fern)
+    points = scene.points
+    assert points is not None and points.observations is not None
+
+    def difference(shift: tuple[float, float]) -> float:
+        total = []
+        for i, view in enumerate(views):
+            seen = points.observations[points.observations[:, 1] == i, 0]  # type: ignore[index]
+            pixels = pixel_coordinates(view.camera, points.xyz[seen])[0] + torch.tensor(shift)
+            grid = pixels / torch.tensor([view.camera.width, view.camera.height]) * 2 - 1
+            colours = torch.nn.functional.grid_sample(view.image[None], grid[None, None].float(), align_corners=False)
+            total.append((colours[0, :, 0].T - points.rgb[seen]).abs())
+        return float(torch.cat(total).mean())
+
+    views = scene.load()
+    here = difference((0, 0))
+    assert all(difference(shift) > here for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)))

@@ -1,0 +1,153 @@
+"""transforms*.json: written by hand, and the real lego."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splat.scenes.formats.transforms import read_points
+from splat.scenes.scene import load_scene
+from splat.scenes.view import pixel_coordinates
+from tests.splat.scenes import folders
+from tests.splat.scenes.folders import CENTRE, FOCAL, NAMES, SIZE, intrinsics, poses, require_poses
+
+
+def test_transforms_cameras_come_back_sorted_by_name(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content["frames"].reverse()
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    scene = load_scene(tmp_path)
+    assert scene.kind == "transforms" and scene.names == tuple(f"images/{name}" for name in NAMES)
+    require_poses(scene)
+    assert intrinsics(scene) == [(*FOCAL, *CENTRE, *SIZE)] * 3
+
+
+def test_intrinsics_of_a_frame_win_over_those_at_the_top(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content["frames"][1].update(fl_x=99.0, cy=3.0)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    cameras = [frame.camera for frame in load_scene(tmp_path).frames]
+    assert [camera.fx for camera in cameras] == [FOCAL[0], 99.0, FOCAL[0]]
+    assert [camera.cy for camera in cameras] == [CENTRE[1], 3.0, CENTRE[1]]
+
+
+@pytest.mark.parametrize(
+    ("top", "message"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model OPENCV_FISHEYE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR"),
+        ({"is_fisheye": True}, "a fisheye lens"),
+        ({"k1": 0.1, "k4": 0.2}, "got k4"),
+    ],
+)
+def test_lenses_that_a_pinhole_cannot_stand_for_are_refused(
+    tmp_path: Path, top: dict[str, object], message: str
+) -> None:
+    folders.write_transforms(tmp_path, **top)
+    with pytest.raises(ValueError, match=f"{message} for 'images/a.png' in .*undistort the photographs"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda c: c.pop("fl_x"), "expected fl_x or camera_angle_x"),
+        (lambda c: c.update(frames=[]), "non-empty list 'frames'"),
+        (lambda c: c["frames"][1].pop("transform_matrix"), "in frame 1"),
+        (
+            lambda c: c["frames"][1].update(transform_matrix=[[1, 2], [3, 4]]),
+            "4 x 4 transform_matrix for 'images/b.png'",
+        ),
+        (
+            lambda c: c["frames"][1].update(file_path="images/z.png"),
+            "3 image files, 1 are missing, the first is .*z.png",
+        ),
+        (lambda c: c["frames"][1].update(file_path="images/a.png"), "'images/a.png' more than once"),
+        (lambda c: c.update(ply_file_path="none.ply"), "cannot read .*none.ply"),
+        (lambda c: c.update(fl_x=None), "expected a finite number, got fl_x = None for 'images/a.png'"),
+        (lambda c: c.update(fl_x=-3.0), "camera of image 'images/a.png' cannot be: expected positive focal lengths"),
+        (lambda c: c.update(fl_x=True), "expected a finite number, got fl_x = True"),
+        (lambda c: c.update(cx=float("nan")), "expected a finite number, got cx = nan"),
+        (lambda c: c.update(w=float("inf")), "expected a finite number, got w = inf"),
+        (lambda c: c.update(h=10**400), "expected a finite number, got h = inf"),
+        (lambda c: c.update(w=0), "'images/a.png' cannot be: expected at least 1 px a side"),
+        (lambda c: c.update(h=-18), "'images/a.png' cannot be: expected at least 1 px a side"),
+        (lambda c: c.update(w=1e30), "'images/a.png' cannot be: .* got 1e\\+30 x 18 px"),
+        (
+            lambda c: (c.pop("fl_x"), c.update(camera_angle_x=0)),
+            "expected camera_angle_x above 0 and below pi, got 0.0",
+        ),
+        (lambda c: c.update(background="white"), "three numbers in"),
+        (lambda c: c.update(background=1), "three numbers in"),
+        (lambda c: c.update(ply_file_path=5), "expected the name of a file, got ply_file_path = 5"),
+        (lambda c: c["frames"][1].update(mask_path=["a.png"]), "expected the name of a file, got mask_path"),
+        (lambda c: c["frames"][2]["transform_matrix"][0].__setitem__(3, 10**400), "finite 4 x 4 transform_matrix"),
+        (lambda c: c["frames"][2]["transform_matrix"][0].__setitem__(0, 2.0), "'images/c.png' cannot be: .*rotation"),
+    ],
+)
+def test_bad_transforms_are_refused_in_one_sentence(
+    tmp_path: Path, damage: Callable[[dict], object], message: str
+) -> None:
+    folders.write_transforms(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    damage(content)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
+        load_scene(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["{", 100_000 * "["])
+def test_a_transforms_file_that_is_no_json_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(ValueError, match="expected a JSON file with frames"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["ply_file_path", "mask_path"])
+def test_null_names_no_file(tmp_path: Path, key: str) -> None:
+    folders.write_transforms(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content[key] = content["frames"][0][key] = None
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert load_scene(tmp_path).names == tuple(f"images/{name}" for name in folders.NAMES)
+
+
+@pytest.mark.parametrize(
+    "header", ["element vertex 1000000000000\nproperty float x", "element vertex 1\nproperty int views"]
+)
+def test_points_that_promise_what_cannot_be_are_refused(tmp_path: Path, header: str) -> None:
+    coordinates = "".join(f"property float {axis}\n" for axis in "xyz" if f"float {axis}" not in header)
+    (tmp_path / "p.ply").write_text(f"ply\nformat ascii 1.0\n{header}\n{coordinates}end_header\n0 0 0 0\n")
+    with pytest.raises(ValueError, match="expected a PLY file of points, cannot read"):
+        read_points(tmp_path / "p.ply", ("a",))
+
+
+def test_blender_cameras_have_the_focal_length_of_their_angle_of_view(tmp_path: Path) -> None:
+    folders.write_blender(tmp_path, (2, 16, 26), (0, 8, 16))
+    scene = load_scene(tmp_path)
+    assert scene.kind == "blender"
+    assert scene.names == ("train/r_2", "train/r_16", "train/r_26", "test/r_0", "test/r_8", "test/r_16")
+    assert [frame.subset for frame in scene.frames] == ["train"] * 3 + ["test"] * 3
+    camera = scene.frames[0].camera
+    assert 2 * np.arctan(camera.width / 2 / camera.fx) == pytest.approx(0.7, abs=folders.ROUND_OFF)
+    assert (camera.fy, camera.cx, camera.cy) == (camera.fx, SIZE[0] / 2, SIZE[1] / 2)
+    np.testing.assert_allclose(camera.rotation.numpy(), poses()[0].world_to_camera, atol=folders.ROUND_OFF)
+
+
+def test_lego_stands_where_all_its_cameras_look(lego: Path) -> None:
+    scene = load_scene(lego, downscale=8)
+    assert scene.kind == "blender" and scene.background.tolist() == [1, 1, 1]
+    views = scene.load(scene.names[::5])
+    for view in views:
+        pixel, depth = pixel_coordinates(view.camera, torch.zeros(1, 3, dtype=torch.float64))
+        assert view.alpha is not None and depth > 0
+        assert (pixel[0] - torch.tensor([50.0, 50.0])).abs().max() < 5
+        corner = view.image[:, 0, 0]
+        assert view.alpha[0, 0] == 0 and corner.tolist() == [1, 1, 1]
+    assert all(view.alpha[45:55, 45:55].mean() > 0.3 for view in views if view.alpha is not None)

@@ -1,0 +1,140 @@
+"""What holds for every method of training: its name, and that it resumes to the same bits."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from splat.scenes.view import View
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.loop import train
+from splat.training.methods.corgs import CoRGS
+from splat.training.methods.dngaussian import DNGaussian
+from splat.training.methods.dropgaussian import DropGaussian
+from splat.training.methods.dropoutgs import DropoutGS
+from splat.training.methods.fsgs import FSGS
+from splat.training.methods.methods import METHODS, ThreeDGS
+from splat.training.methods.sam import SAM
+from splat.training.methods.stablegs.stablegs import StableGS
+from splat.training.state import Method, Training
+from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
+
+SHORT: dict[str, Method] = {
+    "3dgs": ThreeDGS(),
+    "stablegs": StableGS(warm_up=3, every=4),
+    "sam": SAM(),
+    "dropgaussian": DropGaussian(),
+    "dropoutgs": DropoutGS(),
+    "fsgs": FSGS(threshold=0.1, large=0.01),
+    "dngaussian": DNGaussian(soft_start=3),
+    "cor-gs": CoRGS(prune_every=4, prune_start=3, distance=0.3, pseudo_start=5),
+}  # schedules that fit into a dozen steps
+
+
+def views() -> list[View]:
+    """The tiny views with depth maps: a bowl."""
+    rows, columns = torch.meshgrid(torch.arange(14.0), torch.arange(20.0), indexing="ij")
+    return [replace(view, depth=(rows - 7) ** 2 + (columns - 10) ** 2) for view in tiny_views()]
+
+
+def checkpoint_of(training: Training, path: Path) -> bytes:
+    save_checkpoint(path, training, REFERENCE)
+    return path.read_bytes()
+
+
+def test_every_method_is_known_by_its_name():
+    assert list(SHORT) == list(METHODS)
+    for name, settings in METHODS.items():
+        assert settings().name == name
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_training_by_any_method_continues_from_a_checkpoint_to_the_same_bits(tmp_path, name):
+    path, config = tmp_path / "checkpoint.pt", replace(tiny_config(), method=SHORT[name])
+    whole = Training.start(tiny_gaussians(), EXTENT, config)
+    kept = {}
+    for done in train(whole, views()):
+        kept[done.step] = checkpoint_of(whole, path)
+    for stop in (1, 6, 9):
+        path.write_bytes(kept[stop])
+        resumed = load_checkpoint(path).training
+        assert resumed.config == config
+        for _ in train(resumed, views()):
+            pass
+        assert checkpoint_of(resumed, path) == kept[12]
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> dict[str, bytes]:
+    """Checkpoints under way, each with rows in its history."""
+    path, found = tmp_path_factory.mktemp("saved") / "checkpoint.pt", {}
+    for name in ("stablegs", "cor-gs"):
+        training = Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=SHORT[name]))
+        while training.step < 6:
+            next(train(training, views()))
+        found[name] = checkpoint_of(training, path)
+    return found
+
+
+NO_WHOLE_NUMBERS = ["many", -1, 2.5, None, 10**400, torch.zeros(3)]
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "values", "words"),
+    [
+        ("stablegs", ("history", 0, "step"), NO_WHOLE_NUMBERS, "row of the history with plain values, its step"),
+        ("stablegs", ("history", 0, "count"), NO_WHOLE_NUMBERS, "row of the history with plain values, its step"),
+        ("cor-gs", ("history", 0, "pruned"), [-1, 10**400, None], "row of the history with plain values, its step"),
+        ("cor-gs", ("history", 0), [{}, [], "row"], "row of the history with plain values, its step"),
+        ("cor-gs", ("history",), [{}, 3, "rows"], "expected the history as a list of rows"),
+        ("cor-gs", ("partner", "step"), NO_WHOLE_NUMBERS, "step"),
+        ("cor-gs", ("partner", "adam", "updates"), NO_WHOLE_NUMBERS, "updates"),
+        ("cor-gs", ("partner", "config", "iterations"), NO_WHOLE_NUMBERS, "iteration"),
+        ("stablegs", ("magnitudes", "means"), [{}, 3, {"rho": 1.0}], "magnitude|argument"),
+        (
+            "stablegs",
+            ("magnitudes", "means", "rho"),
+            ["much", -1, None, 10**400, float("nan")],
+            "magnitude|finite tau and",
+        ),
+        ("stablegs", ("normals",), [{}, 3, [2], [torch.zeros(3)]], "vectors of two numbers"),
+    ],
+)
+def test_what_no_method_can_have_saved_is_refused_in_a_sentence(tmp_path, saved, name, place, values, words):
+    path = tmp_path / "checkpoint.pt"
+    for value in values:
+        path.write_bytes(saved[name])
+        content = torch.load(path, weights_only=True)
+        at = content["regularizer"]
+        for key in place[:-1]:
+            at = at[key]
+        at[place[-1]] = value
+        torch.save(content, path)
+        with pytest.raises(ValueError, match=words) as caught:
+            load_checkpoint(path)
+        said = str(caught.value)
+        assert (
+            said.startswith("expected a checkpoint") and "\n" not in said and "'regularizer' is not the state" in said
+        )
+        assert "take another copy of the file, or train anew" in said
+
+
+def test_normals_of_other_views_are_refused_before_the_first_step(tmp_path, saved):
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(saved["stablegs"])
+    training = load_checkpoint(path).training
+    training.regularizer.restore(training.regularizer.state() | {"normals": [torch.zeros(2)]})
+    with pytest.raises(ValueError, match="normal for each of 3 training views, found 1"):
+        next(train(training, views()))
+
+
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "3dgs"])
+def test_every_method_changes_what_is_trained(name):
+    ends = []
+    for method in (SHORT["3dgs"], SHORT[name]):
+        training = Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=method))
+        for _ in train(training, views()):
+            pass
+        ends.append(training.gaussians.flat)
+    assert ends[0].shape != ends[1].shape or not torch.equal(*ends)

@@ -1,0 +1,92 @@
+"""SAM against its definition by autograd in the units of its ball."""
+
+from math import sqrt
+
+import pytest
+import torch
+
+from splat.losses.cpu.loss import ViewLoss
+from splat.losses.reference import photometric_loss
+from splat.render.loss_and_gradient import loss_and_gradient
+from splat.render.render import render
+from splat.training.methods import sam
+from splat.training.methods.sam import SAM, ascent
+from splat.training.state import LearningRates, Step, TrainConfig, Training, learning_rates, position_rate
+from tests.splat.tiny import EXTENT, tiny_gaussians, tiny_views
+
+
+def a_step(settings: SAM) -> Step:
+    gaussians = tiny_gaussians(sh_degree=1, dtype=torch.float64)
+    config = TrainConfig(10, background=(0.2, 0.4, 0.1), method=settings)
+    training = Training.start(gaussians, EXTENT, config)
+    views = tiny_views(torch.float64)
+    loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
+    background = torch.tensor(config.background, dtype=torch.float64)
+    return Step(3, training, training.gaussians, views, 1, background, loss)
+
+
+def units_of(step: Step, metric: str) -> torch.Tensor:
+    if metric == "parameters":
+        return torch.ones_like(step.gaussians.flat)
+    rates = LearningRates()
+    return learning_rates(step.gaussians, rates, position_rate(rates, EXTENT, 3, 10))
+
+
+@pytest.mark.parametrize(("metric", "rho"), [("parameters", 0.02), ("rates", 3.0)])
+def test_the_gradient_is_that_of_the_loss_one_unit_ascent_away_in_the_units_of_the_ball(metric, rho):
+    step = a_step(SAM(rho=rho, metric=metric))
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
+    got = step.training.regularizer.gradient(step, base)
+
+    units = units_of(step, metric)
+
+    def loss(u: torch.Tensor) -> torch.Tensor:
+        gaussians = step.gaussians.with_flat(u * units)
+        image = render(gaussians, step.camera, step.background, backend="reference").image
+        return photometric_loss(image, step.views[1].image, step.config.loss)
+
+    u = (step.gaussians.flat / units).requires_grad_()
+    (slope,) = torch.autograd.grad(loss(u), u)
+    radius = rho if metric == "parameters" else rho * sqrt(len(u))
+    worst = (u + radius * slope / slope.norm()).detach().requires_grad_()
+    (expected,) = torch.autograd.grad(loss(worst), worst)
+    expected = expected / units
+    assert (got - expected).norm() < 1e-10 * expected.norm()
+    assert (got - base.gradient).norm() > 1e-3 * expected.norm()
+
+
+def test_no_step_of_the_same_length_rises_faster():
+    generator = torch.Generator().manual_seed(0)
+    gradient, units = torch.randn(2, 40, generator=generator, dtype=torch.float64)
+    units = units.abs()
+    eps = ascent(gradient, units, 0.3)
+    assert (eps / units).norm().item() == pytest.approx(0.3, rel=1e-14)
+    others = torch.randn(200, 40, generator=generator, dtype=torch.float64)
+    others = units * 0.3 * others / others.norm(dim=1, keepdim=True)
+    nearly = 0.999 * eps + 0.001 * others
+    nearly = 0.3 * nearly / (nearly / units).norm(dim=1, keepdim=True)
+    assert (torch.cat([others, nearly]) @ gradient < eps @ gradient).all()
+
+
+def test_one_step_costs_one_more_render_and_where_the_gradient_is_0_nothing_moves(monkeypatch):
+    calls = []
+    monkeypatch.setattr(sam, "loss_and_gradient", lambda *a: calls.append(a[0]) or loss_and_gradient(*a))
+    step = a_step(SAM())
+    step.gaussians.means[:, 2] = -3.0
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)
+    gradient = step.training.regularizer.gradient(step, base)
+    assert len(calls) == 1 and torch.equal(calls[0].flat, step.gaussians.flat)
+    assert not gradient.any()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"rho": 0.0}, "rho above 0"),
+        ({"rho": float("nan")}, "rho above 0"),
+        ({"metric": "l2"}, "'parameters' or 'rates'"),
+    ],
+)
+def test_settings_of_sam_that_make_no_sense_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        SAM(**settings)

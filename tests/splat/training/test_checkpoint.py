@@ -1,0 +1,336 @@
+"""Checkpoints: whole or not at all, read back as they were, refused with the reason where they are not ours."""
+
+import builtins
+import errno
+import io
+import math
+import os
+import pickle
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from splat.model.settings import RenderSettings
+from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
+from splat.training.loop import train
+from splat.training.methods.methods import ThreeDGS
+from splat.training.state import Training
+from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
+
+
+@pytest.fixture(scope="module")
+def training() -> Training:
+    training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
+    for done in train(training, tiny_views()):
+        if done.step == 8:
+            break
+    return training
+
+
+@pytest.fixture
+def path(tmp_path, training) -> Path:
+    save_checkpoint(tmp_path / "checkpoint.pt", training, REFERENCE)
+    return tmp_path / "checkpoint.pt"
+
+
+def test_what_is_saved_is_what_is_loaded(path, training):
+    loaded = load_checkpoint(path)
+    assert loaded.scene == REFERENCE and loaded.torch_version == torch.__version__
+    got = loaded.training
+    assert got.config == training.config
+    assert (got.step, got.extent, got.order) == (8, EXTENT, training.order)
+    assert got.gaussians.sh_degree == training.gaussians.sh_degree == 1
+    assert torch.equal(got.gaussians.flat, training.gaussians.flat)
+    assert torch.equal(got.adam.first.flat, training.adam.first.flat) and got.adam.updates == 8
+    assert torch.equal(got.adam.second.flat, training.adam.second.flat)
+    assert torch.equal(got.screen_gradients.total, training.screen_gradients.total)
+    assert torch.equal(got.screen_gradients.renders, training.screen_gradients.renders)
+    assert torch.equal(got.generator.get_state(), training.generator.get_state())
+
+
+def test_a_checkpoint_holds_no_more_than_its_tensors(path, training):
+    values = sum(t.numel() for t in (training.gaussians.flat, training.adam.first.flat, training.adam.second.flat))
+    assert path.stat().st_size < 4 * values + training.generator.get_state().numel() + 16_000
+
+
+def test_the_same_training_gives_the_same_bytes_under_any_name(path, training):
+    other = path.with_name("other.pt")
+    save_checkpoint(other, training, REFERENCE)
+    assert other.read_bytes() == path.read_bytes()
+
+
+def test_a_write_that_fails_leaves_what_was_there_and_nothing_beside_it(path, monkeypatch):
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="no space left") as caught:
+        write_atomically(path, b"something else")
+    assert caught.value.filename == str(path)
+    assert path.read_bytes() == before and [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def refused(path: Path, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        load_checkpoint(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_reported(tmp_path):
+    with pytest.raises(FileNotFoundError, match="found no such file"):
+        load_checkpoint(tmp_path / "checkpoint.pt")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 nor a zip file", b"\x80\x02}q\x00."])
+def test_a_file_of_another_kind_is_refused(tmp_path, content):
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(content)
+    refused(path, "expected a checkpoint written by landscape train")
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO])
+def test_a_checkpoint_that_the_system_does_not_open_is_reported_in_its_words(path, monkeypatch, number):
+    opened = io.open
+
+    def refuse(file, *arguments, **settings):
+        if str(file) == str(path):
+            raise OSError(number, os.strerror(number), str(file))
+        return opened(file, *arguments, **settings)
+
+    for module in (io, builtins):  # the root, who may read everything, runs tests too
+        monkeypatch.setattr(module, "open", refuse)
+    with pytest.raises(OSError, match=os.strerror(number)) as caught:
+        load_checkpoint(path)
+    assert caught.value.filename == str(path)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_checkpoint_is_refused(path, share):
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    refused(path, "not one or is damaged")
+
+
+def test_a_bit_that_flipped_anywhere_among_the_numbers_is_noticed(path, training):
+    content = bytearray(path.read_bytes())
+    numbers = training.gaussians.flat.numpy().tobytes()
+    place = bytes(content).index(numbers)
+    for byte in (place, place + len(numbers) // 2):
+        content[byte] ^= 1
+        path.write_bytes(content)
+        refused(path, "not one or is damaged")
+        content[byte] ^= 1
+    path.write_bytes(content)
+    load_checkpoint(path)
+
+
+def test_what_is_loaded_is_what_was_checked_though_a_training_replaces_it_meanwhile(path, training, monkeypatch):
+    checked = zipfile.ZipFile.testzip
+
+    def replaced(archive):
+        found = checked(archive)
+        write_atomically(path, b"another")
+        return found
+
+    monkeypatch.setattr(zipfile.ZipFile, "testzip", replaced)
+    assert torch.equal(load_checkpoint(path).training.gaussians.flat, training.gaussians.flat)
+
+
+def test_an_archive_that_torch_stumbles_over_in_its_own_way_is_refused(path):
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    pickled = next(name for name in members if name.endswith("data.pkl"))
+    for start in (b"\x80\x02.", b"\x80\x02]Q.", b"\x80\x02K\x01Q."):  # nothing on the stack; things that are no storage
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in members.items():
+                archive.writestr(name, start if name == pickled else content)
+        refused(path, "not one or is damaged")
+
+
+def test_a_file_that_would_run_code_is_refused_and_runs_nothing(tmp_path):
+    marker = tmp_path / "ran"
+
+    class Attack:
+        def __reduce__(self):
+            return os.mkdir, (str(marker),)
+
+    path = tmp_path / "checkpoint.pt"
+    torch.save({"format": Attack()}, path)
+    refused(path, "not one or is damaged")
+    path.write_bytes(pickle.dumps(Attack()))
+    refused(path, "not one or is damaged")
+    assert not marker.exists()
+
+
+CHANGES = {
+    "format": ("something else", "does not hold the format"),
+    "version": (99, "format version is 99"),
+    "torch": (2, "'torch' is int, expected str"),
+    "step": (1000, "step 1000 is not among its 12"),
+    "extent": (float("inf"), "extent is inf"),
+    "sh_degree": (7, "sh_degree 0, 1, 2 or 3, got 7"),
+    "flat": (torch.zeros(7), "expected a vector of n x 23 parameters"),
+    "adam": ({"first": torch.zeros(3), "second": torch.zeros(3), "updates": 1}, "'first' is torch.float32 of shape"),
+    "screen_gradients": ([], "'screen_gradients' is list, expected dict"),
+    "generator": (torch.zeros(5, dtype=torch.uint8), "not the state of a random generator"),
+    "order": ([3], "does not index its 3 training views"),
+    "regularizer": ({}, "not the state of its method"),
+    "config": ({"iterations": 5}, "'config' has missing or unknown keys: background"),
+    "scene": ({}, "'scene' has missing or unknown keys"),
+}
+
+
+@pytest.mark.parametrize("key", CHANGES)
+def test_every_key_is_checked(path, key):
+    content = torch.load(path, weights_only=True)
+    assert set(content) == set(CHANGES)
+    value, message = CHANGES[key]
+    torch.save({**content, key: value}, path)
+    refused(path, message)
+    torch.save({**content, key: torch.zeros(3, 40)}, path)
+    refused(path, "tensor|Tensor|torch|format")
+    del content[key]
+    torch.save(content, path)
+    refused(path, "missing|format")
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "number"),
+    [("adam", "first", math.nan), ("adam", "second", -1e-9), ("screen_gradients", "total", math.inf)],
+)
+def test_what_a_training_goes_on_from_is_finite_and_what_was_squared_not_negative(path, part, key, number):
+    content = torch.load(path, weights_only=True)
+    content[part][key][1] = number
+    torch.save(content, path)
+    refused(path, f"'{key}' holds a number that is not finite")
+
+
+def test_a_ply_file_is_refused_by_its_name(tmp_path):
+    path = tmp_path / "point_cloud.ply"
+    path.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
+    refused(path, r"damaged \(Gaussians from a PLY file cannot be read\)")
+
+
+def test_a_checkpoint_from_before_sums_had_a_name_has_ordered_ones(path):
+    content = torch.load(path, weights_only=True)
+    del content["config"]["render"]["sums"]
+    torch.save(content, path)
+    assert load_checkpoint(path).training.config.render == RenderSettings()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("iterations", "many", "'config.iterations' is 'many', expected int"),
+        ("background", (0.0, 1.0), "'config.background' is"),
+        ("seed", -1, "expected a seed"),
+        ("loss", {"pixel": "l1"}, "'config.loss' has missing or unknown keys"),
+        ("method", {"name": "magic"}, "'config.method' has the unknown name 'magic'"),
+        ("method", {"name": "stablegs"}, "'config.method' has missing or unknown keys"),
+        ("method", "3dgs", "'config.method' has the unknown name '3dgs'|is str, expected dict"),
+        ("method", {"name": torch.zeros(2000)}, "'config.method' has the unknown name a Tensor"),
+        ("iterations", torch.zeros(50, 50), "'config.iterations' is a Tensor, expected int"),
+        ("iterations", "many " * 100, r"'config.iterations' is 'many .{,80}, expected int"),
+    ],
+)
+def test_settings_in_a_checkpoint_are_checked_like_any_others(path, key, value, message):
+    content = torch.load(path, weights_only=True)
+    content["config"][key] = value
+    torch.save(content, path)
+    refused(path, message)
+
+
+@pytest.mark.parametrize("number", [2**63, 10**30, 10**400], ids=["2^63", "10^30", "10^400"])
+@pytest.mark.parametrize(("part", "key"), [("rates", "position"), ("render", "contour_sigma"), ("densify", "stop")])
+def test_whole_numbers_that_no_machine_number_holds_are_refused_in_a_sentence(path, part, key, number):
+    content = torch.load(path, weights_only=True)
+    content["config"][part][key] = number
+    torch.save(content, path)
+    refused(path, f"'config.{part}.{key}' is .*, expected (int|float)")
+
+
+def test_whole_numbers_in_place_of_real_ones_are_taken(path):
+    content = torch.load(path, weights_only=True)
+    content["config"]["render"]["contour_sigma"] = 2**62
+    content["config"]["rates"]["quats"] = 1
+    torch.save(content, path)
+    config = load_checkpoint(path).training.config
+    assert config.render.contour_sigma == 2**62 and config.rates.quats == 1
+
+
+def test_an_optimiser_that_made_more_updates_than_steps_is_refused(path):
+    content = torch.load(path, weights_only=True)
+    content["adam"]["updates"] = 10**400
+    torch.save(content, path)
+    refused(path, "optimiser has made .* updates in 8 steps")
+
+
+def test_parameters_that_are_not_finite_are_refused_by_name(path):
+    content = torch.load(path, weights_only=True)
+    content["flat"][4] = torch.nan
+    torch.save(content, path)
+    refused(path, "expected finite means.*at Gaussian 1")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"flat": torch.zeros(0)}, "it holds no Gaussian"),
+        ({"flat": torch.zeros(14, dtype=torch.float16)}, "'flat' is torch.float16"),
+        ({"flat": torch.ones(1).expand(23 * 10**12)}, "does not hold its numbers one by one"),
+        ({"flat": torch.zeros(23, device="meta")}, "does not hold its numbers one by one"),
+    ],
+)
+def test_parameters_that_are_no_plain_numbers_are_refused_before_they_are_looked_at(path, change, message):
+    torch.save({**torch.load(path, weights_only=True), **change}, path)
+    refused(path, message)
+
+
+def test_an_optimiser_that_made_less_than_no_update_is_refused(path):
+    content = torch.load(path, weights_only=True)
+    content["adam"]["updates"] = -1
+    torch.save(content, path)
+    refused(path, "has made -1 updates")
+
+
+def test_a_checkpoint_of_float64_comes_back_in_float64(tmp_path):
+    training = Training.start(tiny_gaussians(dtype=torch.float64), EXTENT, tiny_config())
+    save_checkpoint(tmp_path / "checkpoint.pt", training, REFERENCE)
+    assert load_checkpoint(tmp_path / "checkpoint.pt").training.gaussians.flat.dtype == torch.float64
+
+
+def test_the_scene_is_found_from_the_checkpoint_else_where_it_was_else_not_at_all(tmp_path):
+    there, run, moved = tmp_path / "scene", tmp_path / "run", tmp_path / "elsewhere"
+    for folder in (there, run):
+        folder.mkdir()
+    reference = replace(REFERENCE, absolute=str(there), relative="../scene")
+    assert reference.find(run / "checkpoint.pt") == there
+    moved.mkdir()
+    run = run.rename(moved / "run")
+    assert reference.find(run / "checkpoint.pt") == there
+    there.rename(moved / "scene")
+    assert reference.find(run / "checkpoint.pt") == moved / "scene"
+    (moved / "scene").rmdir()
+    with pytest.raises(FileNotFoundError, match="pass where it is now with --scene"):
+        reference.find(run / "checkpoint.pt")
+
+
+def test_a_checkpoint_from_before_there_were_methods_is_3dgs(path):
+    content = torch.load(path, weights_only=True)
+    content["version"] = 1
+    del content["regularizer"], content["config"]["method"]
+    torch.save(content, path)
+    assert load_checkpoint(path).training.config.method == ThreeDGS()
+
+
+def test_checkpoints_from_before_the_start_was_recorded_are_read(tmp_path):
+    save_checkpoint(tmp_path / "new.pt", Training.start(tiny_gaussians(), EXTENT, tiny_config()), REFERENCE)
+    content = torch.load(tmp_path / "new.pt", weights_only=True)
+    del content["scene"]["start"], content["scene"]["depths"]
+    torch.save(content, tmp_path / "old.pt")
+    assert load_checkpoint(tmp_path / "old.pt").scene == REFERENCE

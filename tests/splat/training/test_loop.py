@@ -1,0 +1,319 @@
+"""The training loop: schedules, determinism, and what a killed training resumes to."""
+
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from math import sqrt
+from pathlib import Path
+
+import pytest
+import torch
+
+from splat.losses.reference import LossSettings, photometric_loss
+from splat.render.render import render
+from splat.scenes.view import View
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.densify import DensifySettings, densify
+from splat.training.loop import train, with_background
+from splat.training.optim.adam import EPS
+from splat.training.score.evaluate import evaluate
+from splat.training.state import LearningRates, TrainConfig, Training, learning_rates, position_rate
+from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
+
+ONLY_ADAM = DensifySettings(enabled=False)
+
+
+def run(config: TrainConfig, dtype: torch.dtype = torch.float32):
+    training = Training.start(tiny_gaussians(dtype=dtype), EXTENT, config)
+    return training, list(train(training, tiny_views(dtype)))
+
+
+def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands():
+    config = TrainConfig(10, seed=3, sh_degree=1, sh_degree_every=4, densify=ONLY_ADAM)
+    training, progress = run(config, torch.float64)
+
+    views = {view.name: view for view in tiny_views(torch.float64)}
+    gaussians = tiny_gaussians(dtype=torch.float64).select(torch.arange(12), sh_degree=1)
+    leaves = {name: value.clone().requires_grad_() for name, value in gaussians.attributes.items() if name != "sh"}
+    constant, higher = (part.clone().requires_grad_() for part in gaussians.sh.split([1, 3], dim=1))
+    rates = {"means": 0.0, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 0.05}
+    groups = [{"params": [leaves[name]], "lr": rate} for name, rate in rates.items()]
+    adam = torch.optim.Adam(
+        [*groups, {"params": [constant], "lr": 2.5e-3}, {"params": [higher], "lr": 1.25e-4}], eps=EPS
+    )
+    for done in progress:
+        adam.param_groups[0]["lr"] = EXTENT * 1.6e-4 * 0.01 ** (done.step / 10)
+        mask = 0.0 if done.step <= 4 else 1.0
+        model = gaussians.pack({**leaves, "sh": torch.cat([constant, mask * higher], dim=1)})
+        view = views[done.view]
+        loss = photometric_loss(render(model, view.camera).image, view.image)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        assert abs(done.loss - loss.item()) < 1e-12
+    expected = gaussians.pack({**leaves, "sh": torch.cat([constant, higher], dim=1)}).flat
+    assert training.gaussians.sh_degree == 1
+    assert (training.gaussians.flat - expected).abs().max() < 1e-12
+
+
+def test_position_rate_decays_exponentially_to_its_final_value():
+    rates = LearningRates()
+    assert position_rate(rates, 3.0, 0, 700) == pytest.approx(3.0 * rates.position, rel=1e-14)
+    assert position_rate(rates, 3.0, 700, 700) == pytest.approx(3.0 * rates.position_final, rel=1e-14)
+    assert position_rate(rates, 1.0, 350, 700) == pytest.approx(sqrt(rates.position * rates.position_final), rel=1e-14)
+
+
+def test_every_parameter_has_the_rate_of_its_attribute_and_band():
+    gaussians = tiny_gaussians(sh_degree=3)
+    rates = LearningRates(log_scales=1.0, quats=2.0, opacity_logits=3.0, sh_constant=4.0, sh_higher=5.0)
+    each = gaussians.with_flat(learning_rates(gaussians, rates, 6.0)).attributes
+    assert (each["means"] == 6).all() and (each["log_scales"] == 1).all() and (each["quats"] == 2).all()
+    assert (each["opacity_logits"] == 3).all() and (each["sh"][:, 0] == 4).all() and (each["sh"][:, 1:] == 5).all()
+
+
+def test_a_band_joins_after_every_so_many_steps_until_the_highest():
+    config = TrainConfig(9, sh_degree=2, sh_degree_every=2, densify=ONLY_ADAM)
+    training = Training.start(tiny_gaussians(), EXTENT, config)
+    degrees = [training.gaussians.sh_degree for _ in train(training, tiny_views())]
+    assert degrees == [0, 0, 1, 1, 2, 2, 2, 2, 2]
+
+
+def test_every_epoch_shows_each_view_once_in_a_new_order():
+    _, progress = run(TrainConfig(30, densify=ONLY_ADAM))
+    epochs = [tuple(done.view for done in progress[i : i + 3]) for i in range(0, 30, 3)]
+    assert all(sorted(epoch) == ["view0", "view1", "view2"] for epoch in epochs)
+    assert len(set(epochs)) > 1
+
+
+def test_the_tiny_run_clones_splits_prunes_resets_and_raises_the_degree(monkeypatch):
+    changes, highest_opacity = [], []
+
+    def recorded(*arguments, **settings):
+        changes.append(densify(*arguments, **settings))
+        return changes[-1]
+
+    monkeypatch.setattr("splat.training.loop.densify", recorded)
+    training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
+    for done in train(training, tiny_views()):
+        assert done.gaussians == len(training.gaussians)
+        highest_opacity.append(training.gaussians.opacity_logits.sigmoid().max().item())
+        moments = training.adam.second
+        if changes and training.gaussians is changes[-1].gaussians and not training.screen_gradients.renders.any():
+            assert not moments.select(changes[-1].fresh).flat.any()
+        assert bool(moments.opacity_logits.any()) == (done.step != 5)
+        assert moments.means.any()
+    assert all(sum(getattr(change, what) for change in changes) for what in ("cloned", "split", "pruned"))
+    assert highest_opacity[4] <= 0.010001 < highest_opacity[3]
+    assert training.gaussians.sh_degree == 2
+
+
+@pytest.mark.parametrize(
+    ("background", "drawn", "resets"),
+    [
+        ((1.0, 1.0, 1.0), False, [3, 5]),
+        ((1.0, 1.0, 1.0), True, [5]),
+        ((0.0, 0.0, 0.0), False, [5]),
+        ((1.0, 1.0, 0.9), False, [5]),
+    ],
+)
+def test_on_a_white_background_opacities_are_also_reset_before_density_control_begins(background, drawn, resets):
+    config = replace(tiny_config(), background=background, random_background=drawn)
+    training = Training.start(tiny_gaussians(), EXTENT, config)
+    highest = {
+        done.step: training.gaussians.opacity_logits.sigmoid().max().item() for done in train(training, tiny_views())
+    }
+    assert [
+        step for step, opacity in highest.items() if opacity <= 0.010001
+    ] == resets  # the next update lifts some again
+
+
+def checkpoint_bytes(config: TrainConfig, path: Path) -> bytes:
+    training, _ = run(config)
+    save_checkpoint(path, training, REFERENCE)
+    return path.read_bytes()
+
+
+def test_the_same_seed_gives_the_same_checkpoint_bit_for_bit_and_another_seed_does_not(tmp_path):
+    first = checkpoint_bytes(tiny_config(), tmp_path / "first.pt")
+    assert checkpoint_bytes(tiny_config(), tmp_path / "again.pt") == first
+    one, _ = run(tiny_config(seed=0))
+    other, _ = run(tiny_config(seed=1))
+    assert one.gaussians.flat.shape != other.gaussians.flat.shape or not torch.equal(
+        one.gaussians.flat, other.gaussians.flat
+    )
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
+from splat.checkpoint import save_checkpoint
+from splat.train import Training, train
+training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
+for done in train(training, tiny_views()):
+    if done.step % 4 == 0:
+        save_checkpoint(Path(sys.argv[1]), training, REFERENCE)
+    if done.step == 7:
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_training_killed_and_resumed_ends_with_the_same_bytes_as_one_that_was_not(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    command = [sys.executable, "-c", KILLED, str(path)]
+    result = subprocess.run(command, cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=120)
+    assert result.returncode == -signal.SIGKILL, result.stderr
+
+    loaded = load_checkpoint(path)
+    assert loaded.training.step == 4
+    for _ in train(loaded.training, tiny_views()):
+        pass
+    save_checkpoint(path, loaded.training, loaded.scene)
+    assert path.read_bytes() == checkpoint_bytes(tiny_config(), tmp_path / "uninterrupted.pt")
+
+
+@pytest.mark.parametrize("stop", range(1, 12))
+def test_a_training_saved_after_any_step_continues_to_the_same_bits(tmp_path, stop, uninterrupted):
+    path = tmp_path / "checkpoint.pt"
+    training = Training.start(tiny_gaussians(), EXTENT, tiny_config())
+    for done in train(training, tiny_views()):
+        if done.step == stop:
+            break
+    save_checkpoint(path, training, REFERENCE)
+    resumed = load_checkpoint(path).training
+    for _ in train(resumed, tiny_views()):
+        pass
+    save_checkpoint(path, resumed, REFERENCE)
+    assert path.read_bytes() == uninterrupted
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory) -> bytes:
+    return checkpoint_bytes(tiny_config(), tmp_path_factory.mktemp("uninterrupted") / "checkpoint.pt")
+
+
+def test_training_brings_the_views_closer():
+    views = tiny_views()
+    config = TrainConfig(60, sh_degree=0, densify=ONLY_ADAM)
+    training, _ = run(config)
+    before, after = evaluate(tiny_gaussians(), views), evaluate(training.gaussians, views)
+    assert after.psnr > before.psnr + 3 and after.ssim > before.ssim
+
+
+def test_a_training_does_not_touch_the_gaussians_that_it_starts_from():
+    start = tiny_gaussians()
+    before = start.flat.clone()
+    for _ in train(Training.start(start, EXTENT, TrainConfig(2)), tiny_views()):
+        pass
+    assert torch.equal(start.flat, before)
+
+
+def test_random_backgrounds_show_through_what_is_transparent_in_a_view_as_in_the_render():
+    black, colour = torch.zeros(3), torch.tensor([0.2, 0.5, 0.9])
+    truth, camera = tiny_gaussians(seed=1), tiny_views()[0].camera
+    over_black, over_colour = render(truth, camera, black), render(truth, camera, colour)
+    view = View("view", camera, over_black.image, over_black.alpha)
+    torch.testing.assert_close(with_background(view, black, colour), over_colour.image, rtol=0, atol=1e-6)
+    back = View("view", camera, over_colour.image, over_colour.alpha)
+    torch.testing.assert_close(with_background(back, colour, black), over_black.image, rtol=0, atol=1e-6)
+    opaque = tiny_views()[0]
+    assert with_background(opaque, black, colour) is opaque.image
+
+
+def test_the_background_is_drawn_anew_each_step_where_it_is_random_and_is_the_settings_own_where_not(monkeypatch):
+    colours = []
+
+    def recorded(gaussians, camera, background, settings, **others):
+        colours.append(tuple(background.tolist()))
+        return render(gaussians, camera, background, settings, **others)
+
+    monkeypatch.setattr("splat.render.loss_and_gradient.render", recorded)
+    run(TrainConfig(4, random_background=True))
+    assert len(set(colours)) == 4
+    colours.clear()
+    run(TrainConfig(4, background=(0.25, 0.5, 1.0)))
+    assert set(colours) == {(0.25, 0.5, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"iterations": 0}, "at least 1 iteration"),
+        ({"seed": -1}, "seed"),
+        ({"sh_degree": 4}, "sh_degree"),
+        ({"sh_degree_every": 0}, "sh_degree_every"),
+        ({"background": (0.0, 0.0, 2.0)}, "background"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        TrainConfig(**settings)
+
+
+def test_rates_that_make_no_sense_are_refused():
+    with pytest.raises(ValueError, match="position rates above 0"):
+        LearningRates(position_final=0.0)
+    with pytest.raises(ValueError, match="at least 0"):
+        LearningRates(quats=-1.0)
+    with pytest.raises(ValueError, match="finite position rates"):
+        LearningRates(position=torch.inf)
+    with pytest.raises(ValueError, match="finite learning rates"):
+        LearningRates(opacity_logits=torch.nan)
+
+
+def test_a_start_that_cannot_be_trained_is_refused():
+    config = TrainConfig(1, sh_degree=1)
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        Training.start(tiny_gaussians(0), EXTENT, config)
+    with pytest.raises(ValueError, match="at most the training's SH degree 1, got 2"):
+        Training.start(tiny_gaussians(sh_degree=2), EXTENT, config)
+    with pytest.raises(ValueError, match="extent"):
+        Training.start(tiny_gaussians(), 0.0, config)
+    broken = tiny_gaussians()
+    broken.quats[3, 1] = torch.nan
+    with pytest.raises(ValueError, match=r"finite quats.*Gaussian 3"):
+        Training.start(broken, EXTENT, config)
+    with pytest.raises(ValueError, match="at least one view"):
+        next(train(Training.start(tiny_gaussians(), EXTENT, config), []))
+
+
+def test_a_training_that_loses_every_gaussian_says_so():
+    nothing_stays = DensifySettings(every=1, start_share=0.1, reset_opacity=0.9999, min_opacity=0.9998)
+    with pytest.raises(ValueError, match="every Gaussian became transparent or too large by step 2"):
+        run(replace(tiny_config(), densify=nothing_stays))
+
+
+def test_a_loss_that_is_not_finite_names_the_step_and_the_view():
+    views = tiny_views()
+    for view in views:
+        view.image[:] = torch.inf
+    training = Training.start(tiny_gaussians(), EXTENT, TrainConfig(1, loss=LossSettings(ssim_weight=0.0)))
+    with pytest.raises(ValueError, match=r"finite loss, got inf at step 1 on view view\d"):
+        next(train(training, views))
+
+
+def test_a_gradient_that_is_not_finite_is_refused_before_anything_takes_it_over(monkeypatch):
+    training, views = Training.start(tiny_gaussians(), EXTENT, tiny_config()), tiny_views()
+    steps = train(training, views)
+    next(steps)
+    before = [each.flat.clone() for each in (training.gaussians, training.adam.first, training.adam.second)]
+
+    def broken(_step, base):
+        gradient = base.gradient.clone()
+        gradient[5] = torch.nan
+        return gradient
+
+    monkeypatch.setattr(training.regularizer, "gradient", broken)
+    with pytest.raises(ValueError, match=r"finite gradient, got nan at step 2 on view view\d; lower the rates"):
+        next(steps)
+    after = [each.flat for each in (training.gaussians, training.adam.first, training.adam.second)]
+    assert all(map(torch.equal, after, before)) and training.step == training.adam.updates == 1
+
+
+def test_gaussians_that_no_view_shows_are_left_alone():
+    behind = tiny_gaussians()
+    behind.means[:, 2] = -3.0
+    training = Training.start(behind, EXTENT, TrainConfig(3, densify=ONLY_ADAM))
+    losses = [done.loss for done in train(training, tiny_views())]
+    assert len(losses) == 3 and torch.equal(training.gaussians.flat, behind.flat)

@@ -1,0 +1,236 @@
+"""The Gaussians that a training starts from."""
+
+from dataclasses import replace
+from math import cos, log, pi, sin
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from torch import Tensor
+
+from splat.model.camera import Camera
+from splat.model.harmonics import Y00
+from splat.render.render import render
+from splat.scenes.scene import Scene, load_scene
+from splat.scenes.splits import split_scene
+from splat.scenes.view import Frame, Points, View, inside_image
+from splat.training.start import Source, gaussians_from_points, initial_gaussians, points_in_common_volume
+
+NAMES = ("a", "b", "c")
+
+
+def camera(degrees: float = 0.0, distance: float = 4.0, parallel: bool = False) -> Camera:
+    """On a circle round the origin, looking at it; or in a row, all looking along +z."""
+    c, s = cos(degrees * pi / 180), sin(degrees * pi / 180)
+    rotation = torch.eye(3) if parallel else torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    centre = torch.tensor([distance * s, 0, -distance * c], dtype=torch.float64)
+    return Camera(rotation.double(), centre, 40.0, 40.0, 16.0, 12.0, 32, 24)
+
+
+def views(angles: tuple[float, ...] = (-20, 0, 25), parallel: bool = False) -> list[View]:
+    """The red channel counts columns, the green one rows, the blue one views."""
+    result = []
+    for i, angle in enumerate(angles):
+        row, column = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
+        image = torch.stack([column / 32, row / 24, torch.full_like(row, i / 10)])
+        result.append(View(NAMES[i], camera(angle, parallel=parallel), image))
+    return result
+
+
+def some_points(n: int = 60) -> Points:
+    generator = torch.Generator().manual_seed(3)
+    xyz = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    seen = torch.rand(n, 3, generator=generator) < 0.6
+    return Points(xyz, torch.rand(n, 3, generator=generator), seen.nonzero(), NAMES)
+
+
+def mean_neighbour_distance(xyz: Tensor) -> np.ndarray:
+    """Brute force: root of the mean of the three smallest squared distances to others."""
+    squared = ((xyz[:, None] - xyz[None]) ** 2).sum(-1).numpy()
+    return np.sqrt(np.sort(squared, axis=1)[:, 1:4].mean(axis=1))
+
+
+def test_only_points_that_two_of_the_training_views_see_become_gaussians() -> None:
+    points = some_points()
+    assert points.observations is not None
+    seen = torch.zeros(60, 3, dtype=torch.bool)
+    seen[points.observations[:, 0], points.observations[:, 1]] = True
+    for chosen in ((0, 1, 2), (0, 2), (1,)):
+        needed = min(2, len(chosen))
+        kept = seen[:, list(chosen)].sum(dim=1) >= needed
+        gaussians = gaussians_from_points(points, [views()[i] for i in chosen])
+        torch.testing.assert_close(gaussians.means, points.xyz[kept].float(), atol=0, rtol=0)
+
+
+def test_every_attribute_is_that_of_3dgs() -> None:
+    points = some_points()
+    xyz, rgb = points.xyz, points.rgb
+    everyone = Points(xyz, rgb, torch.cartesian_prod(torch.arange(60), torch.arange(3)), NAMES)
+    gaussians = gaussians_from_points(everyone, views(), sh_degree=2)
+    assert gaussians.sh_degree == 2 and gaussians.flat.dtype == torch.float32
+    wanted = torch.from_numpy(np.log(mean_neighbour_distance(xyz))).float()
+    torch.testing.assert_close(gaussians.log_scales, wanted[:, None].expand(60, 3))
+    assert torch.equal(gaussians.quats, torch.tensor([1.0, 0, 0, 0]).expand(60, 4))
+    torch.testing.assert_close(gaussians.opacity_logits.sigmoid(), torch.full((60,), 0.1))
+    torch.testing.assert_close(0.5 + Y00 * gaussians.sh[:, 0], rgb)
+    assert not gaussians.sh[:, 1:].any()
+
+
+def test_scales_follow_the_units_of_the_world() -> None:
+    points = some_points()
+    for unit in (1e-6, 1e6):
+        scaled = Points(points.xyz * unit, points.rgb, points.observations, NAMES)
+        change = gaussians_from_points(scaled, views()).log_scales - gaussians_from_points(points, views()).log_scales
+        torch.testing.assert_close(change, torch.full_like(change, log(unit)), atol=1e-5, rtol=0)
+
+
+def test_coincident_points_get_a_small_finite_scale_and_a_heap_of_them_is_refused() -> None:
+    points = some_points()
+    everyone = torch.cartesian_prod(torch.arange(60), torch.arange(3))
+    xyz = points.xyz.clone()
+    xyz[:5] = xyz[0]
+    gaussians = gaussians_from_points(Points(xyz, points.rgb, everyone, NAMES), views())
+    gaussians.require_finite()
+    assert gaussians.log_scales[0, 0] < gaussians.log_scales[5:].min()
+    with pytest.raises(ValueError, match="expected distinct points, got 60"):
+        gaussians_from_points(Points(torch.zeros_like(xyz), points.rgb, everyone, NAMES), views())
+
+
+def test_too_few_points_are_refused_with_their_number() -> None:
+    few = Points(
+        torch.randn(5, 3, dtype=torch.float64), torch.zeros(5, 3), torch.tensor([[0, 0], [0, 1], [1, 1]]), NAMES
+    )
+    with pytest.raises(ValueError, match="more than 3 points seen by at least 2 of the 3 training views, got 1 of 5"):
+        gaussians_from_points(few, views())
+
+
+def test_random_points_lie_where_two_views_see_them_in_the_colour_of_a_pixel_there() -> None:
+    chosen = views()
+    points = points_in_common_volume(chosen, 500, torch.Generator().manual_seed(0))
+    assert len(points) == 500
+    # half and one and a half times the distance to the origin, where all look
+    inside = torch.stack([inside_image(view.camera, points.xyz, (2.0, 6.0)) for view in chosen], dim=1)
+    assert int(inside.sum(dim=1).min()) >= 2
+    for i, view in enumerate(chosen):
+        mine = (points.rgb[:, 2] * 10).round() == i
+        assert int(mine.sum()) > 50 and bool(inside[mine, i].all())
+        x, y, z = ((points.xyz[mine] - view.camera.centre) @ view.camera.rotation.T).unbind(-1)
+        column, row = 40 * x / z + 16, 40 * y / z + 12
+        # the colour is the pixel's index; a point at a pixel's edge may round into the neighbour
+        torch.testing.assert_close((points.rgb[mine, 0] * 32).double() + 0.5, column, atol=0.5 + 1e-5, rtol=0)
+        torch.testing.assert_close((points.rgb[mine, 1] * 24).double() + 0.5, row, atol=0.5 + 1e-5, rtol=0)
+
+
+def test_random_points_keep_out_of_what_a_view_shows_as_transparent() -> None:
+    """A ball of radius 1/2 about the place where all look, in front of nothing: 2-D discs, whose cones meet around it."""
+    seen = []
+    for view in views():
+        v, u = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(32) + 0.5, indexing="ij")
+        seen.append(replace(view, alpha=((u - 16).square() + (v - 12).square() < 6**2).float()))
+    points = points_in_common_volume(seen, 300, torch.Generator().manual_seed(0)).xyz
+    for view in seen:
+        x, y, z = ((points - view.camera.centre) @ view.camera.rotation.T).unbind(-1)
+        at = torch.stack([40 * x / z + 16, 40 * y / z + 12], dim=1)
+        # the farthest corner of a pixel whose centre is inside
+        assert bool(((at - torch.tensor([16.0, 12.0])).norm(dim=1) < 6 + 0.5**0.5).all())
+
+
+def test_random_depths_are_uniform_between_near_and_far() -> None:
+    view = views((0,))
+    depth = points_in_common_volume(view, 4000, torch.Generator().manual_seed(0), [(1.0, 3.0)]).xyz[:, 2] + 4
+    assert float(depth.min()) >= 1 and float(depth.max()) <= 3
+    # mean 2 and variance 1/3 of a uniform depth, at 4 standard errors
+    assert abs(float(depth.mean()) - 2) < 4 * (1 / 3 / 4000) ** 0.5
+    assert abs(float(depth.var()) - 1 / 3) < 4 * (4 / 45 / 4000) ** 0.5  # Var((z - 2)^2) = 1/5 - 1/9
+
+
+def test_the_generator_decides_the_points() -> None:
+    first, again, other = (
+        points_in_common_volume(views(), 50, torch.Generator().manual_seed(seed)).xyz for seed in (1, 1, 2)
+    )
+    assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_parallel_cameras_need_a_depth_range() -> None:
+    with pytest.raises(ValueError, match="parallel or diverging"):
+        points_in_common_volume(views(parallel=True), 10, torch.Generator())
+    ranges = [(3.0, 5.0)] * 3
+    assert len(points_in_common_volume(views(parallel=True), 10, torch.Generator(), ranges)) == 10
+
+
+def test_one_view_alone_needs_a_depth_range_and_says_so() -> None:
+    with pytest.raises(
+        ValueError, match=r"at least 2 training views for random points, got 1: .*; take more views, or"
+    ) as caught:
+        points_in_common_volume(views((0,)), 10, torch.Generator())
+    assert "parallel" not in str(caught.value)
+    assert len(points_in_common_volume(views((0,)), 10, torch.Generator(), [(3.0, 5.0)])) == 10
+
+
+def test_views_with_nothing_in_common_are_refused() -> None:
+    apart = views((0, 90))
+    with pytest.raises(ValueError, match="got 0 such places"):
+        points_in_common_volume(apart, 10, torch.Generator(), [(0.1, 0.5)] * 2)
+
+
+def test_a_scene_starts_from_its_points_and_without_them_from_random_ones() -> None:
+    frames = tuple(Frame(v.name, v.camera, lambda v=v: (v.image, None), depth_range=(3.0, 5.0)) for v in views())
+    with_points = Scene("s", Path("s"), "synthetic", frames, some_points(), torch.zeros(3))
+    without = Scene("s", Path("s"), "synthetic", frames, None, torch.zeros(3))
+    generator = torch.Generator().manual_seed(0)
+    start = initial_gaussians(with_points, views(), generator=generator)
+    assert torch.equal(start.flat, gaussians_from_points(some_points(), views()).flat)
+    start = initial_gaussians(without, views(), 1, generator=generator, random_points=40)
+    assert len(start) == 40 and start.sh_degree == 1
+    depths = torch.stack([((start.means.double() - v.camera.centre) @ v.camera.forward) for v in views()])
+    assert int(((depths >= 3 - 1e-6) & (depths <= 5 + 1e-6)).sum(dim=0).min()) >= 2
+
+
+def test_fern_starts_from_the_points_of_its_three_views(fern: Path) -> None:
+    scene = load_scene(fern, downscale=4)
+    chosen = scene.load(split_scene(scene, 3).train)
+    gaussians = initial_gaussians(scene, chosen, 0, generator=torch.Generator())
+    model = pycolmap.Reconstruction(fern / "sparse/0")
+    three = {image.image_id for image in model.images.values() if image.name in [view.name for view in chosen]}
+    tracks = [{element.image_id for element in point.track.elements} for point in model.points3D.values()]
+    assert len(three) == 3 and len(gaussians) == sum(len(track & three) >= 2 for track in tracks)
+    with torch.no_grad():
+        picture = render(gaussians, chosen[1].camera, scene.background)
+    # the start is faint, but where it is, it has the photograph's colours: better than a grey of the same alpha
+    grey = 0.5 * picture.alpha
+    blended = chosen[1].image * picture.alpha
+    assert (picture.image - blended).square().mean() < 0.7 * (grey - blended).square().mean()
+
+
+def test_lego_starts_round_its_middle(lego: Path) -> None:
+    scene = load_scene(lego, downscale=16)
+    chosen = scene.load(split_scene(scene, 8).train)
+    gaussians = initial_gaussians(scene, chosen, 0, generator=torch.Generator().manual_seed(0), random_points=2000)
+    assert len(gaussians) == 2000
+    assert gaussians.means.mean(dim=0).norm() < 0.3  # it is 2 long and half as wide, and so is what all views see
+    assert 0.3 < float(gaussians.means.std(dim=0).mean()) < 0.7
+
+
+def test_the_source_of_the_points_can_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = tuple(Frame(v.name, v.camera, lambda v=v: (v.image, None), depth_range=(3.0, 5.0)) for v in views())
+    with_points = Scene("s", Path("s"), "synthetic", frames, some_points(), torch.zeros(3))
+    without = Scene("s", Path("s"), "synthetic", frames, None, torch.zeros(3))
+    elsewhere = Points(some_points().xyz + 5, some_points().rgb, some_points().observations, NAMES)
+    monkeypatch.setattr(
+        "splat.training.start.triangulated_points", lambda chosen: elsewhere if len(chosen) == 3 else None
+    )
+
+    def start(scene: Scene, source: Source) -> Tensor:
+        generator = torch.Generator().manual_seed(0)
+        return initial_gaussians(scene, views(), generator=generator, random_points=40, source=source).flat
+
+    points = gaussians_from_points(some_points(), views()).flat
+    assert torch.equal(start(with_points, "points"), points) and torch.equal(start(with_points, "scene"), points)
+    assert torch.equal(start(with_points, "random"), start(without, "scene"))
+    triangulated = gaussians_from_points(elsewhere, views()).flat
+    for scene in (with_points, without):
+        assert torch.equal(start(scene, "triangulated"), triangulated)
+    with pytest.raises(ValueError, match="scene with points, s has none; start from triangulated or random ones"):
+        start(without, "points")
