@@ -12,7 +12,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import inf, isfinite, sqrt
+from math import isfinite
 from typing import Literal
 
 from jaxtyping import Float64
@@ -47,16 +47,6 @@ def standard_deviation(samples: Float64[Tensor, "s *shape"]) -> Float64[Tensor, 
     """Along the first axis; in units of the largest sample, as squares may leave the range of floats."""
     unit = float(samples.abs().max()) or 1.0
     return unit * (samples / unit).std(dim=0)
-
-
-def t_interval(samples: Float64[Tensor, " s"], confidence: float) -> tuple[float, float, float, float]:
-    """Mean, standard error and both ends of Student's interval; a single sample has an infinite error."""
-    count, mean = samples.numel(), float(samples.mean())
-    if count < 2:
-        return mean, inf, -inf, inf
-    error = float(standard_deviation(samples)) / sqrt(count)
-    half = t_quantile(count - 1, confidence) * error
-    return mean, error, mean - half, mean + half
 
 
 @dataclass(frozen=True)
