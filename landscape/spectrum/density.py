@@ -30,12 +30,13 @@ both while the first runs are under way.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import ceil, inf
+from math import ceil, inf, isnan
 
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from landscape.eigen.krylov import MARGIN
 from landscape.eigen.lanczos import LanczosFactorization, lanczos
 from landscape.eigen.pairs import EigenEnds
 from landscape.linalg import gram, norm
@@ -173,6 +174,7 @@ class _Runs:
         self.known, self.missed, V = found_before(ends, operator, generator.device)
         self.operator = ProjectedOperator(operator, lambda X: X - V @ (V.T @ X)) if V.shape[1] else operator
         self.V, self.matvecs = V, 0
+        self.noise = 0.0 if ends is None or isnan(ends.noise) else ends.noise  # of a product
         self.rules: list[tuple[Float64[Tensor, " m"], Float64[Tensor, " m"], bool]] = []  # nodes, weights, all of it
 
     def add(self, count: int, steps: int, enough: Lengths | None = None) -> None:
@@ -196,7 +198,8 @@ class _Runs:
         if not self.rules and count > 1:
             known, residuals, V, others = found_by_all(runs, spectra)
             self.known, self.V = torch.cat([self.known, known]), torch.cat([self.V, V], dim=1)
-            self.missed = torch.cat([self.missed, missed(known, residuals)])
+            rounding = torch.finfo(self.operator.dtype).eps * max(size, *(float(x.abs().max()) for x, _ in spectra))
+            self.missed = torch.cat([self.missed, missed(known, residuals + MARGIN * max(self.noise, rounding))])
         for run, (values, S), left in zip(runs, spectra, others, strict=True):
             mass = S[0, left].square()
             self.rules.append((values[left], mass / mass.sum(), norm(run.r) == 0))
@@ -238,8 +241,9 @@ def found_before(
 
 
 def missed(values: Float64[Tensor, " k"], residuals: Float64[Tensor, " k"]) -> Float64[Tensor, " k"]:
-    """See `SpectralDensity.of_known`; an eigenvalue of 0 adds nothing."""
-    return torch.where(values == 0, 0.0, 4 * (residuals / values).square())
+    """See `SpectralDensity.of_known` and `residuals`; an eigenvalue of 0 adds nothing."""
+    share = torch.where(values == 0, 0.0, residuals / values.abs())
+    return 4 * share * share.clamp_max(1.0)
 
 
 def settled(values: Float64[Tensor, " m"], S: Float64[Tensor, "m m"], length: float) -> Bool[Tensor, " m"]:

@@ -127,11 +127,18 @@ class SpectralDensity:
 
         With H in the basis of v and its complement, the trace of f(H) less f(lambda) and that of f of the rest is
         sum_j r_j^2 (f'(lambda) - f'(mu_j)) / (lambda - mu_j) to second order: 2 r^2 for lambda^2, and 2 r^2 / |lambda| at most
-        for |lambda|.  So `missed` is twice 2 (r / lambda)^2.
+        for |lambda|.  So `missed` is twice 2 (r / lambda)^2; twice 2 r / |lambda| where r, then round-off, is above |lambda|.
         """
         terms = function(self.known).abs()
         rounding = EPS * self.dim * float(torch.cat([terms, function(self.nodes[self.weights > 0]).abs()]).max())
         return rounding + (0.0 if self.missed is None else float((self.missed * terms).sum()))
+
+    @property
+    def residuals(self) -> Float64[Tensor, " k"]:
+        """Of the known eigenvalues: within it of each of them lies an eigenvalue of H."""
+        if self.missed is None:
+            return torch.zeros_like(self.known)
+        return self.known.abs() * torch.maximum(self.missed / 4, self.missed.sqrt() / 2)
 
     def by_trace(
         self, function: Callable[[Tensor], Tensor], confidence: float
