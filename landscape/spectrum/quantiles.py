@@ -22,7 +22,7 @@ Eigenvalues that are known are counted as such, each somewhere within its residu
 """
 
 from collections.abc import Sequence
-from math import inf
+from math import exp, inf, log
 
 import numpy as np
 import torch
@@ -159,50 +159,61 @@ def _within(density: SpectralDensity, value: float, low: Tensor | float, high: T
     return Bracket(min(max(value, low), high), low, high, note)
 
 
-def _middle_of_magnitudes(density: SpectralDensity, tails: Sequence[_Tail], p: float) -> float:
-    """The magnitude that the share p of sum |lambda| lies at or below, in the middle of what is certain.
-
-    What is known, and the nodes of a rule that is the measure itself, are where they are; of other rules see `_curve`.
-    """
-    exact, curves = [(density.known.abs(), density.known.abs())], []
-    for (nodes, weights), tail, middle in zip(density.rules(), tails, integrals_of_rules(density)[1], strict=True):
-        weights = density.rest * weights / len(density.nodes)
-        if (weights > 0).all():
-            curves.append(_curve(nodes, weights, tail, float(middle) * density.rest / len(density.nodes)))
-        else:
-            exact.append((nodes.abs(), weights * nodes.abs()))
-    at, mass = (torch.cat(parts) for parts in zip(*exact, strict=True))
-    grid = torch.cat([at, *(nodes for nodes, _, _ in curves)]).unique()
-    smooth = np.zeros(len(grid))
-    for nodes, below, total in curves:
-        smooth += np.interp(grid.numpy(), nodes.numpy(), below.numpy(), left=0.0, right=total)
-    at, order = at.sort()
-    sums = torch.nn.functional.pad(mass[order].cumsum(0), (1, 0))
-    below, upto = (smooth + sums[torch.searchsorted(at, grid, right=side)].numpy() for side in (False, True))
-    goal = p * (float(mass.sum()) + sum(total for _, _, total in curves))
-    k = min(int(np.searchsorted(upto, goal)), len(grid) - 1)
-    if k == 0 or goal > below[k]:
-        return float(grid[k])
-    return float(np.interp(goal, [upto[k - 1], below[k]], grid[k - 1 : k + 1].numpy()))
-
-
-def _curve(
-    nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"], tail: _Tail, middle: float
-) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], float]:
-    """Magnitudes in ascending order, the curvature below each of them, in proportion between them, and all curvature.
+class _Curve:
+    """The curvature at magnitudes below t as one start vector sees it, in the middle of what is certain.
 
     Half of what a node carries is taken to lie below it.  A node near 0 of a measure on both sides of 0 carries less than what
-    it stands for, as both signs cancel in its place; there all that `_Tail` does not see above is below.  middle: the value of
-    all curvature.
+    it stands for, as both signs cancel in its place; there all that `_Tail` does not see above is below.  Between nodes the
+    curvature below t goes with a power of t, as it does below them all, there between t (a density of eigenvalues that rises as
+    1 / t towards 0) and t^2 (one that stays finite).  total: the value of all curvature.
     """
-    if len(tail.magnitudes) and float(nodes.min()) < 0 < float(nodes.max()):
-        carried = tail.carried * float(weights.sum())
-        above = carried.flip(0).cumsum(0).flip(0) - carried / 2
-        at, below = (torch.nn.functional.pad(x, (1, 0)) for x in (tail.magnitudes, (middle - above).clamp_min(0.0)))
-        return at, below, middle
-    at, order = nodes.abs().sort()
-    carried = (weights * nodes.abs())[order]
-    return at, carried.cumsum(0) - carried / 2, float(carried.sum())
+
+    def __init__(self, nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"], tail: _Tail, total: float) -> None:
+        if len(tail.magnitudes) and float(nodes.min()) < 0 < float(nodes.max()):
+            at, carried, rest = tail.magnitudes, tail.carried, max(total - float(tail.carried.sum()), 0.0)
+        else:
+            at, order = nodes.abs().sort()
+            carried, rest = (weights * nodes.abs())[order], 0.0
+        below = rest + carried.cumsum(0) - carried / 2
+        kept = (at > 0) & (below > 0)
+        self.total = rest + float(carried.sum())
+        self.at, self.below = at[kept].log().numpy(), below[kept].log().numpy()
+        rise, run = (float(logs[1] - logs[0]) if len(logs) > 1 else 0.0 for logs in (self.below, self.at))
+        self.power = min(max(rise / run, 1.0), 2.0) if run else 1.0
+
+    def __call__(self, t: float) -> float:
+        if not len(self.at) or t == 0:
+            return 0.0
+        if log(t) < self.at[0]:
+            return exp(self.below[0] + self.power * (log(t) - self.at[0]))
+        return float(np.exp(np.interp(log(t), self.at, self.below))) if log(t) <= self.at[-1] else self.total
+
+
+def _middle_of_magnitudes(density: SpectralDensity, tails: Sequence[_Tail], p: float) -> float:
+    """The magnitude that the share p of sum |lambda| lies at or below, in the middle of what is certain (`_Curve`).
+
+    What is known, and the nodes of a rule that is the measure itself, are where they are.
+    """
+    exact, curves = [(density.known.abs(), density.known.abs())], []
+    each = density.rest / len(tails)
+    for (nodes, weights), tail, total in zip(density.rules(), tails, integrals_of_rules(density)[1], strict=True):
+        if (weights > 0).all():
+            curves.append(_Curve(nodes, weights, tail, float(total)))
+        else:
+            exact.append((nodes.abs(), each * weights * nodes.abs()))
+    at, mass = (torch.cat(parts) for parts in zip(*exact, strict=True))
+    at, order = at.sort()
+    sums = torch.nn.functional.pad(mass[order].cumsum(0), (1, 0))
+    goal = p * (float(sums[-1]) + each * sum(curve.total for curve in curves))
+    low, high = (
+        0.0,
+        max(float(density.nodes.abs().max()) if density.nodes.numel() else 0.0, float(at[-1]) if len(at) else 0.0),
+    )
+    while low < (middle := (low + high) / 2) < high:
+        known = float(sums[int(torch.searchsorted(at, middle, right=True))])
+        enough = known + each * sum(curve(middle) for curve in curves) >= goal
+        low, high = (low, middle) if enough else (middle, high)
+    return high
 
 
 def _mean_quantile(share: Float64[Tensor, " g"], size: float, level: float) -> Float64[Tensor, " g"]:

@@ -11,7 +11,8 @@ other, p_2 + (p_3 / p_2) (T - m) is the one that goes with T.  With b = p_3 / (k
 
     T = m + (q^2 + 2) b / 3 -+ q sqrt(2 p_2 / k + (4 - q^2) b^2 / 3)
 
-q is of Student's t with as many degrees of freedom as what is left to chance of p_2 has, k / (p_4 / p_2^2 - p_3^2 / p_2^3).
+q is of Student's t with as many degrees of freedom as what is left to chance of p_2 has, k / (p_4 / p_2^2 - p_3^2 / p_2^3):
+2 k (two eigenvalues, d and -d) or more.
 
 **Signs see less.**  Start vectors of random signs see nothing of the diagonal of f(H): their variance is a share of 2 p_2 / k,
 1 for eigenvectors that are spread over all rows, 0 for those along the axes.  The samples' own variance says how large the
@@ -112,7 +113,7 @@ class SpectralDensity:
         second, third, fourth = (float((shares * (d / unit) ** power).sum()) for power in (2, 3, 4))
         skewness = third / second
         freedom = self.rest * count / (fourth / second / second - skewness * skewness / second)
-        q = t_quantile(freedom, 1 - (1 - RESERVED) * (1 - confidence))
+        q = t_quantile(max(freedom, 2.0 * count), 1 - (1 - RESERVED) * (1 - confidence))
         b, variance = skewness / count, 2 * self.rest * second / count
         seen = 1.0
         if count > 1:

@@ -118,3 +118,12 @@ def test_a_sample_whose_others_know_no_slope_is_left_as_it_is(count, step):
     y[2] += step
     x = torch.randn(count, dtype=torch.float64, generator=generator())
     assert float(controlled(x, y, 0.4)[2]) == float(x[2])
+
+
+@pytest.mark.parametrize("size", [2.0**531, 2.0**-664])
+def test_a_known_part_of_any_size_helps_as_much(size):
+    settings = TraceSettings.fixed(12)
+    one, other = (estimate_traces(Partly(scale * H, scale * PART), generator(), settings)["a"] for scale in (1.0, size))
+    assert [other.value / size, other.low / size, other.high / size] == pytest.approx(
+        [one.value, one.low, one.high], rel=1e-12
+    )
