@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from math import isfinite, isnan, nan, sqrt
+from math import isfinite, isnan, nan
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from landscape.slices.slice import Slice as Grid
 from landscape.spectrum.quantiles import quantile
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import ActiveCounts, SceneObjective
+from splat.curvature.traces import curvature_scale
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint
@@ -131,7 +132,7 @@ def index_of(bracket: Bracket) -> schema.Index:
 
 def _trace(numbers: Mapping[str, Any]) -> schema.Trace:
     method = "exact, the coupling of pixels sampled with random signs" if numbers["probes"] else "exact"
-    tau = sqrt(max(numbers["value"] or 0.0, 0.0) / numbers["dim"]) if numbers["dim"] else 0.0
+    tau = curvature_scale(numbers["value"] or 0.0, numbers["dim"], 1, "active")
     return convert({**numbers, "tau": tau, "method": method}, schema.Trace)
 
 

@@ -13,15 +13,15 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from analysis.console.overrides import leaves
 from analysis.records.findings import attribute_name
 from analysis.records.quantities import PLACES, SCORES, measured, quantity
 from analysis.records.records import ProbeRecord
 from analysis.records.run_files import ENDS, Clock, Scores
 from analysis.records.schema import INDICES, Anisotropy, Depth, Effect, End, Index, Operator, Trace
 from analysis.records.tables import OPERATOR_NAMES, Cell, bracketed, factor
+from splat.model.typed import leaves
 from splat.training.checkpoint import Checkpoint
-from splat.training.state import Method
+from splat.training.state import MethodSettings
 
 FAMILIES = "families"  # a section that only the page and the file show
 DEPTH = "depth over lateral"
@@ -130,7 +130,7 @@ def _split(section: str, runs: Sequence[Run], operator: Operator, block: str, na
         yield Row(section, "  split control", tuple(_index(effect, factor(effect)) for effect in effects))
 
 
-def _method(method: Method) -> Entry:
+def _method(method: MethodSettings) -> Entry:
     """Its name, and beneath it the settings that are not the published ones.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS
