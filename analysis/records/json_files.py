@@ -22,7 +22,7 @@ MISSING = "Object missing required field `"
 
 
 def read_json(path: Path, kind: type[T], what: str, remedy: str) -> T:
-    """What a file holds.  ValueError names the file and, where its content is not of this kind, the key.
+    """What a file holds.  InputError names the file and, where its content is not of this kind, the key.
 
     what: what the file should be; remedy: what to do about one that is not.
     """
@@ -30,7 +30,7 @@ def read_json(path: Path, kind: type[T], what: str, remedy: str) -> T:
 
 
 def plain_json(path: Path, what: str, remedy: str) -> Any:
-    """A file's content as plain types.  ValueError where it is no JSON."""
+    """A file's content as plain types.  InputError where it is no JSON."""
     try:
         return decoded(msgspec.json.decode(path.read_bytes()))
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -38,7 +38,7 @@ def plain_json(path: Path, what: str, remedy: str) -> Any:
 
 
 def fitted(data: Any, kind: type[T], where: str, remedy: str) -> T:
-    """Plain types as a structure.  ValueError, which begins with `where`, says what was expected under which key."""
+    """Plain types as a structure.  InputError, which begins with `where`, says what was expected under which key."""
     try:
         return msgspec.convert(data, kind, strict=True)
     except msgspec.ValidationError as error:

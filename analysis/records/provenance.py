@@ -48,7 +48,7 @@ class Provenance(Struct, kw_only=True):
 
 
 def require_seed(seed: int) -> None:
-    """ValueError where it is out of range."""
+    """InputError where it is out of range."""
     if not 0 <= seed < 2**63:
         raise InputError(f"expected a seed in [0, 2^63), got {seed}")
 

@@ -198,7 +198,7 @@ def record_folder(folder: str | Path, kind: type[ProbeRecord | SliceRecord] = Pr
 def write_record(folder: str | Path, data: ProbeRecord | SliceRecord, arrays: Mapping[str, Mapping[str, Any]]) -> Path:
     """Write the JSON and the arrays into `folder` (which `record_folder` gave); returns the path of the JSON.
 
-    Raises ValueError where a value is not what the record's type says, or an array is none of numbers.
+    Raises InputError where a value is not what the record's type says, or an array is none of numbers.
     """
     data.arrays = {g: {name: list(np.shape(array)) for name, array in names.items()} for g, names in arrays.items()}
     path = write_data(folder, data)
@@ -223,7 +223,7 @@ def write_data(folder: str | Path, data: ProbeRecord | SliceRecord) -> Path:
 
 
 def read_record(folder: str | Path, kind: type[Data] | None = None) -> Record[Data]:
-    """Read the record in `folder` (or the JSON given).  FileNotFoundError or ValueError say what is wrong.
+    """Read the record in `folder` (or the JSON given).  FileNotFoundError or InputError say what is wrong.
 
     kind: of the record; None: of that which is there.
     """
@@ -255,7 +255,7 @@ def read_record(folder: str | Path, kind: type[Data] | None = None) -> Record[Da
 
 
 def _read_arrays(folder: Path, group: str, shapes: Mapping[str, list[int]], again: str) -> dict[str, np.ndarray]:
-    """The arrays of a group that the record names.  ValueError or FileNotFoundError where one is not as ARRAYS has it."""
+    """The arrays of a group that the record names.  InputError or FileNotFoundError where one is not as ARRAYS has it."""
     path = folder / f"{group}.npz"
     shapes = {name: shape for name, shape in shapes.items() if name in ARRAYS[group] or "*" in ARRAYS[group]}
     if not path.is_file():
@@ -275,7 +275,7 @@ def _read_arrays(folder: Path, group: str, shapes: Mapping[str, list[int]], agai
 
 @contextmanager
 def refusing_damage(what: str, path: Path, remedy: str) -> Iterator[None]:
-    """ValueError that names the file for whatever reading its bytes raises: numpy and zipfile may raise nearly anything."""
+    """InputError that names the file for whatever reading its bytes raises: numpy and zipfile may raise nearly anything."""
     try:
         yield
     except MemoryError:
@@ -319,7 +319,7 @@ def _why_not_found(folder: Path, command: str, file: str) -> str:
 
 
 def require_replaceable(folder: Path, kind: type[ProbeRecord | SliceRecord] = ProbeRecord) -> None:
-    """Replacing deletes: raise ValueError unless folder is absent, empty or an older record of this kind."""
+    """Replacing deletes: raise InputError unless folder is absent, empty or an older record of this kind."""
     if folder.is_dir() and any(folder.iterdir()) and not (folder / kind.FILE).is_file():
         raise InputError(
             f"expected an empty folder or an older record to replace, got {folder} without {kind.FILE}; move it away"

@@ -28,7 +28,8 @@ NO_TIME = "no time"  # how the note of a record of a trajectory begins that was 
 STATES = ("whole", "cut", "skipped")  # of a record of a trajectory
 TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
-NUMBERS = (  # columns of a trajectory, empty where not determined; others may be there too
+ALWAYS = ("step", "gaussians", "seconds")  # columns of a trajectory
+NUMBERS = (  # more of them, empty where not determined; others may be there too
     *(f"trace_{name}{part}" for name in ATTRIBUTES for part in ("", "_error", "_low", "_high")),
     *(f"{name}{part}" for name in ENDS for part in ("", "_error")),
     *(f"{name}{part}" for name in TRAJECTORY_INDICES for part in ("", "_low", "_high")),
@@ -91,14 +92,14 @@ def read_comparison(folder: Path) -> Comparison:
 
 
 def read_trajectory(path: Path) -> "pd.DataFrame":
-    """The rows of a trajectory, whose steps and NUMBERS are numbers.  ValueError names the file and the column."""
+    """The rows of a trajectory, whose columns ALWAYS and NUMBERS hold numbers.  InputError names the file and the column."""
     import pandas as pd  # a third of a second of imports
 
     try:
         table = pd.read_csv(path)
     except (ValueError, OverflowError) as error:  # pandas names no file
         raise InputError(f"expected {_TRAJECTORY} in {path}, got {error}") from None
-    for name in ("state", "step", "gaussians", *NUMBERS):
+    for name in ("state", *ALWAYS, *NUMBERS):
         if name not in table:
             raise InputError(f"expected {_TRAJECTORY} in {path}, got no column {name}")
         column = pd.Series(table[name])
@@ -106,7 +107,7 @@ def read_trajectory(path: Path) -> "pd.DataFrame":
             wrong, what = ~column.isin(STATES), " or ".join(STATES)
         else:
             numbers = pd.Series(pd.to_numeric(column, errors="coerce"))
-            wrong, what = numbers.isna() & (column.notna() | (name in ("step", "gaussians"))), "a number"
+            wrong, what = numbers.isna() & (column.notna() | (name in ALWAYS)), "a number"
             table[name] = numbers
         if wrong.any():
             row = int(wrong.to_numpy().argmax())

@@ -43,7 +43,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from analysis.records.run_files import NO_TIME, RECORDS
+from analysis.records.run_files import NO_TIME, RECORDS, read_trajectory
 from analysis.records.schema import INDICES
 from landscape import (
     CountingOperator,
@@ -252,6 +252,7 @@ def _read_rows(path: Path, step: int) -> list[Row]:
     """Those up to a step."""
     if not path.is_file():
         return []
+    read_trajectory(path)  # which refuses a damaged one
     with path.open(encoding="utf-8", newline="") as stream:
         # as text, which is written back to the same bits
         rows: list[Row] = [dict(row) for row in csv.DictReader(stream)]
