@@ -34,6 +34,7 @@ from torch import Tensor
 
 from analysis.console.interruption import interruption
 from analysis.console.overrides import assignments, overridden
+from analysis.records.json_files import plain
 from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
 from analysis.train.options import TrainOptions
@@ -318,7 +319,7 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
         "train": _scores(seen),
         "test": _scores(tested) if tested else None,
         "seconds": asdict(TrainingTime.read(out)),
-        "provenance": provenance(config.seed, checkpoint=str(out / CHECKPOINT)),
+        "provenance": plain(provenance(config.seed, checkpoint=str(out / CHECKPOINT))),
     }
     write_atomically(out / METRICS, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
     console.print(_table(seen, tested))
