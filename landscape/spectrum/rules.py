@@ -33,6 +33,7 @@ from torch import Tensor
 from landscape.results import Bracket, standard_deviation, t_quantile
 
 RESERVED = 0.2
+ROUND_OFFS = 16  # of a sum of weights of 1, as a multiple of EPS
 EPS = torch.finfo(torch.float64).eps
 
 
@@ -108,7 +109,7 @@ class SpectralDensity:
         shares, count = self.weights / len(self.weights), len(samples)
         d = torch.where(shares > EPS * EPS, values - (shares * values).sum(), 0.0)  # others are round-off
         unit = float(d.abs().max()) if self.rest and d.numel() else 0.0  # no power leaves the range of floats
-        if unit == 0:
+        if unit <= ROUND_OFFS * EPS * float((shares * values).abs().sum()):  # all the same: d is the mean's round-off
             return other, other
         second, third, fourth = (float((shares * (d / unit) ** power).sum()) for power in (2, 3, 4))
         skewness = third / second

@@ -222,7 +222,7 @@ def test_more_views_than_the_scene_has_are_refused(original, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("--iterations", "0", "at least 1 iteration"),
+        ("--iterations", "0", "'iterations': expected int >= 1, got 0"),
         ("--sh-degree", "4", "sh_degree"),
         ("--downscale", "0.5", "downscale of at least 1"),
         ("--ssim-weight", "2", "ssim_weight"),

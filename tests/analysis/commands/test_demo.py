@@ -31,8 +31,8 @@ def test_the_demo_makes_a_scene_trains_probes_and_says_what_to_open(small, tmp_p
     assert f"{out} exists, so this run goes to {out}-2" in said and f"{out}-2/run/probe/report.html" in said
     assert (out / "run" / "probe" / "probe.json").read_bytes() == before
     first, second = (read_record(tmp_path / name / "run" / "probe").data for name in ("demo", "demo-2"))
-    assert first["counts"]["gaussians"] == second["counts"]["gaussians"]
-    assert first["objective"] == second["objective"]
+    assert first.counts.gaussians == second.counts.gaussians
+    assert first.objective == second.objective
 
 
 def test_a_free_folder_is_the_first_that_does_not_exist(tmp_path):

@@ -185,3 +185,12 @@ def test_progress_ends_at_starts_times_steps():
 def test_bad_settings_are_refused():
     with pytest.raises(ValueError, match="starts >= 2"):
         spectral_density(operator("zero"), generator(), starts=1)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 1 / 3])
+def test_equal_values_whose_weights_round_have_an_interval_of_round_off(share):
+    weights = torch.tensor([[share, share, 1 - 2 * share], [share, 1 - share, 0.0]], dtype=torch.float64)
+    found = SpectralDensity(torch.full((2, 3), 2.0, dtype=torch.float64), weights, dim=98, matvecs=6).integral(
+        torch.abs
+    )
+    assert found.low <= 196 <= found.high and found.high - found.low < 1e-10
