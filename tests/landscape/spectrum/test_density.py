@@ -9,6 +9,7 @@ from landscape.linalg import unit_columns
 from landscape.operators.operator import DenseOperator
 from landscape.spectrum.absolute_sum import FAR, absolute_integral, absolute_sum, integrals_of_rules
 from landscape.spectrum.density import SETTLED, draw_starts, spectral_density
+from landscape.spectrum.rules import SpectralDensity
 from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
 from tests.oracles import absolute_matrix
 
