@@ -30,7 +30,7 @@ from analysis.records.provenance import provenance, require_seed
 from analysis.records.records import FILE, PROBE, Record, record_folder, require_replaceable
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
-from landscape.probes import split
+from landscape.probes import spawn
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.device import device_named
 from splat.curvature.objective import SceneObjective
@@ -89,7 +89,7 @@ def _run(
             from analysis.measures.families import measure_families
 
             found = measure_families(
-                objective, checkpoint.training, family_options, split(generator), stages.stage, findings.ends
+                objective, checkpoint.training, family_options, spawn(generator), stages.stage, findings.ends
             )
             data |= found.record()
             data["notes"] += found.notes

@@ -53,7 +53,7 @@ from landscape import (
     symmetric_axis,
 )
 from landscape.errors import InputError
-from landscape.probes import split
+from landscape.probes import spawn
 from landscape.results import Progress
 from landscape.slices.finite_probe import NOISE_POINTS, STEPS, FiniteProbe, finite_probe
 from landscape.slices.grid_evaluations import Loss
@@ -186,8 +186,8 @@ def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch
         own = objective.gaussian_blocks
         value, render = _rendered(objective)
     with stage("checks") as report:
-        operator_check = check_operator(operator, split(generator), settings.checked_vectors)
-        gradient_check = check_against_gradient(hessian, split(generator), report, settings.checked_views)
+        operator_check = check_operator(operator, spawn(generator), settings.checked_vectors)
+        gradient_check = check_against_gradient(hessian, spawn(generator), report, settings.checked_views)
     budget = Budget(settings.seconds, _unasked(settings), generator, stage)
     with budget.stage("traces") as share:
         allowed = replace(settings.traces, max_seconds=share.seconds)

@@ -58,7 +58,7 @@ def probe_arrays(findings: Findings) -> dict[str, dict[str, np.ndarray]]:
         plane = findings.plane.slice
         x, y = plane.coordinates
         arrays["slice"] = {"x": x.numpy(), "y": y.numpy(), "loss": plane.loss.numpy()}
-        optional = {"model": plane.model, "crossed": plane.crossed, "evaluated": plane.evaluated}
+        optional = {"model": plane.model, "crossed": plane.discontinuous, "evaluated": plane.evaluated}
         arrays["slice"] |= {name: array.numpy() for name, array in optional.items() if array is not None}
     return arrays
 

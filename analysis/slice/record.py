@@ -97,7 +97,7 @@ def _direction(
 def slice_arrays(found: Found) -> dict[str, dict[str, np.ndarray]]:
     """The arrays, by file."""
     grid = found.slice
-    optional = {"model": grid.model, "crossed": grid.crossed, "evaluated": grid.evaluated}
+    optional = {"model": grid.model, "crossed": grid.discontinuous, "evaluated": grid.evaluated}
     axes = {name: axis.numpy() for name, axis in zip("xy", grid.coordinates, strict=False)}
     known = {name: array.numpy() for name, array in optional.items() if array is not None}
     return {
