@@ -109,8 +109,8 @@ def _require(options: BenchOptions) -> None:
 def _about(device: torch.device) -> str:
     about = machine(lanes_of(np.float32))
     if device.type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, beside {about['cpu']}"
-    return f"{about['cpu']}, {thread_count()} threads, {about['lanes']} lanes of float32"
+        return f"{torch.cuda.get_device_name(device)}, beside {about.cpu}"
+    return f"{about.cpu}, {thread_count()} threads, {about.lanes} lanes of float32"
 
 
 def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:

@@ -53,7 +53,7 @@ from splat.curvature.traces import LEAST_SAMPLES, exact_traces
 from splat.scenes.synthetic import SyntheticSettings
 from splat.training.checkpoint import write_atomically
 from splat.training.densify import DensifySettings
-from splat.training.loop import train
+from splat.training.loop import prepare, train
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.state import TrainConfig, Training
 
@@ -183,7 +183,7 @@ def training(workload: Workload, device: torch.device, first: int = FIRST, measu
     config = replace(config, method=StableGS(warm_up=0), densify=DensifySettings(enabled=False))
     views, state = list(workload.views[:3]), Training.start(workload.gaussians, 1.0, config)
     state.move(device)
-    state.regularizer.begin(state, views)
+    prepare(state, views)
     steps = train(state, views)
     for _ in range(first):
         next(steps)

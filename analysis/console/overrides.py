@@ -14,7 +14,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from landscape.errors import InputError
 from splat.model.settings import current_settings
-from splat.training.state import Method, TrainConfig
+from splat.model.typed import leaves
+from splat.training.state import MethodSettings, TrainConfig
 
 T = TypeVar("T")
 
@@ -30,18 +31,6 @@ def assignments(texts: Sequence[str]) -> dict[str, str]:
             raise InputError(f"expected each KEY once, got --set {key.strip()} twice; leave one out")
         found[key.strip()] = value.strip()
     return found
-
-
-def leaves(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested settings as one level, by their dotted names.
-
-    >>> leaves({"probe": {"gamma": 0.5}, "viewpoint.parallax": False})
-    {'probe.gamma': 0.5, 'viewpoint.parallax': False}
-    """
-    result = {}
-    for key, value in settings.items():
-        result |= {f"{key}.{name}": v for name, v in leaves(value).items()} if isinstance(value, dict) else {key: value}
-    return result
 
 
 def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
@@ -66,7 +55,7 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     return config
 
 
-def _names(settings: TrainConfig | Method) -> list[str]:
+def _names(settings: TrainConfig | MethodSettings) -> list[str]:
     """Of every single setting, but for the method's among the training's."""
     return [name for name in leaves(asdict(settings)) if name != "name" and not name.startswith("method.")]
 

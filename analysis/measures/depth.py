@@ -19,18 +19,22 @@ pixels where it is across: px |mean - centre| / f.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import inf, nan
+from time import monotonic
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Float64
+from msgspec import convert
 from torch import Tensor
 
+from analysis.console.budget import Share
+from analysis.records.schema import Depth, Rise
 from landscape.errors import InputError
 from landscape.probes import draw_probes
-from landscape.results import Bracket, Progress
+from landscape.results import Bracket, Progress, finite_or_none
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import TraceSettings
 from splat.curvature.objective import SceneObjective
@@ -93,6 +97,46 @@ class DepthRises:
         """Depth over lateral, with standard errors."""
         (depth, lateral), relative = self.values.unbind(dim=1), self.errors / self.values
         return depth / lateral, (depth / lateral).abs() * relative.square().sum(dim=1).sqrt()
+
+    def rows(self) -> list[Rise]:
+        """As a record has them; what is not finite is None."""
+        columns: dict[str, Sequence[float]] = dict(zip(("ratio", "ratio_error"), (x.tolist() for x in self.ratios)))
+        for kind, name in enumerate(KINDS):
+            for suffix, table in (("", self.values), ("_error", self.errors), ("_crossed", self.discontinuous)):
+                columns[f"{name}{suffix}"] = table[:, kind].tolist()
+        numbers = [
+            {name: finite_or_none(column[i]) for name, column in columns.items()} for i in range(len(self.steps))
+        ]
+        return [convert({"pixels": step, **row}, Rise) for step, row in zip(self.steps, numbers, strict=True)]
+
+
+def measure_depth(
+    objective: SceneObjective, traces: TraceSettings, steps: tuple[float, ...], render: float, share: Share
+) -> Depth:
+    """The stage `depth` of a probe.  steps: px; their rises are left out where time is short.
+
+    render: seconds, of all views.
+    """
+    end = monotonic() + share.seconds
+    found = depth_split(objective, share.generator, replace(traces, max_seconds=share.seconds / 2), share.report)
+    rises = []
+    if (2 * len(KINDS) * DRAWS * len(steps) + 1) * render <= end - monotonic():
+        rises = depth_rises(objective, share.generator, steps, progress=share.report).rows()
+    else:
+        share.notes.append(
+            "finite steps along the rays were left out: their renders would have taken more than their time"
+        )
+    return convert(
+        {
+            "gradient_ratio": finite_or_none(found.gradient_ratio),
+            "gradient_median": finite_or_none(found.median_ratio),
+            "pairs": len(found.components),
+            "curvature": {"depth": found.depth.record(), "lateral": found.lateral.record()},
+            "curvature_ratio": found.curvature_ratio.record(),
+            "rises": rises,
+        },
+        Depth,
+    )
 
 
 def depth_split(

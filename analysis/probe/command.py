@@ -3,16 +3,14 @@
 The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.
 """
 
-import shlex
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from math import inf, isfinite
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from rich.console import Console
 
@@ -21,17 +19,14 @@ from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.measurement import ProbeSettings, measure
 from analysis.probe.options import ProbeOptions
-from analysis.probe.record import probe_arrays, probe_data
-from analysis.probe.skips import estimator_skips, product_skips
-from analysis.probe.table import probe_table
-from analysis.records.family_table import family_table
-from analysis.records.findings import verdict
-from analysis.records.provenance import provenance, require_seed
-from analysis.records.records import FILE, PROBE, Record, record_folder, require_replaceable
+from analysis.probe.record import probe_arrays, probe_record, provenance_of
+from analysis.records.findings import findings
+from analysis.records.provenance import require_seed
+from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
+from analysis.records.tables import family_table, probe_table
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import spawn
-from splat.backend.cpu.simd import lanes_of
 from splat.backend.device import device_named
 from splat.curvature.objective import SceneObjective
 from splat.scenes.scene import Scene
@@ -76,38 +71,44 @@ def _run(
     console.print(_introduction(scene, checkpoint, objective), highlight=False)
     with stages:
         generator = torch.Generator(device).manual_seed(options.seed)
-        findings = measure(objective, settings, generator, stages.stage)
-        data = probe_data(findings, objective)
-        with stages.stage("skips"):
-            gaussians, made = checkpoint.training.gaussians, (findings.matvecs, findings.spared)
-            skips = product_skips(objective, gaussians, *made, repetitions=settings.timings)
-            skips |= estimator_skips(findings, stages.timing)
-            data["skipped"] = {name: skip.record() for name, skip in skips.items()}
-        data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
-        arrays = probe_arrays(findings)
+        found = measure(objective, settings, generator, stages.stage)
+        made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
+        data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         if family_options is not None:
             from analysis.measures.families import measure_families
 
-            found = measure_families(
-                objective, checkpoint.training, family_options, spawn(generator), stages.stage, findings.ends
+            stream = spawn(generator)
+            families = measure_families(
+                objective, checkpoint.training, family_options, stream, stages.stage, found.ends
             )
-            data |= found.record()
-            data["notes"] += found.notes
-            data["provenance"]["families"] = asdict(family_options)
-            arrays["families"] = found.arrays()
+            data, arrays["families"] = families.added_to(data), families.arrays()
+            data.provenance.families = asdict(family_options)
         if options.quick:
-            data["notes"].append(WITHOUT_SURFACE.format(out))
+            data.notes.append(WITHOUT_SURFACE.format(out))
         if writes:
-            with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
-                surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
-                write_with_pictures(folder, data, arrays, PROBE, stages, start, drawn, options.pictures)
-                from analysis.records.report import write_report
-
-                write_report(folder, surface.result())
+            _write(out, data, arrays, stages, start, drawn, options.pictures)
     if writes:
         _conclude(data, out)
-    failed = any(check["passed"] is False for check in data["checks"].values())
+    failed = any(check.passed is False for check in data.checks.values())
     return CHECK_FAILED if options.strict and failed else 0
+
+
+def _write(
+    out: Path,
+    data: ProbeRecord,
+    arrays: Arrays,
+    stages: Stages,
+    start: float,
+    drawn: Draw | None,
+    pictures: Sequence[str],
+) -> None:
+    """The record, its pictures and its page, all at once."""
+    with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
+        surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
+        write_with_pictures(folder, data, arrays, stages, start, drawn, pictures)
+        from analysis.records.report import write_report
+
+        write_report(folder, surface.result())
 
 
 def scene_objective(
@@ -150,42 +151,23 @@ def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjectiv
     )
 
 
-def _provenance(
-    options: ProbeOptions, command: Sequence[str], settings: ProbeSettings, checkpoint: Checkpoint, scene: Scene
-) -> dict[str, Any]:
-    dtype = checkpoint.training.gaussians.flat.dtype
-    return provenance(
-        options.seed,
-        lanes=lanes_of(np.float32),
-        checkpoint=str(options.checkpoint),
-        scene=scene.name,
-        scene_folder=str(scene.root),
-        views=list(checkpoint.scene.train),
-        iteration=checkpoint.training.step,
-        dtype=str(dtype).removeprefix("torch."),
-        threads=torch.get_num_threads(),
-        command=shlex.join(command),
-        settings=asdict(settings),
-    )
-
-
-def _embedded_surface(record: Record) -> str:
+def _embedded_surface(record: Record[ProbeRecord]) -> str:
     from analysis.records.report import embedded_surface  # a quarter of a second of imports
 
     return embedded_surface(record)
 
 
-def _conclude(data: dict[str, Any], out: Path) -> None:
+def _conclude(data: ProbeRecord, out: Path) -> None:
     """The table, what was not reached or failed, and the files to open."""
     from analysis.records.report import FILE as REPORT
 
     console = Console()
     console.print(probe_table(data))
-    if "families" in data:
+    if data.families:
         console.print(family_table(data))
-    for line in verdict(data):
+    for line in findings(data):
         if line.level != "fact":
             console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False)
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-    console.print(f"{data['timing']['total']:.1f} s; open {out / REPORT}", soft_wrap=True, highlight=False)
-    console.print(f"pictures: {pictures}; numbers: {FILE}, in {out}", soft_wrap=True, highlight=False)
+    console.print(f"{data.timing['total']:.1f} s; open {out / REPORT}", soft_wrap=True, highlight=False)
+    console.print(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", soft_wrap=True, highlight=False)

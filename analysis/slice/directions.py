@@ -9,20 +9,20 @@
     curvature unit  sqrt(2 rise L / |d.H d|): the step within which the curvature alone changes the loss by rise L
 
 Of two kinds in one plane the second (then e₁⊥, say) is its part at a right angle to the first, drawn out to its old length.
-Eigenvectors that are known already are taken where H itself confirms them: |H v - lambda v| within the tolerance.
+Eigenvectors that are known already are taken where H itself confirms them: |H v - lambda v| within the tolerance, lambda
+falling.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isclose, nan
+from math import isclose
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from analysis.records.records import read_record
+from analysis.records.records import ProbeRecord, read_record
 from analysis.slice.options import Along
 from landscape import (
     EigenSettings,
@@ -184,7 +184,8 @@ def largest_eigenvectors(
         product, exact = operator.apply(vectors).double(), vectors.double()
         values = (exact * product).sum(dim=0)
         residuals = (product - values * exact).norm(dim=0)
-        if (residuals <= RTOL * values.abs()).all() and ((exact.norm(dim=0) - 1).abs() <= RTOL).all():
+        ordered = bool((values.diff() <= RTOL * values.abs().max()).all())  # the steepest first
+        if ordered and (residuals <= RTOL * values.abs()).all() and ((exact.norm(dim=0) - 1).abs() <= RTOL).all():
             report(1, 1, "known already")
             return vectors, residuals.tolist()
         start = vectors
@@ -193,17 +194,23 @@ def largest_eigenvectors(
     return pairs.vectors, pairs.residuals.tolist()
 
 
-def recorded_eigenvectors(folder: Path, loss: str, value: float, precision: float) -> list[Float[Tensor, "n k"]]:
+def recorded_eigenvectors(
+    folder: Path, loss: str, value: float, precision: float, notes: list[str]
+) -> list[Float[Tensor, "n k"]]:
     """Those of the probe recorded in a folder, if any, where its objective is the Hessian of this loss with this value.
 
-    InputError or FileNotFoundError where the record cannot be read.
+    notes: is told where there is a record that cannot be read.
     """
-    if not folder.is_dir():
+    if not (folder / ProbeRecord.FILE).is_file():
         return []
-    record = read_record(folder)
-    about = record.data.get("objective", {})
-    same = (about.get("loss"), about.get("operator")) == (loss, "hessian")
-    if not same or not isclose(about.get("value", nan), value, rel_tol=SAME_LOSS * precision):
+    try:
+        record = read_record(folder, ProbeRecord)
+    except (FileNotFoundError, InputError) as error:
+        notes.append(f"eigenvectors were not taken from the probe: {error}")
         return []
-    vectors: np.ndarray | None = record.arrays.get("eigenvectors", {}).get("largest")
+    about = record.data.objective
+    same = (about.loss, about.operator) == (loss, "hessian") and about.value is not None
+    if not same or not isclose(about.value or 0.0, value, rel_tol=SAME_LOSS * precision):
+        return []
+    vectors = record.arrays.get("eigenvectors", {}).get("largest")
     return [] if vectors is None else [torch.from_numpy(vectors)]

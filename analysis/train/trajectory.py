@@ -43,8 +43,8 @@ import numpy as np
 import pandas as pd
 import torch
 
-from analysis.records.family_table import INDICES
 from analysis.records.run_files import NO_TIME, RECORDS
+from analysis.records.schema import INDICES
 from landscape import (
     CountingOperator,
     EigenSettings,

@@ -156,9 +156,8 @@ class SceneObjective:
     def evaluate(self, flat: Float[Tensor, " p"]) -> tuple[float, Hashable]:
         """(L, smooth piece) at other parameters of the active Gaussians.
 
-        Splats are rendered and sorted anew.  The smooth piece says which splats each tile draws and in which order; it is the
-        same at two points only if L is smooth between them, but for the splats' thresholds in single pixels.  Changes nothing,
-        and may run in several threads at once.
+        Splats are rendered and sorted anew.  The smooth piece stands for the splats that each tile draws and their order: L may
+        be discontinuous between two points whose pieces differ.  Changes nothing, and may run in several threads at once.
         """
         gaussians = self.active.with_flat(flat.to(self.active.flat.device))
         gaussians.require_finite()

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from math import sqrt
 from time import monotonic
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64
@@ -36,6 +37,7 @@ ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
 LEAST_SAMPLES = 4  # a mean, a slope, and a spread of two degrees of freedom
 COLUMNS = 5  # vectors in a pass over the pixels: one for each block
 
+Dimension = Literal["active", "attribute"]
 Draw = Callable[[int, Sequence[torch.Generator], Sequence[str]], Float[Tensor, "p b s"]]
 """(index of a view of this process, generators, names): for each name and each generator a random vector over the active
 parameters, with mean 0 and, as its covariance, the projector onto the named part."""
@@ -81,6 +83,22 @@ def exact_traces(
         SampledTrace(name, sizes[name], known[name], pixelwise.get(name), settings, first, most) for name in known
     ]
     return sampled_traces(objective, generator, partial(_signs, objective, scale), traces, progress)
+
+
+def curvature_scale(trace: float, parameters: int, gaussians: int, dimension: Dimension) -> float:
+    """tau of a block, StableGS's curvature scale of an attribute: sqrt(max(trace, 0) / dim), 0 of an empty block.
+
+    parameters: of the block, N d of N active Gaussians, d = 3 for means, log-scales and quaternions (on the unit sphere), 1 for
+    opacities and 3 (l + 1)^2 for SH of degree l.  The paper's H spans all Gaussians, but its d is that of one:
+
+    dimension "active"      dim = N d: the root of the mean curvature of a parameter; what a probe records
+    dimension "attribute"   dim = d: larger by sqrt(N); the paper's letter, and the default of its probes (`ProbeSettings`)
+
+    >>> curvature_scale(12.0, 12, 4, "active"), curvature_scale(12.0, 12, 4, "attribute")
+    (1.0, 2.0)
+    """
+    dim = parameters if dimension == "active" else parameters // max(gaussians, 1)
+    return sqrt(max(trace, 0.0) / dim) if dim else 0.0
 
 
 def sampled_traces(

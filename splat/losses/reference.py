@@ -21,6 +21,7 @@ from torch import Tensor
 from landscape.errors import InputError
 
 WINDOW, SIGMA = 11, 1.5
+REACH = WINDOW // 2
 C1, C2 = 0.01**2, 0.03**2
 PixelLoss = Literal["l1", "charbonnier", "l2"]
 
@@ -53,7 +54,7 @@ class LossSettings:
 
 def window(dtype: torch.dtype) -> Float[Tensor, "11"]:
     """The normalised 1-D Gaussian; the 2-D window is its outer product."""
-    offset = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    offset = torch.arange(WINDOW, dtype=torch.float64) - REACH
     weight = torch.exp(-(offset**2) / (2 * SIGMA**2))
     return (weight / weight.sum()).to(dtype)
 
@@ -61,8 +62,10 @@ def window(dtype: torch.dtype) -> Float[Tensor, "11"]:
 def blur(fields: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
     """The window's weighted mean round every pixel; zero outside the image.  Its own adjoint."""
     weight, channels = window(fields.dtype), fields.shape[0]
-    rows = F.conv2d(fields[None], weight.view(1, 1, 1, -1).expand(channels, 1, 1, -1), padding=(0, 5), groups=channels)
-    return F.conv2d(rows, weight.view(1, 1, -1, 1).expand(channels, 1, -1, 1), padding=(5, 0), groups=channels)[0]
+    rows = F.conv2d(
+        fields[None], weight.view(1, 1, 1, -1).expand(channels, 1, 1, -1), padding=(0, REACH), groups=channels
+    )
+    return F.conv2d(rows, weight.view(1, 1, -1, 1).expand(channels, 1, -1, 1), padding=(REACH, 0), groups=channels)[0]
 
 
 def ssim_map(image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:

@@ -4,7 +4,6 @@ Nothing here waits for the device but `project`, once: for the size of the large
 """
 
 from math import log
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
@@ -23,10 +22,6 @@ WIDEST = 8  # vectors that a program takes at a time
 CHUNK = 1 << 16  # Gaussians whose blocks are chained at a time
 
 
-def _run(kernel: Any, programs: tuple[int, ...], *arguments) -> None:
-    launch(kernel, programs, *arguments, kernels.FORMULAS)
-
-
 def _lens_numbers(lens: Lens, device: torch.device) -> Float64[Tensor, " 20"]:
     numbers = [*lens.rotation.tolist(), *lens.centre.tolist(), *lens[2:]]
     return torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
@@ -37,7 +32,7 @@ def project(gaussians: Gaussians, lens: Lens) -> tuple[Float64[Tensor, "n 9"], F
     flat, n = gaussians.flat.detach(), len(gaussians)
     splats, depths = flat.new_empty(n, 9, dtype=torch.float64), flat.new_empty(n)
     drawn = flat.new_empty(n, dtype=torch.bool)
-    _run(
+    launch(
         kernels.project_splats, (cdiv(n, BLOCK),),
         flat, _lens_numbers(lens, flat.device), splats, depths, drawn, n, gaussians.sh.shape[1], BLOCK,
     )  # fmt: skip
@@ -57,7 +52,7 @@ def project_adjoint(
     """The gradient in the flat vector, given the adjoint of the splats."""
     flat, n = gaussians.flat.detach(), len(gaussians)
     gradient = torch.empty_like(flat)
-    _run(
+    launch(
         kernels.project_adjoint, (cdiv(n, BLOCK),),
         flat, _lens_numbers(lens, flat.device), splats, drawn, bar.contiguous(), gradient, n, gaussians.sh.shape[1], BLOCK
     )  # fmt: skip
@@ -67,7 +62,7 @@ def project_adjoint(
 def convert(way: int, splats: Float64[Tensor, "n 9"], numbers: Float[Tensor, "n 9"]) -> Float64[Tensor, "n 9"]:
     """Tangents or adjoints of splats in other coordinates: `whitening.converted`."""
     n, out = len(splats), torch.empty_like(splats)
-    _run(kernels.convert, (cdiv(n, BLOCK),), splats, numbers.contiguous(), out, n, way, BLOCK)
+    launch(kernels.convert, (cdiv(n, BLOCK),), splats, numbers.contiguous(), out, n, way, BLOCK)
     return out
 
 
@@ -89,8 +84,8 @@ class CudaProjection:
         _, jacobian, curvature, *colours, logit_slope, logit_curvature = self._at
         outputs = (jacobian, curvature, logit_slope, logit_curvature)
         programs = (cdiv(m, FEW),)
-        _run(kernels.linearize_geometry, programs, *inputs, *outputs, self.n, m, FEW)
-        _run(kernels.linearize_colour, programs, *inputs, curvature, *colours, self.n, m, self.bands, FEW)
+        launch(kernels.linearize_geometry, programs, *inputs, *outputs, self.n, m, FEW)
+        launch(kernels.linearize_colour, programs, *inputs, curvature, *colours, self.n, m, self.bands, FEW)
 
     @property
     def jacobian(self) -> ProjectionJacobian:
@@ -129,7 +124,7 @@ class CudaProjection:
         vectors, m = cotangents.shape[1], self._at.index.numel()
         out = self._at.jacobian.new_zeros(self.parameters, vectors)
         grid, rows, wide = self._grid(vectors)
-        _run(
+        launch(
             kernels.pull_back, grid,
             cotangents.to(out).contiguous(), out if block is None else block.contiguous(), *self._at, out, self.n, m, vectors,
             block is not None, self.bands, rows, wide

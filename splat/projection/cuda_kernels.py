@@ -1,8 +1,8 @@
 """Projection and SH on the GPU: kernels over blocks of Gaussians.
 
-The formulas are those of `formulas.py` and `whitening.py`, run by `traced.py`.  The arrays of a `ProjectionJacobian` have the
-Gaussians along the last axis here, so that neighbouring threads read neighbouring numbers.  A block of vectors (p, K) is laid
-out like the flat vector; `start_of` says where an attribute begins there.
+The formulas are those of `formulas.py` and `whitening.py`, compiled by `triton_formula`.  The arrays of a `ProjectionJacobian`
+have the Gaussians along the last axis here, so that neighbouring threads read neighbouring numbers.  A block of vectors (p, K)
+is laid out like the flat vector; `start_of` says where an attribute begins there.
 
 Values and the tangents of the linearisation are in double precision, products with vectors in that of the parameters.
 """
@@ -13,10 +13,10 @@ Values and the tangents of the linearisation are in double precision, products w
 import triton.language as tl
 
 from splat.backend.gpu.compile import jit, sized
-from splat.backend.gpu.traced import digest, tangent_of, traced, variable
+from splat.backend.gpu.formula import tangent_of, triton_formula, variable
 from splat.projection.formulas import (
+    GEOMETRY,
     Lens,
-    add_symmetric,
     basis,
     colour_adjoint,
     direction_of,
@@ -34,20 +34,20 @@ def lens_from(numbers):
     return Lens(numbers[:9], numbers[9:12], *numbers[12:])
 
 
-@traced
+@triton_formula
 def depth_of(lens, mean):
     camera = lens_from(lens)
     return to_camera(camera, offset_from(camera, mean))[2]
 
 
-@traced
+@triton_formula
 def splat_of(lens, mean, log_scales, quat):
     """Mean x, y and conic, and the sixteen harmonics at the view direction."""
     camera = lens_from(lens)
     return geometry(camera, mean, log_scales, quat), basis(direction_of(camera, mean)[0])
 
 
-@traced
+@triton_formula
 def adjoint_of(lens, mean, log_scales, quat, bar, weight, bands):
     """The adjoints of mean, log-scales and quaternion: of the five numbers in bar, and of weight . harmonics in the mean."""
     camera = lens_from(lens)
@@ -56,7 +56,7 @@ def adjoint_of(lens, mean, log_scales, quat, bar, weight, bands):
     return (m[0] + along[0], m[1] + along[1], m[2] + along[2], *s, *q)
 
 
-@traced
+@triton_formula
 def linearized_geometry(lens, mean, log_scales, quat, splat, moments, lane):
     """The Jacobian (5 rows) and the Hessian of adjoint . geometry (10 rows), one direction at each place of `lane`."""
     camera = lens_from(lens)
@@ -69,7 +69,7 @@ def linearized_geometry(lens, mean, log_scales, quat, splat, moments, lane):
     return jacobian, [tangent_of(row) for row in (*m, *t, *r)]
 
 
-@traced
+@triton_formula
 def linearized_colour(lens, mean, weight, bands, lane):
     """The harmonics at the view direction, their slopes in the mean, and the Hessian of weight . harmonics (3 rows)."""
     camera = lens_from(lens)
@@ -79,20 +79,22 @@ def linearized_colour(lens, mean, weight, bands, lane):
     return basis(direction_of(camera, mean)[0]), slopes, along
 
 
-@traced
+@triton_formula
 def in_other_coordinates(way, splat, numbers):
     return converted(way, splat, numbers)
 
 
-@traced
+@triton_formula
 def curved(packed, u, h):
-    """h + C u: `add_symmetric`."""
-    total = list(h)
-    add_symmetric(packed, u, total)
+    """h + C u, C symmetric with its lower triangle packed row by row."""
+    total, place = list(h), 0
+    for j in range(GEOMETRY):
+        for k in range(j):
+            total[j] = total[j] + packed[place + k] * u[k]
+            total[k] = total[k] + packed[place + k] * u[j]
+        total[j] = total[j] + packed[place + j] * u[j]
+        place += j + 1
     return total
-
-
-FORMULAS = digest()
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -145,7 +147,7 @@ def sigmoid(x):
 
 
 @sized("n")
-def convert(splats, numbers, out, n, WAY: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr):
+def convert(splats, numbers, out, n, WAY: tl.constexpr, BLOCK: tl.constexpr):
     """`whitening.converted` of tangents or adjoints of splats, (n, 9); their colours are alike in all coordinates."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < n
@@ -161,7 +163,7 @@ def convert(splats, numbers, out, n, WAY: tl.constexpr, BLOCK: tl.constexpr, FOR
 
 @sized("n")
 def project_splats(
-    flat, lens, splats, depths, drawn, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+    flat, lens, splats, depths, drawn, n, BANDS: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
     """Splats (n, 9), depths and drawn; a Gaussian behind the near plane gets zeros."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -214,7 +216,7 @@ def harmonic_weights(flat, colour_bar, i, n, BANDS: tl.constexpr, mask):
 
 @sized("n")
 def project_adjoint(
-    flat, lens, splats, drawn, bar, gradient, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+    flat, lens, splats, drawn, bar, gradient, n, BANDS: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
     """The gradient in the flat vector, given the adjoint of the splats, bar (n, 9)."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -251,7 +253,7 @@ def project_adjoint(
 @sized("n", "m")
 def linearize_geometry(
     flat, lens, splats, moments, index, jacobian, curvature, logit_slope, logit_curvature, n, m,
-    BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The derivatives of geometry and opacity of the Gaussians at index (m,), one direction a lane."""
     e, lane = places(BLOCK, 16)
@@ -274,7 +276,7 @@ def linearize_geometry(
 @sized("n", "m")
 def linearize_colour(
     flat, lens, splats, moments, index, curvature, harmonic, slope, colour_bar, visible, colour_slope, n, m,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The derivatives of the colours, one direction a lane; what they add to the curvature is added."""
     e, lane = places(BLOCK, 16)
@@ -348,7 +350,7 @@ def push_forward(
 def pull_back(
     cotangents, block, index, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope, logit_slope,
     logit_curvature, out, n, m, K, SECOND_ORDER: tl.constexpr,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr, FORMULAS: tl.constexpr,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr,
 ):  # fmt: skip
     """P'^T of cotangents (n, K, 9), plus (a . P'') u where SECOND_ORDER: rows of out (p, K)."""
     e, k = places(BLOCK, VECTORS)

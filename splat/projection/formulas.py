@@ -53,18 +53,6 @@ class ProjectionJacobian(NamedTuple):
 ROWS = ((5, GEOMETRY), (SYMMETRIC,), (16,), (16, 3), (3,), (3,), (3, 3), (), ())
 
 
-@formula
-def add_symmetric(packed, u, h):
-    """h += C u, C symmetric with its lower triangle packed row by row."""
-    place = 0
-    for j in range(GEOMETRY):
-        for k in range(j):
-            h[j] += packed[place + k] * u[k]
-            h[k] += packed[place + k] * u[j]
-        h[j] += packed[place + j] * u[j]
-        place += j + 1
-
-
 class Lens(NamedTuple):
     """A camera as the kernels read it: rotation (9,) world to camera, row by row; centre (3,); pixels; thresholds."""
 

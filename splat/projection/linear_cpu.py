@@ -26,7 +26,6 @@ from splat.projection.formulas import (
     ROWS,
     Lens,
     ProjectionJacobian,
-    add_symmetric,
     basis,
     colour_adjoint,
     direction_of,
@@ -174,23 +173,32 @@ def pull_back(
     """P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order; outputs start at 0."""
     K, bands = cotangents.shape[1], out_sh.shape[1]
     u, h, bar = np.empty(GEOMETRY, out_means.dtype), np.empty(GEOMETRY, out_means.dtype), np.empty(3, out_means.dtype)
+    curvature = np.empty((GEOMETRY, GEOMETRY), out_means.dtype)
     for e in range(start, stop):
         i = at.index[e]
+        if second_order:
+            place = 0
+            for j in range(GEOMETRY):
+                for l in range(j + 1):
+                    curvature[j, l] = curvature[l, j] = at.curvature[e, place + l]
+                place += j + 1
         for k in range(K):
             y = cotangents[i, k]
             geometry_tangent(u, i, k, d_means, d_log_scales, d_quats)
             for c in range(3):
                 bar[c] = at.visible[e, c] * y[6 + c]
-            for j in range(GEOMETRY):
-                h[j] = 0
-                for r in range(5):
+            h[:] = 0
+            for r in range(5):
+                for j in range(GEOMETRY):
                     h[j] += at.jacobian[e, r, j] * y[1 + r]
-            for j in range(3):
-                for c in range(3):
+            for c in range(3):
+                for j in range(3):
                     h[j] += at.colour_slope[e, c, j] * bar[c]
             out_logits[i, k] = at.logit_slope[e] * y[0]
             if second_order:
-                add_symmetric(at.curvature[e], u, h)
+                for j in range(GEOMETRY):
+                    for l in range(GEOMETRY):
+                        h[l] += curvature[j, l] * u[j]
                 out_logits[i, k] += at.logit_curvature[e] * d_logits[i, k]
             for b in range(bands):
                 slope, weight = at.slope[e, b], out_means.dtype.type(0)

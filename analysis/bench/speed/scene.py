@@ -175,9 +175,7 @@ def _buffers(item: Any, found: dict[int, int], depth: int = 0) -> dict[int, int]
     """Address and bytes of every array that an object holds, in attributes, tuples, lists or dictionaries."""
     if isinstance(item, torch.Tensor):
         found[item.untyped_storage().data_ptr()] = item.untyped_storage().nbytes()
-    elif isinstance(item, np.ndarray):
-        while isinstance(item.base, np.ndarray):
-            item = item.base
+    elif isinstance(item, np.ndarray):  # a tensor over the same memory begins where the array does
         found[item.ctypes.data] = max(item.nbytes, found.get(item.ctypes.data, 0))
     elif depth < 6:
         inner = item.values() if isinstance(item, dict) else item if isinstance(item, tuple | list) else None

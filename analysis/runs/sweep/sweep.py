@@ -29,7 +29,7 @@ from rich.console import Console
 from analysis.console.drawing import module_environment
 from analysis.console.interruption import interruption
 from analysis.records.provenance import usable_cores
-from analysis.records.records import FILE, read_record
+from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS
 from analysis.runs.options import SweepOptions
 from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
@@ -74,12 +74,11 @@ def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
 
 
 def _probed(cell: Cell, sweep: Sweep) -> bool:
-    if not (cell.out / PROBE / FILE).is_file():
+    if not (cell.out / PROBE / ProbeRecord.FILE).is_file():
         return False
-    data = read_record(cell.out / PROBE).data
-    return data["provenance"].get("iteration") == cell.training.iterations and (
-        "split_control" in data or not sweep.split_control
-    )
+    data = read_record(cell.out / PROBE, ProbeRecord).data
+    whole = bool(data.split_control) or not sweep.split_control
+    return data.provenance.iteration == cell.training.iterations and whole
 
 
 @contextmanager

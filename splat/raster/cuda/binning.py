@@ -21,14 +21,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from landscape.errors import InputError
-from splat.backend.gpu.compile import jit, launch, sized, twins
+from splat.backend.gpu.compile import jit, launch, sized
+from splat.backend.gpu.formula import triton_formula
 from splat.raster import formulas
 
 WIDTH, HEIGHT = 16, 16  # of a tile, in pixels
 BLOCK = 256
 LIMIT = 2**31  # places and accumulators of intersections are 32 bits wide
 
-ellipse_of, box_of, rows_of_strip = twins(formulas.ellipse_of, formulas.box_of, formulas.rows_of_strip)
+ellipse_of, box_of = triton_formula(formulas.ellipse_of), triton_formula(formulas.box_of)
+rows_of_strip = triton_formula(formulas.rows_of_strip)
 
 
 class Lists(NamedTuple):

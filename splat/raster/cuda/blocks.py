@@ -8,7 +8,8 @@ import triton.language as tl
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from splat.backend.gpu.compile import jit, reciprocal, twins
+from splat.backend.gpu.compile import jit
+from splat.backend.gpu.formula import triton_formula
 from splat.raster import formulas
 from splat.raster.cuda.compositing import (
     alpha_row,
@@ -22,7 +23,8 @@ from splat.raster.cuda.compositing import (
 )
 from splat.raster.cuda.packing import ALPHA_MAX, CAP, RED
 
-step_block, cross_terms = twins(formulas.step_block, formulas.cross_terms)
+step_block, cross_terms = triton_formula(formulas.step_block), triton_formula(formulas.cross_terms)
+reciprocal = triton_formula(formulas.reciprocal)
 BLOCK_SUMS = formulas.BLOCK_SUMS
 PADDED = 64
 CROSS, COLOUR, DEGREE2 = tl.constexpr(formulas.CROSS), tl.constexpr(formulas.COLOUR), tl.constexpr(formulas.DEGREE2)

@@ -39,7 +39,8 @@ to pack.
 
 import triton.language as tl
 
-from splat.backend.gpu.compile import fma, jit, sized, twins
+from splat.backend.gpu.compile import jit, sized
+from splat.backend.gpu.formula import triton_formula
 from splat.raster import formulas
 from splat.raster.cuda.packing import (
     ACROSS,
@@ -62,12 +63,16 @@ from splat.raster.cuda.packing import (
 NEVER = tl.constexpr(2**31 - 1)  # the stop index of a pixel that does not stop
 CHUNK = tl.constexpr(16)  # intersections between two looks whether all pixels of a tile have stopped
 
-alpha_row, quadratic, along_row, plus, behind_all = twins(
-    formulas.alpha_row, formulas.quadratic, formulas.along_row, formulas.plus, formulas.behind_all
-)
-step_back, step_tangent, step_backward_tangent, row_terms, column_terms = twins(
-    formulas.step_back, formulas.step_tangent, formulas.step_backward_tangent, formulas.row_terms, formulas.column_terms
-)
+alpha_row = triton_formula(formulas.alpha_row)
+quadratic = triton_formula(formulas.quadratic)
+along_row = triton_formula(formulas.along_row)
+plus = triton_formula(formulas.plus)
+behind_all = triton_formula(formulas.behind_all)
+step_back = triton_formula(formulas.step_back)
+step_tangent = triton_formula(formulas.step_tangent)
+step_backward_tangent = triton_formula(formulas.step_backward_tangent)
+row_terms = triton_formula(formulas.row_terms)
+column_terms = triton_formula(formulas.column_terms)
 
 
 # --- what the kernels share -------------------------------------------------------------------------------------------
@@ -90,10 +95,10 @@ def exponent_terms(params, x0, y0, x, y):
     """
     along, across, shear = tl.load(params + ALONG), tl.load(params + ACROSS), tl.load(params + SHEAR)
     dx, dy = x0 - tl.load(params + X), y0 - tl.load(params + Y)
-    u = fma(x, along, fma(along, dx, tl.load(params + U)))
-    corner = fma(across, fma(tl.load(params + SHEAR_REST), dx, fma(shear, dx, dy)), tl.load(params + V))
-    v = fma(y, across, fma(x, across * shear, corner))
-    return u, v, (v, across, fma(-u, u, tl.load(params + LO)), tl.load(params + CUT))
+    u = tl.fma(x, along, tl.fma(along, dx, tl.load(params + U)))
+    corner = tl.fma(across, tl.fma(tl.load(params + SHEAR_REST), dx, tl.fma(shear, dx, dy)), tl.load(params + V))
+    v = tl.fma(y, across, tl.fma(x, across * shear, corner))
+    return u, v, (v, across, tl.fma(-u, u, tl.load(params + LO)), tl.load(params + CUT))
 
 
 @jit
@@ -224,7 +229,7 @@ def forward(
             following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
             _u, v, terms = exponent_terms(splat, x0, y0, x, y)
             alpha, _uncapped = alpha_row(v, terms, T > 0, cap)
-            w, after = alpha * T, fma(-alpha, T, T)
+            w, after = alpha * T, tl.fma(-alpha, T, T)
             ends = (after < floor) & (T > 0)
             w, T = tl.where(ends, 0.0, w), tl.where(ends, -T, after)
             stopped = tl.where(ends, k, stopped)
@@ -336,7 +341,7 @@ def tangent(
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         w = alpha * T
-        T = fma(-alpha, T, T)
+        T = tl.fma(-alpha, T, T)
         q, dcolour = tangents_of(tangents, s_index, begin + i, stride)
         w_dq = tl.where(uncapped <= tl.load(splat + CAP), w, 0.0) * quadratic(v, along_row(q, u))
         dT, image = step_tangent(dT, (red, green, blue), alpha, w, w_dq, load3(splat, RED), dcolour)

@@ -13,7 +13,8 @@ precision, so the kernels need no double precision to tell what is left of a nee
 
 import triton.language as tl
 
-from splat.backend.gpu.compile import jit, sized, twins
+from splat.backend.gpu.compile import jit, sized
+from splat.backend.gpu.formula import triton_formula
 from splat.projection import whitening
 from splat.raster import formulas
 from splat.raster.cuda.binning import load_splat
@@ -25,7 +26,7 @@ FARTHEST = tl.constexpr(2.0**22)  # a pixel farther out is not exact in single p
 CONTOUR, LEAST, ALPHA_MAX, FREE, FLOOR, BACKGROUND = (tl.constexpr(i) for i in range(1, 7))
 HALF_LOG2_E = tl.constexpr(whitening.LOG2_E / 2)
 
-whiten, second_order = twins(whitening.whitening, formulas.second_order)
+whiten, second_order = triton_formula(whitening.whitening), triton_formula(formulas.second_order)
 
 
 @jit

@@ -1,6 +1,6 @@
-"""How well Gaussians show views that they were not trained on.
+"""Scores of Gaussians on views that they were not trained on.
 
-Where views have masks, only what is inside counts, as on DTU since pixelNeRF (RegNeRF, DNGaussian and CoR-GS, in its
+Where views have masks, only the pixels inside count, as on DTU since pixelNeRF (RegNeRF, DNGaussian and CoR-GS, in its
 `metrics_dtu.py`): PSNR is over the pixels inside; for SSIM and LPIPS, whose windows reach across the edge, both images are
 white outside.
 """
@@ -36,7 +36,7 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of every view; their means are what papers report.  masked: whether they are of what is inside masks."""
+    """Scores of every view, and their means, which papers report.  masked: whether only pixels inside masks count."""
 
     views: tuple[ViewScore, ...]
     masked: bool = False
@@ -85,7 +85,7 @@ def evaluate(
 
 
 def have_masks(views: Sequence[View]) -> bool:
-    """Whether the views have masks.  ValueError where only some do: their scores would have no mean."""
+    """Whether the views have masks.  InputError where only some do: their scores would have no mean."""
     without = [view.name for view in views if view.mask is None]
     if 0 < len(without) < len(views):
         raise InputError(

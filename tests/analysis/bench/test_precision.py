@@ -8,6 +8,7 @@ import torch
 
 from analysis.bench.precision import precision, same_decisions
 from analysis.bench.workloads import Size, Workload, synthetic_workload
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.model.settings import RenderSettings
 from splat.projection.cpu import project_arrays
 from splat.projection.formulas import lens_of

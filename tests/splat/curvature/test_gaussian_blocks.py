@@ -11,6 +11,7 @@ from landscape.traces.control import controlled
 from landscape.traces.trace import TraceSettings
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.kept_views import VECTORS
+from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, SampledTrace, _signs, coupling_samples, exact_traces
 from splat.losses.cpu.loss import CpuViewLoss
@@ -70,15 +71,15 @@ def test_own_blocks_are_those_of_the_dense_hessian(loss: LossSettings, gauss_new
         assert abs(traces[name] - float(H.diagonal()[block].sum())) <= 1e-10 * float(H.diagonal()[block].abs().sum())
 
 
-def test_memory_decides_which_views_are_kept_and_changes_no_bit() -> None:
-    gaussians, loss = awkward_gaussians(), LossSettings()
+def test_memory_decides_which_views_are_kept_and_changes_no_bit(monkeypatch) -> None:
+    gaussians, loss, widths, hvp = awkward_gaussians(), LossSettings(), [], LinearizedView.hvp
+    monkeypatch.setattr(LinearizedView, "hvp", lambda view, U: widths.append(U.shape[1]) or hvp(view, U))
     roomy = objective_of(gaussians, loss, noise=0.3)
     tight = SceneObjective(gaussians, roomy.views, loss, BACKGROUND, memory=0)
     assert (tight.linearized.kept, roomy.linearized.kept) == (1, 2)
-    V = torch.randn(
-        SceneHessian(roomy).dim, VECTORS + 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
+    V = random_like((SceneHessian(roomy).dim, VECTORS + 3), 0)
     assert torch.equal(SceneHessian(roomy).apply(V), SceneHessian(tight).apply(V))
+    assert widths == [VECTORS, 3] * 4  # of two views, each time
 
 
 def test_under_l1_alone_the_appearance_has_no_curvature() -> None:

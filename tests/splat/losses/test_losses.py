@@ -116,7 +116,7 @@ def test_kernels_give_the_specifications_value_gradient_and_products(size, setti
     assert held.value == pytest.approx(float(expected.value), rel=IMAGE[dtype], abs=IMAGE[dtype])
     assert loss.value(loss.padded(expected.image.to(dtype))) == held.value
     assert relative_error(loss.cropped(held.gradient), expected.gradient) < DERIVATIVE[dtype]
-    tangents = np.stack([loss.padded(v.to(dtype)) for v in expected.v])
+    tangents = torch.stack([loss.padded(v.to(dtype)) for v in expected.v])
     products = held.hvp(tangents)
     for product, each in zip(products, expected.product, strict=True):
         assert relative_error(loss.cropped(product), each) < DERIVATIVE[dtype]
@@ -125,12 +125,12 @@ def test_kernels_give_the_specifications_value_gradient_and_products(size, setti
 @each_dtype
 @each_loss
 @each_size
-def test_quadratic_forms_are_those_of_the_specifications_products_and_of_the_diagonal(size, settings, dtype):
+def test_quadratic_forms_are_those_of_products_and_of_the_diagonal(size, settings, dtype):
     expected = truth(size, settings)
     exact, loss = (CpuViewLoss(expected.target.to(each), settings, each) for each in (torch.float64, dtype))
     diagonal = exact.cropped(exact.linearize(exact.padded(expected.image)).diagonal)
     held = loss.linearize(loss.padded(expected.image.to(dtype)))
-    full, pixelwise = held.curvatures(np.stack([loss.padded(v.to(dtype)) for v in expected.v]))
+    full, pixelwise = held.curvatures(torch.stack([loss.padded(v.to(dtype)) for v in expected.v]))
     for found, products in ((full, expected.product), (pixelwise, diagonal * expected.v)):
         terms = (expected.v * products).flatten(1)
         assert ((found - terms.sum(dim=1)).abs() <= DERIVATIVE[dtype] * terms.abs().sum(dim=1)).all()
@@ -168,7 +168,7 @@ def test_near_a_fit_of_a_smooth_picture_ssim_keeps_its_digits_in_float32():
     for dtype in DTYPES:
         loss = CpuViewLoss(target, LossSettings(ssim_weight=1.0), dtype)
         held = loss.linearize(loss.padded(image.to(dtype)))
-        product = held.hvp(np.concatenate([loss.padded(v.to(dtype)), loss.padded(v.to(dtype))[:1]])[None])[0]
+        product = held.hvp(torch.cat([loss.padded(v.to(dtype)), loss.padded(v.to(dtype))[:1]])[None])[0]
         found.append((torch.tensor(held.value), *map(loss.cropped, (held.gradient, product, held.diagonal))))
     bound = 2 * WINDOW * torch.finfo(torch.float32).eps  # two sums over a window's length, one after the other
     assert [relative_error(single, double) < bound for single, double in zip(*found, strict=True)] == [True] * 4
@@ -187,28 +187,21 @@ def test_padding_and_alpha_have_no_derivative(settings, dtype):
 
 
 @each_loss
-def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_vectors(settings, monkeypatch):
+def test_threads_change_no_bit_and_products_may_overwrite_their_vectors(settings, monkeypatch):
     monkeypatch.setattr("splat.losses.cpu.loss.RINGS", 1 << 16)  # so that two vectors are two sweeps
     expected = truth((37, 53), settings)
     x, y = expected.image.clone().requires_grad_(), expected.target.clone().requires_grad_()
 
-    def everything() -> list[np.ndarray]:
+    def everything() -> list[Tensor]:
         loss = CpuViewLoss(expected.target, settings, torch.float64)
         held = loss.linearize(loss.padded(expected.image))
-        tangents = np.stack([loss.padded(v) for v in expected.v])
-        over = np.concatenate([tangents, tangents[:, :1]], axis=1)  # four planes, as the products have
+        tangents = torch.stack([loss.padded(v) for v in expected.v])
+        over = torch.cat([tangents, tangents[:, :1]], dim=1)  # four planes, as the products have
         held.hvp(over, out=over)
         consistency = consistency_loss(x, y, settings)
-        both = [each.numpy() for each in (consistency.detach(), *torch.autograd.grad(consistency, (x, y)))]
-        return [
-            np.array(held.value),
-            held.gradient,
-            held.hvp(tangents),
-            over,
-            held.diagonal,
-            *map(Tensor.numpy, held.curvatures(tangents)),
-            *both,
-        ]
+        both = consistency.detach(), *torch.autograd.grad(consistency, (x, y))
+        products = held.hvp(tangents), over, held.diagonal, *held.curvatures(tangents)
+        return [torch.tensor(held.value), held.gradient, *products, *both]
 
     before = torch.get_num_threads()
     try:
@@ -233,7 +226,7 @@ def test_the_diagonal_is_that_of_the_dense_hessian(size, settings):
     held = loss.linearize(loss.padded(expected.image))
     count = expected.image.numel()
     every = [loss.padded(row.view(3, *size)) for row in torch.eye(count, dtype=torch.float64)]
-    columns = [loss.cropped(product).reshape(-1) for product in held.hvp(np.stack(every))]
+    columns = [loss.cropped(product).reshape(-1) for product in held.hvp(torch.stack(every))]
     dense = torch.stack(columns, dim=1)
     assert relative_error(dense, dense.T) < 1e-12
     assert relative_error(loss.cropped(held.diagonal).reshape(-1), dense.diagonal()) < 1e-12
@@ -271,7 +264,7 @@ def truth_of_both(size: tuple[int, int], settings: LossSettings) -> tuple[Tensor
 @each_dtype
 @each_loss
 @each_size
-def test_the_consistency_of_two_images_has_the_specifications_value_and_gradients(size, settings, dtype):
+def test_consistency_has_the_specifications_value_and_gradients(size, settings, dtype):
     value, *gradients = truth_of_both(size, settings)
     x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target(size))
     found = consistency_loss(x, y, settings)

@@ -9,7 +9,7 @@ import torch
 from splat.losses.reference import photometric_loss
 from splat.render.render import render
 from splat.training.loop import train
-from splat.training.methods.dropgaussian import DropGaussian, DropRegularizer
+from splat.training.methods.dropout.dropgaussian import DropGaussian, DropGaussianMethod
 from splat.training.state import TrainConfig, Training
 from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
 
@@ -17,14 +17,14 @@ from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
 @pytest.fixture
 def gains(monkeypatch) -> list[torch.Tensor]:
     """Every gain that a training draws."""
-    drawn, draw = [], DropRegularizer.opacity_scale
+    drawn, draw = [], DropGaussianMethod.opacity_scale
     monkeypatch.setattr(
-        DropRegularizer, "opacity_scale", lambda self, step: drawn.append(draw(self, step)) or drawn[-1]
+        DropGaussianMethod, "opacity_scale", lambda self, step: drawn.append(draw(self, step)) or drawn[-1]
     )
     return drawn
 
 
-def test_the_loss_is_that_of_the_remaining_gaussians_with_their_opacities_raised(gains):
+def test_the_loss_is_of_the_remaining_gaussians_with_raised_opacities(gains):
     start, views = tiny_gaussians(dtype=torch.float64), tiny_views(torch.float64)
     start.opacity_logits.clamp_max_(-0.1)  # raised by 1 / (1 - 0.4) they stay below 1
     training = Training.start(start, EXTENT, TrainConfig(1, seed=1, method=DropGaussian(p_max=0.4)))
@@ -51,7 +51,7 @@ def test_the_share_grows_in_proportion_to_the_step_up_to_p_max_at_the_last(gains
         assert abs(dropped - p) < 4 * sqrt(p * (1 - p) / len(gain))
 
 
-def test_a_gaussian_is_dropped_irrespective_of_the_others_and_anew_at_each_step(gains):
+def test_a_gaussian_is_dropped_independently_and_anew_at_each_step(gains):
     n = 4000
     config = TrainConfig(2, method=DropGaussian(p_max=0.5))
     for _ in train(Training.start(tiny_gaussians(n), EXTENT, config), tiny_views()):
@@ -59,9 +59,3 @@ def test_a_gaussian_is_dropped_irrespective_of_the_others_and_anew_at_each_step(
     first, second = ((gain > 0).double() for gain in gains)
     for one, other in [(first, second), (first[1:], first[:-1])]:
         assert abs(torch.corrcoef(torch.stack([one, other]))[0, 1]) < 4 / sqrt(len(one))
-
-
-@pytest.mark.parametrize("p_max", [0.0, 1.0, float("nan")])
-def test_settings_of_dropgaussian_that_make_no_sense_are_refused(p_max):
-    with pytest.raises(ValueError, match="p_max above 0 and below 1"):
-        DropGaussian(p_max=p_max)

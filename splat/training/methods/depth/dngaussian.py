@@ -7,88 +7,83 @@
     E           mean of (N(D) - N(prior))^2 over the pixels where |N(D) - N(prior)| > tolerance, N either of
     N_local     (D - mean_P) / (std_P + 0.01 std)           mean_P, std_P over the patch of a pixel, std over the image
     N_global    (D - mean_P) / std
-    P           square patches side by side from the top left corner, what is left over at the edges not counted; their
+    P           square patches side by side from the top left corner; pixels left over at the edges do not count; their
                 side is drawn anew for each E, uniform in [smallest_patch, largest_patch], at most the image's
 
-std over the image is a constant to the derivative.  D and prior: see `depth_prior.py`.  Weights, starts, sides and tolerance
-are those of the published code for LLFF.  It takes a step of Adam for each of the three losses, the paper their sum, as here.
+std over the image is a constant to the derivative.  D and prior: see `prior.py`.  Weights, starts, sides and tolerance
+are those of the published code for LLFF (Fictionarry/DNGaussian, train_llff.py and scripts/run_llff.sh).  It takes a step of
+Adam for each of the three losses, the paper their sum, as here.
 
 Not here: its neural colours, its penalties on shape, scale and opacity, and its smoothness of depth.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import inf, log
-from typing import Literal
+from dataclasses import dataclass, replace
+from math import log
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
 from landscape.errors import InputError
 from splat.model.gaussians import Gaussians
+from splat.model.typed import Count, NonNegative
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render_depth
 from splat.scenes.view import View
-from splat.training.methods.depth_prior import DepthKind, prior, require_kind, require_maps
-from splat.training.state import Method, Regularizer, Step, Training
+from splat.training.methods.depth.prior import DepthKind, prior, require_maps
+from splat.training.state import Method, MethodSettings, Step, TrainConfig, Training
 
 HARD = log(0.95 / 0.05)
 EPS = 0.01
+Patch = Annotated[int, Meta(ge=2)]
 
 
 @dataclass(frozen=True)
-class DNGaussian(Method):
+class DNGaussian(MethodSettings):
     """tolerance: of normalised depth; smallest_patch, largest_patch: px; hard_start, soft_start: steps.
 
     depths: what the depth maps hold, "disparity" (larger is nearer) or "depth" (larger is farther).
     """
 
     name: Literal["dngaussian"] = "dngaussian"
-    local_weight: float = 0.1
-    global_weight: float = 1.0
-    tolerance: float = 2.5e-4
-    smallest_patch: int = 5
-    largest_patch: int = 17
-    hard_start: int = 0
-    soft_start: int = 1000
+    local_weight: NonNegative = 0.1
+    global_weight: NonNegative = 1.0
+    tolerance: NonNegative = 2.5e-4
+    smallest_patch: Patch = 5
+    largest_patch: Patch = 17
+    hard_start: Count = 0
+    soft_start: Count = 1000
     depths: DepthKind = "disparity"
 
     def __post_init__(self) -> None:
-        weights = self.local_weight, self.global_weight
-        if not all(0 <= weight < inf for weight in weights) or not any(weights):
-            raise InputError(f"expected finite weights of at least 0, not both 0, got {weights}")
-        if not 0 <= self.tolerance < inf or min(self.hard_start, self.soft_start) < 0:
+        super().__post_init__()
+        if not (self.local_weight or self.global_weight):
+            raise InputError("expected a local_weight or global_weight above 0, got 0 for both")
+        if self.smallest_patch > self.largest_patch:
             raise InputError(
-                "expected tolerance, hard_start and soft_start of at least 0, got "
-                f"{self.tolerance}, {self.hard_start} and {self.soft_start}"
+                f"expected smallest_patch <= largest_patch, got {self.smallest_patch} and {self.largest_patch}"
             )
-        if not 2 <= self.smallest_patch <= self.largest_patch:
-            raise InputError(
-                f"expected 2 <= smallest_patch <= largest_patch, got {self.smallest_patch} and {self.largest_patch}"
-            )
-        require_kind(self.depths)
 
-    def regularizer(self, seed: int) -> "DNRegularizer":
-        return DNRegularizer(self, seed)
+    def create(self, seed: int) -> Method:
+        return DNGaussianMethod(self, seed)
+
+    def parts(self, config: TrainConfig) -> dict[str, int]:
+        return {"hard_start": self.hard_start, "soft_start": self.soft_start}
 
 
-class DNRegularizer(Regularizer):
-    """Holds nothing between steps but the generator."""
-
-    def __init__(self, settings: DNGaussian, seed: int):
-        super().__init__(seed)
-        self.settings = settings
-
-    def begin(self, training: Training, views: Sequence[View]) -> None:
+class DNGaussianMethod(Method[DNGaussian]):
+    def on_start(self, training: Training, views: Sequence[View]) -> None:
         require_maps(views, self.settings.name)
 
-    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> LossAndGradient:
         settings, total = self.settings, base.gradient
         for start, attribute in ((settings.hard_start, "means"), (settings.soft_start, "opacity_logits")):
             if step.number > start:
                 total = total + self._depth_gradient(step, attribute)
-        return total
+        return replace(base, gradient=total)
 
     def _depth_gradient(self, step: Step, attribute: str) -> Float[Tensor, " p"]:
         """The gradient of the hard loss in the means, or of the soft loss in the opacities; 0 in all else."""

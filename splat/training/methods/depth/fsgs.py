@@ -7,12 +7,13 @@ Proximity-guided unpooling, at every densification up to `unpool_until`:
     grown       one on each edge from a source to one of its neighbours (the destination): the mean half way, scales and
                 opacity of the destination, no rotation (1, 0, 0, 0), SH 0; edges of both directions count
 
-The paper's threshold is 10 in the units of the scene; here it is as in the published code, relative to the scene.
+The paper's threshold is 10 in the units of the scene; here it is relative to the scene, as in the published code
+(VITA-Group/FSGS, scene/gaussian_model.py).
 
 Depth supervision, at every step:
 
     L = L_recon + depth_weight (1 - corr(D, prior)),   corr Pearson's over the pixels of the sampled view
-    D, prior    see `depth_prior.py`; for disparity m the better of -m and 1 / (m + 200), as in the published code
+    D, prior    see `prior.py`; for disparity m the better of -m and 1 / (m + 200), as in the published code
                 (200: for MiDaS's numbers; of maps in [0, 1] the two are the same)
 
 with late_depth_weight after `depth_until`.  depth_weight 0 leaves the unpooling alone, and needs no depth maps.
@@ -22,8 +23,7 @@ the score, which only the code does.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import inf
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import scipy
@@ -31,90 +31,76 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from landscape.errors import InputError
 from splat.model.gaussians import Gaussians
+from splat.model.typed import Count, Length, NonNegative, Positive
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render_depth
 from splat.scenes.view import View
 from splat.training.densify import Densified
-from splat.training.methods.depth_prior import DepthKind, prior, require_kind, require_maps
-from splat.training.state import Method, Regularizer, Step, Training
+from splat.training.methods.depth.prior import DepthKind, prior, require_maps
+from splat.training.state import Method, MethodSettings, Step, TrainConfig, Training
 
 MIDAS = 200.0
 
 
 @dataclass(frozen=True)
-class FSGS(Method):
+class FSGS(MethodSettings):
     """neighbours: K; threshold, large: in units of the scene's extent; unpool_until, depth_until: steps.
 
     depths: what the depth maps hold, "disparity" (larger is nearer) or "depth" (larger is farther).
     """
 
     name: Literal["fsgs"] = "fsgs"
-    neighbours: int = 3
-    threshold: float = 5.0
-    large: float = 1.0
-    unpool_until: int = 2000
-    depth_weight: float = 0.05
-    late_depth_weight: float = 0.001
-    depth_until: int = 9500
+    neighbours: Length = 3
+    threshold: Positive = 5.0
+    large: NonNegative = 1.0
+    unpool_until: Count = 2000
+    depth_weight: NonNegative = 0.05
+    late_depth_weight: NonNegative = 0.001
+    depth_until: Count = 9500
     depths: DepthKind = "disparity"
 
-    def __post_init__(self) -> None:
-        if self.neighbours < 1 or min(self.unpool_until, self.depth_until) < 0:
-            raise InputError(
-                "expected neighbours of at least 1, unpool_until and depth_until of at least 0, got "
-                f"{self.neighbours}, {self.unpool_until} and {self.depth_until}"
-            )
-        if not (0 < self.threshold < inf and 0 <= self.large < inf):
-            raise InputError(
-                f"expected a finite threshold above 0 and large of at least 0, got {self.threshold} and {self.large}"
-            )
-        if not (0 <= self.depth_weight < inf and 0 <= self.late_depth_weight < inf):
-            raise InputError(
-                f"expected finite depth weights of at least 0, got {self.depth_weight} and {self.late_depth_weight}"
-            )
-        require_kind(self.depths)
+    def create(self, seed: int) -> Method:
+        return FSGSMethod(self, seed)
 
-    def regularizer(self, seed: int) -> "FSGSRegularizer":
-        return FSGSRegularizer(self, seed)
+    def parts(self, config: TrainConfig) -> dict[str, int]:
+        begins = config.densify.begins(config.iterations)
+        unpooling = {"densify.start": begins} if config.densify.enabled and self.unpool_until > begins else {}
+        return unpooling | ({"depth_weight": 0} if self.depth_weight else {})
 
 
-class FSGSRegularizer(Regularizer):
+class FSGSMethod(Method[FSGS]):
     """history: how many Gaussians each unpooling grew."""
 
-    def __init__(self, settings: FSGS, seed: int):
-        super().__init__(seed)
-        self.settings = settings
-
-    def begin(self, training: Training, views: Sequence[View]) -> None:
+    def on_start(self, training: Training, views: Sequence[View]) -> None:
         if self.settings.depth_weight:
             require_maps(views, self.settings.name)
 
-    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> LossAndGradient:
         settings = self.settings
         weight = settings.depth_weight and (
             settings.depth_weight if step.number <= settings.depth_until else settings.late_depth_weight
         )
         if not weight:
-            return base.gradient
+            return base
         flat = step.gaussians.flat.detach().requires_grad_()
         rendered, _alpha = render_depth(step.gaussians.with_flat(flat), step.camera, step.config.render)
         if rendered.min() == rendered.max():  # nothing is seen
-            return base.gradient
+            return base
         loss = depth_loss(rendered, step.views[step.chosen], settings.depths)
-        return base.gradient + weight * torch.autograd.grad(loss, flat)[0]
+        return replace(base, gradient=base.gradient + weight * torch.autograd.grad(loss, flat)[0])
 
-    def after(self, step: Step) -> None:
+    def after_step(self, step: Step) -> None:
         settings, training = self.settings, step.training
         if step.number > settings.unpool_until:
             return
-        if step.config.densify.densifies(step.number, step.config.iterations):
+        schedule = step.config.method.density_control(step.config)
+        if schedule.densifies(step.number, step.config.iterations):
             change = unpool(training.gaussians, training.extent, settings)
             grown = int(change.fresh.sum())
             self.history.append({"step": step.number, "grown": grown})
             if grown:
-                training.follow(change)
+                training.replace_gaussians(change)
 
 
 def depth_loss(rendered: Float[Tensor, "h w"], view: View, kind: DepthKind) -> Float[Tensor, ""]:
@@ -139,7 +125,7 @@ def pearson(x: Tensor, y: Tensor) -> Float[Tensor, ""]:
 
 @torch.no_grad()
 def unpool(gaussians: Gaussians, extent: float, settings: FSGS) -> Densified:
-    """The Gaussians with new ones on the edges of the sources.  What is there stays, first and in its order."""
+    """The Gaussians, which stay first and in their order, with new ones on the edges of the sources."""
     n, device = len(gaussians), gaussians.flat.device
     k = min(settings.neighbours, n - 1)
     everyone = torch.arange(n, device=device)

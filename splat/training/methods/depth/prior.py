@@ -18,14 +18,8 @@ from splat.scenes.view import View
 DepthKind = Literal["disparity", "depth"]
 
 
-def require_kind(kind: str) -> None:
-    """ValueError unless it is one of the two."""
-    if kind not in ("disparity", "depth"):
-        raise InputError(f"expected depths 'disparity' (larger is nearer) or 'depth' (larger is farther), got {kind!r}")
-
-
 def require_maps(views: Sequence[View], method: str) -> None:
-    """ValueError unless every view has a depth map."""
+    """InputError unless every view has a depth map."""
     without = [view.name for view in views if view.depth is None]
     if without:
         raise InputError(

@@ -1,7 +1,7 @@
-"""What a CUDA graph takes of a product, on the CPU: its operations and kernels with their memory, to be repeated there.
+"""A CUDA graph on the CPU: records a product's torch operations and kernel launches with their memory, and repeats them.
 
-As on a GPU, whatever waits for the device is refused, and a replay knows nothing but that memory: what a product takes from the
-host while it is recorded, it has for ever.
+As on a GPU, an operation that waits for the device is refused while recording, and a replay reads only the memory that was
+recorded: numbers taken from the host are constants of the graph.
 """
 
 from collections.abc import Callable
@@ -12,20 +12,19 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_leaves
 
-from tests.splat.placed import KERNELS, waits_for_values
+from splat.backend.gpu.compile import Kernel
+from tests.splat.fake_device import waits_for_values
 
 
-class Tape(TorchDispatchMode):
-    """`capture` is a `recording.Capture`."""
+class FakeCudaGraph(TorchDispatchMode):
+    """`capture` is a `Capture` of `backend/gpu/graphs.py`; replays: how often its graphs were repeated."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch):
         super().__init__()
         self._steps: list[Callable[[], Any]] = []
         self._running = False
         self.replays = 0
-        for name in KERNELS:
-            module = pytest.importorskip(f"splat.{name}")
-            monkeypatch.setattr(module, "launch", self._launch(module.launch))
+        monkeypatch.setattr(Kernel, "run", self._run(Kernel.run))
 
     def capture(self, call: Callable[[], Tensor]) -> tuple[Tensor, Callable[[], None]]:
         self._steps, self._running = [], True
@@ -60,11 +59,11 @@ class Tape(TorchDispatchMode):
         self._steps.append(step)
         return made
 
-    def _launch(self, original: Callable) -> Callable:
-        def launch(*arguments: Any, **constants: Any) -> None:
-            with _disable_current_modes():
-                original(*arguments, **constants)
+    def _run(self, original: Callable) -> Callable:
+        def run(*arguments: Any, **options: Any) -> Any:
             if self._running:
-                self._steps.append(lambda: original(*arguments, **constants))
+                self._steps.append(lambda: original(*arguments, **options))
+            with _disable_current_modes():
+                return original(*arguments, **options)
 
-        return launch
+        return run

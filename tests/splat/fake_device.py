@@ -1,10 +1,15 @@
-"""Tensors on the CPU that are taken for a GPU's: what would fail there is noted, and what would wait for the device.
+"""Tensors on the CPU treated as if they were on a GPU: notes operations that would fail there or wait for the device.
 
-Every storage has a label, which goes over to all that is computed of it: GPU where `on_gpu` put it there or what is there was
-asked for its like; EITHER where it was made on a device by name, since that of a GPU's tensors is the CPU's here; else HOST.
+Every storage has a label, which results inherit from what they are computed from:
 
-    mixed    operations on GPU and HOST, kernels' arguments and numpy() on the wrong side; what torch allows is left out:
-             copies, single numbers, indices on the host
+    GPU      put there by `on_gpu`, or made like a tensor that is there
+    EITHER   made on a device that is named: the device of a fake GPU's tensor is the CPU, so the name does not tell
+    HOST     anything else
+
+and three counters note operations by name:
+
+    mixed    operations on GPU and HOST, kernels' arguments and numpy() on the wrong side; not what torch allows: copies,
+             single numbers, indices on the host
     waits    numbers that the host reads, sizes that depend on values, copies that block, indices that come from the host
     brought  copies from the host, whether or not they block
 """
@@ -21,27 +26,22 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_leaves
 
+from splat.backend.gpu.compile import Kernel
+
 GPU, EITHER, HOST = "gpu", "either", "host"
 READS = {"_local_scalar_dense", "nonzero", "unique_dim", "_unique2", "masked_select", "equal"}
 INDEXED = {"index", "index_put", "index_put_"}
 ACROSS = {"copy_", "_to_copy", *INDEXED}
-KERNELS = (
-    "raster.cuda.binning",
-    "raster.cuda.raster",
-    "projection.cuda",
-    "losses.cuda.loss",
-    "training.optim.adam_cuda",
-)
 
 
 def waits_for_values(func: Any, args: Any) -> bool:
-    """Whether an operation on a GPU's tensors waits for it, to give the host a number or a tensor of which one is the size."""
+    """Whether an operation on a GPU's tensors waits for it: it gives a number, or a tensor whose size depends on values."""
     name = func._schema.name.removeprefix("aten::")
     return name in READS or (name in INDEXED and any(each is not None and each.dtype == torch.bool for each in args[1]))
 
 
 class _Named(TorchFunctionMode):
-    """Whether the function that was called last was given a device: those that it calls are given one always."""
+    """Notes whether the torch function called last was given a device (the functions below it always are)."""
 
     found = False
 
@@ -50,22 +50,20 @@ class _Named(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-class Placed(TorchDispatchMode):
-    """Notes while it is entered: `mixed`, `waits` and `brought`, names of operations with their numbers."""
+class FakeDevice(TorchDispatchMode):
+    """Counts while it is entered: `mixed`, `waits` and `brought`, see above."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch):
         super().__init__()
         self.mixed, self.waits, self.brought = Counter[str](), Counter[str](), Counter[str]()
         self._labels: dict[int, str] = {}
-        self._kept: list[Any] = []  # storages, lest another takes a freed one's place
+        self._kept: list[Any] = []  # storages, so that no new one gets the address of a freed one
         self._within, self._named = False, _Named()
         for name in ("to", "cpu", "numpy", "new_tensor"):
             monkeypatch.setattr(Tensor, name, self._method(getattr(self, f"_{name}"), getattr(Tensor, name)))
-        for name in KERNELS:
-            module = pytest.importorskip(f"splat.{name}")
-            monkeypatch.setattr(module, "launch", self._launch(module.launch))
+        monkeypatch.setattr(Kernel, "run", self._run(Kernel.run))
 
-    def __enter__(self) -> "Placed":
+    def __enter__(self) -> "FakeDevice":
         self._named.__enter__()
         return super().__enter__()
 
@@ -154,11 +152,11 @@ class Placed(TorchDispatchMode):
         self.brought["new_tensor"] += self._label(tensor) == GPU
         return self._moved(made, self._label(tensor) or HOST)
 
-    def _launch(self, original: Callable) -> Callable:
-        def launch(kernel: Any, programs: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
+    def _run(self, original: Callable) -> Callable:
+        def run(kernel: Any, *arguments: Any, **options: Any) -> Any:
             tensors = [each for each in arguments if isinstance(each, Tensor) and each.numel()]
             self.mixed[kernel.fn.__name__] += sum(self._label(each) == HOST for each in tensors)
             with self._quietly(), _disable_current_modes():
-                original(kernel, programs, *arguments, **constants)
+                return original(kernel, *arguments, **options)
 
-        return launch
+        return run
