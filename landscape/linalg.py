@@ -1,6 +1,6 @@
-"""Linear algebra of tall vectors: lengths, dot products, orthogonalisation and sums over groups of rows.
+"""Linear algebra of long vectors: lengths, dot products, orthogonalisation, sums over groups of rows.
 
-Sums are accumulated in float64 and are the same to the last bit from run to run, on the CPU and on a GPU.
+Sums are accumulated in float64.  They are the same to the last bit from run to run, on the CPU and on a GPU.
 """
 
 from math import inf, isfinite
@@ -9,14 +9,16 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-SMALLEST = 1e-140  # a length whose square has all its digits, and those of its parts
-ROWS = 65_536  # taken to float64 at a time
+from landscape.errors import InputError
+
+SMALLEST = 1e-140  # shorter vectors are rescaled: the squares of their entries lose digits near 1e-308
+ROWS = 65_536  # converted to float64 at a time
 
 
 def orthogonalise(vectors: Float[Tensor, "b n"], basis: Float[Tensor, "m n"]) -> Float64[Tensor, "m b"]:
-    """Remove from vectors, in place, their components along the orthonormal rows of basis; return these, on the CPU."""
+    """Remove the components of vectors along the orthonormal rows of basis, in place; return these components, on the CPU."""
     components = basis.new_zeros(basis.shape[0], vectors.shape[0], dtype=torch.float64)
-    for _ in range(2):  # "twice is enough"
+    for _ in range(2):  # "twice is enough": the second pass removes the round-off of the first (Kahan and Parlett)
         part = basis @ vectors.T
         vectors.addmm_(part.T, basis, alpha=-1)
         components += part.double()
@@ -24,7 +26,7 @@ def orthogonalise(vectors: Float[Tensor, "b n"], basis: Float[Tensor, "m n"]) ->
 
 
 def norm(vector: Tensor) -> float:
-    """Euclidean length, added up in float64; where squares leave its range, in units of the largest entry."""
+    """Euclidean length in float64.  Where squares leave the range of float64, entries are divided by the largest first."""
     length = float(torch.linalg.vector_norm(vector, dtype=torch.float64))
     if SMALLEST < length < inf or not vector.numel():
         return length
@@ -35,15 +37,20 @@ def norm(vector: Tensor) -> float:
 
 
 def unit_columns(vectors: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """The directions of start vectors.  ValueError where one is 0 or not finite."""
+    """Columns divided by their lengths.  Raises InputError where a length is zero or not finite."""
+    return vectors / column_lengths(vectors, "start vectors").to(vectors.dtype)
+
+
+def column_lengths(vectors: Float[Tensor, "n k"], name: str) -> Float64[Tensor, " k"]:
+    """Euclidean lengths of the columns.  Raises InputError, with this name for them, where one is zero or not finite."""
     lengths = torch.linalg.vector_norm(vectors, dim=0, dtype=torch.float64)
     if not ((lengths > 0) & torch.isfinite(lengths)).all():
-        raise ValueError(f"expected finite start vectors that are not zero, got lengths {lengths.tolist()}")
-    return vectors / lengths.to(vectors.dtype)
+        raise InputError(f"expected finite {name} that are not zero, got lengths {lengths.tolist()}")
+    return lengths
 
 
 def is_roundoff(length: float, scale: float, dtype: torch.dtype) -> bool:
-    """Whether a remainder this long is the round-off of orthogonalising vectors of length `scale`."""
+    """Whether a remainder of this length is only round-off, left by orthogonalising vectors of length `scale`."""
     return length <= 10 * torch.finfo(dtype).eps * scale
 
 
@@ -62,10 +69,10 @@ def column_dots(A: Float[Tensor, "n k"], B: Float[Tensor, "n k"]) -> Float64[Ten
 
 
 def group_sums(values: Float[Tensor, "n *k"], groups: Int[Tensor, " n"], count: int) -> Float[Tensor, "{count} *k"]:
-    """The sum of the rows of each group; groups: the number, from 0, of the group of every row.
+    """Sum of the rows of each group.  groups: the number (from 0) of every row's group.
 
-    A GPU's `index_add_` adds in whatever order its threads come; its `index_put_` sorts the rows by their groups first.  On the
-    CPU it is the other way round.
+    The order of additions is fixed on both devices: `index_put_` sorts the rows by group on a GPU, where `index_add_` adds in
+    any order; on the CPU `index_add_` is the one with a fixed order.
 
     >>> import torch
     >>> group_sums(torch.tensor([1.0, 2.0, 4.0]), torch.tensor([2, 0, 2]), 3)

@@ -1,7 +1,7 @@
-"""Random probe vectors z with E z z^T = I: where every estimator of the package draws its randomness.
+"""Random probe vectors z with E z z^T = I, the source of all randomness in the estimators.
 
-Vectors are drawn one after the other on the generator's device, so the first m of them are the same vectors however
-many are drawn at a time.
+Vectors are drawn one after the other on the generator's device.  The first m are therefore the same vectors however many are
+drawn at a time.
 """
 
 from typing import Literal
@@ -26,7 +26,10 @@ def draw_probes(
     return rows.T.contiguous()
 
 
-def split(generator: torch.Generator) -> torch.Generator:
-    """A new generator, seeded from the given one: streams of their own for parts whose lengths are not known yet."""
+def spawn(generator: torch.Generator) -> torch.Generator:
+    """A new generator on the same device, seeded from the given one.
+
+    Two parts of a computation that each draw from a spawned generator do not depend on how many numbers the other draws.
+    """
     seed = torch.randint(2**62, (), generator=generator, device=generator.device)
     return torch.Generator(generator.device).manual_seed(int(seed))

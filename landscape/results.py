@@ -1,19 +1,20 @@
-"""What the estimators return: frozen records, each number with its error and each run with the reason it stopped.
+"""Parts that all results share: intervals, reasons to stop, records for JSON.
 
-    interval        [low, high], the truth inside with the probability `confidence`
-    standard error  of a mean over probe vectors: s / sqrt(probes)
-    residual        |H v - lambda v| for a unit v: an eigenvalue lies within it of lambda, whatever v is
-    reason          why the work ended: "tolerance" (the error asked for is reached), "noise floor" (more work would not
-                    help: the error left is the matvec's own), "matvec budget", "evaluation budget", "time budget", "exact",
-                    or "not asked for"
+Every estimator returns a frozen dataclass: each number with its error, and the reason why the run stopped.
 
-`record()` gives the scalars of a result as plain Python values for JSON; what is infinite or undefined is None there.
+    interval        [low, high], contains the truth with the probability `confidence`
+    standard error  s / sqrt(m) of a mean over m probe vectors with the sample standard deviation s
+    residual        |H v - lambda v| for a unit vector v: some eigenvalue of H is no farther than this from lambda
+    reason          "tolerance" (the requested error is reached), "noise floor" (the remaining error is that of the matvec, so
+                    more work would not help), "matvec budget", "evaluation budget", "time budget", "exact" or "not asked for"
+
+`record()` of a result gives its scalars as plain Python values for JSON, with None for what is infinite or undefined.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
-from typing import Literal
+from typing import Any, Literal
 
 from jaxtyping import Float64
 from scipy.special import stdtrit
@@ -26,7 +27,7 @@ Sign = Literal["positive", "negative", "zero", "undetermined"]
 Number = float | None
 
 Progress = Callable[[int, int, str], None]
-"""progress(done, most, state): units of work done, the most there can be, and a few words on the state of the estimate."""
+"""progress(done, most, state): units of work done, the largest possible number of them, the estimate so far in words."""
 
 
 def finite_or_none(value: float) -> Number:
@@ -34,8 +35,25 @@ def finite_or_none(value: float) -> Number:
     return float(value) if isfinite(value) else None
 
 
+def plain(result: object, names: str) -> dict[str, Any]:
+    """The named attributes of a result for JSON: tensors and tuples as lists, None for numbers that are not finite.
+
+    >>> plain(Bracket(2.0, 1.0, float("inf")), "low high")
+    {'low': 1.0, 'high': None}
+    """
+    return {name: _plain(getattr(result, name)) for name in names.split()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return finite_or_none(value) if isinstance(value, float) else value
+
+
 def t_quantile(freedom: float, confidence: float) -> float:
-    """What Student's t of so many degrees of freedom stays within, on both sides, with this probability.
+    """q with P(|t| <= q) = confidence, for Student's t with this many degrees of freedom.
 
     >>> round(t_quantile(9, 0.95), 3)
     2.262
@@ -44,17 +62,17 @@ def t_quantile(freedom: float, confidence: float) -> float:
 
 
 def standard_deviation(samples: Float64[Tensor, "s *shape"]) -> Float64[Tensor, "*shape"]:
-    """Along the first axis; in units of the largest sample, as squares may leave the range of floats."""
+    """The standard deviation along the first axis; in units of the largest sample, as squares may leave the range of floats."""
     unit = float(samples.abs().max()) or 1.0
     return unit * (samples / unit).std(dim=0)
 
 
 @dataclass(frozen=True)
 class Bracket:
-    """A number derived from other results, in [low, high], whose ends carry the errors of these results.
+    """A number derived from other results, and bounds [low, high] that carry the errors of those results.
 
-    value is None where the number is undefined or cannot be told; low and high may be infinite.  note: what limits it, or what
-    the bracket rests on, in a few words.
+    value: None where the number is undefined or cannot be determined.  low, high: may be infinite.  note: the assumption or
+    the limit behind the bounds, in a few words.
     """
 
     value: Number
@@ -63,8 +81,7 @@ class Bracket:
     note: str = ""
 
     def record(self) -> dict[str, Number | str]:
-        value = None if self.value is None else finite_or_none(self.value)
-        return {"value": value, "low": finite_or_none(self.low), "high": finite_or_none(self.high), "note": self.note}
+        return plain(self, "value low high note")
 
     def __str__(self) -> str:
         if self.value is not None:

@@ -7,7 +7,7 @@ from time import monotonic
 
 import torch
 
-from landscape.probes import split
+from landscape.probes import spawn
 from landscape.results import Progress
 
 Stage = Callable[[str], AbstractContextManager[Progress]]
@@ -51,7 +51,7 @@ class Budget:
     def __init__(self, seconds: float, unasked: Collection[str], generator: torch.Generator, stage: Stage) -> None:
         self._end, self._begin = monotonic() + seconds, stage
         self._to_come = {name: share for name, share in SHARES.items() if name not in unasked}
-        self._streams = {name: split(generator) for name in SHARES}
+        self._streams = {name: spawn(generator) for name in SHARES}
         self.notes = [note for name, note in LEFT_OUT.items() if name in unasked]
 
     @contextmanager

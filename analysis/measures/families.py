@@ -35,7 +35,7 @@ from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, finished
-from landscape.probes import split
+from landscape.probes import spawn
 from landscape.results import Progress, finite_or_none
 from landscape.spectrum.families import WHOLE, Lead
 from landscape.traces.trace import total_trace
@@ -164,7 +164,7 @@ def measure_families(
     clock = _Clock(options.seconds, {name: len(scene.active) for name, scene in scenes.items()})
     unit, scale = _metric(options.metric, objective, training)
     streams: dict[tuple[SceneName, schema.Operator], torch.Generator] = {
-        (scene, operator): split(generator)
+        (scene, operator): spawn(generator)
         for scene in scenes  # the trained one first: its numbers are the same without the split control
         for operator in OPERATORS
     }
@@ -232,11 +232,11 @@ def _of_operator(
     """(block, dim, family) of the whole and of every attribute of one operator.  ends: of the whole, where known."""
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
     spaces, found = active_spaces(hessian.objective, hessian.projector, scale), []
-    traces = _traces(hessian, scale, split(generator))
+    traces = _traces(hessian, scale, spawn(generator))
     each = _seconds_a_product(operator, options.family.batch, hessian.objective) if options.seconds < inf else 0.0
     names = [WHOLE, *hessian.blocks]
     for done, name in enumerate(names):
-        stream, allowed = split(generator), seconds()
+        stream, allowed = spawn(generator), seconds()
         if name != WHOLE and name not in spaces:  # an attribute without parameters, or wholly null
             continue
         report(done, len(names), name)

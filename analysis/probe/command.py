@@ -26,7 +26,7 @@ from analysis.records.records import Arrays, ProbeRecord, Record, record_folder,
 from analysis.records.tables import family_table, probe_table
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
-from landscape.probes import split
+from landscape.probes import spawn
 from splat.backend.device import device_named
 from splat.curvature.objective import SceneObjective
 from splat.scenes.scene import Scene
@@ -77,7 +77,7 @@ def _run(
         if family_options is not None:
             from analysis.measures.families import measure_families
 
-            stream = split(generator)
+            stream = spawn(generator)
             families = measure_families(
                 objective, checkpoint.training, family_options, stream, stages.stage, found.ends
             )

@@ -51,7 +51,7 @@ from landscape import (
     symmetric_axis,
 )
 from landscape.errors import InputError
-from landscape.probes import split
+from landscape.probes import spawn
 from landscape.results import Progress
 from landscape.slices.finite_probe import NOISE_POINTS, STEPS, FiniteProbe, finite_probe
 from landscape.slices.grid_evaluations import Loss
@@ -180,8 +180,8 @@ def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch
         gradient, value, render = _linearised(objective, report)
         blocks = objective.gaussian_blocks
     with stage("checks") as report:
-        operator_check = check_operator(operator, split(generator), settings.checked_vectors)
-        gradient_check = check_against_gradient(hessian, split(generator), report, settings.checked_views)
+        operator_check = check_operator(operator, spawn(generator), settings.checked_vectors)
+        gradient_check = check_against_gradient(hessian, spawn(generator), report, settings.checked_views)
     budget = Budget(settings.seconds, _unasked(settings), generator, stage)
     with budget.stage("traces") as share:
         allowed = replace(settings.traces, max_seconds=share.seconds)

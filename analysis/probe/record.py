@@ -79,7 +79,7 @@ def probe_arrays(found: Measured) -> dict[str, dict[str, np.ndarray]]:
 def grid_arrays(grid: Grid) -> dict[str, np.ndarray]:
     """The arrays of a slice."""
     known = dict(zip("xy", grid.coordinates, strict=False))
-    known |= {"loss": grid.loss, "model": grid.model, "crossed": grid.crossed, "evaluated": grid.evaluated}
+    known |= {"loss": grid.loss, "model": grid.model, "crossed": grid.discontinuous, "evaluated": grid.evaluated}
     return {name: array.numpy() for name, array in known.items() if array is not None}
 
 

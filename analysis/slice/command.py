@@ -51,7 +51,7 @@ from analysis.slice.options import SliceOptions
 from analysis.slice.record import Found, slice_arrays, slice_record
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
 from landscape.errors import InputError
-from landscape.probes import split
+from landscape.probes import spawn
 from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
 from splat.backend.device import device_named
 from splat.curvature.hessian import SceneHessian
@@ -160,7 +160,7 @@ def _measure(
 ) -> Found:
     center = objective.active.flat
     seed = torch.Generator(center.device).manual_seed(options.seed)
-    generators = {name: split(seed) for name in ("eigenvectors", "random", "holdout")}
+    generators = {name: spawn(seed) for name in ("eigenvectors", "random", "holdout")}
     with stages.stage("linearise") as report:
         report(0, 1, f"{len(objective.views)} views")
         gradient = objective.gradient

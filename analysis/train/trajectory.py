@@ -56,7 +56,7 @@ from landscape import (
 )
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
-from landscape.probes import split
+from landscape.probes import spawn
 from landscape.spectrum.anisotropy import Anisotropy
 from landscape.spectrum.density import ActiveSpace
 from landscape.traces.estimate import TraceEstimate
@@ -205,7 +205,7 @@ def measure(
     objective: SceneObjective, generator: torch.Generator, settings: TrajectorySettings, seconds: float = inf
 ) -> Found:
     """One record, in about so many seconds, counted from the call."""
-    began, streams = perf_counter(), [split(generator) for _ in range(3)]
+    began, streams = perf_counter(), [spawn(generator) for _ in range(3)]
 
     def left() -> float:
         return seconds - (perf_counter() - began)

@@ -1,12 +1,10 @@
 """Eigenpairs at the two ends of the spectrum.
 
-`extreme_eigenpairs` grows one subspace for both ends by a Lanczos recurrence (`krylov`).  A run ends when every
-wanted pair has a residual under max(rtol |lambda|, atol), or under the round-off of the matvec, or at its budget.
+`extreme_eigenpairs` grows one subspace for both ends by a Lanczos recurrence (`krylov`).  A run ends when the residual of every
+wanted pair is under max(rtol |lambda|, atol) or under the round-off of a matvec, or when the budget is spent.
 
-Why not Davidson's method?  Preconditioned by the blocks of single Gaussians it takes half the products or less, but it may
-settle beside an end that only the couplings between Gaussians make.  On a scene of 13,000 Gaussians (400 steps on lego) it took
--0.0149 for the least eigenvalue, which is -0.0646, in 5 of 6 runs; on one of 1,356 it took the second least for the least in 4
-of 6.  A recurrence comes across such ends by itself: from the same starts it found them in all 12 runs.
+Davidson's method, preconditioned by diagonal blocks, would take fewer products.  But it can miss an extreme eigenvalue that
+only the entries outside these blocks make, and converge to its neighbour; a Lanczos recurrence finds such ends, too.
 """
 
 from time import monotonic
@@ -34,10 +32,10 @@ def extreme_eigenpairs(
 ) -> EigenEnds:
     """The largest and smallest eigenvalues with vectors and residuals; by default one of each, to 0.1%.
 
-    start: one or more vectors to begin from, such as those of an earlier checkpoint: the first vector of the recurrence is the
-    sum of their directions, scaled to length 1, plus a random vector of length settings.noise; None: it is random.  Progress
-    counts matvecs.  ValueError where more pairs are asked for than H has rows.  An end that is not found within the budget
-    raises nothing: see its `reason` and residuals.
+    start: a warm start from one or more vectors, such as eigenvectors of an earlier checkpoint.  The first vector of the
+    recurrence is then the sum of their directions, scaled to length 1, plus a random vector of length settings.noise; None: a
+    random vector alone.  Progress counts matvecs.  Raises InputError where H has fewer rows than wanted pairs.  An end that is
+    not found within the budget raises nothing: see its `reason` and residuals.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.linspace(-1, 3, 50, dtype=torch.float64)))
@@ -62,7 +60,7 @@ def extreme_eigenpairs(
         late = monotonic() > deadline
         goal = Goal(strictness * settings.rtol, max(strictness * settings.atol, space.floor(ritz)))
         complete = space.size == n
-        # of no more values than wanted, the last may be of the other end
+        # with no more values than wanted pairs, the last one may belong to the other end
         settled = space.size > settings.wanted and not (space.exhausted(ritz, goal) and ritz.moved(before, goal))
         near, converged = ritz.near(space.seen_noise, goal), complete or (settled and not ritz.open(goal))
         before = ritz.values[ritz.wanted]

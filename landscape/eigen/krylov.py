@@ -1,26 +1,24 @@
-"""The subspace of a (block) Lanczos recurrence with thick restarts (Wu and Simon 2000), and what is reported of its pairs.
+"""The subspace of a (block) Lanczos recurrence with thick restarts (Wu and Simon 2000), and the errors of its eigenpairs.
 
-Q is orthonormal and T = Q^T H Q is known as a full matrix, so that nothing is assumed of its shape after a restart.  When the
-memory budget of basis vectors is full, the Ritz vectors (`ritz`) next to both ends are kept and the recurrence goes on from
-them.  The residual r_i = H v_i - lambda_i v_i is known up to the noise of products: the vectors that come next, times B s_i
-with B what couples them to the newest rows of Q and s_i the coordinates of v_i in these.
+The rows of `basis` are an orthonormal Q, and T = Q^T H Q is stored as a full matrix, as a restart fills it.  When the memory
+for basis vectors is full, the Ritz vectors (`ritz`) next to both ends are kept and the recurrence goes on from them.  The
+residual r_i = H v_i - lambda_i v_i follows from the recurrence without a product: r_i = N^T B s_i with the next rows N of the
+basis, their coupling B to the newest rows, and the coordinates s_i of v_i in the newest rows.
 
-**What is seen of a product's noise.**  By symmetry a product H q_j has components q_i . H q_j that are known already.  Each
-is off by q_i . e_j - e_i . q_j, e the noise of a product: its rounding, or whatever else sets it off.  A recurrence begins at
-a random vector, so all m (m - 1) / 2 pairs of m steps see noise as random vectors do, 2 |e|^2 / n in the mean square.  The
-|r| reported is widened by MARGIN times this |e|, or times the round-off that a product of this precision has at best,
-eps |lambda|_max, where that is more.  No product is spent on the noise where the sum is as small as was asked for, or where
-less than this round-off was asked for.
+**Noise from symmetry.**  H is symmetric, so components q_i . H q_j of a new product are known from earlier ones.  They differ
+by q_i . e_j - e_i . q_j, where e is the noise of a product: round-off, or any other error.  A recurrence starts at a random
+vector, so this difference behaves as for random vectors, with the mean square 2 |e|^2 / n; this gives |e|.  Reported residuals
+are widened by MARGIN times the larger of |e| and eps |lambda|_max, the smallest possible round-off of a product.  If the
+widened residual meets the goal, or the goal is below that round-off, no further product is made.
 
-**What is not seen.**  The components are sums in the vectors' precision, whose own round-off may be the larger noise in long
-float32 vectors.  Where the sum above misses the goal, one product with all k pairs, signs at random,
+**Noise from one more product.**  The components themselves are rounded sums in the vectors' precision, which can hide noise in
+long float32 vectors.  Where the widened residual misses the goal, one product with all k pairs, with random signs,
 
     f = H x - sum_i +-(lambda_i v_i + r_i),  x = sum_i +-v_i
 
-shows what the subspace does not know: |f|^2 is on average k times the mean square of one pair's noise, and |r_i +- f| is taken
-for the residual.  Where that is more than was asked for, as at the end of a budget, each pair has a product of its own.  The
-noise is also measured once before, with one vector more, when a residual that is still above its goal has come near the noise
-that is seen: from there on steps might be made in vain.
+measures it: |f|^2 is on average k times the mean square of one pair's noise, and |r_i +- f| is reported as residual.  Where
+that misses the goal as well, or at the end of a budget, each pair gets its own product.  When a residual above its goal comes
+near the noise from symmetry, further steps may be useless; the noise is then measured once, by one vector more in a product.
 """
 
 from math import hypot, inf, isfinite, isnan, log, nan, sqrt
@@ -38,14 +36,16 @@ from landscape.probes import draw_probes
 from landscape.results import StopReason
 
 KEEP = 0.6  # share of the basis that a restart keeps
-MARGIN = 4.0  # of the noise that is seen: what it may be in the directions of the wanted vectors
-PAIRS = 10  # known components from which it can be told
+MARGIN = 4.0  # the noise along wanted vectors may exceed the mean noise by this factor
+PAIRS = 10  # components known from symmetry that an estimate of the noise needs
 
 
 class Krylov:
-    """Rows 0..size of the basis are orthonormal with T = Q^T H Q known; the `width` rows after them come next.
+    """The basis: orthonormal rows 0..size with known T = Q^T H Q, and `width` next rows, to which H is applied next.
 
-    It grows by what H makes of its newest rows.
+    coupling: B.  scale: largest length of a product.  foreseen: components of the next products known from symmetry; pairs,
+    surprise: the number of such components so far, and the sum of the squares of their differences.  noise: of a product,
+    measured; nan before.  first_cycle: steps before the first restart.  random_share: length of the random part of the start.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Krylov:
     ) -> None:
         first = draw_probes(operator.dim, min(settings.block, operator.dim), generator, operator.dtype)
         self.operator, self.generator, self.settings = operator, generator, settings
-        self.capacity = min(settings.basis, operator.dim)  # rows with T known at a time
+        self.capacity = min(settings.basis, operator.dim)  # rows with known T
         rows = self.capacity + settings.block
         self.basis = torch.empty(rows, operator.dim, dtype=operator.dtype, device=generator.device)
         self.T = torch.zeros(self.capacity, self.capacity, dtype=torch.float64)
@@ -65,12 +65,11 @@ class Krylov:
             first[:, 0] = _mixed(start, first[:, 0], settings.noise)
             self.random_share = settings.noise / (1 + settings.noise)
         self.append(first.T.contiguous())
-        # components that symmetry tells, how many were, and the root of the sum of squares that they are off by
         self.foreseen = torch.zeros(0, self.width, dtype=torch.float64)
         self.pairs, self.surprise = 0, 0.0
 
     def expand(self, near_noise: bool) -> None:
-        """Apply H to the rows that come next; near_noise: and measure the noise, if it is not known yet."""
+        """Apply H to the next rows.  near_noise: also measure the noise, unless it is known."""
         old, new = self.size, self.size + self.width
         W = self.products(near_noise)
         lengths = [norm(w) for w in W]
@@ -86,7 +85,7 @@ class Krylov:
         self.first_cycle += not self.restarted
 
     def ritz(self) -> Ritz:
-        """All pairs of the rows so far; the wanted ones of the upper end descending, of the lower one ascending."""
+        """All Ritz pairs.  Indices of wanted ones: at the upper end descending, at the lower end ascending."""
         m, settings = self.size, self.settings
         values, coordinates = torch.linalg.eigh(self.T[:m, :m])
         residuals = torch.linalg.vector_norm(self.coupling @ coordinates[m - self.coupling.shape[1] :], dim=0)
@@ -94,21 +93,21 @@ class Krylov:
         return Ritz(values, coordinates, residuals, descending, list(range(settings.smallest)))
 
     def exhausted(self, ritz: Ritz, goal: Goal) -> bool:
-        """Whether H has led out of the rows no more, now or before: rows since then are random ones.
+        """Whether the basis spans (or did before) an invariant subspace, so that later rows are random vectors.
 
-        No residual says then that another eigenvector of a wanted value is missing, so a run ends only where one more row has
-        moved none.
+        All residuals are then small even where another eigenvector of a wanted value is missing.  So a run ends only when one
+        more row has changed no wanted value.
         """
-        # no residual is longer than what H makes of the newest rows is at right angles to all
+        # |B| bounds every residual
         self._exhausted |= norm(self.coupling) <= float(goal.of(ritz.values[ritz.wanted]).max())
         return self._exhausted
 
     def make_room(self, ritz: Ritz) -> None:
-        """Restart where there is none for the rows that come next.
+        """Restart if the memory has no room for the next rows.
 
-        From the share KEEP of the memory, at least the wanted pairs.  Those beyond come from both ends evenly, whichever end is
-        still open: those of its own end speed it up where the spectrum is dense there, those of the other end where that one
-        reaches far.
+        The share KEEP of the Ritz vectors stays, and at least the wanted ones.  Further ones come evenly from both ends: those
+        next to an end that has not converged help where the spectrum is dense there, the others where it reaches far on the
+        other side.
         """
         if self.size + self.width <= self.capacity:
             return
@@ -126,19 +125,19 @@ class Krylov:
 
     @property
     def seen_noise(self) -> float:
-        """The noise of a product as far as symmetry shows it; nan: not yet."""
+        """The noise of a product from symmetry; nan while there are fewer than PAIRS known components."""
         return self.surprise * sqrt(self.operator.dim / (2 * self.pairs)) if self.pairs >= PAIRS else nan
 
     def floor(self, ritz: Ritz) -> float:
-        """The residual that the matvec's noise leaves at least, as far as it was measured."""
+        """The smallest residual that the measured noise of a product permits."""
         return self.rounding(ritz) if isnan(self.noise) else max(self.noise, self.rounding(ritz))
 
     def rounding(self, ritz: Ritz) -> float:
-        """What rounding leaves of a product at best, independent in every row."""
+        """The smallest possible round-off of a product, eps |lambda|_max."""
         return torch.finfo(self.basis.dtype).eps * float(ritz.values.abs().max())
 
     def products(self, near_noise: bool) -> Float[Tensor, "width n"]:
-        """H times the rows that come next, whatever numbers it has."""
+        """H times the next rows, not checked for finite numbers."""
         V = self.basis[self.size : self.size + self.width].T
         if near_noise and isnan(self.noise):
             V = torch.cat([V, SCALE * V[:, :1]], dim=1)
@@ -149,7 +148,7 @@ class Krylov:
         return W
 
     def project(self, components: Float64[Tensor, "new width"]) -> None:
-        """T has the rows that came next too, given q_i . H q_j of all rows with these."""
+        """Extend T by the next rows, given their components q_i . H q_j with all rows."""
         old, self.size = self.size, len(components)
         new = slice(old, self.size)
         self.T[: self.size, new] = components
@@ -157,10 +156,10 @@ class Krylov:
         self.T[new, new] = (components[old:] + components[old:].T) / 2
 
     def append(self, W: Float[Tensor, "b n"]) -> Float64[Tensor, "next b"]:
-        """Orthonormal rows after the first `size` that span the rows of W, orthogonal to these; B with W^T = next^T B.
+        """Make orthonormal next rows N that span the rows of W, which are orthogonal to the basis; return B with W^T = N^T B.
 
-        A row that is round-off alone, of vectors of the length `scale` (an invariant subspace is complete), is replaced by a
-        random one, with B = 0.
+        A row that is only round-off of vectors of length `scale` means that the basis spans an invariant subspace.  It is
+        replaced by a random vector, with B = 0.
         """
         B = torch.zeros(W.shape[0], W.shape[0], dtype=torch.float64)
         self.width = 0
@@ -171,7 +170,7 @@ class Krylov:
             before = norm(w)
             B[: self.width, j] = orthogonalise(w[None], found)[:, 0]
             length = norm(w)
-            if length < max(before, self.scale) / 10:  # cancellation brought the round-off of earlier passes forward
+            if length < max(before, self.scale) / 10:  # cancellation has magnified the round-off of earlier passes
                 orthogonalise(w[None], self.basis[: self.size + self.width])
                 length = norm(w)
             if is_roundoff(length, self.scale, w.dtype):
@@ -186,13 +185,16 @@ class Krylov:
         return B[: self.width]
 
     def measured(self, ritz: Ritz, budget: StopReason, converged: bool) -> tuple[EigenEnds, bool]:
-        """The wanted pairs with residuals by the operator itself, and whether more steps would make them better."""
+        """The wanted pairs with reported residuals, and whether more steps would make them better.
+
+        budget: the reason for pairs that have not reached their goal.  converged: whether the recurrence meets the goal.
+        """
         s = self.settings
         vectors = self.basis[: self.size].T @ ritz.coordinates[:, ritz.wanted].to(self.basis)
-        vectors /= torch.linalg.vector_norm(vectors, dim=0)  # restarts leave a little of their round-off
+        vectors /= torch.linalg.vector_norm(vectors, dim=0)  # restarts add round-off
         known = ritz.residuals[ritz.wanted]
         values, residuals = self._checked(ritz, vectors, converged)
-        # a residual far above what the subspace knows of it is the matvec's round-off: more steps cannot lower it
+        # a residual far above that of the recurrence is noise of the matvec: more steps cannot lower it
         stuck = (known <= residuals / 4) | (known <= self.floor(ritz))
         reached = residuals <= Goal(s.rtol, s.atol).of(values)
         errors = residuals / ritz.gaps()
@@ -218,7 +220,7 @@ class Krylov:
     def _checked(
         self, ritz: Ritz, vectors: Float[Tensor, "n k"], converged: bool
     ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-        """Values and residuals of the wanted pairs: the recurrence's with a margin where these do, else from products."""
+        """Values and residuals of the wanted pairs: from the recurrence, from one product, or from one product each."""
         values, rounding = ritz.values[ritz.wanted], self.rounding(ritz)
         asked = Goal(self.settings.rtol, self.settings.atol).of(values)
         residuals = ritz.residuals[ritz.wanted] + MARGIN * max(self.seen_noise, rounding)
@@ -232,7 +234,7 @@ class Krylov:
         return rayleigh(self.operator, vectors)
 
     def _together(self, ritz: Ritz, vectors: Float[Tensor, "n k"]) -> Float64[Tensor, " k"]:
-        """Residuals of all pairs from one product; measures the noise."""
+        """Residuals of all wanted pairs from one product, which also measures the noise."""
         signs = draw_probes(len(ritz.wanted), 1, self.generator, torch.float64, "rademacher")[:, 0]
         unknown = product(self.operator, (vectors @ signs.to(vectors.dtype))[:, None])[:, 0].double()
         self.matvecs += 1
@@ -243,24 +245,24 @@ class Krylov:
         return torch.tensor([norm(signs[i] * known[:, i] + unknown) for i in range(len(signs))], dtype=torch.float64)
 
     def remainders(self, ritz: Ritz) -> Float[Tensor, "n k"]:
-        """r of the wanted pairs."""
+        """r_i of the wanted pairs (columns), from the recurrence."""
         last = ritz.coordinates[self.size - self.coupling.shape[1] : self.size, ritz.wanted]
         return self.basis[self.size : self.size + self.width].T @ (self.coupling @ last).to(self.basis)
 
 
 def _mixed(start: Tensor, random: Tensor, noise: float) -> Tensor:
-    """The normalised sum of the start vectors' directions, with so much of the random vector."""
+    """The normalised sum of the start vectors' directions, plus `noise` times the direction of the random vector."""
     total = unit_columns(start.reshape(random.numel(), -1).to(random)).sum(dim=1)
     return total / norm(total) + noise * random / norm(random)
 
 
 def _beyond(n: int, steps: int, spread: float, share: float) -> float:
-    """How far outside the Ritz values the spectrum may reach, with probability 0.99 over a random start.
+    """Distance that the spectrum can reach beyond the Ritz values, with probability 0.99 over the random start.
 
-    Kuczynski and Wozniakowski (1992), Theorem 4.2: after m steps the end is missed by more than the share eps of the
-    spectrum's width with probability at most 1.648 sqrt(n) exp(-sqrt(eps) (2 m - 1)).  Beside a random vector of this share of
-    the start's length a given one costs a factor of 1 / share: it lengthens the start, and the end's component of the sum is
-    no likelier to be small than that of the random vector alone, whose density is symmetric and falls from 0 on.
+    Kuczynski and Wozniakowski (1992), Theorem 4.2: after m steps the probability that an end is missed by more than the share
+    eps of the spectrum's width is at most 1.648 sqrt(n) exp(-sqrt(eps) (2 m - 1)).  With a warm start only this `share` of the
+    start's length is random, which multiplies the probability by at most 1 / share: the start is longer, and its component
+    along the end is no likelier to be small than that of the random part, whose density is symmetric with its maximum at 0.
     """
     if steps >= n:
         return 0.0

@@ -2,9 +2,8 @@
 
     H Q = Q T + r e_m^T      Q (n, m) orthonormal, T tridiagonal, r orthogonal to Q
 
-Vectors are in the operator's dtype, T in float64.  Every new vector is orthogonalised twice against all the earlier
-ones: the first pass leaves components of the size of its own round-off, the second removes them and corrects the
-entries of T ("twice is enough", Kahan and Parlett).  Rows of the workspaces are vectors, so that each is contiguous.
+Vectors have the operator's dtype, T is float64.  Every new vector is orthogonalised twice against all earlier ones
+(`linalg.orthogonalise`).  Vectors are rows of the workspaces, so that each is contiguous.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +21,7 @@ from landscape.results import Progress
 
 @dataclass(frozen=True, eq=False)
 class LanczosFactorization:
-    """H Q = Q T + r e_m^T, m the steps made: fewer than asked for where Q spans an invariant subspace (r = 0) or was enough."""
+    """H Q = Q T + r e_m^T after m steps: fewer than asked for if Q spans an invariant subspace (r = 0) or `enough` ended it."""
 
     Q: Float[Tensor, "n m"]
     T: Float64[Tensor, "m m"]
@@ -37,11 +36,11 @@ def lanczos(
     scale: float = 0.0,
     enough: Callable[[Sequence[tuple[Float64[Tensor, "m m"], float]]], bool] | None = None,
 ) -> list[LanczosFactorization]:
-    """One factorisation per column of starts, run in lock-step so that the operator sees blocks of k vectors.
+    """One factorisation for each column of starts, all one step at a time, so that H is applied to blocks of k vectors.
 
-    Memory: k * steps vectors.  starts: not zero, of any length.  A recurrence ends early where its remainder is round-off.
-    scale: |H|, where starts do not show it (because they were projected off the largest eigenvectors, say): round-off is
-    then relative to it.  enough: is given (T, |r|) of every run after each step; once it returns True, all end.
+    Memory: k * steps vectors.  starts: not zero, of any length.  A recurrence ends early where its remainder is only round-off
+    relative to |H|.  scale: |H| where the starts do not show it, for example if the largest eigenvectors were projected out.
+    enough: called with (T, |r|) of every recurrence after each step; all end when it returns True.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> A = DenseOperator(torch.diag(torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)))

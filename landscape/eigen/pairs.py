@@ -1,22 +1,21 @@
-"""Eigenpairs of one end of a spectrum, and of both, with residuals that bound their errors."""
+"""Results: eigenpairs of one end of a spectrum, and of both ends, with residuals that bound their errors."""
 
 from dataclasses import dataclass
 
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from landscape.results import Number, StopReason, finite_or_none
+from landscape.results import Number, StopReason, finite_or_none, plain
 
 
 @dataclass(frozen=True, eq=False)
 class Eigenpairs:
     """k eigenpairs of one end of the spectrum, the outermost first.
 
-    vectors: columns of unit length; of Lanczos with their largest entries positive.
-    residuals: |H v - lambda v|.  Where the recurrence's own estimate of it plus a margin for the matvec's noise meets the goal,
-        this sum (`krylov`); else measured by a last application of the operator.
-    vector_errors: residual over the distance to the nearest other approximate eigenvalue, about the sine of the angle
-        between v and the true eigenvector; infinite where that distance is not known.
+    vectors: columns of unit length.  Lanczos makes their largest entries positive.
+    residuals: |H v - lambda v|, from the recurrence plus a margin for noise, or from further products (`krylov`).
+    vector_errors: residual over the distance to the nearest other approximate eigenvalue, about the sine of the angle between v
+        and the true eigenvector; infinite where that distance is not known.
     reason: why the search for this end stopped.
     """
 
@@ -30,16 +29,14 @@ class Eigenpairs:
         return self.values.numel()
 
     def interval(self, index: int = 0) -> tuple[float, float]:
-        """[value - residual, value + residual] of the pair at this index: an eigenvalue of H lies in it."""
+        """[value - residual, value + residual] of the pair at this index.  It contains an eigenvalue of H."""
         value, residual = float(self.values[index]), float(self.residuals[index])
         return value - residual, value + residual
 
     def record(self, index: int = 0) -> dict[str, Number | str]:
-        return {
-            "value": finite_or_none(float(self.values[index])),
-            "residual": finite_or_none(float(self.residuals[index])),
-            "vector_error": finite_or_none(float(self.vector_errors[index])),
-            "reason": self.reason,
+        columns = {"value": self.values, "residual": self.residuals, "vector_error": self.vector_errors}
+        return {name: finite_or_none(float(column[index])) for name, column in columns.items()} | {
+            "reason": self.reason
         }
 
 
@@ -48,13 +45,13 @@ class EigenEnds:
     """Both ends of the spectrum.
 
     largest, smallest: by signed value; an end that was not asked for has no pairs.
-    method: "lanczos" or "power iteration".  matvecs: products that both ends took together.
-    beyond: with the probability 0.99 over the random start, no eigenvalue lies farther than this outside
-        [smallest[0], largest[0]] (a worst-case bound over all spectra, far from sharp; infinite where there is none).
-    noise: the length of the error (round-off and any other) of one matvec of a unit vector: measured where a residual asked for
-        was near it; else estimated from how far products are from symmetric; nan where neither was possible.
-    ritz: all approximate eigenvalues of the last basis, ascending, and below them estimates of their residuals; None where
-        the method has no basis.
+    method: "lanczos" or "power iteration".  matvecs: products used for both ends together.
+    beyond: no eigenvalue lies farther than this outside [smallest[0], largest[0]], with probability 0.99 over the random start.
+        A worst-case bound over all spectra, far from sharp; infinite where there is none.
+    noise: length of the error (round-off or other) of H v for a unit vector v: measured by a product if a residual came near
+        it, else estimated from the asymmetry of products, else nan.
+    ritz: first row: all approximate eigenvalues of the last basis, ascending; second row: estimates of their residuals.  None
+        for a method without a basis.
     """
 
     largest: Eigenpairs
@@ -66,11 +63,6 @@ class EigenEnds:
     ritz: Float64[Tensor, "2 m"] | None = None
 
     def record(self) -> dict[str, object]:
-        return {
-            "max": [self.largest.record(i) for i in range(len(self.largest))],
-            "min": [self.smallest.record(i) for i in range(len(self.smallest))],
-            "method": self.method,
-            "matvecs": self.matvecs,
-            "beyond": finite_or_none(self.beyond),
-            "noise": finite_or_none(self.noise),
-        }
+        ends = {"max": self.largest, "min": self.smallest}
+        pairs: dict[str, object] = {name: [end.record(i) for i in range(len(end))] for name, end in ends.items()}
+        return pairs | plain(self, "method matvecs beyond noise")

@@ -1,9 +1,9 @@
-"""Power iteration and its shifted form: how StableGS takes both ends of the spectrum (the ratio of Eq. (3)).
+"""Power iteration and its shifted form, by which StableGS computes both ends of the spectrum (the ratio of Eq. (3)).
 
     v <- (H - shift) v / |(H - shift) v|
 
-converges to the eigenvalue farthest from the shift, each step reducing the other components by the ratio of their
-distances to it.  `landscape.eigen.eigen` needs far fewer products; this is the baseline, with residuals beside it.
+converges to an eigenvector of the eigenvalue farthest from the shift.  Each step reduces every other component by the ratio of
+the two distances to the shift.  This is a baseline: `landscape.eigen.eigen` needs far fewer products.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from landscape.results import Progress, StopReason
 class PowerSettings:
     """Power iteration stops at a residual |H v - lambda v| of max(rtol |lambda|, atol), or when its budget is spent.
 
-    max_matvecs, max_seconds: for one end; `power_ends` may spend them twice.
+    max_matvecs, max_seconds: for one end; `power_ends` can spend them twice.
     """
 
     rtol: float = 1e-3
@@ -47,11 +47,10 @@ def power_iteration(
     shift: float = 0.0,
     progress: Progress | None = None,
 ) -> tuple[Eigenpairs, int]:
-    """The eigenpair of H whose eigenvalue is farthest from shift, and the matvecs it took.
+    """The eigenpair of H whose eigenvalue is farthest from shift, and the matvecs used, from a Gaussian start.
 
-    v <- (H - shift) v / |(H - shift) v|, from a Gaussian start.  With shift = 0 this is the eigenvalue of largest
-    magnitude, of either sign; with that eigenvalue as the shift it is the other end of the spectrum.  rtol is relative to the
-    eigenvalue of H, not of H - shift.
+    With shift = 0 it is the eigenvalue of largest magnitude, of either sign; with that eigenvalue as shift it is the other end
+    of the spectrum.  rtol is relative to the eigenvalue of H, not of H - shift.
     """
     v = draw_probes(operator.dim, 1, generator, operator.dtype)[:, 0]
     deadline, epsilon = monotonic() + settings.max_seconds, torch.finfo(operator.dtype).eps
@@ -90,10 +89,9 @@ def power_ends(
     settings: PowerSettings = PowerSettings(),
     progress: Progress | None = None,
 ) -> EigenEnds:
-    """Both ends of the spectrum as StableGS takes them: power iteration, then power iteration on H - lambda I.
+    """Both ends of the spectrum as StableGS computes them: power iteration on H, then on H - lambda I.
 
-    The first run finds the eigenvalue of largest magnitude, which is lambda_max or, where the negative end is longer,
-    lambda_min; the run shifted by it finds the other end.
+    The first run finds the eigenvalue lambda of largest magnitude: lambda_max, or lambda_min if the negative end is longer.
     """
     first, steps = power_iteration(operator, generator, settings, progress=progress)
     other, more = power_iteration(operator, generator, settings, shift=float(first.values), progress=progress)

@@ -1,8 +1,8 @@
-"""Which eigenpairs are looked for, and what a subspace knows of them.
+"""Settings of the search for eigenpairs, and the Ritz pairs of a subspace.
 
-With an orthonormal Q and T = Q^T H Q, T y = lambda y gives the Ritz pair (lambda, v = Q y) with the residual r = H v -
-lambda v: an eigenvalue lies within |r| of lambda.  A pair is wanted if it is one of those asked for at either end, and open
-as long as its |r| is above what was asked for.  How Q grows is left to `krylov`.
+With an orthonormal Q and T = Q^T H Q, an eigenpair T y = lambda y gives the Ritz pair (lambda, v = Q y) with the residual
+r = H v - lambda v; an eigenvalue of H lies within |r| of lambda.  Pairs are `wanted` if they were asked for at either end, and
+`open` while |r| is above its goal.  `krylov` grows Q.
 """
 
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from landscape.errors import InputError
 from landscape.linalg import norm
 from landscape.operators.operator import SymmetricOperator, product
 
-NEAR = 30.0  # of a product's noise, from which on a residual is near it
-NEAREST = 3e-4  # of the largest value: root of the eps of float32, which rounding stays below in either precision
+NEAR = 30.0  # a residual below this multiple of the noise of a product is near it ...
+NEAREST = 3e-4  # ... if it is also below this share of the largest value: sqrt(eps) of float32
 CHUNK = 1 << 16  # entries of vectors that are combined at a time
 
 
@@ -25,17 +25,15 @@ CHUNK = 1 << 16  # entries of vectors that are combined at a time
 class EigenSettings:
     """How many pairs at each end, to which residual, with how much memory and work.
 
-    largest, smallest: pairs of the largest and of the smallest (signed) eigenvalues.
-    rtol, atol: a pair is good enough when its residual |H v - lambda v| is max(rtol |lambda|, atol) or less.
-    basis: vectors kept at a time, `block` more in work (the memory budget): at least largest + smallest + 3 block.
-    block: vectors per application of the operator; more than one helps with multiple eigenvalues and where the operator is
-        cheaper per vector in blocks.
-    noise: length of a random vector added to a given start of unit length, so that an end that the start misses is still
-        found.  The shorter, the fewer products from a good start, and the likelier to take the neighbour of an end for it,
-        where they are about rtol apart: with rtol = 1% and two lowest eigenvalues 1.5% apart in 40% of the runs at 1, in 85%
-        at 0.3, in 2% from a random start.  With a start of several directions (`splat.curvature.block_eigenvectors.LEADS`) it
-        makes no difference.
-    max_matvecs, max_seconds: budgets of both ends together; a step under way at the end of the time is finished.
+    largest, smallest: numbers of pairs of the largest and of the smallest (signed) eigenvalues.
+    rtol, atol: a pair is done when its residual |H v - lambda v| is at most max(rtol |lambda|, atol).
+    basis: memory budget in vectors, with `block` more in work: at least largest + smallest + 3 block.
+    block: vectors in one application of the operator.  More than one helps with multiple eigenvalues, and where products with
+        several vectors are cheaper per vector.
+    noise: length of the random vector that is added to a warm start of unit length, so that an end to which the start is
+        orthogonal is found.  A short one saves products from a good start, but the run can miss an extreme eigenvector that the
+        start has no component in, and report a neighbour about rtol away.  A start of several directions avoids that.
+    max_matvecs, max_seconds: budgets of both ends together; a step that has begun when the time ends is completed.
     """
 
     largest: int = 1
@@ -71,7 +69,7 @@ class EigenSettings:
 
 @dataclass(frozen=True)
 class Goal:
-    """The largest residual that is good enough: rtol |lambda|, or floor where that is more."""
+    """The goal for residuals: max(rtol |lambda|, floor)."""
 
     rtol: float
     floor: float
@@ -82,7 +80,7 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class Ritz:
-    """Ritz values (ascending), their vectors' coordinates in the basis (columns), |residuals|, and the wanted ones' indices."""
+    """Ritz values (ascending), coordinates of their vectors in the basis (columns), |r|, and the indices of wanted pairs."""
 
     values: Float64[Tensor, " m"]
     coordinates: Float64[Tensor, "m m"]
@@ -95,22 +93,22 @@ class Ritz:
         return self.largest + self.smallest
 
     def open(self, goal: Goal) -> list[int]:
-        """Indices of the wanted pairs whose residuals are above the goal."""
+        """Indices of the wanted pairs with residuals above the goal."""
         asked = goal.of(self.values)
         return [i for i in self.wanted if not self.residuals[i] <= asked[i]]
 
     def moved(self, before: Float64[Tensor, " k"] | None, goal: Goal) -> bool:
-        """Whether a wanted value differs from its value before by more than the goal; True where there was none before."""
+        """Whether a wanted value has changed by more than the goal; True where there was none before."""
         values = self.values[self.wanted]
         return before is None or not ((values - before).abs() <= goal.of(values)).all()
 
     def near(self, noise: float, goal: Goal) -> bool:
-        """Whether an open pair's residual is so small that this noise of a product may be all that is left of it."""
+        """Whether the residual of an open pair is so small that it may be only the noise of a product."""
         limit = min(NEAR * noise, NEAREST * float(self.values.abs().max()))
         return any(float(self.residuals[i]) < limit for i in self.open(goal))
 
     def gaps(self) -> Float64[Tensor, " k"]:
-        """Distance of each wanted value to the nearest other one."""
+        """Distance from each wanted value to the nearest other one."""
         steps = torch.diff(self.values, prepend=torch.tensor([-inf]), append=torch.tensor([inf]))
         return torch.minimum(steps[:-1], steps[1:])[self.wanted]
 
@@ -124,7 +122,7 @@ class Ritz:
 
 
 def recombine(rows: Float[Tensor, "m n"], combination: Float64[Tensor, "kept size"]) -> None:
-    """The first rows become these combinations of the first `size`, in place."""
+    """Replace the first `kept` rows by combination @ (the first `size` rows), in place."""
     C = combination.to(rows)
     for first in range(0, rows.shape[1], CHUNK):
         columns = slice(first, first + CHUNK)
@@ -134,7 +132,7 @@ def recombine(rows: Float[Tensor, "m n"], combination: Float64[Tensor, "kept siz
 def rayleigh(
     operator: SymmetricOperator, vectors: Float[Tensor, "n k"]
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-    """Rayleigh quotients and residuals of k vectors that are near to unit length, added up in float64."""
+    """Rayleigh quotients and residuals of k vectors of about unit length, in float64."""
     values, residuals = [], []
     for v, w in zip(vectors.T, product(operator, vectors.contiguous()).T, strict=True):
         length = norm(v)
@@ -145,6 +143,6 @@ def rayleigh(
 
 
 def turned(vectors: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """The columns with their largest entries positive, so that slices along them look alike from run to run."""
+    """The columns with their signs changed so that their largest entries are positive, for slices that look alike."""
     peaks = vectors.gather(0, vectors.abs().argmax(dim=0, keepdim=True))
     return torch.where(peaks < 0, -vectors, vectors)

@@ -1,15 +1,20 @@
-"""Is it the Hessian?  Cheap measurements on an operator before anything is concluded from it.
+"""Checks that an operator is the Hessian of an objective, for a few products and evaluations.
 
-symmetry    of G = Z^T H Z for Gaussian Z (n, m): rms |G - G^T| off the diagonal over rms |H z|.  In expectation
+symmetry    rms |G - G^T| off the diagonal over rms |H z|, with G = Z^T H Z for Gaussian Z (n, m).  Its expectation is
             |H - H^T|_F / |H|_F, because E (u . A v)^2 = |A|_F^2 and E |H z|^2 = |H|_F^2
-noise       |H (a z) / a - H z| / |H z| with a = 1/3: what rounding differently does to one matvec
-gradient    |H v - (g(theta + h v) - g(theta - h v)) / (2 h)| / |H v|, at the best of several steps h
-objective   |v.H v - (L(theta + h v) - 2 L(theta) + L(theta - h v)) / h^2| / |v.H v|, likewise
+noise       |H (a z) / a - H z| / |H z| with a = 1/3: the change of a product when its input is rounded differently
+gradient    |H v - (g(theta + h v) - g(theta - h v)) / (2 h)| / |H v| with the gradient g, at the best of several steps h
+objective   |v.H v - (L(theta + h v) - 2 L(theta) + L(theta - h v)) / h^2| / |v.H v| with the loss L, likewise
+
+A step h is useful only where the objective is smooth from theta - h v to theta + h v.  `smooth_piece(theta)`, if given, returns
+a label of the smooth piece that contains theta (for a scene: the order of the splats and the set of visible ones); steps whose
+ends have another label than theta are skipped.
 """
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, isnan, nan
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -18,18 +23,18 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
 from landscape.probes import draw_probes
-from landscape.results import Number, finite_or_none
+from landscape.results import plain
 
 SCALE = 1 / 3  # not a power of two, so that the scaled vector rounds differently
-ROUND_OFFS = 1e4  # of a sum of up to 1e8 rounded terms, whose errors add up as a random walk
+ROUND_OFFS = 1e4  # units of round-off in a sum of 1e8 rounded terms, whose errors add up like a random walk: sqrt(1e8)
 
 
 @dataclass(frozen=True)
 class OperatorCheck:
-    """Measured asymmetry and round-off of an operator, relative to |H z| of a random vector z.
+    """Asymmetry and round-off of an operator, relative to |H z| of a random vector z.
 
-    symmetry, noise: see the top of this module; nan where a product was not finite.  tolerance: what either may be.
-    matvecs: products it took.
+    symmetry, noise: see the top of this module; nan where a product was not finite.  tolerance: the largest value of either
+    that passes.  matvecs: products used.
     """
 
     symmetry: float
@@ -42,24 +47,16 @@ class OperatorCheck:
     def passed(self) -> bool:
         return self.finite and self.symmetry <= self.tolerance and self.noise <= self.tolerance
 
-    def record(self) -> dict[str, Number | bool | int]:
-        return {
-            "symmetry": finite_or_none(self.symmetry),
-            "noise": finite_or_none(self.noise),
-            "finite": self.finite,
-            "tolerance": self.tolerance,
-            "passed": self.passed,
-            "matvecs": self.matvecs,
-        }
+    def record(self) -> dict[str, Any]:
+        return plain(self, "symmetry noise finite tolerance passed matvecs")
 
 
 @dataclass(frozen=True)
 class DerivativeCheck:
-    """Relative error of the operator against finite differences.
+    """Relative error of an operator against finite differences.
 
-    steps, errors: those that were tried, and their relative errors; error, step: the least of these errors and its step, both
-    nan where no step was tried.  skipped: how many steps were left out because the signature changed along them (a sort or a
-    threshold was crossed), so that they prove nothing.
+    steps, errors: the steps that were tried, with their relative errors.  error, step: the smallest of these errors and its
+    step; both nan where no step was tried.  skipped: number of steps that end on another smooth piece, and so say nothing.
     """
 
     error: float
@@ -68,14 +65,8 @@ class DerivativeCheck:
     errors: tuple[float, ...]
     skipped: int
 
-    def record(self) -> dict[str, Number | int | list[Number]]:
-        return {
-            "error": finite_or_none(self.error),
-            "step": finite_or_none(self.step),
-            "steps": [finite_or_none(step) for step in self.steps],
-            "errors": [finite_or_none(error) for error in self.errors],
-            "skipped": self.skipped,
-        }
+    def record(self) -> dict[str, Any]:
+        return plain(self, "error step steps errors skipped")
 
 
 def check_operator(
@@ -83,8 +74,8 @@ def check_operator(
 ) -> OperatorCheck:
     """Symmetry, round-off and finiteness of products, from vectors + 1 matvecs.
 
-    vectors: random ones that are compared pair by pair, at least 2.  tolerance: of asymmetry and round-off, relative to |H z|;
-    1e4 units of round-off (eps) of the operator's dtype where None.  A check that fails raises nothing: see `passed`.
+    vectors: number of random vectors (2 or more), compared pair by pair.  tolerance: the largest asymmetry and round-off that
+    pass, relative to |H z|; 1e4 eps of the operator's dtype where None.  A failed check raises nothing: see `passed`.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> H = DenseOperator(torch.eye(5, dtype=torch.float64))
@@ -116,14 +107,20 @@ def check_gradient(
     center: Float[Tensor, " n"],
     direction: Float[Tensor, " n"],
     steps: Sequence[float] = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6),
-    signature: Callable[[Tensor], Hashable] | None = None,
+    smooth_piece: Callable[[Tensor], Hashable] | None = None,
     enough: float = 0.0,
 ) -> DerivativeCheck:
     """H v against the central difference of the gradient along v = direction.
 
-    gradient(theta) -> (n,), of the objective at any theta; center: where H is taken.  steps: multiples of direction, all above
-    0.  signature(theta): which smooth piece of the objective theta lies in; steps that leave the centre's are skipped.
-    enough: no further step is tried once a relative error is this small; 0 tries all, unless one is exact.
+    gradient(theta) -> (n,): the objective's gradient at any theta.  center: the point of H.  steps: multiples of direction,
+    positive.  smooth_piece: see the top of this module.  enough: once a relative error is this small, no further step is
+    tried; with 0 all steps are tried, unless one is exact.
+
+    >>> from landscape.operators.operator import DenseOperator
+    >>> theta, v = torch.tensor([1.0, 2.0]).double(), torch.tensor([0.6, 0.8]).double()
+    >>> H = DenseOperator(torch.diag(12 * theta**2))  # of L = sum theta^4, whose gradient is 4 theta^3
+    >>> check_gradient(H, lambda x: 4 * x**3, theta, v).error < 1e-9
+    True
     """
     product = operator.apply(direction.to(operator.dtype)[:, None])[:, 0].double()
 
@@ -131,7 +128,7 @@ def check_gradient(
         ahead, behind = (gradient(_moved(center, direction, sign * step)).double() for sign in (1, -1))
         return float(((ahead - behind) / (2 * step) - product).norm())
 
-    return _best_step(discrepancy, float(product.norm()), center, direction, steps, signature, enough)
+    return _best_step(discrepancy, float(product.norm()), center, direction, steps, smooth_piece, enough)
 
 
 def check_objective(
@@ -140,9 +137,18 @@ def check_objective(
     center: Float[Tensor, " n"],
     direction: Float[Tensor, " n"],
     steps: Sequence[float] = (1e-1, 1e-2, 1e-3, 1e-4),
-    signature: Callable[[Tensor], Hashable] | None = None,
+    smooth_piece: Callable[[Tensor], Hashable] | None = None,
 ) -> DerivativeCheck:
-    """v . H v against the second difference of loss(theta) along v = direction; the rest as for `check_gradient`."""
+    """v . H v against the second difference of loss(theta) along v = direction.  Other arguments: see `check_gradient`.
+
+    >>> from landscape.operators.operator import DenseOperator
+    >>> theta, v = torch.tensor([1.0, 2.0]).double(), torch.tensor([0.6, 0.8]).double()
+    >>> H, twice = (DenseOperator(factor * torch.diag(12 * theta**2)) for factor in (1, 2))  # of L = sum theta^4, and of 2 L
+    >>> check_objective(H, lambda x: (x**4).sum(), theta, v).error < 1e-6
+    True
+    >>> round(check_objective(twice, lambda x: (x**4).sum(), theta, v).error, 3)
+    0.5
+    """
     v = direction.to(operator.dtype)
     curvature = float(torch.dot(v.double(), operator.apply(v[:, None])[:, 0].double()))
     middle = float(loss(center))
@@ -151,7 +157,7 @@ def check_objective(
         ahead, behind = (float(loss(_moved(center, direction, sign * step))) for sign in (1, -1))
         return abs((ahead - 2 * middle + behind) / step**2 - curvature)
 
-    return _best_step(discrepancy, abs(curvature), center, direction, steps, signature)
+    return _best_step(discrepancy, abs(curvature), center, direction, steps, smooth_piece)
 
 
 def _moved(center: Tensor, direction: Tensor, step: float) -> Tensor:
@@ -164,24 +170,24 @@ def _best_step(
     center: Tensor,
     direction: Tensor,
     steps: Sequence[float],
-    signature: Callable[[Tensor], Hashable] | None,
+    smooth_piece: Callable[[Tensor], Hashable] | None,
     enough: float = 0.0,
 ) -> DerivativeCheck:
-    """The smallest relative discrepancy: large steps see the next derivative, small ones round-off."""
+    """The step with the smallest relative discrepancy.  Truncation spoils large steps, round-off small ones."""
     if not steps or min(steps) <= 0:
         raise InputError(f"expected positive steps, got {tuple(steps)}")
-    here = signature(center) if signature else None
+    here = smooth_piece(center) if smooth_piece else None
     kept, errors, skipped = [], [], 0
     for step in steps:
         if errors and min(errors) <= enough:
             break
-        if signature and any(signature(_moved(center, direction, sign * step)) != here for sign in (1, -1)):
+        if smooth_piece and any(smooth_piece(_moved(center, direction, sign * step)) != here for sign in (1, -1)):
             skipped += 1
             continue
         difference = discrepancy(step)
         kept.append(step)
         error = difference / size if size else (inf if difference else 0.0)
-        errors.append(inf if isnan(error) else error)  # beyond where the objective is finite
+        errors.append(inf if isnan(error) else error)  # the objective is not finite there
     best = min(range(len(kept)), key=errors.__getitem__, default=None)
     error, step = (nan, nan) if best is None else (errors[best], kept[best])
     return DerivativeCheck(error, step, tuple(kept), tuple(errors), skipped)

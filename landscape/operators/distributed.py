@@ -1,4 +1,4 @@
-"""Operators whose terms are spread over processes: H V = sum_r H_r V, H_r the terms of rank r, added by an all-reduce.
+"""Sums of operators over processes: H V = sum_r H_r V, where rank r has the terms H_r and an all-reduce adds the products.
 
     torchrun --nproc-per-node 2 study.py                     # in it, on every rank alike:
     torch.distributed.init_process_group("gloo")             # "nccl" for ranks with a GPU each, made current before
@@ -6,10 +6,10 @@
     H = DistributedOperator(SumOperator([term_of(view) for view in ranks.share(views)]), ranks)
     estimate_traces(H, torch.Generator().manual_seed(0))     # the same numbers on every rank
 
-Every rank runs the same estimator with the same seed.  An all-reduce hands the same bits to all, so all take the same steps;
-the numbers are those of one process but for the order of the sum.  What clocks decide may differ between ranks, so time
-budgets have to stay infinite.  Before a product the ranks compare a checksum of their vectors: where they parted, all raise.
-Where a process fails the others do not wait for it: what they exchange next raises ConnectionError.
+Every rank runs the same estimator with the same seed.  An all-reduce gives the same bits to all ranks, so all take the same
+steps.  The numbers are those of one process up to the order of the sum.  Time budgets must stay infinite, because clocks differ
+between ranks.  Before each product the ranks compare a checksum of their vectors; all raise an error where these differ.  When
+a process fails, the next exchange of every other process raises ConnectionError.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,34 +31,32 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Ranks:
-    """The processes of a group, seen from the one of number `rank` (from 0) out of `size`.
+    """The `size` processes of torch's default group, seen from the process of number `rank` (from 0).
 
-    Every method but `share` is collective: all processes have to call it, in the same order.  group: all processes where None.
-    device: where tensors are exchanged; they come back to the device that they were on.  A single rank exchanges nothing and
-    needs no group: `ALONE`.
+    Every method except `share` is collective: all processes have to call it, in the same order.  device: where tensors are
+    exchanged; results return to the device of the argument.  A single rank exchanges nothing and needs no group: `ALONE`.
     """
 
     rank: int
     size: int
-    group: dist.ProcessGroup | None = None
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
     @classmethod
-    def joined(cls, group: dist.ProcessGroup | None = None) -> "Ranks":
-        """The group that this process has joined (all processes where None).  ValueError where none is initialised."""
+    def joined(cls) -> "Ranks":
+        """The default group, which this process has joined.  Raises InputError where none is initialised."""
         if not (dist.is_available() and dist.is_initialized()):
             raise InputError(
                 "expected an initialised process group, got none; start with torchrun and call "
                 'torch.distributed.init_process_group("gloo") first ("nccl" on GPUs)'
             )
-        on_gpu = dist.get_backend(group) == "nccl"  # which moves nothing but what lies on a GPU
+        on_gpu = dist.get_backend() == "nccl"  # exchanges tensors on GPUs only
         device = torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
-        return cls(dist.get_rank(group), dist.get_world_size(group), group, device)
+        return cls(dist.get_rank(), dist.get_world_size(), device)
 
     def share(self, items: Sequence[Item], name: str = "item") -> Sequence[Item]:
-        """This rank's items: a contiguous part, so that all parts one after the other are the items in order.
+        """This rank's part of the items.  The parts of all ranks, one after the other, are the items in order.
 
-        ValueError where there are fewer items than ranks, which calls them by their name.
+        Raises InputError where there are fewer items than ranks.  name: what the message calls an item.
 
         >>> Ranks(0, 2).share("abcde"), Ranks(1, 2).share("abcde")
         ('ab', 'cde')
@@ -70,24 +68,24 @@ class Ranks:
         return items[self.rank * len(items) // self.size : (self.rank + 1) * len(items) // self.size]
 
     def sum(self, x: Shaped[Tensor, "..."]) -> Shaped[Tensor, "..."]:
-        """The sum of x over ranks, the same bits on each."""
+        """The sum of x over ranks, with the same bits on each."""
         return self._reduced(x, dist.ReduceOp.SUM)
 
     def any(self, mask: Bool[Tensor, "..."]) -> Bool[Tensor, "..."]:
-        """Where the mask of at least one rank is set."""
+        """True where the mask of at least one rank is."""
         return self._reduced(mask.to(torch.uint8), dist.ReduceOp.MAX).bool()
 
     def gather(self, x: Shaped[Tensor, "..."]) -> list[Shaped[Tensor, "..."]]:
-        """x of every rank, in their order; x has to have the same shape and dtype on all."""
+        """x of every rank, in the order of ranks.  Its shape and dtype must be the same on all."""
         if self.size == 1:
             return [x]
         parts = [torch.empty_like(x, device=self.device) for _ in range(self.size)]
         with _exchange():
-            dist.all_gather(parts, x.to(self.device).contiguous(), group=self.group)
+            dist.all_gather(parts, x.to(self.device).contiguous())
         return [part.to(x.device) for part in parts]
 
     def require_same(self, name: str, value: object) -> None:
-        """Raise ValueError on all ranks unless the value's text is the same on each."""
+        """Raise InputError on all ranks unless str(value) is the same on each."""
         if self.size == 1:
             return
         digest = int.from_bytes(blake2b(str(value).encode(), digest_size=8).digest(), "little", signed=True)
@@ -95,11 +93,11 @@ class Ranks:
             raise InputError(f"expected the same {name} on every rank, got {value} on rank {self.rank} of {self.size}")
 
     def require_same_vectors(self, V: Float[Tensor, "n k"]) -> None:
-        """Raise ValueError on all ranks unless they have as many vectors, with the same sum of all entries' bit patterns."""
+        """Raise InputError on all ranks unless they have equally many vectors, with equal sums of the entries' bit patterns."""
         if self.size == 1:
             return
         bits = {2: torch.int16, 4: torch.int32, 8: torch.int64}[V.element_size()]
-        fingerprint = int(V.contiguous().view(bits).sum(dtype=torch.int64))  # exact, in whatever order it is added up
+        fingerprint = int(V.contiguous().view(bits).sum(dtype=torch.int64))  # integers: exact in any order of addition
         if not self._agree(V.shape[1], fingerprint):
             raise InputError(
                 f"expected the same vectors on every rank, got others on some (here {V.shape[1]}); seed the generators "
@@ -107,7 +105,10 @@ class Ranks:
             )
 
     def _agree(self, *numbers: int) -> bool:
-        """Whether these integers are the same on all ranks: the least of them and of their complements then match."""
+        """Whether these integers are the same on all ranks.
+
+        The complement ~x falls as x rises, so the minimum over ranks of ~x is ~(maximum of x): equal iff minimum = maximum.
+        """
         mine = torch.tensor([*numbers, *(~number for number in numbers)])
         least = self._reduced(mine, dist.ReduceOp.MIN)
         return torch.equal(least[: len(numbers)], ~least[len(numbers) :])
@@ -117,16 +118,16 @@ class Ranks:
             return x
         total = x.to(self.device, copy=True).contiguous()
         with _exchange():
-            dist.all_reduce(total, operation, group=self.group)
+            dist.all_reduce(total, operation)
         return total.to(x.device)
 
 
-ALONE = Ranks(0, 1)  # a process that shares nothing
+ALONE = Ranks(0, 1)  # a single process
 
 
 @contextmanager
 def _exchange() -> Iterator[None]:
-    """The back end's own error, in a sentence that leads to the process that failed first."""
+    """Turn an error of the back end into a ConnectionError that points to the process that failed first."""
     try:
         yield
     except RuntimeError as error:
@@ -137,9 +138,9 @@ def _exchange() -> Iterator[None]:
 
 @contextmanager
 def torchrun_ranks(device: torch.device) -> Iterator[Ranks | None]:
-    """The processes that torchrun started with this one, joined for as long as the block runs; None without torchrun.
+    """Join the processes that torchrun started, for the duration of a with block; yield None without torchrun.
 
-    device: this process's own; what the ranks exchange goes from GPU to GPU by NCCL, and by gloo between CPUs.
+    device: the device of this process.  Ranks exchange tensors by NCCL between GPUs, and by gloo between CPUs.
     """
     if not dist.is_available() or not dist.is_torchelastic_launched():
         yield None
@@ -156,9 +157,17 @@ def torchrun_ranks(device: torch.device) -> Iterator[Ranks | None]:
 
 
 class DistributedOperator:
-    """sum_r H_r over ranks; `local` is this rank's H_r.  Collective: every rank has to apply it to the same vectors.
+    """sum_r H_r over ranks, with this rank's H_r as `local`.  Collective: every rank has to apply it to the same vectors.
 
-    Raises ValueError on all ranks where they disagree on rows, dtype or blocks, and on the vectors of a product.
+    Raises InputError on all ranks where they differ in rows, dtype or blocks, or in the vectors of a product.
+
+    >>> from landscape.operators.operator import DenseOperator, SumOperator
+    >>> ranks = ALONE  # under torchrun: Ranks.joined(); the sum is the same for any number of processes
+    >>> terms = [torch.diag(torch.tensor([1.0, 2.0])), torch.tensor([[0.0, 4.0], [4.0, 0.0]]), 3 * torch.eye(2)]
+    >>> H = DistributedOperator(SumOperator([DenseOperator(term) for term in ranks.share(terms)]), ranks)
+    >>> H.apply(torch.eye(2))
+    tensor([[4., 4.],
+            [4., 5.]])
     """
 
     def __init__(self, local: SymmetricOperator, ranks: Ranks) -> None:

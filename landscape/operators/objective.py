@@ -1,9 +1,8 @@
-"""The Hessian of any plain torch objective, by differentiating its gradient once more (Pearlmutter 1994).
+"""The Hessian of any torch objective L(theta), as derivative of the gradient (Pearlmutter 1994).
 
     H v = d/dtheta (g(theta) . v),   g = dL/dtheta
 
-The objective is a function of one flat vector.  Its graph is built once and kept; each product is one backward pass
-through it.
+theta is one flat vector.  The graph of g is built once and kept; a product with one vector is one backward pass through it.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,11 +18,11 @@ from landscape.operators.operator import require_blocks, require_vectors
 class ObjectiveHessian:
     """The Hessian of loss(theta) at `point`, in the dtype of point.
 
-    loss: from the flat vector theta (n,) to a tensor of one finite number, by torch operations alone.  point: (n,); it is
-    copied.  blocks: named ranges of its rows; one of all, "all", where None.  value: the loss there.
+    loss: from a flat vector (n,) to a tensor of one finite number, by torch operations alone.  point: (n,), copied.  blocks:
+    named ranges of rows; None: one block of all rows, "all".  value: the loss at the point.
 
-    A loss that torch does not trace back to the point raises ValueError: it would look flat.  One that is linear in the
-    point, or piecewise so (as is an l1 norm), has the Hessian 0.
+    Raises InputError for a loss that torch cannot trace back to the point; its Hessian would wrongly be 0.  A loss that is
+    linear in theta, or piecewise linear like an l1 norm, has the Hessian 0.
 
     >>> def rosenbrock(x):
     ...     return (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2
@@ -51,12 +50,12 @@ class ObjectiveHessian:
 
     @property
     def gradient(self) -> Float[Tensor, " n"]:
-        """dL/dtheta at the point, (n,)."""
+        """dL/dtheta at the point."""
         return self._gradient.detach()
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         require_vectors(V, self.dim)
-        if not self._gradient.requires_grad:  # an objective that is linear in theta
+        if not self._gradient.requires_grad:  # the objective is linear in theta
             return torch.zeros_like(V)
         columns = [
             torch.autograd.grad(self._gradient, self._point, v, retain_graph=True, materialize_grads=True)[0]
@@ -66,7 +65,7 @@ class ObjectiveHessian:
 
 
 def _require_loss(value: object) -> None:
-    """ValueError unless it is a tensor of one finite number."""
+    """Raise InputError unless value is a tensor of one finite number."""
     if not isinstance(value, Tensor):
         kind = type(value).__name__
         raise InputError(
@@ -79,7 +78,7 @@ def _require_loss(value: object) -> None:
 
 
 def _traced_gradient(value: Tensor, point: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """dL/dtheta, with the graph for its own derivative.  ValueError where the loss has none that leads to the point."""
+    """dL/dtheta with its graph, for another derivative.  Raises InputError where no graph connects loss and point."""
     gradient = None
     if value.requires_grad:
         (gradient,) = torch.autograd.grad(value, point, create_graph=True, allow_unused=True)

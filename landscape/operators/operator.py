@@ -1,15 +1,15 @@
-"""Symmetric operators: all that the rest of the package sees of an objective's curvature.
+"""Symmetric operators: the interface between an objective's curvature and the estimators.
 
-An operator H has n rows (`dim`), named groups of rows (`blocks`: one per attribute, say), a `dtype`, and
+An operator H has n rows (`dim`), named ranges of rows (`blocks`; for a scene one per attribute), a `dtype`, and
 `apply(V) -> H V` for k vectors at once, V of shape (n, k).  Operators compose:
 
     SumOperator         sum_i w_i H_i
     RestrictedOperator  E^T H E     one block, E its rows of the identity
-    ScaledOperator      D H D       a change of metric: curvature in the units theta / d
-    ProjectedOperator   P H P       P an orthogonal projector, to leave a known null space out
-    CountingOperator    H           counts the vectors it is applied to, and the seconds that takes
+    ScaledOperator      D H D       a change of units: the curvature in theta / d, D = diag(d)
+    ProjectedOperator   P H P       P an orthogonal projector, to remove a known null space
+    CountingOperator    H           counts vectors, calls and seconds
 
-One that wraps another has its rows, blocks and dtype unless it says otherwise.
+An operator that wraps another one has the same rows, blocks and dtype unless stated otherwise.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,10 +25,10 @@ from landscape.errors import InputError
 
 @runtime_checkable
 class SymmetricOperator(Protocol):
-    """H = H^T as a product with blocks of vectors: the interface that every estimator takes.
+    """H = H^T, given by its products with blocks of vectors.
 
-    dim: n, the number of rows.  blocks: named ranges of rows, disjoint; an operator without a structure has one, "all".
-    dtype: of V and of H V; they are on the device of the generator that the estimator is given.
+    dim: the number n of rows.  blocks: named, disjoint ranges of rows; one, "all", for an operator without structure.
+    dtype: of V and of H V.  Both lie on the device of the generator that an estimator is given.
     """
 
     @property
@@ -41,7 +41,7 @@ class SymmetricOperator(Protocol):
     def dtype(self) -> torch.dtype: ...
 
     def apply(self, V: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        """H V, which the next call may overwrite.  Raises ValueError where V has another shape than (dim, k)."""
+        """H V.  The next call may overwrite it.  Raises ValueError unless V has the shape (dim, k)."""
         ...
 
 
@@ -54,9 +54,10 @@ def require_vectors(V: Tensor, n: int) -> None:
 
 
 def product(operator: SymmetricOperator, V: Float[Tensor, "n k"], finite: bool = True) -> Float[Tensor, "n k"]:
-    """H V, which the next call may overwrite.  ValueError where it has another shape or dtype than V, or is not finite.
+    """H V, checked.  The next call may overwrite it.  Raises InputError unless it is finite, with the shape and dtype of V.
 
-    finite: whether the latter is looked at, for which the host waits; else by `require_finite`, in what comes to it anyway.
+    finite: False leaves out the check for finiteness, for which the CPU has to wait for a GPU.  Such callers pass a number that
+    they need anyway to `require_finite`.
     """
     HV = operator.apply(V)
     if HV.shape != V.shape or HV.dtype != V.dtype:
@@ -70,7 +71,7 @@ def product(operator: SymmetricOperator, V: Float[Tensor, "n k"], finite: bool =
 
 
 def require_finite(operator: SymmetricOperator, finite: bool) -> None:
-    """ValueError that says of whose products it is, unless they are finite."""
+    """Raise InputError, with the names of the operator's blocks, unless its products are finite."""
     if not finite:
         raise InputError(
             f"expected finite products H V, got NaN or infinity in {', '.join(operator.blocks)}; check the parameters with "
@@ -78,15 +79,24 @@ def require_finite(operator: SymmetricOperator, finite: bool) -> None:
         )
 
 
+def products(operator: SymmetricOperator, V: Float[Tensor, "n k"], batch: int) -> Float[Tensor, "n k"]:
+    """H V in a tensor of its own, from products with `batch` vectors at a time."""
+    result = torch.empty_like(V)
+    for part, vectors in zip(result.split(batch, dim=1), V.split(batch, dim=1), strict=True):
+        if vectors.shape[1]:
+            part.copy_(product(operator, vectors.contiguous()))
+    return result
+
+
 def finished(tensor: Tensor) -> Tensor:
-    """The tensor, once it is computed: a GPU is still at work when the call that launched it returns."""
+    """The tensor, after waiting for it: a call that starts work on a GPU returns before the work is done."""
     if tensor.is_cuda:
         torch.cuda.synchronize(tensor.device)
     return tensor
 
 
 def require_blocks(blocks: Mapping[str, slice], n: int) -> dict[str, slice]:
-    """A copy of blocks; raise ValueError unless they are disjoint ranges of 0..n."""
+    """A copy of blocks.  Raises InputError unless they are disjoint ranges of 0..n."""
     end = 0
     for name, block in sorted(blocks.items(), key=lambda item: (item[1].start or 0, item[1].stop or 0)):
         if block.start is None or block.stop is None or block.step not in (None, 1):
@@ -102,8 +112,8 @@ def require_blocks(blocks: Mapping[str, slice], n: int) -> dict[str, slice]:
 class DenseOperator:
     """A symmetric matrix as an operator.
 
-    blocks: one of all rows, "all", where None.  ValueError unless the matrix is square, finite and symmetric to round-off, and
-    the blocks are disjoint.
+    blocks: None means one block of all rows, "all".  Raises InputError unless the matrix is square, finite and symmetric to
+    round-off, and the blocks are disjoint.
 
     >>> H = DenseOperator(torch.tensor([[2.0, 1.0], [1.0, 3.0]]))
     >>> H.apply(torch.tensor([[1.0], [-1.0]]))
@@ -131,7 +141,7 @@ class DenseOperator:
 
 
 class SumOperator:
-    """sum_i weights_i H_i; weights are 1 where None.  ValueError unless all H_i have the same rows, blocks and dtype."""
+    """sum_i weights_i H_i, all weights 1 where None.  Raises ValueError unless all H_i have the same rows, blocks and dtype."""
 
     def __init__(self, terms: Sequence[SymmetricOperator], weights: Sequence[float] | None = None) -> None:
         if not terms:
@@ -158,7 +168,7 @@ class SumOperator:
 
 
 class RestrictedOperator:
-    """E^T H E: the diagonal block of H on one named block of rows, its only block.  A product costs one with all of H.
+    """E^T H E: the diagonal block of H on one named block of rows.  A product with it costs a product with H.
 
     >>> H = DenseOperator(torch.tensor([[2.0, 1.0], [1.0, 3.0]]), {"a": slice(0, 1), "b": slice(1, 2)})
     >>> RestrictedOperator(H, "b").apply(torch.ones(1, 1))
@@ -182,7 +192,7 @@ class RestrictedOperator:
 
 
 class ScaledOperator:
-    """D H D with D = diag(scale), n finite numbers: the Hessian with respect to theta / scale."""
+    """D H D with D = diag(scale), for n finite scales: the Hessian with respect to theta / scale."""
 
     def __init__(self, inner: SymmetricOperator, scale: Float[Tensor, " n"]) -> None:
         if scale.shape != (inner.dim,) or not torch.isfinite(scale).all():
@@ -199,7 +209,7 @@ class ScaledOperator:
 class ProjectedOperator:
     """P H P for an orthogonal projector `project(V) -> P V`, V of shape (n, k).
 
-    That it is linear, symmetric and idempotent is the caller's promise, and is not checked.
+    `project` must be linear, symmetric and idempotent, which is not checked.
     """
 
     def __init__(self, inner: SymmetricOperator, project: Callable[[Tensor], Tensor]) -> None:
@@ -212,9 +222,9 @@ class ProjectedOperator:
 
 
 class CountingOperator:
-    """H itself, with counts of its use so far.
+    """H, with counts of its use so far.
 
-    matvecs: vectors that it was applied to; calls: of `apply`; seconds: that these took, a GPU's work included.
+    matvecs: vectors that it was applied to.  calls: of `apply`.  seconds: duration of these calls, with the work of a GPU.
     """
 
     def __init__(self, inner: SymmetricOperator) -> None:

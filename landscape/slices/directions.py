@@ -1,12 +1,12 @@
-"""Directions to slice along, as columns (n, d), in the units of the parameters, in the dtype of what they are made from.
+"""Directions for slices, as columns (n, d), in parameter units and in the dtype of the argument.
 
-    random, filter-normalised   d_g <- d_g |theta_g| / |d_g| for every group g of parameters that one filter, or one attribute
-                                of one item, consists of: a step of 1 changes each by its own size (Li et al. 2018, Sec. 4)
+    random, filter-normalised   d_g <- d_g |theta_g| / |d_g| for every group g of parameters (a filter, or one attribute of one
+                                item): a step of 1 changes each group by its size (Li et al. 2018, Sec. 4)
     gradient                    g / |g|, the steepest ascent
-    line                        theta_1 - theta_0: 0 is the first point, 1 the second
-    orthonormal                 the same line or plane from unit directions at a right angle, the first one kept
+    line                        theta_1 - theta_0: the coordinate 0 is the first point, 1 the second
+    orthonormal                 the same line or plane, from unit directions at right angles; the first one is kept
 
-Eigenvectors are `landscape.extreme_eigenpairs(...).largest.vectors`.
+Eigenvectors come from `landscape.extreme_eigenpairs(...).largest.vectors`.
 """
 
 from collections.abc import Mapping
@@ -16,17 +16,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from landscape.errors import InputError
-from landscape.linalg import group_sums
+from landscape.linalg import column_lengths, group_sums
 from landscape.operators.operator import require_blocks
 
-SMALLEST_SINE = 1e-6  # of the angle between two directions that span a plane; round-off makes up most of one below
+SMALLEST_SINE = (
+    1e-6  # of the angle between two directions that span a plane: a smaller one is mostly round-off in float32
+)
 
 
 def groups_of(blocks: Mapping[str, slice], items: int, n: int) -> Int[Tensor, " n"]:
-    """The group of every parameter, for `random_directions`: each item of each block is a group of its own.
+    """The group of every parameter, for `random_directions`: each item of each block is a separate group.
 
-    blocks: ranges of the n parameters, each of which holds `items` items of equal length one after the other (the positions of
-    all Gaussians, say, then all weights).  ValueError where a block cannot be divided so.
+    blocks: ranges of the n parameters, each of `items` items of equal length one after the other (for a scene: the positions of
+    all Gaussians, then all opacities, ...).  Raises ValueError where a block cannot be divided into that many items.
 
     >>> groups_of({"position": slice(0, 6), "weight": slice(6, 8)}, items=2, n=8)
     tensor([0, 0, 0, 1, 1, 1, 2, 3])
@@ -44,9 +46,9 @@ def groups_of(blocks: Mapping[str, slice], items: int, n: int) -> Int[Tensor, " 
 def random_directions(
     center: Float[Tensor, " n"], groups: Int[Tensor, " n"], generator: torch.Generator, count: int = 2
 ) -> Float[Tensor, "n {count}"]:
-    """`count` Gaussian directions, filter-normalised: in every group as long as the group's own parameters.
+    """`count` Gaussian directions, filter-normalised: in every group as long as the group's parameters.
 
-    groups[i]: the number, from 0, of the group of parameter i.  A group whose parameters are all 0 does not move.
+    groups[i]: the number (from 0) of the group of parameter i.  A group of parameters that are all 0 does not move.
 
     >>> groups = torch.tensor([0, 0, 1])
     >>> d = random_directions(torch.tensor([3.0, 4.0, -0.5]), groups, torch.Generator().manual_seed(0), count=1)
@@ -68,7 +70,7 @@ def random_directions(
 
 
 def _lengths(rows: Float[Tensor, "n k"], groups: Int[Tensor, " n"]) -> Float[Tensor, "g k"]:
-    """The norm over each group; 1 for numbers that are no parameter's."""
+    """The norm over each group; 1 for numbers that no parameter has."""
     number = int(groups.max()) + 1
     squares = group_sums(rows.square(), groups, number)
     used = rows.new_zeros(number, dtype=torch.bool).index_fill_(0, groups, True)
@@ -82,16 +84,14 @@ def gradient_direction(gradient: Float[Tensor, " n"]) -> Float[Tensor, "n 1"]:
     tensor([[ 0.],
             [-1.]])
     """
-    length = torch.linalg.vector_norm(gradient.double())
-    if gradient.ndim != 1 or not (torch.isfinite(length) and length > 0):
-        raise InputError(
-            f"expected a flat gradient that is finite and not zero, got shape {tuple(gradient.shape)} and length {length}"
-        )
-    return (gradient.double() / length).to(gradient.dtype)[:, None]
+    if gradient.ndim != 1:
+        raise ValueError(f"expected a flat gradient, got shape {tuple(gradient.shape)}")
+    column = gradient[:, None]
+    return (column.double() / column_lengths(column, "gradients")).to(gradient.dtype)
 
 
 def line_between(start: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[Tensor, "n 1"]:
-    """end - start, not normalised: in a slice with center = start, coordinate 0 is start and 1 is end.
+    """end - start, not normalised: in a slice with center = start, the coordinate 0 is start and 1 is end.
 
     >>> line_between(torch.tensor([1.0, 2.0]), torch.tensor([1.0, 5.0])).T
     tensor([[0., 3.]])
@@ -110,18 +110,15 @@ def line_between(start: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[
 
 
 def orthonormal(directions: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Unit directions at right angles: the first keeps its direction, each other its part orthogonal to those before.
+    """Unit directions at right angles: the first one, and the part of each other one that is orthogonal to those before.
 
-    ValueError where one is zero or not finite, or lies in the span of those before.
+    Raises InputError where one is zero or not finite, or lies in the span of those before.
 
     >>> orthonormal(torch.tensor([[3.0, 1.0], [4.0, 1.0]]))
     tensor([[ 0.6000,  0.8000],
             [ 0.8000, -0.6000]])
     """
-    lengths = torch.linalg.vector_norm(directions.double(), dim=0)
-    if directions.ndim != 2 or not (torch.isfinite(lengths) & (lengths > 0)).all():
-        raise InputError(f"expected finite directions (n, d) that are not zero, got lengths {lengths.tolist()}")
-    q, r = torch.linalg.qr(directions.double() / lengths)
+    q, r = torch.linalg.qr(directions.double() / column_lengths(directions, "directions"))
     sines = r.diagonal()
     if (sines.abs() < SMALLEST_SINE).any():
         raise InputError(

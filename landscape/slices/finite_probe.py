@@ -1,14 +1,14 @@
-"""Curvature along a direction at finite steps, beside the infinitesimal one: what probing a loss at a distance d sees.
+"""Curvature along a direction v from values of the loss at finite steps d, next to the infinitesimal curvature v.H v.
 
     c(d) = (L(theta + d v) - 2 L(theta) + L(theta - d v)) / d^2  =  v.H v + d^2 L4 / 12 + ...       L4 = d^4 L / dv^4
 
 round-off   4 sqrt(6 noise^2 + 2 (d s)^2) / d^2: four standard errors of a second difference of values with independent errors.
-            s = eps |theta * H v| / sqrt(12): away from theta the slope has grown by d H v, and theta + d v is rounded
-truncation  |c(d) - v.H v| as far as neighbouring steps tell it: the term in d^2 that makes their c differ.  It says nothing
-            across a kink, a jump or a crossed sort, where c(d) is no derivative at all but still what the probe sees
-noise       standard deviation of L's own error, from differences of order k = 4 of values at close, even steps along v, in
-            which the smooth part of L cancels: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and Wild 2011,
-            Sec. 2); at least the resolution of the numbers that the objective returns (Python floats that are all
+            s = eps |theta * H v| / sqrt(12): the rounding of theta + d v, times the slope d H v there
+truncation  estimate of |c(d) - v.H v|: the term in d^2 that makes neighbouring c(d) differ.  Without meaning across a kink or a
+            jump of L, where c(d) is not a derivative
+noise       standard deviation of the error of one value of L, from differences of order k = 4 of values at small even steps
+            along v, in which the smooth part of L cancels: sigma^2 = (k!)^2 / (2k)! mean (Delta^k L)^2 (Hamming; More and
+            Wild 2011, Sec. 2).  At least the resolution of the numbers that the objective returns (Python floats that are all
             float32 numbers count as float32)
 """
 
@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import factorial, isfinite, sqrt
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,28 +25,29 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, product
-from landscape.results import Number, Progress, finite_or_none
+from landscape.results import Progress, plain
 from landscape.slices.grid_evaluations import Loss
 
-ORDER, NOISE_POINTS = 4, 24  # of the differences; the values they are taken of
-CLOSER = 4  # the values lie this many times closer together than the smallest step is long, ...
-ROUNDINGS = 4  # ... but so many round-offs of the parameters apart, lest their rounding be the same
+ORDER, NOISE_POINTS = 4, 24  # order of the differences, number of values
+CLOSER = 4  # the distance between these values is the smallest step over this ...
+ROUNDINGS = 4  # ... but at least this many round-offs of the parameters, so that each value is rounded differently
 STEPS = tuple(10.0 ** (k / 2) for k in range(-10, 1))
 
 
 @dataclass(frozen=True, eq=False)
 class FiniteProbe:
-    """The curvature c(d) at increasing steps d, in multiples of the direction, with its round-off and its truncation.
+    """The curvature c(d) at increasing steps d, in multiples of the direction, with its round-off and truncation.
 
-    infinitesimal: v.H v, which c(d) tends to for small d; crossed: where the signature at +d or -d is not the centre's (None:
-    the objective has none); noise: the standard deviation of one evaluation's error; evaluations: of the objective.
+    discontinuous: steps d for which +d or -d lies on another smooth piece than the centre; None where the objective does not
+    name its pieces.  infinitesimal: v.H v, the limit of c(d) for small d.  noise: standard deviation of the error of one
+    evaluation.  evaluations: of the objective.
     """
 
     steps: Float64[Tensor, " m"]
     curvatures: Float64[Tensor, " m"]
     round_off: Float64[Tensor, " m"]
     truncation: Float64[Tensor, " m"]
-    crossed: Bool[Tensor, " m"] | None
+    discontinuous: Bool[Tensor, " m"] | None
     infinitesimal: float
     center_loss: float
     noise: float
@@ -53,26 +55,16 @@ class FiniteProbe:
 
     @property
     def best(self) -> int | None:
-        """Index of the step, of those that cross nothing, whose round-off and truncation are least in sum; None without any."""
+        """Index of the step with the smallest sum of round-off and truncation, among those that are not discontinuous."""
         error = (self.round_off + self.truncation).nan_to_num(torch.inf, posinf=torch.inf)
-        if self.crossed is not None:
-            error = error.masked_fill(self.crossed, torch.inf)
+        if self.discontinuous is not None:
+            error = error.masked_fill(self.discontinuous, torch.inf)
         return int(error.argmin()) if error.isfinite().any() else None
 
-    def record(self) -> dict[str, Number | int | list[Number] | list[bool] | None]:
-        columns = {
-            name: [finite_or_none(value) for value in getattr(self, name).tolist()]
-            for name in ("steps", "curvatures", "round_off", "truncation")
-        }
-        return {
-            **columns,
-            "crossed": None if self.crossed is None else self.crossed.tolist(),
-            "infinitesimal": finite_or_none(self.infinitesimal),
-            "center_loss": finite_or_none(self.center_loss),
-            "noise": finite_or_none(self.noise),
-            "best": self.best,
-            "evaluations": self.evaluations,
-        }
+    def record(self) -> dict[str, Any]:
+        crossed = None if self.discontinuous is None else self.discontinuous.tolist()
+        names = "steps curvatures round_off truncation infinitesimal center_loss noise best evaluations"
+        return plain(self, names) | {"crossed": crossed}
 
 
 def finite_probe(
@@ -84,10 +76,10 @@ def finite_probe(
     progress: Progress | None = None,
     noise_points: int = NOISE_POINTS,
 ) -> FiniteProbe:
-    """Probe along direction, for one matvec and 2 len(steps) + 1 + noise_points evaluations.
+    """Curvature along direction at finite steps, for one matvec and 2 len(steps) + 1 + noise_points evaluations.
 
-    loss, center: as for `evaluate_slice`; operator: H at center.  steps: two or more, increasing, in multiples of direction; by
-    default 1e-5 to 1, two a decade.  noise_points: values that the noise is estimated from, more than four.
+    loss, center: as for `evaluate_slice`.  operator: H at center.  steps: two or more, increasing, in multiples of direction.
+    noise_points: number of values for the estimate of the noise, more than four.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> found = finite_probe(lambda x: (x**4).sum(), torch.ones(1, dtype=torch.float64), torch.ones(1),
@@ -102,7 +94,7 @@ def finite_probe(
     middle, here = at(0.0)
     if not isfinite(middle):
         raise InputError(f"expected a finite objective at the centre, got {middle}")
-    # theta_i / v_i, weighted by v_i^4: of the parameters that make up the direction
+    # eps |theta_i / v_i|, averaged with weights v_i^4: the step along v that rounding of theta makes
     rounding = torch.finfo(center.dtype).eps * float((origin * v).norm() / v.square().norm())
     spacing = max(steps[0] / CLOSER, ROUNDINGS * rounding)
     close = [at((k - (noise_points - 1) / 2) * spacing)[0] for k in range(noise_points)]
@@ -120,7 +112,7 @@ def finite_probe(
         curvatures=curvatures,
         round_off=4 * (6 * noise**2 + 2 * (d * slope).square()).sqrt() / d.square(),
         truncation=_truncation(d, curvatures),
-        crossed=None if here is None else other,
+        discontinuous=None if here is None else other,
         infinitesimal=float(torch.dot(v, Hv)),
         center_loss=middle,
         noise=noise,
@@ -129,7 +121,7 @@ def finite_probe(
 
 
 class _Line:
-    """The objective along the direction.  coarsest: the largest eps of the numbers that it has returned so far."""
+    """The objective along the direction.  coarsest: the largest eps of the dtypes that it has returned so far."""
 
     def __init__(
         self, loss: Loss, origin: Tensor, v: Tensor, dtype: torch.dtype, total: int, progress: Progress | None
@@ -139,19 +131,19 @@ class _Line:
         self.coarsest = torch.finfo(torch.float64).eps
 
     def __call__(self, step: float) -> tuple[float, object]:
-        """Value and signature at this step, in multiples of the direction."""
+        """Value and smooth piece at this step, in multiples of the direction."""
         found = self.loss((self.origin + step * self.v).to(self.dtype))
-        value, signature = found if isinstance(found, tuple) else (found, None)
+        value, piece = found if isinstance(found, tuple) else (found, None)
         if isinstance(value, Tensor) and value.is_floating_point():
             self.coarsest = max(self.coarsest, torch.finfo(value.dtype).eps)
         self.done += 1
         if self.progress:
             self.progress(self.done, self.total, "finite steps")
-        return float(value), signature
+        return float(value), piece
 
 
 def resolution(values: Sequence[float]) -> float:
-    """The eps of float32 where values that differ are all float32 numbers; else that of float64.
+    """The eps of float32 where the values are all float32 numbers and not all equal; else that of float64.
 
     >>> resolution([0.5, 0.1]) < resolution([0.5, 0.10000000149011612])
     True
@@ -164,7 +156,7 @@ def resolution(values: Sequence[float]) -> float:
 
 
 def evaluation_noise(values: Sequence[float]) -> float:
-    """The standard deviation of the errors of values of a smooth function at even steps.
+    """Standard deviation of the errors in values of a smooth function at even steps.
 
     >>> evaluation_noise([x**3 for x in range(8)])
     0.0
@@ -176,7 +168,7 @@ def evaluation_noise(values: Sequence[float]) -> float:
 
 
 def _truncation(steps: Tensor, curvatures: Tensor) -> Tensor:
-    """|a| d^2 of the parabola in d through c at each step and the next larger one (for the last, the one before)."""
+    """|a| d^2 of the parabola c(d) = c_0 + a d^2 through each step and the next larger one (for the last: the one before)."""
     squares = steps.square()
     slopes = (curvatures.diff() / squares.diff()).abs()
     return torch.cat([slopes, slopes[-1:]]) * squares

@@ -1,9 +1,8 @@
-"""True evaluations of an objective at points of a slice's grid: in parallel, and kept in a file from which a killed run
-continues.
+"""Evaluations of an objective at points of a slice's grid: in parallel, and kept in a file so that a run can continue.
 
-The file names the slice by a SHA-256 digest of (center, directions, coordinates) and holds the loss at the centre.  That and
-the value which is farthest from it are evaluated anew and compared when the file is read: another slice's values, or another
-objective's, are refused.
+The file holds a SHA-256 digest of (center, directions, coordinates) and the loss at the centre.  When it is read, the loss at
+the centre and the value that differs most from it are evaluated again and compared.  Values of another slice or of another
+objective are refused with an InputError.
 """
 
 import hashlib
@@ -25,26 +24,26 @@ from landscape.results import Progress
 
 Evaluation = float | Tensor | tuple[float | Tensor, Hashable]
 Loss = Callable[[Tensor], Evaluation]
-"""loss(theta) -> the objective, or (the objective, signature), where the signature tells which smooth piece theta lies in."""
+"""loss(theta) -> the objective, or (the objective, smooth_piece): a label of the smooth piece that contains theta."""
 
 SAVE_EVERY = 5.0  # seconds
-SAME_LOSS = 100.0  # round-offs by which one objective at one point may differ between runs, summed in another order
+SAME_LOSS = 100.0  # units of round-off by which two evaluations at one point may differ, summed in different orders
 
 
 def evaluated_at(loss: Loss, theta: Tensor) -> tuple[float, Hashable]:
-    """The value and the signature, None where the objective gives none."""
+    """The value and the smooth piece; None for an objective that does not name its pieces."""
     found = loss(theta)
-    value, signature = found if isinstance(found, tuple) else (found, None)
-    return float(value), signature
+    value, piece = found if isinstance(found, tuple) else (found, None)
+    return float(value), piece
 
 
 class GridEvaluations:
-    """The objective at center + directions @ points[i]: what is known so far, and `require` for more.
+    """The objective at center + directions @ points[i].  `require` makes points known.
 
-    value, known, crossed [points]: the loss (nan where not known), which are known, and which of those have another
-    signature than the centre; has_signature: whether the objective gives any; made: how many of the points were evaluated here,
-    not read.  loss must be safe to call from several
-    threads if workers > 1.  Points are formed in float64, where center is, and rounded once to its dtype.
+    value, known, discontinuous [points]: the loss (nan where not known), whether it is known, and whether the point lies on
+    another smooth piece than the centre.  has_pieces: whether the objective names its pieces.  made: number of points that were
+    evaluated, not read.  If workers > 1, loss must be safe to call from several threads.  Points are computed in float64 on the
+    device of center, and rounded once to its dtype.
     """
 
     def __init__(
@@ -63,15 +62,14 @@ class GridEvaluations:
         self.center_loss, self._here = evaluated_at(loss, self._center)
         if not isfinite(self.center_loss):
             raise InputError(f"expected a finite objective at the centre, got {self.center_loss}")
-        self.has_signature = self._here is not None
-        count = len(points)
-        self.value, self.known, self.crossed = np.full(count, np.nan), np.zeros(count, bool), np.zeros(count, bool)
-        self.made = 0
+        self.has_pieces = self._here is not None
+        self.value, self.made = np.full(len(points), np.nan), 0
+        self.known, self.discontinuous = np.zeros((2, len(points)), bool)
         self._digest = slice_digest(self._center, self._spans, points)
         self._stored = self._read() if store is not None and store.exists() else {}
 
     def require(self, points: Iterable[int]) -> None:
-        """Evaluate those of the points that are not known yet."""
+        """Evaluate the points that are not known yet."""
         wanted = [int(point) for point in dict.fromkeys(points) if not self.known[point]]
         missing = [point for point in wanted if point not in self._stored]
         for point in wanted:
@@ -79,8 +77,8 @@ class GridEvaluations:
                 self._set(point, *self._stored[point])
         saved = monotonic()
         try:
-            for point, (value, signature) in zip(missing, self._evaluate(missing), strict=True):
-                self._stored[point] = value, signature != self._here
+            for point, (value, piece) in zip(missing, self._evaluate(missing), strict=True):
+                self._stored[point] = value, piece != self._here
                 self.made += 1
                 self._set(point, *self._stored[point])
                 if self._store is not None and monotonic() - saved > SAVE_EVERY:
@@ -104,8 +102,8 @@ class GridEvaluations:
         theta = (self._origin + self._spans @ self._points[point]).to(self._center.dtype)
         return evaluated_at(self._loss, theta)
 
-    def _set(self, point: int, value: float, crossed: bool) -> None:
-        self.value[point], self.crossed[point], self.known[point] = value, crossed, True
+    def _set(self, point: int, value: float, discontinuous: bool) -> None:
+        self.value[point], self.discontinuous[point], self.known[point] = value, discontinuous, True
         if self._progress:
             self._progress(int(self.known.sum()), len(self.known), "slice")
 
@@ -118,7 +116,7 @@ class GridEvaluations:
                 stream,
                 digest=np.array(self._digest),
                 center_loss=np.array(self.center_loss),
-                has_signature=np.array(self.has_signature),
+                has_signature=np.array(self.has_pieces),
                 points=np.array(list(self._stored), dtype=np.int64),
                 values=np.array(values, dtype=np.float64),
                 crossed=np.array(crossed, dtype=bool),
@@ -131,7 +129,7 @@ class GridEvaluations:
         try:
             with np.load(self._store, allow_pickle=False) as archive:
                 digest, center_loss = str(archive["digest"]), float(archive["center_loss"])
-                has_signature = bool(archive["has_signature"])
+                has_pieces = bool(archive["has_signature"])
                 columns = [archive[name].tolist() for name in ("points", "values", "crossed")]
             stored = {point: (value, crossed) for point, value, crossed in zip(*columns, strict=True)}
         except (ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
@@ -143,7 +141,7 @@ class GridEvaluations:
                 f"expected evaluations of this slice in {self._store}, got another center, other directions or "
                 f"coordinates; {advice}"
             )
-        self._require_same("at the centre", self.center_loss, center_loss, has_signature == self.has_signature, advice)
+        self._require_same("at the centre", self.center_loss, center_loss, has_pieces == self.has_pieces, advice)
         finite = {point: value for point, (value, _) in stored.items() if isfinite(value)}
         if finite:
             point = max(finite, key=lambda point: abs(finite[point] - center_loss))
@@ -160,7 +158,7 @@ class GridEvaluations:
 
 
 def slice_digest(center: Tensor, directions: Tensor, points: Tensor) -> str:
-    """SHA-256 of dtype, shapes and bytes."""
+    """SHA-256 digest of dtypes, shapes and numbers."""
     digest = hashlib.sha256()
     for tensor in (center, directions, points):
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}\n".encode())

@@ -1,13 +1,13 @@
-"""Where to evaluate a slice: points are added to a sparse grid until random points are predicted well.
+"""Choice of the points at which a slice is evaluated: a sparse grid grows until it predicts random points well.
 
-    refine      all points whose parents' surplus exceeds the threshold, the largest first, `batch` at a time
-    hold out    random points that are not known, predicted first and then evaluated.  If all are within tolerance * range,
-                the grid is done; otherwise those that are not become nodes, the threshold is halved, and it refines again
+    refine      evaluate points whose parents' surplus (`sparse_grid`) exceeds a threshold, the largest first, `batch` at a time
+    hold out    predict random points that are not known, then evaluate them.  If all errors are within tolerance * range, the
+                slice is done.  Otherwise the points with larger errors become nodes, the threshold is halved, and refinement
+                goes on
 
-The errors of the last hold-out are the slice's interpolation error: no point of it was chosen by the refinement, and none has
-entered the interpolant.  As it is drawn anew until one passes, what it says is at the level 0.05 / 2^k at the k-th look: all
-looks together are wrong in 5% of the slices at most.  Decisions are made once a batch, so that the result does not depend on
-the number of workers.
+The errors of the last hold-out are the interpolation error of the slice: its points were chosen at random and have not entered
+the interpolant.  Hold-outs are drawn until one passes, so the k-th one uses the level 0.05 / 2^k: at most 5% of the slices
+have a larger error than stated.  Decisions are made once a batch, so that the result does not depend on the number of workers.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from landscape.results import StopReason
 from landscape.slices.grid_evaluations import GridEvaluations
 from landscape.slices.sparse_grid import SparseGrid
 
-SHARE_HELD_OUT = 1 / 8  # at most, of the points that are not known: small grids
+SHARE_HELD_OUT = 1 / 8  # largest share of the unknown points in a hold-out, for small grids
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,11 @@ class SliceSettings:
     """Which points of a slice are evaluated; the others are interpolated.
 
     tolerance: of the interpolation, as a share of the range of the values; None: every point is evaluated.
-    holdout: random points that judge the interpolation, at most an eighth of those not known.  (With 30, and none off by
-        more than the tolerance at the first look, at most 12% of the points not evaluated are, with 95% confidence; with 5,
-        52%.)
-    batch: points that are added between two decisions.  workers: threads that evaluate.
-    max_evaluations, max_seconds: budgets, hold-out points and the one at the centre included; ValueError without a tolerance,
-        as a slice of every point has none.  A slice that continues from a store has its evaluations in total, but its time
-        anew: a call takes at most so long.
+    holdout: random points of a hold-out, at most an eighth of those not known.  If m points at the first look all meet the
+        tolerance, at most 1 - 0.025^(1/m) of the other points do not, with 95% confidence over all looks: 12% for 30 points.
+    batch: points between two decisions.  workers: threads that evaluate.
+    max_evaluations, max_seconds: budgets, with hold-out points and the one at the centre; allowed only with a tolerance.  If a
+        slice continues from a store, its evaluations count in total, but time counts from the call.
     """
 
     tolerance: float | None = 0.01
@@ -65,8 +63,7 @@ class SliceSettings:
 def evaluate_adaptively(
     evaluations: GridEvaluations, x: np.ndarray, y: np.ndarray, settings: SliceSettings, generator: torch.Generator
 ) -> tuple[np.ndarray, np.ndarray, int, StopReason]:
-    """Values at every point of x times y (true where known), |prediction - value| of the last hold-out, which look that was,
-    why it ended."""
+    """Values at every point of x times y, |prediction - value| of the last hold-out, the number of looks, why it ended."""
     assert settings.tolerance is not None
     grid, budget = SparseGrid(x, y), _Budget(evaluations, settings)
     _insert(grid, evaluations, grid.coarse(), budget.room)
@@ -99,7 +96,7 @@ def value_range(values: np.ndarray) -> float:
 def _refine(
     grid: SparseGrid, evaluations: GridEvaluations, threshold: float, batch: int, budget: "_Budget"
 ) -> StopReason | None:
-    """Insert until no surplus exceeds the threshold (as a share of the range); the budget that ended it before."""
+    """Insert points until no surplus exceeds the threshold (a share of the range).  Returns the budget that ended it."""
     while True:
         doubt = grid.doubt()
         doubtful = np.flatnonzero(doubt > threshold * value_range(evaluations.value))
@@ -111,48 +108,48 @@ def _refine(
 
 
 def _insert(grid: SparseGrid, evaluations: GridEvaluations, points: np.ndarray, room: int) -> None:
-    """Make nodes of the points and their ancestors, as far as there is room."""
+    """Make nodes of the points and their ancestors, at most `room` of them."""
     nodes = grid.with_ancestors(points)[:room]
     evaluations.require(nodes)
     grid.insert(nodes, evaluations.value[nodes])
 
 
 def _draw(known: np.ndarray, size: int, generator: torch.Generator) -> np.ndarray:
-    """Points that are not known, at random."""
+    """Random points among those that are not known."""
     unknown = np.flatnonzero(~known)
     order = torch.randperm(len(unknown), generator=generator, device=generator.device)
     return unknown[order[:size].cpu().numpy()]
 
 
 class _Budget:
-    """What is left for refinement when the next hold-out is paid for."""
+    """The remaining budget of the refinement, after setting aside the next hold-out."""
 
     def __init__(self, evaluations: GridEvaluations, settings: SliceSettings):
         self._evaluations, self._settings, self._start = evaluations, settings, monotonic()
 
     @property
     def held_out(self) -> int:
-        """Points of a hold-out drawn now."""
+        """Number of points of the next hold-out."""
         unknown = int((~self._evaluations.known).sum())
         return min(self._settings.holdout, ceil(SHARE_HELD_OUT * unknown))
 
     @property
     def left(self) -> int:
-        """Evaluations; the one at the centre is counted."""
+        """Remaining evaluations; the one at the centre is counted."""
         known = self._evaluations.known
         most = min(self._settings.max_evaluations, known.size + self._settings.holdout + 1)
         return max(int(most) - 1 - int(known.sum()), 0)
 
     @property
     def room(self) -> int:
-        """Evaluations of the refinement."""
+        """Remaining evaluations of the refinement."""
         return max(self.left - self.held_out, 0)
 
     @property
     def spent(self) -> StopReason | None:
-        """The budget that ends refinement, which goes on only where there is room and time for a whole batch."""
+        """The budget that ends refinement.  It goes on only if there is room for a point and time for a whole batch."""
         if self.room == 0:
             return "evaluation budget"
-        elapsed, made = monotonic() - self._start, self._evaluations.made  # what was stored took no time
+        elapsed, made = monotonic() - self._start, self._evaluations.made  # points from a store take no time
         next_ones = self._settings.batch + self._settings.holdout
         return "time budget" if made and elapsed * (1 + next_ones / made) > self._settings.max_seconds else None

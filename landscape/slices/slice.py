@@ -1,27 +1,29 @@
-"""The objective on a line or a plane: rendered and interpolated values beside the quadratic model."""
+"""Result: the objective on a line or a plane, evaluated or interpolated, with its quadratic model."""
 
 from dataclasses import dataclass
 from math import inf
+from typing import Any
 
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from landscape.results import Number, StopReason, finite_or_none
+from landscape.results import StopReason, plain
 
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """The objective on a grid center + sum_d x_d directions[:, d], d = 1 or 2, beside its quadratic model.
+    """The objective on a grid center + sum_d x_d directions[:, d], d = 1 or 2.
 
     coordinates: increasing x_d of the grid, in multiples of the directions.
-    loss has one axis per direction (rows follow coordinates[0], columns coordinates[1]): the objective itself at points that
-    are `evaluated`, interpolated elsewhere.  holdout: |prediction - objective| at the random points of the last hold-out, which
-    tells how good the interpolation is; empty where none was drawn.
-    model: center_loss + slope . x + x^T curvature x / 2, with slope and curvature the derivatives of the objective in x; the
-    three are None where neither gradient nor operator was given.  crossed marks evaluated points whose signature (order of
-    sorting, visible set) differs from the centre's, so that the objective may jump on the way there; at points that are not
-    evaluated it is False and nothing is known.  evaluations: of the objective, the centre's too.
-    looks: hold-outs that were drawn, one after the other, until one was good enough or a budget ended it.
+    loss: one axis for each direction (rows for coordinates[0], columns for coordinates[1]).  The objective at points that are
+        `evaluated`, interpolated values elsewhere.
+    holdout: |prediction - objective| at the random points of the last hold-out; empty where none was drawn.
+    model: center_loss + slope . x + x^T curvature x / 2, with the derivatives of the objective in x.  All three are None where
+        neither gradient nor operator was given.
+    discontinuous: evaluated points on another smooth piece than the centre (for a scene: another order of the splats or set of
+        visible ones), so that the objective can jump on the way there.  False at points that are not evaluated; None for an
+        objective that does not name its pieces.
+    evaluations: of the objective, with the one at the centre.  looks: number of hold-outs drawn.
     """
 
     coordinates: tuple[Float64[Tensor, " _"], ...]
@@ -32,14 +34,14 @@ class Slice:
     model: Float64[Tensor, "..."] | None
     slope: Float64[Tensor, " d"] | None
     curvature: Float64[Tensor, "d d"] | None
-    crossed: Bool[Tensor, "..."] | None
+    discontinuous: Bool[Tensor, "..."] | None
     evaluations: int
     reason: StopReason
     looks: int = 1
 
     @property
     def difference(self) -> Float64[Tensor, "..."] | None:
-        """Objective minus quadratic model."""
+        """Loss minus quadratic model."""
         return None if self.model is None else self.loss - self.model
 
     @property
@@ -50,7 +52,7 @@ class Slice:
 
     @property
     def interpolation_error(self) -> float:
-        """The largest error of the hold-out as a share of the range; 0 where every point is evaluated, infinite without any."""
+        """The largest error of the hold-out over the range: 0 if every point is evaluated, infinite without a hold-out."""
         if self.evaluated.all():
             return 0.0
         if not self.holdout.numel():
@@ -61,24 +63,19 @@ class Slice:
 
     @property
     def share_beyond(self) -> float:
-        """With 95% confidence, at most this share of the interpolated points is off by more than interpolation_error.
+        """The largest share of interpolated points with errors above interpolation_error, with 95% confidence.
 
-        If a share p were, a hold-out of m random points would miss all of them with the probability (1 - p)^m at most.  p is
-        where that is 0.05 / 2^k at the k-th look: with many looks it is likelier that one of them is lucky.
+        If this share is p, m random points miss all such points with a probability of at most (1 - p)^m.  p is chosen so that
+        this is 0.05 / 2^k at the k-th look: several looks have more chances to be lucky.
         """
         if self.evaluated.all():
             return 0.0
         return 1 - (0.05 / 2**self.looks) ** (1 / self.holdout.numel()) if self.holdout.numel() else 1.0
 
-    def record(self) -> dict[str, Number | int | str]:
+    def record(self) -> dict[str, Any]:
         return {
             "points": self.loss.numel(),
             "evaluated_points": int(self.evaluated.sum()),
-            "crossed_points": 0 if self.crossed is None else int(self.crossed.sum()),
-            "evaluations": self.evaluations,
-            "center_loss": self.center_loss,
-            "interpolation_error": finite_or_none(self.interpolation_error),
+            "crossed_points": 0 if self.discontinuous is None else int(self.discontinuous.sum()),
             "holdout_points": self.holdout.numel(),
-            "share_beyond": self.share_beyond,
-            "reason": self.reason,
-        }
+        } | plain(self, "evaluations center_loss interpolation_error share_beyond reason")

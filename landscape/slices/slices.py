@@ -1,11 +1,10 @@
-"""Slices of an objective: its values on a grid of one or two directions, beside the quadratic model there.
+"""Slices of an objective L: its values on a grid along one or two directions e_d, and its quadratic model.
 
-    f(x)     = L(center + sum_d x_d e_d)              true evaluations where needed (`refinement`), interpolated elsewhere
+    f(x)     = L(center + sum_d x_d e_d)              evaluated where needed (`refinement`), interpolated elsewhere
     model(x) = L + b . x + x^T A x / 2                b = E^T g,  A = E^T H E
 
-x is in multiples of the directions as given: for unit eigenvectors, in parameter units.  `curvature_reach` gives ranges
-in units of the curvature instead: where the quadratic along an eigenvector has risen by a given amount,
-x = r sqrt(2 dL / |lambda|).
+x is in multiples of the directions: in parameter units for unit vectors.  `curvature_reach` gives ranges in units of the
+curvature instead: the distance r sqrt(2 dL / |lambda|), at which the quadratic term along an eigenvector is r^2 dL.
 """
 
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.linalg import column_lengths
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.results import Progress, StopReason
 from landscape.slices.grid_evaluations import GridEvaluations, Loss
@@ -26,7 +26,7 @@ from landscape.slices.slice import Slice
 
 
 def symmetric_axis(radius: float, points: int = 41) -> Float64[Tensor, " points"]:
-    """Evenly spaced from -radius to radius, with 0 itself among them; points is odd, 3 or more.
+    """Evenly spaced coordinates from -radius to radius that contain 0 exactly.  points: odd, 3 or more.
 
     >>> symmetric_axis(1.0, 5)
     tensor([-1.0000, -0.5000,  0.0000,  0.5000,  1.0000], dtype=torch.float64)
@@ -40,10 +40,10 @@ def symmetric_axis(radius: float, points: int = 41) -> Float64[Tensor, " points"
 
 
 def curvature_reach(curvature: float, rise: float, multiple: float = 1.0) -> float:
-    """multiple * sqrt(2 rise / |curvature|): with multiple = 1, the distance at which the quadratic term alone is rise.
+    """multiple * sqrt(2 rise / |curvature|).  With multiple = 1: the distance at which the quadratic term equals rise.
 
     For a unit direction: curvature in loss per squared parameter unit, rise in loss, the result in parameter units.
-    ValueError where the curvature is 0 or not finite, or rise or multiple is not above 0.
+    Raises InputError where the curvature is 0 or not finite, or rise or multiple is not positive.
 
     >>> curvature_reach(curvature=-8.0, rise=1.0)
     0.5
@@ -70,12 +70,12 @@ def evaluate_slice(
 ) -> Slice:
     """loss on the grid coordinates[0] x coordinates[1] (d = 2) or along coordinates[0] (d = 1).
 
-    loss(theta) is the objective, or (objective, signature) where it is piecewise smooth: points whose signature differs from
-    the centre's are marked.  It must be safe to call from settings.workers threads.  coordinates: increasing, in multiples of
-    the directions.  gradient, operator: both at center, both or neither: with them the quadratic model comes beside it, for d
-    matvecs, or for none where the operator is given as the matrix E^T H E.  generator draws the hold-out points
-    (`refinement`); it may be None only where settings.tolerance is.  store: a file that keeps the evaluations, from which a
-    killed run continues.  ValueError where the objective at the centre is not finite, or store holds another slice.
+    loss(theta): the objective, or (objective, smooth_piece) if it is piecewise smooth (`grid_evaluations`); it must be safe to
+    call from settings.workers threads.  coordinates: increasing, in multiples of the directions.  gradient, operator: both at
+    center, or neither.  They give the quadratic model, for d matvecs; none if the operator is given as the matrix E^T H E.
+    generator: draws the hold-out points (`refinement`); may be None only if settings.tolerance is.  store: a file that keeps
+    the evaluations, from which an interrupted run continues.  Raises InputError if the objective at the centre is not finite,
+    or store holds another slice.
 
     >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
     >>> line = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :1], [axis], generator=generator)
@@ -115,7 +115,7 @@ def evaluate_slice(
         model=model,
         slope=slope,
         curvature=curvature,
-        crossed=torch.from_numpy(found.crossed).reshape(shape) if found.has_signature else None,
+        discontinuous=torch.from_numpy(found.discontinuous).reshape(shape) if found.has_pieces else None,
         evaluations=int(found.known.sum()) + 1,
         reason=reason,
         looks=looks,
@@ -125,7 +125,7 @@ def evaluate_slice(
 def _derivatives(
     gradient: Tensor, operator: SymmetricOperator | Float64[Tensor, "d d"], directions: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """b and A of the model, on the CPU as all that a slice gives."""
+    """b and A of the model, on the CPU."""
     spans = directions.detach().double()
     slope = (spans.T @ gradient.double()).cpu()
     if isinstance(operator, Tensor):
@@ -163,6 +163,4 @@ def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Ten
         )
     if not all(axis.isfinite().all() and (axis.diff() > 0).all() for axis in coordinates):
         raise ValueError("expected finite coordinates that increase, got others; sort them and drop repeated ones")
-    lengths = torch.linalg.vector_norm(directions.double(), dim=0)
-    if not ((lengths > 0) & torch.isfinite(lengths)).all():
-        raise ValueError(f"expected finite directions that are not zero, got lengths {lengths.tolist()}")
+    column_lengths(directions, "directions")

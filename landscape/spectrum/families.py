@@ -17,7 +17,7 @@ from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.operators.operator import RestrictedOperator, SymmetricOperator
-from landscape.probes import split
+from landscape.probes import spawn
 from landscape.results import Progress
 from landscape.spectrum.anisotropy import Anisotropy, anisotropy
 from landscape.spectrum.density import ActiveSpace, spectral_density
@@ -94,7 +94,7 @@ def families(
         raise InputError(f"expected parts out of {', '.join(known)}, got {unknown[0]!r}")
     results: dict[str, Family] = {}
     for name in names:
-        stream = split(generator)
+        stream = spawn(generator)
         part = operator if name == WHOLE else RestrictedOperator(operator, name)
         if part.dim == 0:
             continue

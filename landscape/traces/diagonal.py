@@ -1,19 +1,19 @@
-"""The diagonal of H, and how much of it lies on groups of rows.
+"""The diagonal of H, and its sums over groups of rows.
 
-    method "signs"   random signs (Bekas, Kokiopoulou and Saad 2007)
-    method "auto"    the default: the first half of the probes are signs.  Where their products tell that a sketch pays, by the
-                     rule of `choice`, they become its test vectors and the other matvecs go into the sketch's products
-                     (`sketched_diagonal`); else the other half are signs too
+    method "signs"   probes z_i of random signs (Bekas, Kokiopoulou and Saad 2007)
+    method "auto"    the default.  The first half of the probes are signs.  Where their products show that a sketch pays, they
+                     become its test vectors and the other half of the budget goes into the sketch (`sketched_diagonal`);
+                     otherwise the second half are signs, too
 
-    a_i = z_i * (H z_i),   diag H ~ mean of a_i,   variance of an entry: the other entries of its row, squared, over k
+    a_i = z_i * (H z_i),   diag H ~ mean of a_i,   variance of an entry: the squares of the other entries of its row, over k
 
-A sketch pays where 4 r is below the sum of the entries' variances
-with one probe, r what the sketch leaves.
+As in `choice`, a sketch pays where 4 r is below the variance of one a_i, summed over the entries; r is the square of what lies
+outside the sketch.
 
-The sensitivity of a group of rows (a Gaussian, say) is the sum of |H_rr| over them.  The modulus of an estimate is too large on
-average: for a normal error s by at most s sqrt(2 / pi), where the entry is zero.  `GroupSums.bias` is that expected excess
-at the estimated entries, summed over the group.  The standard error is that of the sum of s_r H_rr, s_r the estimated signs
-taken for certain: so it includes how the errors of a group's rows are correlated.
+The sensitivity of a group of rows (for a scene: a Gaussian) is the sum of |H_rr| over them.  |x| of an estimate x with a normal
+error s is too large on average, by s sqrt(2 / pi) where the true entry is zero and by less elsewhere.  `GroupSums.bias` is this
+excess at the estimated entries, summed over the group.  The standard error is that of the sum of sign_r H_rr with the estimated
+signs, and so includes the correlations between the errors of a group's rows.
 """
 
 from collections.abc import Mapping
@@ -27,10 +27,11 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.linalg import group_sums
-from landscape.operators.operator import SymmetricOperator, product
+from landscape.operators.operator import SymmetricOperator, product, products
 from landscape.probes import draw_probes
 from landscape.results import Progress
-from landscape.traces.choice import WORSE, sketch_leaves
+from landscape.traces.choice import WORSE, outside_sketch
+from landscape.traces.hutchinson import joined
 from landscape.traces.sketched import added_directions
 from landscape.traces.sketched_diagonal import sketched_samples
 
@@ -43,7 +44,7 @@ SQUARED = 1e-140, 1e140  # numbers whose squares, and sums of them, are floats w
 class GroupSums:
     """sum |H_rr| over the rows of each group, with its standard error.
 
-    bias: by how much noise makes the sum too large on average (the top of this module); it is not subtracted from `values`.
+    bias: the mean excess of `values` that noise causes (see the top of this module); it is not subtracted.
     """
 
     values: Float64[Tensor, " groups"]
@@ -53,9 +54,9 @@ class GroupSums:
 
 @dataclass(frozen=True, eq=False)
 class DiagonalEstimate:
-    """diag H.  samples: one column a test vector, whose mean is `values`.
+    """diag H.  samples: one column for each test vector, with the mean `values`.
 
-    matvecs: products with H that it took.  method: "signs" or "sketch", whichever was used in the end.
+    matvecs: products used.  method: "signs" or "sketch".
     """
 
     values: Float64[Tensor, " n"]
@@ -66,19 +67,14 @@ class DiagonalEstimate:
     method: str = "signs"
 
     def block(self, name: str) -> "DiagonalEstimate":
-        """The part of the estimate in one block's rows; its matvecs are those of the whole."""
+        """The part of the estimate in one block's rows.  Its matvecs are those of the whole."""
         rows = self.blocks[name]
-        own = {name: slice(0, rows.stop - rows.start)}
-        return replace(
-            self,
-            values=self.values[rows],
-            standard_errors=self.standard_errors[rows],
-            samples=self.samples[rows],
-            blocks=own,
-        )
+        values, errors, samples = self.values[rows], self.standard_errors[rows], self.samples[rows]
+        blocks = {name: slice(0, rows.stop - rows.start)}
+        return replace(self, values=values, standard_errors=errors, samples=samples, blocks=blocks)
 
     def sensitivity(self, groups: Int64[Tensor, " n"], count: int) -> GroupSums:
-        """sum |H_rr| over the rows of each of `count` groups; groups: the number, from 0, of the group of every row."""
+        """sum |H_rr| over the rows of each of `count` groups.  groups: the number (from 0) of every row's group."""
         if groups.shape != self.values.shape or not ((groups >= 0) & (groups < count)).all():
             raise ValueError(
                 f"expected a group in 0..{count - 1} for each of {len(self.values)} rows, got shape {tuple(groups.shape)}"
@@ -99,16 +95,20 @@ def estimate_diagonal(
     progress: Progress | None = None,
     method: Method = "auto",
 ) -> DiagonalEstimate:
-    """diag H with a standard error for every entry, from `probes` (3 or more) matvecs at most.
+    """diag H with a standard error for every entry, from at most `probes` (3 or more) matvecs.
 
-    batch: vectors in one application of the operator.  Keeps n x probes numbers in float64, and squares them: entries within
-    SQUARED, as all of float32 are, have their errors, and InputError where the largest is not.  Method "auto" is "signs" with
-    fewer than 8 probes, and with no more rows than probes.
+    batch: vectors in one application of the operator.  Memory: n x probes numbers in float64.  These are squared: entries
+    within SQUARED, as all of float32 are, have right errors; InputError where the largest entry is outside; scale H then.
+    Method "auto" is "signs" with fewer than 8 probes, or with no more rows than probes.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([1.0, -2.0])))
-    >>> estimate_diagonal(H, torch.Generator().manual_seed(0)).values  # exact on a diagonal
+    >>> estimate_diagonal(H, torch.Generator().manual_seed(0)).values  # signs are exact for a diagonal matrix
     tensor([ 1., -2.], dtype=torch.float64)
+    >>> v = torch.linspace(-1, 1, 100, dtype=torch.float64)
+    >>> found = estimate_diagonal(DenseOperator(torch.outer(v, v)), torch.Generator().manual_seed(0))
+    >>> found.method, found.matvecs, torch.allclose(found.values, v * v)  # a sketch is exact for a low rank
+    ('sketch', 17, True)
     """
     if probes < 3:
         raise InputError(f"expected at least 3 probes, got {probes}")
@@ -127,9 +127,13 @@ def estimate_diagonal(
         if progress:
             progress(samples.shape[1], probes, f"diagonal: {samples.shape[1]} probes")
         if choosing and samples.shape[1] <= half:
-            kept.append((Z, Y.clone()))  # an operator may give the same buffer again
-        if choosing and samples.shape[1] == half and _pays(samples, kept):
-            return _sketched(operator, kept, batch, probes, progress)
+            kept.append((Z, Y.clone()))  # an operator may return the same buffer again
+        if choosing and samples.shape[1] == half:
+            Z, Y = joined(kept)
+            if WORSE * outside_sketch(Y) < float(samples.var(dim=1).sum()):
+                Q = added_directions(Y[:, :0], Y)
+                samples = sketched_samples(Z, Y, Q, products(operator, Q, batch))
+                return _mean(samples, operator, half + Q.shape[1], "sketch")
     return _mean(samples, operator, probes, "signs")
 
 
@@ -146,29 +150,8 @@ def _mean(samples: Float64[Tensor, "n k"], operator: SymmetricOperator, matvecs:
     return DiagonalEstimate(samples.mean(dim=1), errors, samples, operator.blocks, matvecs, method)
 
 
-def _pays(samples: Float64[Tensor, "n k"], kept: list[tuple[Tensor, Tensor]]) -> bool:
-    """Whether a sketch leaves so much less to chance that half as many test vectors do better."""
-    leaves = sketch_leaves(torch.cat([Y for _, Y in kept], dim=1))
-    return WORSE * leaves < float(samples.var(dim=1).sum())
-
-
-def _sketched(
-    operator: SymmetricOperator, kept: list[tuple[Tensor, Tensor]], batch: int, most: int, progress: Progress | None
-) -> DiagonalEstimate:
-    """With the products of the sketch's own directions."""
-    Z, Y = (torch.cat(parts, dim=1) for parts in zip(*kept, strict=True))
-    Q = added_directions(Y[:, :0], Y)
-    HQ, done = torch.empty_like(Q), Z.shape[1]
-    for columns in torch.arange(Q.shape[1]).split(batch):
-        HQ[:, columns] = product(operator, Q[:, columns].contiguous())
-        done += len(columns)
-        if progress:
-            progress(done, most, f"diagonal: a sketch of {Q.shape[1]} directions")
-    return _mean(sketched_samples(Z, Y, Q, HQ), operator, done, "sketch")
-
-
 def _folded_excess(size: Tensor, error: Tensor) -> Tensor:
-    """E |x| - size for a normal x of the mean size and the standard deviation error."""
+    """E |x| - size for a normal x with the mean `size` and the standard deviation `error`."""
     z = size / error.clamp_min(1e-300)
     normal = torch.exp(-z.square() / 2) * sqrt(2 / pi)
     return error * (normal - z * torch.special.erfc(z / sqrt(2)))

@@ -1,19 +1,18 @@
 """Hutchinson's estimator, E z^T H z = tr H for E z z^T = I (Girard 1989, Hutchinson 1990), until the error is small enough.
 
-An adaptive run stops when the interval's half width is below max(rtol |trace|, atol).  Every look is a chance to stop on a
-spread that is too small by luck, so it looks only when the number of probes has grown by half since the last look, stops
-when the tolerance still holds four probes later (Simons 1968), and takes its interval 5% wider.  Cover measured over 2,000
-seeds, tolerances that take 12 to 70 probes, relative and absolute: 93 to 97.1% on all spectra of `quadratic`; up to 97.7%
-where the tolerance is as large as the trace of one dominant eigenvalue, and the first look decides.
+An adaptive run stops when half the width of the interval is below max(rtol |trace|, atol).  Each look at the error is a chance
+to stop on a spread that is too small by luck.  So a run looks only when the number of probes has grown by half since the last
+look, stops only if the tolerance still holds four probes later (Simons 1968), and widens its interval by 5%.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, inf
 from time import monotonic
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
@@ -26,11 +25,11 @@ from landscape.traces.quadratic import FEWEST, PowerSums, mean_interval, power_s
 
 Reading = Literal["block", "full"]
 Method = Literal["auto", "hutchinson", "hutch++", "xtrace"]
-LEAST = 8  # probes: with fewer no interval can be trusted
-GROWTH = 1.5  # between two looks
-CONFIRMATION = 4  # probes between reaching the tolerance and believing it
-WIDENING = 1.05  # of the interval of an adaptive run
-GROUP = 32  # probes whose vectors are kept for the law of the mean
+LEAST = 8  # probes that an interval needs: see the degrees of freedom in `quadratic`
+GROWTH = 1.5  # ratio of the numbers of probes at two looks
+CONFIRMATION = 4  # probes between reaching the tolerance and stopping
+WIDENING = 1.05  # factor of the interval of an adaptive run
+GROUP = 32  # probes whose vectors are kept at a time, for the pairs in `quadratic`
 
 
 @dataclass(frozen=True)
@@ -39,12 +38,11 @@ class TraceSettings:
 
     distribution: entries of a probe are random signs ("rademacher") or standard normal ("gaussian").
     reading, method: see `landscape.traces.trace`.
-    rtol, atol: a block is done when half the width of its interval is max(rtol |trace|, atol) or less; both 0: every block
+    rtol, atol: a block is done when half the width of its interval is at most max(rtol |trace|, atol).  With both 0 every block
         takes max_probes, unless max_seconds end it.  confidence: of the interval.
-    min_probes: before the error is first looked at.  max_probes: the most matvecs of a block, by any method (a probe of
-        Hutchinson's is one; a sketch takes more for each).
+    min_probes: probes before the first look at the error.  max_probes: largest number of matvecs of a block by any method.
     max_seconds: for all blocks together, after min_probes.  batch: vectors in one application of the operator.
-    memory: GiB for the vectors that a sketch keeps; XTrace stops where they are full.
+    memory: GiB for the vectors that a sketch keeps; XTrace stops when they are full.
     """
 
     distribution: Distribution = "rademacher"
@@ -88,12 +86,12 @@ class TraceSettings:
         reading: Reading = "block",
         method: Method = "hutchinson",
     ) -> "TraceSettings":
-        """Exactly this many probes, whatever the error (a method other than "hutchinson" counts matvecs)."""
+        """Exactly this many probes, whatever the error.  For methods other than "hutchinson": matvecs."""
         return cls(distribution, reading, rtol=0.0, min_probes=probes, max_probes=probes, method=method)
 
     @property
     def least(self) -> int:
-        """The fewest matvecs of the method: LEAST for each of its tasks."""
+        """The fewest matvecs of the method: LEAST for each of its parts (sketch, its products, probes)."""
         return LEAST * {"auto": 1, "hutchinson": 1, "hutch++": 3, "xtrace": 2}[self.method]
 
     @property
@@ -101,19 +99,19 @@ class TraceSettings:
         return (self.rtol > 0 or self.atol > 0) and self.min_probes < self.max_probes
 
     def reached(self, value: float, low: float, high: float) -> bool:
-        """Whether an interval is as short as was asked for."""
+        """Whether an interval is short enough."""
         asked = self.rtol > 0 or self.atol > 0
         return asked and (high - low) / 2 <= max(self.rtol * abs(value), self.atol)
 
 
 class StoppingRule:
-    """When an adaptive run looks at its error, and whether it may then stop.  next: the number of probes at the next look."""
+    """The looks of an adaptive run at its error.  next: the number of probes at the next look."""
 
     def __init__(self, first: int, most: int, confirmation: int = CONFIRMATION) -> None:
         self.next, self._most, self._confirmation, self._confirming = first, most, confirmation, False
 
     def end(self, probes: int, reached: bool) -> bool:
-        """Whether the run ends with this look, at which the error asked for was reached or not."""
+        """Whether the run ends with this look.  reached: whether the error is small enough now."""
         if probes == self._most or (reached and self._confirming):
             return True
         self.next = min(probes + self._confirmation if reached else ceil(GROWTH * probes), self._most)
@@ -122,9 +120,10 @@ class StoppingRule:
 
 
 class Hutchinson:
-    """One operator, probed until every one of its groups of rows has the error asked for.
+    """Hutchinson's estimator on one operator, for every one of its groups of rows at once.
 
-    known: a part of the trace that is not in the operator; spent: matvecs that it took.
+    rows: named groups of rows.  samples: z^T H z, a line for each group.  known: a part of the trace that is not in the
+    operator.  spent: matvecs that this part took.  keep: up to this number, probes and their products stay in `kept`.
     """
 
     def __init__(
@@ -136,70 +135,66 @@ class Hutchinson:
         deadline: float = inf,
         known: float = 0.0,
         spent: int = 0,
+        keep: int = 0,
     ) -> None:
         self.operator, self.rows, self.generator = operator, rows, generator
-        self.settings, self.deadline, self.known, self.spent = settings, deadline, known, spent
-        self.samples = torch.empty(len(rows), 0, dtype=torch.float64)  # z^T H z, a line for each group of rows
+        self.settings, self.deadline, self.known, self.spent, self.keep = settings, deadline, known, spent, keep
+        self.samples = torch.empty(len(rows), 0, dtype=torch.float64)
         self.groups: dict[str, list[PowerSums]] = {name: [] for name in rows}
         self.current: list[tuple[Tensor, Tensor]] = []  # Z and H Z of the probes that are in no group yet
+        self.kept: list[tuple[Tensor, Tensor]] = []
 
-    def estimate(
-        self, done_before: int = 0, most: int = 0, progress: Progress | None = None
-    ) -> dict[str, TraceEstimate]:
-        """Progress counts matvecs, from done_before to most."""
-        settings, probes, looks = self.settings, 0, StoppingRule(self.first_look, self.settings.max_probes)
+    def estimate(self, progress: Progress | None = None) -> dict[str, TraceEstimate]:
+        """The trace of every group of rows.  Progress counts matvecs."""
+        *_, (estimates, _) = self.looks(self.settings.min_probes, progress)
+        return estimates
+
+    def looks(self, first: int, progress: Progress | None = None) -> Iterator[tuple[dict[str, TraceEstimate], bool]]:
+        """The estimates at every look, the first one after `first` probes, and whether the run ends there."""
+        settings, probes, rule, ended = self.settings, 0, StoppingRule(first, self.settings.max_probes), False
         if self.operator.dim == 0:
             exact = (self.known, settings.confidence, self.spent)
-            return {name: TraceEstimate.exact(name, 0, *exact) for name in self.rows}
-        while True:
-            self.draw(min(settings.batch, looks.next - probes, GROUP - probes % GROUP))
+            yield {name: TraceEstimate.exact(name, 0, *exact) for name in self.rows}, True
+            return
+        while not ended:
+            self.draw(min(settings.batch, rule.next - probes, GROUP - probes % GROUP))
             probes = self.samples.shape[1]
             if progress:
-                progress(done_before + probes, most, f"trace of {', '.join(self.rows)}: {probes} probes")
+                progress(probes, settings.max_probes, f"trace of {', '.join(self.rows)}: {probes} probes")
             late = monotonic() > self.deadline and probes >= settings.min_probes
-            if probes < looks.next and not late:
+            if probes < rule.next and not late:
                 continue
             estimates = self._estimates("time budget" if late else "matvec budget")
-            reached = all(estimate.reason == "tolerance" for estimate in estimates.values())
-            if late or looks.end(probes, reached) or (not reached and self.leaves(estimates)):
-                return estimates
+            ended = late or rule.end(probes, all(found.reason == "tolerance" for found in estimates.values()))
+            yield estimates, ended
 
-    @property
-    def first_look(self) -> int:
-        return self.settings.min_probes
-
-    def leaves(self, estimates: Mapping[str, TraceEstimate]) -> bool:
-        """Whether these estimates are where this method ends, because another one does better."""
-        return False
-
-    def draw(self, count: int) -> tuple[Tensor, Tensor]:
-        """Probes and their products with H, taken into account."""
+    def draw(self, count: int) -> None:
+        """Add this many probes and their products with H."""
         Z = draw_probes(self.operator.dim, count, self.generator, self.operator.dtype, self.settings.distribution)
-        Y = product(self.operator, Z).clone()  # kept below, and an operator may give the same buffer again
+        Y = product(self.operator, Z).clone()  # kept below; an operator may return the same buffer again
         sums = torch.stack([column_dots(Z[r], Y[r]) for r in self.rows.values()])
         self.samples = torch.cat([self.samples, sums.cpu()], dim=1)
+        self.kept = [*self.kept, (Z, Y)] if self.samples.shape[1] <= self.keep else []
         self.current.append((Z, Y))
         if self.samples.shape[1] % GROUP == 0:
             for name, group in self._open_groups().items():
                 self.groups[name].append(group)
             self.current = []
-        return Z, Y
 
     def _open_groups(self) -> dict[str, PowerSums]:
-        """The power sums of every block from the probes in no group yet."""
-        if sum(parts[0].shape[1] for parts in self.current) < FEWEST:
+        """The power sums of every group of rows, from the probes in no group of probes yet."""
+        if sum(Z.shape[1] for Z, _ in self.current) < FEWEST:
             return {}
-        Z, Y = (torch.cat(parts, dim=1) for parts in zip(*self.current, strict=True))
+        Z, Y = joined(self.current)
         kind = self.settings.distribution
         return {name: power_sums(Z[rows], Y[rows], kind) for name, rows in self.rows.items()}
 
     def _estimates(self, reason: StopReason) -> dict[str, TraceEstimate]:
-        """The estimates so far; those that have the error asked for say so, the others give the reason."""
+        """The estimates so far, with the reason "tolerance" where it is reached and the given one elsewhere."""
         settings, results, opened = self.settings, {}, self._open_groups()
         probes = self.samples.shape[1]
         widening = WIDENING if settings.adaptive else 1.0
-        for i, (name, rows) in enumerate(self.rows.items()):
-            samples = self.samples[i] + self.known
+        for samples, (name, rows) in zip(self.samples + self.known, self.rows.items(), strict=True):
             groups = self.groups[name] + ([opened[name]] if opened else [])
             value = float(samples.mean())
             error, low, high = mean_interval(value, probes, groups, settings.confidence, widening)
@@ -215,6 +210,11 @@ class Hutchinson:
                 matvecs=self.spent + probes,
                 reason="tolerance" if settings.reached(value, low, high) else reason,
                 samples=samples,
-                method="hutchinson",
             )
         return results
+
+
+def joined(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k"]]:
+    """The probes and the products of all pairs (Z, H Z), side by side."""
+    Z, Y = (torch.cat(parts, dim=1) for parts in zip(*pairs, strict=True))
+    return Z, Y

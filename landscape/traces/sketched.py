@@ -1,42 +1,38 @@
-"""Traces by sketching: what a few eigenvalues dominate is taken exactly, and only the rest is left to chance.
+"""Traces by sketching: the part of H that a few eigenvalues dominate is taken exactly, and only the rest by probes.
 
-Hutch++ (Meyer, Musco, Musco and Woodruff 2021), a third of the matvecs each for S, Q and the probes:
+Hutch++ (Meyer, Musco, Musco and Woodruff 2021), with a third of the matvecs each for H S, H Q and the probes:
 
     Q = orth(H S),   tr H = tr(Q^T H Q) + tr(P H P),   P = I - Q Q^T,   the last trace by Hutchinson
 
-XTrace (Epperly, Tropp and Webber 2024, in its resphered form), s matvecs each for Omega and Q; no vector
-serves one task alone, because each omega_i in turn is the probe for the sketch of the others:
+XTrace (Epperly, Tropp and Webber 2024, in its resphered form), with s matvecs each for H Omega and H Q.  Every test vector
+omega_i serves twice: in the sketch of the others, and as the probe for the sketch that the others make:
 
     Q_i = orth(H Omega without its column i),   u = (I - Q_i Q_i^T) omega_i
     t_i = tr(Q_i^T H Q_i) + (n - s + 1) / |u|^2 u^T H u,   tr H ~ mean t_i
 
-All t_i come from one QR: with Y = H Omega = Q R, Q_i spans Q less the unit vector Q s_i, s_i ~ R^-T e_i.  The squared
-length of u, replaced by the one it has on average, is random no more.
+All t_i follow from one QR decomposition Y = H Omega = Q R: the range of Q_i is that of Q without the unit vector Q s_i, where
+s_i is the normalised column i of R^-T.  The factor (n - s + 1) / |u|^2 replaces the squared length of u by its expectation.
+Test vectors that were random signs before (`choice`) keep their lengths: the factor is 1 for them.
 
-**Its error.**  The published one, the spread of the t_i over sqrt(s), takes them as independent.  They share their sketch:
+**The error.**  The published one, the standard deviation of the t_i over sqrt(s), is too small: it takes the t_i as
+independent, but they share a sketch.  With V = Var t_i and C = Cov(t_i, t_j)
 
-    Var(mean) = (V + (s - 1) C) / s,    V = Var t_i,  C = Cov(t_i, t_j);    the spread s_t^2 of the t_i is V - C on average
+    Var(mean) = (V + (s - 1) C) / s,    and the sample variance s_t^2 of the t_i has the expectation V - C
 
-C is known, too.  Let t_i^j be t_i with j left out of the sketch as well.  Given the other test vectors, t_i^j and t_j^i are
-independent and unbiased; so is t_j for any omega_i, of which alone t_i^j depends.  All products but one thus have the mean
-(tr H)^2, and
+C can be estimated, too.  Let t_i^j be t_i with j left out of the sketch as well.  Given the other test vectors, t_i^j and t_j^i
+are independent and unbiased; so is t_j for any omega_i, and t_i^j depends on omega_i only.  So all products except t_i t_j have
+the mean (tr H)^2, and
 
     C = E (t_i - t_i^j) (t_j - t_j^i),      error^2 = s_t^2 / s + |C^|,    C^ the mean over all pairs
 
-without bias but for the modulus, which keeps a C^ that is below zero by chance from shortening the interval.  All t_i^j follow
-from the one QR.  Student's interval with s - 1 degrees of freedom covers (2,000 seeds, n = 60, 8 to 27 test vectors, nominal
-95%): 93.6 to 96.7% on power laws, clustered, indefinite and flat spectra, and with one dominant eigenvalue; up to 98% where the
-spectrum falls exponentially, and above where it has a step at the very size of the sketch.  The published error covers
-77 to 93%.
+This is unbiased except for the modulus, which prevents a C^ that is negative by chance from shortening the interval.  The
+interval is Student's with s - 1 degrees of freedom.  All t_i^j follow from the one QR decomposition.
 
-An adaptive run believes an error below its tolerance only if one test vector more leaves it there: errors that are small by
-luck go with values that are off (twelve eigenvalues of 1, 12 test vectors, 10%: one run in fourteen ended so, 60% of them
-covered; confirmed ones 96.5%, without being wider).
+An adaptive run stops only if one test vector more leaves its error below the tolerance, because an error that is small by
+chance goes with a value that is off.
 
-Test vectors are signs where they were probes before (`choice`), and their squared lengths are left as they are.
-
-Products are taken in the operator's dtype, the small matrices in float64.  Directions of H Omega that are round-off alone
-are no part of Q and cost nothing: a matrix of low rank r is exact after s + r products.
+Products are taken in the operator's dtype, small matrices in float64.  Directions of H Omega that are only round-off are left
+out of Q and cost nothing: a matrix of low rank r is exact after s + r products.
 """
 
 from dataclasses import replace
@@ -49,7 +45,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.linalg import column_dots, gram, is_roundoff, norm
-from landscape.operators.operator import ProjectedOperator, SymmetricOperator, product
+from landscape.operators.operator import ProjectedOperator, SymmetricOperator, product, products
 from landscape.probes import draw_probes
 from landscape.results import StopReason, t_quantile
 from landscape.traces.estimate import TraceEstimate
@@ -57,8 +53,8 @@ from landscape.traces.hutchinson import LEAST, Hutchinson, StoppingRule, TraceSe
 
 EPS = torch.finfo(torch.float64).eps
 GIB = 2**30
-VECTORS = 4  # kept for each test vector of XTrace
-CONFIRMATION = 1  # test vectors more between reaching the tolerance and believing it
+VECTORS = 4  # vectors kept for each test vector of XTrace: of Omega, Y, Q and H Q
+CONFIRMATION = 1  # test vectors between reaching the tolerance and stopping
 
 
 def hutch_plus_plus(
@@ -68,20 +64,27 @@ def hutch_plus_plus(
     deadline: float = inf,
     name: str = "all",
 ) -> TraceEstimate:
-    """The trace of an operator.
+    """The trace of an operator by Hutch++.
 
-    A third of max_probes, or of the time, goes into the sketch; an adaptive run saves probes on the rest.
+    A third of max_probes, or of the time, goes into the sketch.  An adaptive run saves probes on the rest.
+
+    >>> from landscape.operators.operator import DenseOperator
+    >>> v = torch.linspace(-1, 1, 101, dtype=torch.float64)
+    >>> H = DenseOperator(torch.outer(v, v))  # of rank 1, with the trace |v|^2 = 34.34
+    >>> found = hutch_plus_plus(H, torch.Generator().manual_seed(0), TraceSettings.fixed(24, method="hutch++"))
+    >>> round(found.value, 9), found.half_width < 1e-9
+    (34.34, True)
     """
     if operator.dim <= settings.max_probes:
         return by_identity(operator, settings, name, generator.device)
     sketch = draw_probes(operator.dim, settings.max_probes // 3, generator, operator.dtype, settings.distribution)
     start, Y = monotonic(), sketch[:, :0]
     for vectors in sketch.split(settings.batch, dim=1):
-        Y = torch.cat([Y, _products(operator, vectors, settings)], dim=1)
+        Y = torch.cat([Y, product(operator, vectors)], dim=1)
         if monotonic() - start > (deadline - start) / 3:
             break
     Q, rank = torch.linalg.qr(Y).Q, Y.shape[1]
-    known = float((Q.double() * _products(operator, Q, settings).double()).sum())
+    known = float((Q.double() * products(operator, Q, settings.batch).double()).sum())
     rest = ProjectedOperator(operator, lambda V: V - Q @ (Q.T @ V))
     most = settings.max_probes - 2 * rank
     probing = replace(settings, min_probes=min(settings.min_probes, most), max_probes=most, method="hutchinson")
@@ -97,9 +100,16 @@ def xtrace(
     name: str = "all",
     start: tuple[Float[Tensor, "n s"], Float[Tensor, "n s"]] | None = None,
 ) -> TraceEstimate:
-    """The trace of an operator.
+    """The trace of an operator by XTrace.
 
-    start: test vectors of settings.distribution with their products, to go on from; else their directions are uniform.
+    start: test vectors of settings.distribution to begin with, and their products; None: directions are uniformly distributed.
+
+    >>> from landscape.operators.operator import DenseOperator
+    >>> v = torch.linspace(-1, 1, 101, dtype=torch.float64)
+    >>> H = DenseOperator(torch.outer(v, v))  # of rank 1, with the trace |v|^2 = 34.34
+    >>> found = xtrace(H, torch.Generator().manual_seed(0), TraceSettings.fixed(24, method="xtrace"))
+    >>> round(found.value, 9), found.half_width < 1e-9, found.matvecs  # 12 test vectors and one direction
+    (34.34, True, 13)
     """
     n, most = operator.dim, most_test_vectors(operator, settings)
     if start is None and n <= settings.max_probes:
@@ -108,20 +118,21 @@ def xtrace(
         raise InputError(f"expected memory for {VECTORS * LEAST} vectors of {n} numbers, got {settings.memory:g} GiB")
     kind = "gaussian" if start is None else settings.distribution
     count = max(settings.min_probes, settings.least) // 2 if start is None else start[0].shape[1]
-    empty = torch.empty(n, 0, dtype=operator.dtype, device=generator.device if start is None else start[0].device)
-    Omega, Y, Q, HQ = (empty,) * 4
+    Omega, Y, Q, HQ = (torch.empty(n, 0, dtype=operator.dtype, device=generator.device),) * 4
     looks = StoppingRule(count, most, CONFIRMATION)
     while True:
-        Z = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, kind) if start is None else start[0]
-        HZ = _products(operator, Z, settings) if start is None else start[1]
-        start, Omega, Y = None, torch.cat([Omega, Z], dim=1), torch.cat([Y, HZ], dim=1)
+        if start is None:
+            Z = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, kind)
+            start = Z, products(operator, Z, settings.batch)
+        (Z, HZ), start = start, None
+        Omega, Y = torch.cat([Omega, Z], dim=1), torch.cat([Y, HZ], dim=1)
         new = added_directions(Q, HZ)
-        Q, HQ = torch.cat([Q, new], dim=1), torch.cat([HQ, _products(operator, new, settings)], dim=1)
+        Q, HQ = torch.cat([Q, new], dim=1), torch.cat([HQ, products(operator, new, settings.batch)], dim=1)
         samples, without = _leave_out(Omega, Y, Q, HQ, kind == "gaussian")
         value, error, spent = float(samples.mean()), _error(samples, without), count + Q.shape[1]
         half = t_quantile(count - 1, settings.confidence) * error
         late, reached = monotonic() > deadline, settings.reached(value, value - half, value + half)
-        complete = Q.shape[1] < count  # H has no more directions: the trace is that of Q^T H Q
+        complete = Q.shape[1] < count  # the range of H is complete: its trace is that of Q^T H Q
         if late or (reached and complete) or looks.end(count, reached):
             reason: StopReason = "tolerance" if reached else "time budget" if late else "matvec budget"
             interval = value, error, value - half, value + half, settings.confidence
@@ -132,13 +143,13 @@ def xtrace(
 
 
 def most_test_vectors(operator: SymmetricOperator, settings: TraceSettings) -> int:
-    """How many XTrace may have: two products and VECTORS vectors each."""
+    """Largest number of test vectors of XTrace: each takes two products and the memory of VECTORS vectors."""
     size = max(operator.dim, 1) * torch.empty((), dtype=operator.dtype).element_size()
     return min(settings.max_probes // 2, int(settings.memory * GIB / size) // VECTORS)
 
 
 def added_directions(Q: Float[Tensor, "n r"], Y: Float[Tensor, "n s"]) -> Float[Tensor, "n a"]:
-    """Orthonormal directions that Y adds to those of Q, round-off left out."""
+    """Orthonormal directions that Y adds to those of Q, without those that are only round-off."""
     rest = Y.clone(memory_format=torch.contiguous_format)
     for _ in range(2):
         rest -= Q @ (Q.T @ rest)
@@ -149,9 +160,9 @@ def added_directions(Q: Float[Tensor, "n r"], Y: Float[Tensor, "n s"]) -> Float[
 
 
 def _error(samples: Tensor, without: Tensor) -> float:
-    """The root of the spread of the mean and the modulus of the covariance."""
+    """sqrt(s_t^2 / s + |C^|), with `without` as from `_leave_out`."""
     count = len(samples)
-    unit = float(samples.abs().max()) or 1.0  # of squares that leave the range of floats
+    unit = float(samples.abs().max()) or 1.0  # so that squares stay in the range of floats
     samples, changes = samples / unit, ((samples - without) / unit).fill_diagonal_(0)
     covariance = float((changes * changes.T).sum()) / (count * (count - 1))
     return unit * sqrt(float(samples.var()) / count + abs(covariance))
@@ -160,51 +171,49 @@ def _error(samples: Tensor, without: Tensor) -> float:
 def _leave_out(
     Omega: Tensor, Y: Tensor, Q: Tensor, HQ: Tensor, spherical: bool
 ) -> tuple[Float64[Tensor, " s"], Float64[Tensor, "s s"]]:
-    """t_j of every test vector; and in row i, column j that without the i-th one.
+    """All t_j; and t_j without test vector i in the sketch, in row i and column j.  spherical: lengths of u are replaced.
 
-    Without the columns in P the sketch spans Q less Q S_P; all of Q where Y has a lower rank than columns, as any columns
-    but one span it then.  With g = S_P^T S_P, b = S_P^T w, y = g^-1 b and w = Q^T omega: u = omega - Q (w - S_P y), whose
-    square and whose u^T H u follow from products of small matrices.  spherical: lengths of u are replaced.
+    Without the columns in P the sketch is Q without Q S_P.  With g = S_P^T S_P, b = S_P^T w, y = g^-1 b and w = Q^T omega:
+    u = omega - Q (w - S_P y).  |u|^2 and u^T H u follow from products of small matrices.
     """
     (n, count), rank = Omega.shape, Q.shape[1]
     R, W, core, T = gram(Q, Y), gram(Q, Omega), gram(Q, HQ), gram(HQ, Omega)
-    S, less = R.new_zeros(rank, count), 0
-    if rank == count:
-        U, sigma, Vh = torch.linalg.svd(R)
-        S, less = U @ (Vh / (sigma / sigma[0]).clamp_min(EPS)[:, None]), 1  # R^-T, but for its length
-        S = S / S.norm(dim=0)
+    found = left_out_directions(R)
+    S, less = (R.new_zeros(rank, count), 0) if found is None else (found, 1)  # less: dimensions that a test vector adds
     angles, b, pull, inner = S.T @ S, S.T @ W, S.T @ (T - core @ W), S.T @ core @ S
     squares = column_dots(Omega, Omega) - W.square().sum(dim=0)
     products = column_dots(Omega, Y) - 2 * (W * T).sum(dim=0) + (W * (core @ W)).sum(dim=0)
-    own, b_own, pull_own = inner.diagonal(), b.diagonal(), pull.diagonal()
-    quadratic = products + 2 * b_own * pull_own + b_own.square() * own
-    length = (n - rank + less) / (squares + b_own.square()) if spherical else 1.0
-    t = core.trace() - own + length * quadratic
-    # row i is left out, column j tested
+    inner_jj, b_jj, pull_jj = inner.diagonal(), b.diagonal(), pull.diagonal()
+    quadratic = products + 2 * b_jj * pull_jj + b_jj.square() * inner_jj
+    length = (n - rank + less) / (squares + b_jj.square()) if spherical else 1.0
+    t = core.trace() - inner_jj + length * quadratic
+    # the same without i (rows) for the probe j (columns): a 2 x 2 system for y = (y_i, y_j)
     det = (1 - angles.square()).fill_diagonal_(1)
-    y, y_own = (b - angles * b_own) / det, (b_own - angles * b) / det
-    squares = squares + b * y + b_own * y_own
-    quadratic = products + 2 * (y * pull + y_own * pull_own)
-    quadratic = quadratic + y.square() * own[:, None] + 2 * y * y_own * inner + y_own.square() * own
-    left = core.trace() - (own[:, None] + own - 2 * angles * inner) / det
+    y_i, y_j = (b - angles * b_jj) / det, (b_jj - angles * b) / det
+    squares = squares + b * y_i + b_jj * y_j
+    quadratic = products + 2 * (y_i * pull + y_j * pull_jj)
+    quadratic = quadratic + y_i.square() * inner_jj[:, None] + 2 * y_i * y_j * inner + y_j.square() * inner_jj
+    trace = core.trace() - (inner_jj[:, None] + inner_jj - 2 * angles * inner) / det
     length = (n - rank + 2 * less) / squares if spherical else 1.0
-    return t.cpu(), (left + length * quadratic).cpu()
+    return t.cpu(), (trace + length * quadratic).cpu()
+
+
+def left_out_directions(R: Float64[Tensor, "r s"]) -> Float64[Tensor, "r s"] | None:
+    """Unit vectors s_i (columns): the columns of Q R without the i-th span Q without Q s_i.  They are those of R^-T.
+
+    None where R has fewer rows than columns: then the other columns span all of Q.
+    """
+    if R.shape[0] < R.shape[1]:
+        return None
+    U, sigma, Vh = torch.linalg.svd(R)
+    S = U @ (Vh / (sigma / sigma[0]).clamp_min(EPS)[:, None])  # R^-T times sigma[0]
+    return S / S.norm(dim=0)
 
 
 def by_identity(
     operator: SymmetricOperator, settings: TraceSettings, name: str, device: torch.device, spent: int = 0
 ) -> TraceEstimate:
-    """Where all of a small matrix costs no more than the estimate.  spent: matvecs that it took to know."""
+    """The exact trace, from the product with every column of the identity.  spent: matvecs used before."""
     identity = torch.eye(operator.dim, dtype=operator.dtype, device=device)
-    value = float(_products(operator, identity, settings).diagonal().double().sum()) if operator.dim else 0.0
+    value = float(products(operator, identity, settings.batch).diagonal().double().sum()) if operator.dim else 0.0
     return TraceEstimate.exact(name, operator.dim, value, settings.confidence, spent + operator.dim)
-
-
-def _products(operator: SymmetricOperator, V: Tensor, settings: TraceSettings) -> Tensor:
-    """H V, `batch` vectors at a time."""
-    if V.shape[1] == 0:
-        return V
-    result = torch.empty_like(V)
-    for part, vectors in zip(result.split(settings.batch, dim=1), V.split(settings.batch, dim=1), strict=True):
-        part.copy_(product(operator, vectors))
-    return result

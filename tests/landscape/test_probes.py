@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from landscape.probes import draw_probes, split
+from landscape.probes import draw_probes, spawn
 
 
 def generator(seed=0):
@@ -29,7 +29,7 @@ def test_rademacher_entries_are_signs():
 
 
 def test_split_generators_are_reproducible_and_differ():
-    a, b = (split(source) for source in [generator()] * 2)
-    c = split(generator())
+    a, b = (spawn(source) for source in [generator()] * 2)
+    c = spawn(generator())
     draws = [draw_probes(8, 1, source, torch.float64) for source in (a, b, c)]
     assert torch.equal(draws[0], draws[2]) and not torch.equal(draws[0], draws[1])

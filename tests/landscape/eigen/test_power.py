@@ -66,7 +66,7 @@ def test_a_power_setting_that_is_no_number_is_refused(wrong):
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])
-def test_power_iteration_knows_no_scale(scale):
+def test_power_iteration_scales_with_the_operator(scale):
     H = operator("clustered")
     pair, steps = power_iteration(DenseOperator(scale * H.matrix), generator(), PowerSettings(rtol=1e-4))
     plain, expected = power_iteration(H, generator(), PowerSettings(rtol=1e-4))

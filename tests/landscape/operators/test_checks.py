@@ -35,7 +35,7 @@ def test_a_symmetric_matrix_passes_at_the_dtypes_round_off(dtype):
     assert check.symmetry < 10 * torch.finfo(dtype).eps
 
 
-def test_the_asymmetry_measured_is_the_frobenius_norm_of_the_antisymmetric_part():
+def test_the_asymmetry_is_the_frobenius_norm_of_the_antisymmetric_part():
     skew = torch.randn(N, N, generator=generator(1), dtype=torch.float64)
     matrix = A + 1e-3 * (skew - skew.T)
     check = check_operator(Any(lambda V: matrix @ V), generator(), vectors=32)
@@ -109,11 +109,11 @@ def test_a_hessian_that_is_one_percent_too_long_is_seen():
     assert by_loss.error == pytest.approx(0.01 / 1.01, abs=1e-5)
 
 
-def test_steps_across_a_change_of_signature_are_skipped():
-    def signature(x):
+def test_steps_to_another_smooth_piece_are_skipped():
+    def smooth_piece(x):
         return bool((x - POINT) @ DIRECTION > 5e-4)
 
-    check = check_gradient(H, gradient, POINT, DIRECTION, steps=(1e-2, 1e-3, 1e-4, 1e-5), signature=signature)
+    check = check_gradient(H, gradient, POINT, DIRECTION, steps=(1e-2, 1e-3, 1e-4, 1e-5), smooth_piece=smooth_piece)
     assert check.skipped == 2 and check.steps == (1e-4, 1e-5) and check.error < 1e-8
 
 
@@ -125,7 +125,7 @@ def test_no_further_step_is_tried_once_one_is_good_enough():
 
 
 def test_where_every_step_is_skipped_there_is_no_number():
-    check = check_gradient(H, gradient, POINT, DIRECTION, signature=lambda x: float(x.sum()))
+    check = check_gradient(H, gradient, POINT, DIRECTION, smooth_piece=lambda x: float(x.sum()))
     assert check.skipped == 5 and check.record()["error"] is None
 
 

@@ -54,7 +54,16 @@ def work(ranks):
         "few": complaint(lambda: ranks.share([0])),
         "any": ranks.any(torch.tensor([False, ranks.rank == 1, True])),
         "gathered": torch.cat(ranks.gather(torch.tensor([ranks.rank]))),
+        "lost": []
+        if ranks.rank
+        else [told_of_a_loss(ranks.sum), told_of_a_loss(ranks.gather)],  # the second rank leaves
     }
+
+
+def told_of_a_loss(exchange):
+    with pytest.raises(ConnectionError) as caught:
+        exchange(torch.ones(3))
+    return str(caught.value)
 
 
 @pytest.fixture(scope="module")
@@ -89,21 +98,9 @@ def test_ranks_that_disagree_all_say_so(found):
         assert "at least one item for each of 2 ranks, got 1" in rank["few"]
 
 
-def lost(ranks):
-    """What the first rank is told where the second leaves before it has had its share of an exchange."""
-    if ranks.rank == 1:
-        return {}
-    said = {}
-    for name in ("sum", "gather"):
-        with pytest.raises(ConnectionError) as caught:
-            getattr(ranks, name)(torch.ones(3))
-        said[name] = str(caught.value)
-    return said
-
-
-def test_a_process_that_leaves_is_not_waited_for(tmp_path):
-    told = on_ranks(2, tmp_path, lost)[0]
-    assert all("expected all processes to exchange numbers, lost one" in told[name] for name in ("sum", "gather"))
+def test_a_process_that_leaves_is_not_waited_for(found):
+    said = found[0]["lost"]
+    assert len(said) == 2 and all("expected all processes to exchange numbers, lost one" in told for told in said)
 
 
 def test_masks_and_tensors_meet_in_the_order_of_ranks(found):
@@ -116,7 +113,7 @@ def test_without_a_group_the_error_says_how_to_make_one():
         Ranks.joined()
 
 
-def test_processes_of_torchrun_exchange_by_nccl_between_gpus_and_by_gloo_otherwise(monkeypatch):
+def test_ranks_of_torchrun_use_nccl_between_gpus_and_gloo_otherwise(monkeypatch):
     said = []
     monkeypatch.setattr(dist, "is_torchelastic_launched", lambda: True)
     monkeypatch.setattr(dist, "init_process_group", lambda backend, device_id=None: said.append((backend, device_id)))

@@ -58,7 +58,7 @@ WEIGHTS = torch.ones(5, dtype=torch.float64, requires_grad=True)
         lambda x: (WEIGHTS * x.detach() ** 2).sum(),  # it has a graph, in which the point is not
     ],
 )
-def test_a_loss_that_is_cut_off_from_the_point_is_refused_and_not_taken_for_a_flat_one(cut):
+def test_a_loss_that_is_cut_off_from_the_point_is_refused(cut):
     with pytest.raises(ValueError, match=r"computed from the point.*\.detach\(\).*no_grad"):
         ObjectiveHessian(cut, POINT)
 

@@ -171,7 +171,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_no_estimator_makes_a_number_of_products_that_are_none(estimator, mistake):
+def test_every_estimator_refuses_products_of_another_shape_or_not_finite(estimator, mistake):
     change, expected = MISTAKES[mistake]
     with pytest.raises(ValueError, match=expected):
         ESTIMATORS[estimator](Wrong(change), torch.Generator().manual_seed(0))

@@ -32,13 +32,13 @@ def test_a_random_direction_is_isotropic_within_a_group():
     assert ((d.square().mean(dim=1) - 1 / 3).abs() < 4 * (4 / 45 / count) ** 0.5).all()
 
 
-def test_random_directions_scale_with_the_parameters_and_repeat_with_the_seed():
+def test_random_directions_scale_with_parameters_and_repeat_with_the_seed():
     one, two = (random_directions(scale * CENTER, GROUPS, torch.Generator().manual_seed(2)) for scale in (1, 10))
     assert torch.allclose(two, 10 * one, rtol=1e-14, atol=0)
     assert torch.equal(one, random_directions(CENTER, GROUPS, torch.Generator().manual_seed(2)))
 
 
-def test_on_a_gpu_a_random_direction_is_not_summed_in_the_order_in_which_threads_come(monkeypatch):
+def test_on_a_gpu_group_sums_do_not_depend_on_the_order_of_threads(monkeypatch):
     here = random_directions(CENTER, GROUPS, torch.Generator().manual_seed(0))
     monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda _tensor: True))
     monkeypatch.setattr(torch.Tensor, "index_add_", None)

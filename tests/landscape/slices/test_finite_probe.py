@@ -33,7 +33,7 @@ def test_a_finite_step_sees_the_fourth_derivative_and_says_how_much_of_it():
     told = (found.truncation - 2 * QUARTIC * found.steps.square()).abs()
     assert (told <= 2 * found.round_off).all()
     assert found.best is not None and abs(float(found.curvatures[found.best]) - exact) < 1e-5
-    assert found.crossed is None and found.evaluations == 2 * len(STEPS) + 1 + NOISE_POINTS
+    assert found.discontinuous is None and found.evaluations == 2 * len(STEPS) + 1 + NOISE_POINTS
 
 
 @pytest.mark.parametrize("sigma", [1e-9, 1e-6])
@@ -71,13 +71,13 @@ def test_the_round_off_of_float32_parameters_is_within_its_bound():
     assert (error > 4 * 6**0.5 * found.noise / found.steps.square()).any()
 
 
-def test_across_a_kink_the_probe_sees_two_slopes_and_the_signature_says_so():
+def test_across_a_kink_the_probe_sees_two_slopes_and_marks_them():
     def kinked(theta):
         along = float((theta - CENTER) @ V / (V @ V))
         return 1 + abs(along - 0.01), along > 0.01
 
     found = probed(kinked, steps=(0.001, 0.1, 1.0))
-    assert found.crossed is not None and found.crossed.tolist() == [False, True, True] and found.best == 0
+    assert found.discontinuous is not None and found.discontinuous.tolist() == [False, True, True] and found.best == 0
     assert probed(kinked, steps=(0.1, 1.0)).best is None
     # |d - a| + |d + a| - 2 a = 2 (d - a) for d > a
     assert found.curvatures[1:].tolist() == pytest.approx([2 * 0.09 / 0.01, 2 * 0.99], rel=1e-10)

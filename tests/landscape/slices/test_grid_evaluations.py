@@ -41,7 +41,7 @@ def test_a_killed_slice_continues_and_ends_as_if_it_had_not_been(tmp_path, setti
         sliced(Objective(dies_after=50), store, **settings)
     rest = Objective()
     found = sliced(rest, store, **settings)
-    for name in ("loss", "evaluated", "holdout", "crossed"):
+    for name in ("loss", "evaluated", "holdout", "discontinuous"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
     assert found.evaluations == expected.evaluations == whole.calls
     # the centre and one point are evaluated anew; what other workers had finished of the batch behind the one that died is lost
@@ -62,7 +62,7 @@ def test_a_slice_that_continues_has_its_evaluations_in_total(tmp_path):
     assert found.reason == "evaluation budget" and found.evaluations == 100 and rest.calls == 100 - 48
 
 
-def test_a_slice_that_continues_has_its_time_anew_and_keeps_to_it(tmp_path, monkeypatch):
+def test_a_slice_that_continues_has_its_whole_time_again(tmp_path, monkeypatch):
     store, rest, limit = tmp_path / "slice.npz", Objective(), 80.0
     settings = {"tolerance": 1e-4, "batch": 16, "holdout": 8}
     with pytest.raises(KeyboardInterrupt):

@@ -1,3 +1,5 @@
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -37,14 +39,22 @@ def sliced(loss, seed=0, axes=(SIDE, SIDE), **settings):
     )
 
 
-def errors(loss, found):
-    """Of the interpolated values, as shares of the true range."""
-    points = torch.stack(torch.meshgrid(*found.coordinates, indexing="ij"), dim=-1)
+@cache
+def truth(loss, axes):
+    """The loss at every point of the grid of some axes, which are given as tuples of numbers."""
+    points = torch.stack(
+        torch.meshgrid(*(torch.tensor(axis, dtype=torch.float64) for axis in axes), indexing="ij"), dim=-1
+    )
     flat = points.reshape(-1, points.shape[-1])
     flat = torch.nn.functional.pad(flat, (0, 2 - flat.shape[1]))
-    truth = torch.tensor([float(loss(point)) for point in flat], dtype=torch.float64).reshape(found.loss.shape)
-    assert torch.equal(found.loss[found.evaluated], truth[found.evaluated])
-    return (found.loss - truth).abs() / (truth.max() - truth.min())
+    return torch.tensor([float(loss(point)) for point in flat], dtype=torch.float64).reshape(points.shape[:-1])
+
+
+def errors(loss, found):
+    """Of the interpolated values, as shares of the true range."""
+    true = truth(loss, tuple(tuple(axis.tolist()) for axis in found.coordinates))
+    assert torch.equal(found.loss[found.evaluated], true[found.evaluated])
+    return (found.loss - true).abs() / (true.max() - true.min())
 
 
 @pytest.mark.parametrize(("loss", "share"), [(bowl, 0.05), (valley, 0.1), (crease, 0.4)])
@@ -89,7 +99,7 @@ def hidden(theta):
     return height if abs(height) > 1e-9 else 0.0
 
 
-def test_the_interpolation_error_is_that_of_random_points_before_they_were_known():
+def test_the_interpolation_error_is_that_of_random_points_not_yet_known():
     found = sliced(hidden, max_evaluations=60)
     assert found.reason == "evaluation budget" and found.interpolation_error > 0.4
     assert errors(hidden, found).max() > 0.4
@@ -132,7 +142,7 @@ def test_no_more_evaluations_are_made_than_allowed(most):
     assert found.interpolation_error > 0.1 and (most > 1 or found.share_beyond == 1)
 
 
-def test_on_a_small_grid_the_hold_out_takes_no_more_of_a_budget_than_its_points():
+def test_on_a_small_grid_the_hold_out_takes_only_its_points_of_the_budget():
     found = sliced(bowl, axes=(symmetric_axis(1.0, 41),), max_evaluations=16)
     assert found.evaluations <= 16 and found.holdout.numel() == 4 and found.interpolation_error < 1e-14
 
@@ -158,7 +168,7 @@ def test_of_noise_every_point_is_evaluated():
     assert float(found.evaluated.double().mean()) > 0.95 and found.interpolation_error <= 0.01
 
 
-def test_a_region_without_finite_values_is_not_papered_over():
+def test_a_region_without_finite_values_is_evaluated_everywhere():
     def broken(theta):
         return float("nan") if theta[0] > 0.2 else bowl(theta)
 
@@ -167,7 +177,7 @@ def test_a_region_without_finite_values_is_not_papered_over():
     assert found.loss[SIDE <= 0.2].isfinite().all() and float(found.evaluated[SIDE <= 0.2].double().mean()) < 0.4
 
 
-def test_losses_that_are_not_finite_and_met_by_the_hold_out_alone_are_found():
+def test_losses_that_are_not_finite_are_found_by_the_hold_out():
     def broken(theta):
         return float("inf") if 0.26 < theta[0] < 0.49 else bowl(theta)
 
@@ -188,12 +198,12 @@ def test_time_ends_the_refinement():
     assert found.reason == "time budget" and found.evaluations == 21 + 30 + 1
 
 
-def test_crossed_says_nothing_of_points_that_were_not_evaluated():
+def test_points_that_were_not_evaluated_are_not_marked_discontinuous():
     found = sliced(lambda theta: (bowl(theta), bool(theta[0] > 0)))
-    assert found.crossed is not None
-    assert torch.equal(found.crossed, found.evaluated & (SIDE > 0)[:, None])
+    assert found.discontinuous is not None
+    assert torch.equal(found.discontinuous, found.evaluated & (SIDE > 0)[:, None])
     record = found.record()
-    assert record["crossed_points"] == int(found.crossed.sum()) and record["points"] == 41**2
+    assert record["crossed_points"] == int(found.discontinuous.sum()) and record["points"] == 41**2
     assert record["evaluated_points"] == int(found.evaluated.sum()) == found.evaluations - 1 < 41**2
 
 

@@ -21,7 +21,7 @@ def quadratic(theta):
     return 7 + G @ step + step @ A @ step / 2
 
 
-def test_of_a_quadratic_the_slice_is_its_own_model():
+def test_the_slice_of_a_quadratic_is_its_model():
     directions = torch.stack([EIGENVECTORS[:, -1], EIGENVECTORS[:, 0] + EIGENVECTORS[:, 3]], dim=1)
     result = evaluate_slice(quadratic, CENTER, directions, AXES, gradient=G, operator=DenseOperator(A), settings=ALL)
     assert result.loss.shape == (5, 3) and result.center_loss == 7 and result.evaluations == 16
@@ -34,7 +34,7 @@ def test_of_a_quadratic_the_slice_is_its_own_model():
     assert torch.allclose(result.curvature, directions.T @ A @ directions, rtol=0, atol=1e-14)
 
 
-def test_the_model_is_the_same_from_the_curvature_between_the_directions_alone():
+def test_the_model_is_the_same_from_the_matrix_of_the_directions():
     directions = torch.stack([EIGENVECTORS[:, -1], EIGENVECTORS[:, 0] + EIGENVECTORS[:, 3]], dim=1)
     by_operator, by_curvature = (
         evaluate_slice(quadratic, CENTER, directions, AXES, G, H, ALL)
@@ -82,13 +82,13 @@ def test_points_are_rounded_once_to_the_dtype_of_the_center():
     assert torch.equal(seen[0], CENTER.float()) and torch.equal(seen[3], CENTER.float())
 
 
-def test_points_whose_signature_differs_from_the_centres_are_marked():
+def test_points_on_another_smooth_piece_than_the_centre_are_marked():
     def pieces(theta):
         return quadratic(theta), bool(theta[0] > 0.5)
 
     result = evaluate_slice(pieces, torch.zeros(N), torch.eye(N)[:, :2], AXES, settings=ALL)
-    assert result.crossed is not None
-    assert torch.equal(result.crossed, (AXES[0] > 0.5)[:, None].expand(5, 3))
+    assert result.discontinuous is not None
+    assert torch.equal(result.discontinuous, (AXES[0] > 0.5)[:, None].expand(5, 3))
 
 
 def test_the_reach_is_where_the_quadratic_has_risen_by_the_given_amount():

@@ -23,7 +23,7 @@ def test_every_coordinate_is_a_node_of_the_tree_below_its_parent(n):
     assert tree.level.max() <= 1 + np.ceil(np.log2(n))
 
 
-def test_a_basis_function_is_one_at_its_node_and_zero_at_all_nodes_but_those_below_it():
+def test_a_basis_function_is_one_at_its_node_and_zero_outside_its_subtree():
     tree = hierarchy(UNEVEN)
     for node, (support, basis) in enumerate(zip(tree.support, tree.basis, strict=True)):
         full = np.zeros(len(UNEVEN))
@@ -32,21 +32,21 @@ def test_a_basis_function_is_one_at_its_node_and_zero_at_all_nodes_but_those_bel
         assert full[node] == 1 and not np.delete(full, below).any()
 
 
-def test_where_every_point_is_a_node_the_function_is_met():
+def test_where_every_point_is_a_node_the_interpolant_is_the_function():
     random = np.random.default_rng(1)
     values = random.standard_normal((22, 7))
     grid, _ = interpolated(lambda x, y: values, UNEVEN, UNEVEN[:7])
     assert abs(grid.interpolant - values).max() < 1e-14 and grid.node.all()
 
 
-def test_a_sum_of_functions_of_one_axis_is_met_everywhere_from_the_two_axes_alone():
+def test_a_sum_of_functions_of_one_axis_needs_only_the_two_axes():
     x, y = UNEVEN, UNEVEN[:9]
     axes = [i * 9 + 4 for i in range(22)] + [11 * 9 + j for j in range(9)]
     grid, values = interpolated(lambda x, y: abs(x) + np.sign(y) * y**3, x, y, axes)
     assert grid.node.sum() == 30 and abs(grid.interpolant - values).max() < 1e-14
 
 
-def test_products_of_parabolas_are_met_from_two_intervals_a_side():
+def test_products_of_parabolas_are_exact_from_two_intervals_a_side():
     five = [int(i) for i in np.flatnonzero(hierarchy(UNEVEN).level <= 2)]
     points = [22 * i + j for i in five for j in five]
     grid, values = interpolated(lambda x, y: (x**2 - x) * (2 * y**2 + y) + x, UNEVEN, UNEVEN, points)
@@ -82,7 +82,7 @@ def test_ancestors_come_first_and_nodes_are_not_named_again():
     assert grid.with_ancestors([17 * 3 + 5]).tolist() == nodes[6:]
 
 
-def test_a_value_that_is_not_finite_spoils_no_other_and_leaves_its_children_in_doubt():
+def test_a_value_that_is_not_finite_affects_only_the_doubt_of_its_children():
     x = np.linspace(-1, 1, 9)
     grid, values = SparseGrid(x, np.zeros(1)), x**2
     values[8] = np.nan

@@ -7,7 +7,7 @@ from tests.landscape.spectra import generator
 
 
 @pytest.mark.parametrize("trace", [0.0, 2.0**24, 2.0**30])
-def test_no_sample_has_a_part_in_its_own_slope(trace):
+def test_the_slope_of_a_sample_is_fitted_to_all_others(trace):
     x, y = torch.randn(2, 9, dtype=torch.float64, generator=generator())
     found = controlled(x + trace, y + trace, 0.3 + trace) - trace  # a large trace hides no slope
     for i in range(9):
@@ -18,7 +18,7 @@ def test_no_sample_has_a_part_in_its_own_slope(trace):
 
 @pytest.mark.parametrize("step", [0.3, 0.7, 1e3 / 3])
 @pytest.mark.parametrize("count", [8, 10, 12, 13, 32])
-def test_a_sample_whose_others_know_no_slope_is_left_as_it_is(count, step):
+def test_a_sample_stays_as_it_is_where_the_other_controls_are_equal(count, step):
     """As random signs give them where the known part is sparse."""
     y = torch.full((count,), 0.37, dtype=torch.float64)
     y[2] += step

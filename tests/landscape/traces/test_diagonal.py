@@ -41,7 +41,7 @@ def test_sensitivities_are_sums_of_moduli_within_their_errors():
     assert (sums.bias > 0).all() and (sums.bias < sums.values).all()
 
 
-def test_the_bias_of_a_sum_of_moduli_is_the_one_of_theory_where_the_diagonal_is_zero():
+def test_the_bias_of_a_sum_of_moduli_of_a_zero_diagonal_is_that_of_theory():
     hollow = INDEFINITE - torch.diag(INDEFINITE.diagonal())
     seeds, one = 200, torch.zeros(N, dtype=torch.int64)
     runs = [estimate_diagonal(DenseOperator(hollow), generator(seed), 32) for seed in range(seeds)]

@@ -1,3 +1,4 @@
+from functools import cache
 from math import sqrt
 from types import SimpleNamespace
 from typing import Any
@@ -21,9 +22,18 @@ INDEFINITE = torch.from_numpy(symmetric_matrix(np.linspace(-0.5, 1, N) ** 3, see
 ROUND_OFF = N * torch.finfo(torch.float64).eps
 
 
+MATRICES = {"power law": POWER, "indefinite": INDEFINITE}
+
+
 def runs(matrix, settings, seeds):
     operator = DenseOperator(matrix)
     return [estimate_traces(operator, generator(seed), settings)["all"] for seed in range(seeds)]
+
+
+@cache
+def many_runs(method, name, matvecs=40, seeds=250):
+    """The same runs for all tests of averages over seeds."""
+    return runs(MATRICES[name], TraceSettings.fixed(matvecs, method=method), seeds)
 
 
 class Placed:
@@ -46,19 +56,18 @@ def root_mean_square(estimates, truth):
     return sqrt(sum((e.value - truth) ** 2 for e in estimates) / len(estimates))
 
 
-@pytest.mark.parametrize("matrix", [POWER, INDEFINITE], ids=["power law", "indefinite"])
+@pytest.mark.parametrize("name", MATRICES)
 @pytest.mark.parametrize("method", METHODS)
-def test_the_mean_over_seeds_is_the_trace(method, matrix):
-    seeds = 150
-    values = torch.tensor([e.value for e in runs(matrix, TraceSettings.fixed(30, method=method), seeds)])
-    assert abs(float(values.mean() - matrix.trace())) < 4 * float(values.std()) / sqrt(seeds)
+def test_the_mean_over_seeds_is_the_trace(method, name):
+    values = torch.tensor([e.value for e in many_runs(method, name)])
+    assert abs(float(values.mean() - MATRICES[name].trace())) < 4 * float(values.std()) / sqrt(len(values))
 
 
-@pytest.mark.parametrize("matrix", [POWER, INDEFINITE], ids=["power law", "indefinite"])
+@pytest.mark.parametrize("name", MATRICES)
 @pytest.mark.parametrize("method", METHODS)
-def test_intervals_cover_at_least_at_the_nominal_rate(method, matrix):
-    seeds, truth = 250, float(matrix.trace())
-    estimates = runs(matrix, TraceSettings.fixed(40, method=method), seeds)
+def test_intervals_cover_at_least_at_the_nominal_rate(method, name):
+    truth, estimates = float(MATRICES[name].trace()), many_runs(method, name)
+    seeds = len(estimates)
     covered = sum(e.low <= truth <= e.high for e in estimates) / seeds
     assert covered > 0.95 - 4 * sqrt(0.95 * 0.05 / seeds)
     # and the stated error is no larger than twice the true one
@@ -68,9 +77,9 @@ def test_intervals_cover_at_least_at_the_nominal_rate(method, matrix):
 @pytest.mark.parametrize("method", METHODS)
 def test_on_a_power_law_the_error_falls_faster_than_one_over_matvecs(method):
     truth = float(POWER.trace())
-    few, many = (root_mean_square(runs(POWER, TraceSettings.fixed(m, method=method), 100), truth) for m in (24, 96))
+    few, many = (root_mean_square(many_runs(method, "power law", m, 100), truth) for m in (24, 96))
     assert many < few / 4 / 1.5  # 1.5: an error estimated from 100 runs is within a third of the true one, 4 sigma
-    plain = root_mean_square(runs(POWER, TraceSettings.fixed(96), 100), truth)
+    plain = root_mean_square(many_runs("hutchinson", "power law", 96, 100), truth)
     assert many < plain / 10
 
 
@@ -115,7 +124,7 @@ def test_an_adaptive_run_stops_at_its_tolerance(method):
         assert estimate.half_width <= 0.05 * estimate.value
 
 
-def test_xtrace_believes_an_error_only_if_it_was_small_enough_one_test_vector_before():
+def test_xtrace_stops_only_if_the_error_was_small_one_test_vector_before():
     def run(seed: int, most: int):
         settings = TraceSettings(rtol=0.1, method="xtrace", max_probes=most)
         return estimate_traces(DenseOperator(POWER), generator(seed), settings)["all"]
@@ -135,7 +144,7 @@ def test_single_precision_products_give_the_trace_to_single_precision(method):
 
 
 @pytest.mark.parametrize("spherical", [True, False])
-def test_xtrace_of_all_vectors_but_one_is_the_one_that_never_saw_it(spherical):
+def test_xtrace_without_a_vector_equals_xtrace_of_the_others(spherical):
     Omega = torch.randn(N, 6, dtype=torch.float64, generator=generator())
     Y = INDEFINITE @ Omega
     Q = torch.linalg.qr(Y).Q
@@ -154,8 +163,8 @@ def test_xtrace_of_all_vectors_but_one_is_the_one_that_never_saw_it(spherical):
 
 def test_the_error_of_xtrace_counts_that_the_test_vectors_share_a_sketch():
     """Its square is the mean squared error, which the published one is half of."""
-    seeds = 300
-    estimates = runs(POWER, TraceSettings.fixed(40, method="xtrace"), seeds)
+    estimates = many_runs("xtrace", "power law")
+    seeds = len(estimates)
     squares = torch.tensor([(e.value - float(POWER.trace())) ** 2 for e in estimates]).double()
     ours = torch.tensor([e.standard_error**2 for e in estimates]).double()
     published = torch.tensor([float(e.samples.var()) / len(e.samples) for e in estimates]).double()

@@ -72,7 +72,7 @@ def test_the_time_budget_ends_a_run_after_the_least_probes():
     assert estimate.reason == "time budget" and estimate.probes == 8
 
 
-def test_an_absolute_tolerance_stops_a_trace_near_zero_whose_sign_stays_open():
+def test_an_absolute_tolerance_ends_a_trace_near_zero_without_a_sign():
     balanced = DenseOperator(INDEFINITE - INDEFINITE.trace() / N * torch.eye(N))
     estimate = estimate_traces(balanced, generator(), TraceSettings(rtol=0.01, atol=2.0, max_probes=5000))["all"]
     assert estimate.reason == "tolerance" and estimate.half_width <= 2.0
@@ -86,7 +86,7 @@ def test_signs_are_told_where_the_interval_decides_them():
     assert signs == {name: name for name in signs}
 
 
-def test_the_papers_estimator_is_ten_gaussian_probes_on_one_block_at_a_time():
+def test_the_papers_estimator_is_ten_gaussian_probes_for_each_block():
     operator = CountingOperator(DenseOperator(INDEFINITE, BLOCKS))
     estimates = estimate_traces(operator, generator(), PAPER)
     assert operator.matvecs == 10 * len(BLOCKS)
@@ -201,7 +201,7 @@ def test_a_setting_that_is_no_number_is_refused(wrong):
 
 @pytest.mark.parametrize("method", ["hutchinson", "hutch++", "xtrace", "auto"])
 @pytest.mark.parametrize("power", [-664, -300, 250, 664])
-def test_intervals_know_no_scale(power, method):
+def test_intervals_scale_with_the_operator(power, method):
     """Powers of two, which round nothing off: squares and fourth powers leave the range of float64 at 1e+-154 and 1e+-77."""
     matrix = torch.from_numpy(symmetric_matrix(1 / np.arange(1, 121.0) ** 1.5, seed=1))
     settings = TraceSettings.fixed(40, method=method)
