@@ -12,7 +12,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import inf, isfinite, sqrt
+from math import isfinite
 from typing import Literal
 
 from jaxtyping import Float64
@@ -43,14 +43,10 @@ def t_quantile(freedom: float, confidence: float) -> float:
     return float(stdtrit(freedom, (1 + confidence) / 2))
 
 
-def t_interval(samples: Float64[Tensor, " s"], confidence: float) -> tuple[float, float, float, float]:
-    """Mean, standard error and both ends of Student's interval; a single sample has an infinite error."""
-    count, mean = samples.numel(), float(samples.mean())
-    if count < 2:
-        return mean, inf, -inf, inf
-    error = float(samples.std()) / sqrt(count)
-    half = t_quantile(count - 1, confidence) * error
-    return mean, error, mean - half, mean + half
+def standard_deviation(samples: Float64[Tensor, "s *shape"]) -> Float64[Tensor, "*shape"]:
+    """Along the first axis; in units of the largest sample, as squares may leave the range of floats."""
+    unit = float(samples.abs().max()) or 1.0
+    return unit * (samples / unit).std(dim=0)
 
 
 @dataclass(frozen=True)
@@ -73,4 +69,7 @@ class Bracket:
     def __str__(self) -> str:
         if self.value is not None:
             return f"{self.value:.4g} in [{self.low:.4g}, {self.high:.4g}]" + (f" ({self.note})" if self.note else "")
-        return f">= {self.low:.4g}: {self.note}" if isfinite(self.low) else f"undefined: {self.note}"
+        if not isfinite(self.low):
+            return f"undefined: {self.note}"
+        ends = f"in [{self.low:.4g}, {self.high:.4g}]" if isfinite(self.high) else f">= {self.low:.4g}"
+        return f"{ends}: {self.note}"

@@ -23,7 +23,7 @@ noise is also measured once before, with one vector more, when a residual that i
 that is seen: from there on steps might be made in vain.
 """
 
-from math import inf, isfinite, isnan, log, nan, sqrt
+from math import hypot, inf, isfinite, isnan, log, nan, sqrt
 
 import torch
 from jaxtyping import Float, Float64
@@ -65,7 +65,7 @@ class Krylov:
             first[:, 0] = _mixed(start, first[:, 0], settings.noise)
             self.random_share = settings.noise / (1 + settings.noise)
         self.append(first.T.contiguous())
-        # components that symmetry tells, how many were, and the sum of squares that they are off by
+        # components that symmetry tells, how many were, and the root of the sum of squares that they are off by
         self.foreseen = torch.zeros(0, self.width, dtype=torch.float64)
         self.pairs, self.surprise = 0, 0.0
 
@@ -77,7 +77,7 @@ class Krylov:
         require_finite(self.operator, all(map(isfinite, lengths)))
         self.scale = max(self.scale if old else 0.0, *lengths)
         components = orthogonalise(W, self.basis[:new])
-        self.surprise += float((components[:old] - self.foreseen).square().sum())
+        self.surprise = hypot(self.surprise, norm(components[:old] - self.foreseen))
         self.pairs += self.foreseen.numel()
         self.project(components)
         self.coupling = self.append(W)
@@ -127,7 +127,7 @@ class Krylov:
     @property
     def seen_noise(self) -> float:
         """The noise of a product as far as symmetry shows it; nan: not yet."""
-        return sqrt(self.operator.dim * self.surprise / (2 * self.pairs)) if self.pairs >= PAIRS else nan
+        return self.surprise * sqrt(self.operator.dim / (2 * self.pairs)) if self.pairs >= PAIRS else nan
 
     def floor(self, ritz: Ritz) -> float:
         """The residual that the matvec's noise leaves at least, as far as it was measured."""

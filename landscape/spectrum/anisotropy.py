@@ -18,7 +18,7 @@ on spectra with a gap at the ends in none.  `EigenEnds.beyond` bounds how far ou
 """
 
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import copysign, inf, isfinite
 
 import torch
 
@@ -73,7 +73,7 @@ def literal(ends: EigenEnds) -> Bracket:
     """lambda_max / lambda_min, signed: StableGS's Eq. (3).
 
     The value is always the quotient of what was found; where lambda_min may be 0, the bracket is that of its modulus instead,
-    with no upper bound.  The note says so, or else whether the operator is definite.
+    with no upper bound.  The note says so, or else whether the operator is definite, as far as lambda_max tells.
     """
     top, bottom = _intervals(ends)
     smallest = float(ends.smallest.values[0])
@@ -83,7 +83,10 @@ def literal(ends: EigenEnds) -> Bracket:
             value, _at_least(top, bottom), inf, "lambda_min is not resolved from zero: the bracket is for |A|"
         )
     quotients = [a / b for a in top for b in bottom if isfinite(a) or isfinite(b)]
-    return Bracket(value, min(quotients), max(quotients), "definite" if top[0] * bottom[0] > 0 else "indefinite")
+    note = "lambda_max is not resolved from zero: definite or indefinite"
+    if top[0] > 0 or top[1] < 0:
+        note = "definite" if bottom[0] > 0 or top[1] < 0 else "indefinite"
+    return Bracket(value, min(quotients), max(quotients), note)
 
 
 def saddle(ends: EigenEnds) -> Bracket:
@@ -96,30 +99,34 @@ def saddle(ends: EigenEnds) -> Bracket:
     if bottom[1] >= 0:
         return Bracket(None, _at_least(top, bottom), inf, "if lambda_min is negative at all: not resolved from zero")
     low, high = max(top[0], 0.0) / -bottom[0], top[1] / -bottom[1]
+    if top[0] <= 0:
+        return Bracket(None, low, high, "if lambda_max is positive at all: not resolved from zero")
     return Bracket(float(ends.largest.values[0] / -ends.smallest.values[0]), low, high)
 
 
 def share(ends: EigenEnds, density: SpectralDensity) -> Bracket:
     """lambda_max / sum |lambda|, at most 1: the share of all curvature that lies in the steepest direction."""
-    top, total = _intervals(ends)[0], absolute_sum(density, JOINT)
+    top, total, known = _intervals(ends)[0], absolute_sum(density, JOINT), _farthest(ends)
     if not total.value:
         return Bracket(None, inf, inf, "the operator is zero")
-    sums = max(total.low, _farthest(ends)), total.high
-    quotients = [a / b if b else inf for a in top for b in sums]
-    value = min(float(ends.largest.values[0]) / total.value, 1.0)
-    return Bracket(value, min(quotients), min(max(quotients), 1.0), total.note)
+    low, high = _quotients(top, (max(total.low, known), max(total.high, known)))
+    value = min(float(ends.largest.values[0]) / max(total.value, known), 1.0)
+    return Bracket(value, low, min(high, 1.0), total.note)
 
 
 def effective_rank(ends: EigenEnds, density: SpectralDensity) -> Bracket:
     """(sum |lambda|)^2 / sum lambda^2, between 1 and n: over how many directions curvature is spread."""
-    total, squares = absolute_sum(density, JOINT), density.integral(lambda x: x.square(), JOINT)
-    if not total.value or not squares.value:
+    total, known = absolute_sum(density, JOINT), _farthest(ends)
+    if not total.value:
         return Bracket(None, inf, inf, "the operator is zero")
-    known = _farthest(ends)
-    low = max(total.low, known) ** 2 / squares.high
-    square = max(squares.low, known**2)
-    high = total.high**2 / square if square else inf
-    value = min(max(total.value**2 / squares.value, 1.0), float(density.dim))
+    unit = total.value  # so that no square leaves the range of floats
+    squares = density.integral(lambda x: (x / unit).square(), JOINT)
+    least, middle, most = (max(value, known) / unit for value in (total.low, unit, total.high))
+    floor = (known / unit) ** 2
+    low = least**2 / max(squares.high, floor)
+    square = max(squares.low, floor)
+    high = most**2 / square if square else inf
+    value = min(max(middle**2 / max(squares.value or 0.0, floor), 1.0), float(density.dim))
     return Bracket(value, max(low, 1.0), min(high, float(density.dim)), total.note)
 
 
@@ -128,15 +135,14 @@ def mass_quantile(ends: EigenEnds, density: SpectralDensity, p: float = 0.05) ->
     top, small = _intervals(ends)[0], absolute_quantile(density, p, JOINT)
     if not small.value:
         return Bracket(None, inf, inf, small.note)
-    quotients = [a / b if b else inf for a in top for b in (small.low, small.high)]
-    return Bracket(float(ends.largest.values[0]) / small.value, min(quotients), max(quotients), small.note)
+    return Bracket(float(ends.largest.values[0]) / small.value, *_quotients(top, (small.low, small.high)), small.note)
 
 
 def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float]]:
     """Where lambda_max and lambda_min lie: residuals, plus one unit of round-off of the larger magnitude.
 
     A residual says that an eigenvalue is near, not that none is farther out: an end that ran out of its budget reaches
-    out by `ends.beyond`.
+    out by `ends.beyond`.  Neither end lies beyond what the other one may be.
     """
     if not (len(ends.largest) and len(ends.smallest)):
         raise InputError(
@@ -146,12 +152,22 @@ def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float
     (a, b), (c, d) = ends.largest.interval(), ends.smallest.interval()
     slack = torch.finfo(ends.largest.vectors.dtype).eps * max(abs(a), abs(b), abs(c), abs(d))
     above, below = (0.0 if end.reason in ARRIVED else ends.beyond for end in (ends.largest, ends.smallest))
-    return (a - slack, b + slack + above), (c - slack - below, d + slack)
+    least, most = c - slack - below, b + slack + above
+    return (max(a - slack, least), most), (least, min(d + slack, most))
 
 
 def _farthest(ends: EigenEnds) -> float:
     """A magnitude that some eigenvalue has at least: what both sums are bounded by from below."""
     return max(0.0, *(max(low, -high) for low, high in _intervals(ends)))
+
+
+def _quotients(top: tuple[float, float], sizes: tuple[float, float]) -> tuple[float, float]:
+    """The least and the largest quotient of a number in `top` and one above 0 in `sizes`."""
+    over = sizes[top[0] >= 0], sizes[top[1] < 0]
+    least, most = (
+        end / size if size else copysign(inf, end) if end else 0.0 for end, size in zip(top, over, strict=True)
+    )
+    return least, most
 
 
 def _at_least(top: tuple[float, float], bottom: tuple[float, float]) -> float:

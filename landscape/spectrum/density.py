@@ -30,12 +30,13 @@ both while the first runs are under way.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import ceil, inf
+from math import ceil, inf, isnan
 
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from landscape.eigen.krylov import MARGIN
 from landscape.eigen.lanczos import LanczosFactorization, lanczos
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
@@ -148,11 +149,13 @@ class Lengths:
         rest, starts = max(self.rest - found / len(runs), 0.0), self.matvecs / steps
         low, _, high = absolute_integral(nodes[0], weights[0])  # of one run: they cost as much as a product
         x, w = torch.cat(nodes), torch.cat(weights) / len(runs)
+        unit = float(x.abs().max()) or 1.0 if len(x) else 1.0  # of squares that leave the range of floats
+        x = x / unit
         squares = float((w * x.square()).sum())
         if self.traced and squares:
             squares -= float((w * x * x.abs()).sum()) ** 2 / squares
         # the variance over random signs is 2 sum f(lambda)^2 at most
-        spread = (2 * rest * max(squares, 0.0) / starts) ** 0.5
+        spread = unit * (2 * rest * max(squares, 0.0) / starts) ** 0.5
         return t_quantile(starts - 1, CONFIDENCE) * spread + rest * (high - low) / 2
 
 
@@ -169,9 +172,10 @@ class _Runs:
     ) -> None:
         self.generator, self.active, self.progress = generator, active, progress
         self.rank = operator.dim if active is None else active.rank
-        self.known, self.missed, V = found_before(ends, operator, generator.device)
+        self.known, self.residuals, V = found_before(ends, operator, generator.device)
         self.operator = ProjectedOperator(operator, lambda X: X - V @ (V.T @ X)) if V.shape[1] else operator
         self.V, self.matvecs = V, 0
+        self.noise = 0.0 if ends is None or isnan(ends.noise) else ends.noise  # of a product
         self.rules: list[tuple[Float64[Tensor, " m"], Float64[Tensor, " m"], bool]] = []  # nodes, weights, all of it
 
     def add(self, count: int, steps: int, enough: Lengths | None = None) -> None:
@@ -194,8 +198,10 @@ class _Runs:
         others = [torch.ones_like(values, dtype=torch.bool) for values, _ in spectra]
         if not self.rules and count > 1:
             known, residuals, V, others = found_by_all(runs, spectra)
+            rounding = torch.finfo(self.operator.dtype).eps * max(size, *(float(x.abs().max()) for x, _ in spectra))
+            residuals += MARGIN * max(self.noise, rounding) + pushed(known, self.known, self.residuals)
+            self.residuals = torch.cat([self.residuals, residuals])
             self.known, self.V = torch.cat([self.known, known]), torch.cat([self.V, V], dim=1)
-            self.missed = torch.cat([self.missed, missed(known, residuals)])
         for run, (values, S), left in zip(runs, spectra, others, strict=True):
             mass = S[0, left].square()
             self.rules.append((values[left], mass / mass.sum(), norm(run.r) == 0))
@@ -209,7 +215,9 @@ class _Runs:
             nodes[i, : len(at)], weights[i, : len(at)] = at, mass
         whole = torch.tensor([whole for _, _, whole in self.rules])
         known, order = self.known.sort()
-        return SpectralDensity(nodes, weights, self.rank, self.matvecs, known, whole, trace, self.missed[order])
+        return SpectralDensity(
+            nodes, weights, self.rank, self.matvecs, known, whole, trace, missed(known, self.residuals[order])
+        )
 
 
 def draw_starts(n: int, count: int, generator: torch.Generator, dtype: torch.dtype) -> Float[Tensor, "n count"]:
@@ -223,7 +231,7 @@ def draw_starts(n: int, count: int, generator: torch.Generator, dtype: torch.dty
 def found_before(
     ends: EigenEnds | None, operator: SymmetricOperator, device: torch.device
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Float[Tensor, "n k"]]:
-    """Eigenvalues, what they miss (`SpectralDensity`) and orthonormal vectors of the pairs that are good."""
+    """Eigenvalues, residuals and orthonormal vectors of the pairs that are good."""
     if ends is None:
         none = torch.zeros(0, dtype=torch.float64)
         return none, none, torch.zeros(operator.dim, 0, dtype=operator.dtype, device=device)
@@ -233,12 +241,24 @@ def found_before(
     )
     good = (errors < FOUND) & (residuals <= CLOSE * values.abs())
     vectors = torch.cat([pair.vectors for pair in pairs], dim=1)[:, good.to(ends.largest.vectors.device)]
-    return values[good], missed(values[good], residuals[good]), torch.linalg.qr(vectors).Q
+    return values[good], residuals[good], torch.linalg.qr(vectors).Q
 
 
 def missed(values: Float64[Tensor, " k"], residuals: Float64[Tensor, " k"]) -> Float64[Tensor, " k"]:
-    """See `SpectralDensity.of_known`; an eigenvalue of 0 adds nothing."""
-    return torch.where(values == 0, 0.0, 4 * (residuals / values).square())
+    """See `SpectralDensity.of_known` and `residuals`; an eigenvalue of 0 adds nothing."""
+    share = torch.where(values == 0, 0.0, residuals / values.abs())
+    return 4 * share * share.clamp_max(1.0)
+
+
+def pushed(
+    values: Float64[Tensor, " k"], known: Float64[Tensor, " l"], residuals: Float64[Tensor, " l"]
+) -> Float64[Tensor, " k"]:
+    """How far eigenvalues of what known pairs leave may lie from eigenvalues of H, which couples them by the pairs' residuals.
+
+    (hypot(g, 2 r) - g) / 2 for each pair at the distance g (Li and Li 2005).
+    """
+    gaps, reach = (values[:, None] - known).abs(), 2 * residuals.expand(len(values), -1)
+    return (torch.hypot(gaps, reach) - gaps).sum(dim=1) / 2
 
 
 def settled(values: Float64[Tensor, " m"], S: Float64[Tensor, "m m"], length: float) -> Bool[Tensor, " m"]:

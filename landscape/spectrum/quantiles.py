@@ -18,10 +18,11 @@ follows from that of mu: f(y) = y^(-1/2) gives
 a variance of at most 2 F (1 - F) / n a start vector: the beta distribution of that mean and variance says how far the mean
 over the start vectors may be off at F = p.  The sums of curvature are compared by Student's interval of (curvature above t) -
 (1 - p) (all curvature), which is linear in what the start vectors see.  A bracket ends where the test just fails to exclude t.
-Eigenvalues that are known are counted as such, and the tests are of the others.
+Eigenvalues that are known are counted as such, each somewhere within its residual, and the tests are of the others.
 """
 
-from math import inf
+from collections.abc import Sequence
+from math import exp, inf, log
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ from torch import Tensor
 from landscape.eigen.lanczos import lanczos
 from landscape.errors import InputError
 from landscape.operators.operator import DenseOperator
-from landscape.results import Bracket, t_quantile
+from landscape.results import Bracket, standard_deviation, t_quantile
 from landscape.spectrum.absolute_sum import integrals_of_rules
 from landscape.spectrum.rules import SpectralDensity
 
@@ -53,7 +54,8 @@ def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Br
     """
     _require_share(p)
     rules = list(zip(density.nodes, density.weights, strict=True))
-    grid = torch.cat([density.nodes[density.weights > 0], density.known]).unique()
+    first, last = (density.known - density.residuals).sort().values, (density.known + density.residuals).sort().values
+    grid = torch.cat([density.nodes[density.weights > 0], first, last]).unique()
     below, upto = (torch.zeros(len(rules), len(grid), dtype=torch.float64) for _ in range(2))
     for i, (nodes, weights) in enumerate(rules):
         nodes, order = nodes[weights > 0].sort()
@@ -61,14 +63,15 @@ def quantile(density: SpectralDensity, p: float, confidence: float = 0.95) -> Br
         # mu(x <= grid) is at least the sum before its last node that is not above, at most the sum to the next node
         below[i] = sums[(torch.searchsorted(nodes, grid, right=True) - 1).clamp_min(0)]
         upto[i] = sums[(torch.searchsorted(nodes, grid) + 1).clamp_max(len(nodes))]
-    trials = len(rules) * density.rest / 2
-    # of the others, the share that has to lie at or below as well
-    share = (p * density.dim - torch.searchsorted(density.known, grid, right=True)) / max(density.rest, 1)
-    inner, size = share.clamp(TINY, 1 - EPS).numpy(), max(trials, TINY)
-    levels = np.array([[(1 - confidence) / 2], [(1 + confidence) / 2]])
-    least, most = torch.from_numpy(betaincinv(size * inner, size * (1 - inner), levels))
-    above = grid[(share > 0) & ((upto.mean(dim=0) < least) | (share > 1))]
-    reached = grid[(share <= 0) | ((below.mean(dim=0) >= most) & (share <= 1))]
+    # of the others, the share that has to lie at or below as well: beside all known ones that may, and those that must
+    least, most = (
+        (p * density.dim - torch.searchsorted(known, grid, right=True)) / max(density.rest, 1)
+        for known in (first, last)
+    )
+    size = max(len(rules) * density.rest / 2, TINY)
+    tail = (1 - confidence) / 2
+    above = grid[(least > 0) & ((upto.mean(dim=0) < _mean_quantile(least, size, tail)) | (least > 1))]
+    reached = grid[(most <= 0) | ((below.mean(dim=0) >= _mean_quantile(most, size, 1 - tail)) & (most <= 1))]
     high = _first(reached, inf)
     nodes, weights = density.table()
     at, order = nodes.flatten().sort()
@@ -82,26 +85,39 @@ def absolute_quantile(density: SpectralDensity, p: float = 0.05, confidence: flo
     _require_share(p)
     totals = integrals_of_rules(density).T.tolist()
     tails = [_Tail(*rule, (low, high)) for rule, (low, _, high) in zip(density.rules(), totals, strict=True)]
-    known = density.known.abs().sort().values
-    grid = torch.cat([torch.zeros(1, dtype=torch.float64), known, *(tail.magnitudes for tail in tails)]).unique()
+    known = density.known.abs()
+    first, last = (known - density.residuals).clamp_min(0.0), known + density.residuals
+    zero = torch.zeros(1, dtype=torch.float64)
+    grid = torch.cat([zero, first, last, *(tail.magnitudes for tail in tails)]).unique()
     if len(grid) == 1:
         return Bracket(None, 0.0, inf, "the operator is zero")
-    at_or_below = torch.nn.functional.pad(known.cumsum(0), (1, 0))[torch.searchsorted(known, grid, right=True)]
-    certain = p * known.sum() - at_or_below  # what is known above t, less (1 - p) of all that is known
+    # what is known above t, less (1 - p) of all that is known
+    unknown = zip(*(tail.excess(grid, p) for tail in tails), strict=True)
     least, most = (
-        density.rest * torch.stack(column) + certain
-        for column in zip(*(tail.excess(grid, p) for tail in tails), strict=True)
+        density.rest * torch.stack(column) + _sum_above(known, limits, grid) - (1 - p) * known.sum()
+        for column, limits in zip(unknown, (first, last), strict=True)
     )
+    error = 2 * density.of_known(torch.abs)  # of two sums
     margin = t_quantile(len(tails) - 1, confidence) / len(tails) ** 0.5
-    beneath = least.mean(dim=0) - margin * least.std(dim=0) > 0  # t is certainly too low, up to the next of the grid
-    beyond = most.mean(dim=0) + margin * most.std(dim=0) <= 0  # certainly high enough
-    totals = density.rest * torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64) + known.sum()
+    # t is certainly too low, up to the next of the grid; certainly high enough
+    beneath = least.mean(dim=0) - margin * standard_deviation(least) > error
+    beyond = most.mean(dim=0) + margin * standard_deviation(most) <= -error
+    totals = density.rest * torch.tensor([tail.total[0] for tail in tails], dtype=torch.float64) + known.sum() - error
     # n eigenvalues up to t add up to n t at most
-    floor = p * float(totals.mean() - margin * totals.std()) / density.dim
+    floor = p * float(totals.mean() - margin * standard_deviation(totals)) / density.dim
     low = float(grid[int(beneath.long().cumprod(0).sum().clamp_max(len(grid) - 1))])
-    last = int(beyond.long().flip(0).cumprod(0).sum())
-    high = float(grid[-last]) if last else inf
-    return _within(density, _middle_of_magnitudes(density, p), max(low, floor), high)
+    enough = int(beyond.long().flip(0).cumprod(0).sum())
+    high = float(grid[-enough]) if enough else inf
+    return _within(density, _middle_of_magnitudes(density, tails, p), max(low, floor), high)
+
+
+def _sum_above(
+    values: Float64[Tensor, " k"], limits: Float64[Tensor, " k"], grid: Float64[Tensor, " g"]
+) -> Float64[Tensor, " g"]:
+    """The sum of the values whose limits are above each number of the grid."""
+    limits, order = limits.sort()
+    sums = torch.nn.functional.pad(values[order].flip(0).cumsum(0).flip(0), (0, 1))
+    return sums[torch.searchsorted(limits, grid, right=True)]
 
 
 class _Tail:
@@ -144,31 +160,67 @@ def _within(density: SpectralDensity, value: float, low: Tensor | float, high: T
     return Bracket(min(max(value, low), high), low, high, note)
 
 
-def _middle_of_magnitudes(density: SpectralDensity, p: float) -> float:
-    """The magnitude that the share p of sum |lambda| lies at or below, in the middle of what is certain.
+class _Curve:
+    """The curvature at magnitudes below t as one start vector sees it, in the middle of what is certain.
 
-    Of what a node carries half is taken to lie below it (see above), and more in proportion up to the next node.  What is
-    known, and the nodes of a rule that is the measure itself, are where they are.
+    Half of what a node carries is taken to lie below it.  A node near 0 of a measure on both sides of 0 carries less than what
+    it stands for, as both signs cancel in its place; there all that `_Tail` does not see above is below.  Between nodes the
+    curvature below t goes with a power of t, as it does below them all, there between t (a density of eigenvalues that rises as
+    1 / t towards 0) and t^2 (one that stays finite).  total: the value of all curvature.
+    """
+
+    def __init__(self, nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"], tail: _Tail, total: float) -> None:
+        if len(tail.magnitudes) and float(nodes.min()) < 0 < float(nodes.max()):
+            at, carried, rest = tail.magnitudes, tail.carried, max(total - float(tail.carried.sum()), 0.0)
+        else:
+            at, order = nodes.abs().sort()
+            carried, rest = (weights * nodes.abs())[order], 0.0
+        below = rest + carried.cumsum(0) - carried / 2
+        kept = (at > 0) & (below > 0)
+        self.total = rest + float(carried.sum())
+        self.at, self.below = at[kept].log().numpy(), below[kept].log().numpy()
+        rise, run = (float(logs[1] - logs[0]) if len(logs) > 1 else 0.0 for logs in (self.below, self.at))
+        self.power = min(max(rise / run, 1.0), 2.0) if run else 1.0
+
+    def __call__(self, t: float) -> float:
+        if not len(self.at) or t == 0:
+            return 0.0
+        if log(t) < self.at[0]:
+            return exp(self.below[0] + self.power * (log(t) - self.at[0]))
+        return float(np.exp(np.interp(log(t), self.at, self.below))) if log(t) <= self.at[-1] else self.total
+
+
+def _middle_of_magnitudes(density: SpectralDensity, tails: Sequence[_Tail], p: float) -> float:
+    """The magnitude that the share p of sum |lambda| lies at or below, in the middle of what is certain (`_Curve`).
+
+    What is known, and the nodes of a rule that is the measure itself, are where they are.
     """
     exact, curves = [(density.known.abs(), density.known.abs())], []
-    for nodes, weights in density.rules():
-        points = nodes.abs(), density.rest * weights * nodes.abs() / len(density.nodes)
-        (curves if (weights > 0).all() else exact).append(points)
+    each = density.rest / len(tails)
+    for (nodes, weights), tail, total in zip(density.rules(), tails, integrals_of_rules(density)[1], strict=True):
+        if (weights > 0).all():
+            curves.append(_Curve(nodes, weights, tail, float(total)))
+        else:
+            exact.append((nodes.abs(), each * weights * nodes.abs()))
     at, mass = (torch.cat(parts) for parts in zip(*exact, strict=True))
-    grid = torch.cat([at, *(nodes for nodes, _ in curves)]).unique()
-    smooth = np.zeros(len(grid))
-    for nodes, amounts in curves:
-        nodes, order = nodes.sort()
-        below = amounts[order].cumsum(0) - amounts[order] / 2
-        smooth += np.interp(grid.numpy(), nodes.numpy(), below.numpy(), left=0.0, right=float(amounts.sum()))
     at, order = at.sort()
     sums = torch.nn.functional.pad(mass[order].cumsum(0), (1, 0))
-    below, upto = (smooth + sums[torch.searchsorted(at, grid, right=side)].numpy() for side in (False, True))
-    goal = p * (float(mass.sum()) + sum(float(amounts.sum()) for _, amounts in curves))
-    k = min(int(np.searchsorted(upto, goal)), len(grid) - 1)
-    if k == 0 or goal > below[k]:
-        return float(grid[k])
-    return float(np.interp(goal, [upto[k - 1], below[k]], grid[k - 1 : k + 1].numpy()))
+    goal = p * (float(sums[-1]) + each * sum(curve.total for curve in curves))
+    low, high = (
+        0.0,
+        max(float(density.nodes.abs().max()) if density.nodes.numel() else 0.0, float(at[-1]) if len(at) else 0.0),
+    )
+    while low < (middle := (low + high) / 2) < high:
+        known = float(sums[int(torch.searchsorted(at, middle, right=True))])
+        enough = known + each * sum(curve(middle) for curve in curves) >= goal
+        low, high = (low, middle) if enough else (middle, high)
+    return high
+
+
+def _mean_quantile(share: Float64[Tensor, " g"], size: float, level: float) -> Float64[Tensor, " g"]:
+    """Of the mean over start vectors that see, each with its error, this share: by the beta distribution of `size`."""
+    inner = share.clamp(TINY, 1 - EPS).numpy()
+    return torch.from_numpy(betaincinv(size * inner, size * (1 - inner), level))
 
 
 def _first(values: Tensor, otherwise: float) -> Tensor | float:

@@ -19,9 +19,15 @@ def controlled(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], m
     """samples - c (control - mean), c the least-squares slope through the other samples (0 where they do not vary)."""
     if len(samples) < 3:
         return samples
-    x, y = samples - samples.mean(), control - control.mean()
+    x, (y, unit) = samples - samples.mean(), _in_units(control - control.mean())
     left = len(samples) / (len(samples) - 1)  # as the means move, too, when a sample is left out
     cross, spread = (x * y).sum() - left * x * y, y.square().sum() - left * y.square()
     varies = spread > ROUND_OFFS * EPS * y.square().sum()
     slope = torch.where(varies, cross / spread.clamp_min(1e-300), torch.zeros_like(cross))
-    return samples - slope * (control - mean)
+    return samples - slope * ((control - mean) / unit)
+
+
+def _in_units(y: Float64[Tensor, " s"]) -> tuple[Float64[Tensor, " s"], float]:
+    """y over its largest modulus, and that modulus: squares of y may leave the range of floats."""
+    unit = float(y.abs().max()) or 1.0
+    return y / unit, unit

@@ -36,6 +36,7 @@ from landscape.traces.sketched_diagonal import sketched_samples
 
 Method = Literal["auto", "signs"]
 FEWEST = 4  # test vectors of a sketch
+SQUARED = 1e-140, 1e140  # numbers whose squares, and sums of them, are floats with all their digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +102,8 @@ def estimate_diagonal(
     """diag H with a standard error for every entry, from `probes` (3 or more) matvecs at most.
 
     batch: vectors in one application of the operator.  Keeps n x probes numbers in float64, and squares them: entries within
-    1e-150 to 1e150, as all of float32 are, have their errors; scale H before where others matter.  Method "auto" is "signs"
-    with fewer than 8 probes, and with no more rows than probes.
+    SQUARED, as all of float32 are, have their errors, and InputError where the largest is not.  Method "auto" is "signs" with
+    fewer than 8 probes, and with no more rows than probes.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([1.0, -2.0])))
@@ -121,6 +122,7 @@ def estimate_diagonal(
         until = half if choosing and done < half else probes
         Z = draw_probes(operator.dim, min(batch, until - done), generator, operator.dtype, "rademacher")
         Y = product(operator, Z)
+        _require_squares(float(Y.abs().max()) if Y.numel() else 0.0)
         samples = torch.cat([samples, Z.double() * Y.double()], dim=1)
         if progress:
             progress(samples.shape[1], probes, f"diagonal: {samples.shape[1]} probes")
@@ -129,6 +131,14 @@ def estimate_diagonal(
         if choosing and samples.shape[1] == half and _pays(samples, kept):
             return _sketched(operator, kept, batch, probes, progress)
     return _mean(samples, operator, probes, "signs")
+
+
+def _require_squares(largest: float) -> None:
+    """ValueError unless the square of the largest entry of products is a float with all its digits."""
+    if largest and not SQUARED[0] <= largest <= SQUARED[1]:
+        raise ValueError(
+            f"expected products H z with a largest entry from {SQUARED[0]:g} to {SQUARED[1]:g}, got {largest:.3g}; scale H"
+        )
 
 
 def _mean(samples: Float64[Tensor, "n k"], operator: SymmetricOperator, matvecs: int, method: str) -> DiagonalEstimate:

@@ -126,8 +126,8 @@ class CudaProjection:
         grid, rows, wide = self._grid(vectors)
         launch(
             kernels.pull_back, grid,
-            cotangents.to(out).contiguous(), out if block is None else block.contiguous(), *self._at, out, self.n, m, vectors,
-            block is not None, self.bands, rows, wide
+            cotangents.to(out.dtype).contiguous(), out if block is None else block.contiguous(), *self._at, out,
+            self.n, m, vectors, block is not None, self.bands, rows, wide
         )  # fmt: skip
         return out
 

@@ -7,21 +7,17 @@ import torch
 from landscape.eigen.eigen import extreme_eigenpairs
 from landscape.eigen.power import power_ends
 from landscape.operators.checks import check_operator
-from landscape.results import Bracket, t_interval
+from landscape.results import Bracket, standard_deviation
 from landscape.spectrum.anisotropy import anisotropy
 from landscape.spectrum.density import spectral_density
 from landscape.traces.trace import estimate_traces
 from tests.landscape.spectra import generator, operator
 
 
-def test_students_interval_of_four_numbers_is_the_textbooks():
-    mean, error, low, high = t_interval(torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64), 0.95)
-    assert mean == 2.5 and error == pytest.approx((5 / 3) ** 0.5 / 2)
-    assert high - mean == mean - low == pytest.approx(3.182446305 * error)  # t(0.975; 3)
-
-
-def test_one_sample_has_no_error_bar():
-    assert t_interval(torch.tensor([3.0], dtype=torch.float64), 0.95)[1:] == (inf, -inf, inf)
+@pytest.mark.parametrize("size", [1.0, 2.0**600, 2.0**-600])
+def test_a_standard_deviation_is_the_textbooks_at_any_size(size):
+    samples = size * torch.tensor([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [4.0, 0.0]], dtype=torch.float64)
+    assert standard_deviation(samples).tolist() == pytest.approx([size * (5 / 3) ** 0.5, 0.0], rel=1e-14)
 
 
 @pytest.mark.parametrize("name", ["both tails", "zero", "rank-deficient"])
@@ -45,4 +41,5 @@ def test_a_record_has_no_number_where_there_is_none():
 def test_a_bracket_reads_as_a_sentence():
     assert str(Bracket(2.0, 1.0, 3.0, "a note")) == "2 in [1, 3] (a note)"
     assert str(Bracket(None, 5.0, inf, "why")) == ">= 5: why"
+    assert str(Bracket(None, 0.0, 5.0, "why")) == "in [0, 5]: why"
     assert str(Bracket(None, inf, inf, "why")) == "undefined: why"

@@ -33,7 +33,7 @@ def ended(monkeypatch, capsys, error: BaseException, *more: str) -> tuple[int, s
         (MemoryError(), 71, "memory ran out"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"), 71, "memory ran"),
         (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"), 71, "memory ran out"),
-        (np._core._exceptions._ArrayMemoryError((9,), np.dtype("f8")), 71, "memory ran out"),
+        (np._core._exceptions._ArrayMemoryError((9,), np.dtype("f8")), 71, "memory ran out"),  # pyright: ignore[reportAttributeAccessIssue]
         (OSError(errno.ENOSPC, "No space left on device", "run/metrics.json"), 74, "disk is full (run/metrics.json)"),
         (OSError(errno.EDQUOT, "Disk quota exceeded"), 74, "the disk is full"),
         (KeyboardInterrupt(), 130, "interrupted"),

@@ -7,7 +7,7 @@ from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds, Eigenpairs
 from landscape.eigen.power import PowerSettings, power_ends
 from landscape.operators.operator import DenseOperator
-from landscape.spectrum.anisotropy import anisotropy, effective_rank, literal, mass_quantile, saddle, share
+from landscape.spectrum.anisotropy import _quotients, anisotropy, effective_rank, literal, mass_quantile, saddle, share
 from landscape.spectrum.density import spectral_density
 from tests.landscape.spectra import ROUNDING, N, eigenvalues, generator, operator
 
@@ -47,6 +47,69 @@ def test_an_unresolved_small_end_bounds_the_index_from_below_only():
 def test_a_small_end_that_is_zero_to_round_off_bounds_the_index_by_the_dtype():
     index = literal(ends(4.0, 0.0))
     assert index.value is None and isclose(index.low, 1 / torch.finfo(torch.float64).eps, rel_tol=1e-6)
+
+
+def test_an_unresolved_large_end_leaves_open_whether_there_is_positive_curvature_at_all():
+    unresolved = ends(-0.01, -4.0, residuals=(0.02, 0.4))
+    index = saddle(unresolved)
+    assert index.value is None and (index.low, index.high) == pytest.approx((0.0, 0.01 / 3.6))
+    assert "lambda_max is positive at all" in index.note and str(index).startswith("in [0, 0.0027")
+    index = literal(unresolved)
+    assert index.value == pytest.approx(0.01 / 4) and (index.low, index.high) == pytest.approx(
+        (-0.01 / 3.6, 0.03 / 3.6)
+    )
+    assert "lambda_max is not resolved" in index.note
+    assert [literal(ends(*pair)).note for pair in ((2.0, 1.0), (2.0, -1.0), (-1.0, -2.0))] == [
+        "definite",
+        "indefinite",
+        "definite",
+    ]
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_brackets_hold_all_that_the_intervals_of_both_ends_allow_and_nothing_else(seed):
+    """Against a grid of both intervals."""
+    draws = torch.Generator().manual_seed(seed)
+    bottom, top = torch.randn(2, generator=draws).double().sort().values.tolist()
+    residuals = tuple((0.5 * torch.rand(2, generator=draws)).tolist())
+    found = ends(top, bottom, residuals)
+    x = torch.linspace(top - residuals[0], top + residuals[0], 101, dtype=torch.float64)[:, None]
+    y = torch.linspace(bottom - residuals[1], bottom + residuals[1], 101, dtype=torch.float64)
+    allowed = (x >= y) & (y != 0)
+    quotients, index = (x / y)[allowed], literal(found)
+    if not index.note.endswith("|A|"):
+        assert index.low <= float(quotients.min()) and float(quotients.max()) <= index.high
+        signs = (x * y).sign()[allowed].unique().tolist()
+        assert index.note == {1: "definite", -1: "indefinite"}.get(sum(signs), index.note)
+        assert ("not resolved" in index.note) == (len(signs) > 1)
+        assert index.value is not None and index.low <= index.value <= index.high
+    saddles, down = -(x / y)[allowed & (x > 0) & (y < 0)], saddle(found)
+    assert down.value is None or down.low <= down.value <= down.high
+    if len(saddles) and down.high < inf:
+        assert down.low <= float(saddles.min()) and float(saddles.max()) <= down.high * (1 + ROUNDING)
+        assert down.high - down.low <= 1.1 * float(saddles.max() - saddles.min()) + 0.1 * down.high
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_negative_operator_whose_large_end_the_budget_left_behind_has_no_saddle_below_zero(seed):
+    values = -torch.cat([torch.logspace(-6, -3, 1900), torch.logspace(0, 1, 100)]).double()
+    H, generator = DenseOperator(torch.diag(values)), torch.Generator().manual_seed(seed)
+    found = extreme_eigenpairs(H, generator, EigenSettings(max_matvecs=12))
+    assert found.largest.reason == "matvec budget" and float(found.largest.values[0]) < 0
+    down, index = saddle(found), literal(found)
+    assert down.value is None and down.low == 0 < down.high
+    assert index.low <= float(values.max() / values.min()) <= index.high and "not resolved" in index.note
+
+
+@pytest.mark.parametrize("top", [(-3.0, -1.0), (-3.0, 1.0), (1.0, 3.0)])
+@pytest.mark.parametrize("sizes", [(0.5, 2.0), (0.0, 2.0)])
+def test_quotients_of_either_sign_by_a_size_that_may_be_as_small_as_any_are_bounded_on_the_right_side(top, sizes):
+    x = torch.linspace(top[0], top[1], 101, dtype=torch.float64)[:, None]
+    y = torch.linspace(sizes[0], sizes[1], 101, dtype=torch.float64).clamp_min(1e-300)
+    low, high = _quotients(top, sizes)
+    least, most = float((x / y).min()), float((x / y).max())
+    assert low == pytest.approx(least if least > -1e290 else -inf)
+    assert high == pytest.approx(most if most < 1e290 else inf)
 
 
 def test_semi_definite_operators_have_no_saddle_and_the_words_say_so():

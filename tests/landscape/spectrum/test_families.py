@@ -87,3 +87,14 @@ def test_a_part_is_led_to_its_ends_and_the_others_have_the_numbers_that_they_hav
     assert float(led["all"].ends.smallest.values[0]) == pytest.approx(-1, rel=1e-2)
     for part in ("a", "b"):
         assert led[part].record() == alone[part].record()
+
+
+@pytest.mark.parametrize("size", [2.0**531, 2.0**-664])
+def test_indices_do_not_depend_on_the_size_of_the_numbers(size):
+    """1e160 and 1e-200: powers of two, which round nothing off."""
+    one, other = (
+        families(DenseOperator(scale * operator("both tails").matrix), generator())["all"] for scale in (1.0, size)
+    )
+    assert other.ends.noise == pytest.approx(size * one.ends.noise, rel=1)
+    for index, scaled in zip(vars(one.indices).values(), vars(other.indices).values(), strict=True):
+        assert [scaled.value, scaled.low, scaled.high] == pytest.approx([index.value, index.low, index.high], rel=1e-9)

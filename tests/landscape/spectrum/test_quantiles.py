@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 import torch
 
+from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
+from landscape.eigen.lanczos import lanczos
 from landscape.linalg import unit_columns
 from landscape.operators.operator import DenseOperator, ProjectedOperator
 from landscape.probes import draw_probes
@@ -9,7 +11,7 @@ from landscape.spectrum.absolute_sum import absolute_integral, absolute_sum
 from landscape.spectrum.density import ActiveSpace, draw_starts, spectral_density
 from landscape.spectrum.quantiles import _Tail, absolute_quantile, quantile
 from landscape.spectrum.rules import SpectralDensity
-from tests.landscape.spectra import SPECTRA, N, eigenvalues, generator, operator
+from tests.landscape.spectra import ROUNDING, SPECTRA, N, eigenvalues, generator, operator
 
 NOT_ZERO = [name for name in SPECTRA if name != "zero"]
 
@@ -102,6 +104,54 @@ def test_a_known_null_space_is_left_out_and_the_counts_are_those_of_the_rest():
     assert medians / runs >= floor and covered / runs >= floor
     whole = spectral_density(H, generator(), matvecs=164, starts=4)
     assert quantile(whole, 0.5).value == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["power law", "both tails", "indefinite"])
+def test_brackets_about_known_eigenvalues_are_as_wide_as_their_residuals(name, dtype):
+    """Ends that were found to 1%, and all that is left between them."""
+    true = torch.from_numpy(SPECTRA[name][:: N // 12]).double()
+    Q = torch.linalg.qr(torch.randn(len(true), len(true), generator=generator(4), dtype=torch.float64)).Q
+    H = DenseOperator(((Q * true) @ Q.T).to(dtype))
+    true, held, narrow, runs = eigenvalues(H), 0, 0, 12
+    for seed in range(runs):
+        ends = extreme_eigenpairs(H, generator(seed), EigenSettings(3, 2, rtol=1e-2))
+        density = spectral_density(H, generator(seed), 60, 3, batch=3, ends=ends)
+        for p in (0.05, 0.5, 0.9):
+            truth, bracket = by_curvature(true, p), absolute_quantile(density, p)
+            rank, median = by_count(true, p), quantile(density, p)
+            slack = ROUNDING * float(true.abs().max())
+            held += bracket.low - slack <= truth <= bracket.high + slack
+            held += median.low - slack <= rank <= median.high + slack
+            narrow += bracket.high - bracket.low < 0.02 * float(true.abs().max())
+    assert held == 6 * runs and narrow > runs
+
+
+def middles(values, steps, p=0.05):
+    """Log of the value over the truth, of a start vector that sees all eigenvalues alike."""
+    (run,) = lanczos(DenseOperator(torch.diag(values)), torch.ones(len(values), 1, dtype=torch.float64), steps)
+    nodes, S = torch.linalg.eigh(run.T)
+    density = SpectralDensity(nodes.repeat(2, 1), S[0].square().repeat(2, 1), len(values), 2 * steps)
+    value = absolute_quantile(density, p).value
+    assert value is not None
+    return np.log(value / by_curvature(values, p))
+
+
+@pytest.mark.parametrize("steps", [9, 12, 16])
+@pytest.mark.parametrize("decades", [2, 4])
+def test_the_middle_of_a_mass_quantile_is_near_where_eigenvalues_gather_about_zero(steps, decades):
+    """As many in every octave; a node near 0 has eigenvalues of both signs in its place."""
+    sizes, off = torch.logspace(-decades, 0, 400, dtype=torch.float64), []
+    for seed in range(15):
+        signs = torch.where(torch.rand(400, generator=generator(seed)) < 0.4, -1.0, 1.0)
+        off.append(middles(signs * sizes, steps))
+    assert np.sqrt(np.mean(np.square(off))) < 0.2 and np.max(np.abs(off)) < 0.4
+
+
+@pytest.mark.parametrize("steps", [9, 14, 25])
+def test_the_middle_of_a_mass_quantile_is_near_where_eigenvalues_are_uniform(steps):
+    off = [middles(torch.linspace(c - 1, c + 1, 300, dtype=torch.float64), steps) for c in np.linspace(-0.3, 0.3, 21)]
+    assert np.sqrt(np.mean(np.square(off))) < 0.2 and np.max(np.abs(off)) < 0.3
 
 
 def test_the_zero_operator_has_no_curvature_to_share_and_its_eigenvalues_are_zero():

@@ -24,3 +24,10 @@ def test_a_sample_whose_others_know_no_slope_is_left_as_it_is(count, step):
     y[2] += step
     x = torch.randn(count, dtype=torch.float64, generator=generator())
     assert float(controlled(x, y, 0.4)[2]) == float(x[2])
+
+
+@pytest.mark.parametrize("size", [2.0**531, 2.0**-664])
+def test_a_control_of_any_size_helps_as_much(size):
+    x, y = torch.randn(2, 9, dtype=torch.float64, generator=generator())
+    one, other = controlled(x, y, 0.3), controlled(x, y * size, 0.3 * size)
+    assert torch.allclose(other, one, rtol=1e-12, atol=0)

@@ -81,3 +81,10 @@ def test_an_operator_may_give_the_same_memory_at_every_call():
     plain, buffered = (estimate_diagonal(H, generator(), 32) for H in (DenseOperator(matrix), Buffered(matrix)))
     assert plain.method == buffered.method == "sketch"
     assert torch.allclose(plain.values, buffered.values, rtol=1e-9)
+
+
+@pytest.mark.parametrize("size", [2.0**531, 2.0**-664])
+def test_products_whose_squares_leave_the_range_of_floats_are_refused_with_a_sentence(size):
+    with pytest.raises(ValueError, match=r"largest entry from 1e-140 to 1e\+140, got .*; scale H"):
+        estimate_diagonal(DenseOperator(size * INDEFINITE), generator(), 24)
+    assert not estimate_diagonal(DenseOperator(0 * INDEFINITE), generator(), 24).values.any()

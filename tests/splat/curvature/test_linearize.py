@@ -219,5 +219,6 @@ def test_tiles_are_dark_where_the_picture_is_met_exactly_and_the_loss_does_not_c
     view = replace(view, image=torch.cat([met, view.image[:, 16:].double()], dim=1))
     alone, coupled = (hold(gaussians, view, LossSettings(ssim_weight=weight)) for weight in (0.0, 0.2))
     first_row = -(-45 // lanes_of(np.float64))
-    assert (np.diff(alone._raster.lists.start)[:first_row] > 0).all()
+    lists = alone._raster.lists  # pyright: ignore[reportAttributeAccessIssue]
+    assert (np.diff(lists.start)[:first_row] > 0).all()
     assert alone.dark_tiles == first_row and coupled.dark_tiles == 0

@@ -61,7 +61,7 @@ SWITCHES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("values", product(*SWITCHES.values()), ids=str)
+@pytest.mark.parametrize("values", list(product(*SWITCHES.values())), ids=str)
 def test_kernels_and_plain_torch_agree_for_every_combination_of_settings(values):
     settings = RenderSettings(**dict(zip(SWITCHES, values, strict=True)))
     gaussians, camera = random_gaussians(20, 1, logit=5.0), random_camera(36, 24, focal=60.0)

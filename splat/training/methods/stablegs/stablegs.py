@@ -14,10 +14,10 @@ magnitudes and edges, or none.  The history notes it, and counts the probed view
 
 Schedule.  The paper trains for 10,000 steps, 1,000 of them warm-up (Sec. 4, Algorithm 1).  Algorithm 1 densifies only after the
 warm-up (line 18), its text builds on 3DGS, which begins after step 500: `densify_after_warm_up` chooses.  In a training of
-another length T, `StableGS.scaled` multiplies the warm-up, the first and last step of density control and the steps between
-resets of the opacities by T / 10,000, so that probing and densification overlap as they do in the paper.  The steps between two
-densifications stay: Gaussians that have had no time to move would be cloned again and again.  `landscape train` does so for all
-that is not set by hand.
+another length T, `StableGS.scaled` multiplies the warm-up and the first and last step of density control by T / 10,000, so that
+probing and densification overlap as they do in the paper; `landscape train` does so for all that is not set by hand.  The steps
+between two densifications and between resets of the opacities stay: they are the time in which Gaussians move and become
+opaque again, which does not depend on T.
 
 Accuracy.  tr H_b has an exact part and one that is sampled (`splat/curvature/traces.py`), with as many samples, from 8 to
 MOST_SAMPLES, as bring the 95% interval of rho within `accuracy` of it; rho takes the root of the trace.  A trace that almost
@@ -108,14 +108,12 @@ class StableGS(MethodSettings):
         return replace(config.densify, start=start, start_share=1.0)
 
     def scaled(self, config: TrainConfig, keep: Collection[str] = ()) -> TrainConfig:
-        def steps(name: str, value: int, least: int = 0) -> int:
-            return value if name in keep else max(round(value * config.iterations / PAPERS_STEPS), least)
+        def steps(name: str, value: int) -> int:
+            return value if name in keep else round(value * config.iterations / PAPERS_STEPS)
 
+        density = config.densify
         density = replace(
-            config.densify,
-            start=steps("densify.start", config.densify.start),
-            stop=steps("densify.stop", config.densify.stop),
-            reset_every=steps("densify.reset_every", config.densify.reset_every, 1),
+            density, start=steps("densify.start", density.start), stop=steps("densify.stop", density.stop)
         )
         return replace(config, densify=density, method=replace(self, warm_up=steps("warm_up", self.warm_up)))
 
