@@ -65,6 +65,7 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
 
+OPTIONAL = ("power iteration", "density", "finite probe", "depth")  # stages
 FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density and along a side of a slice that are worth their time
 FEWEST_STARTS = 3  # of a density of less than MANY_MATVECS; two have three times the interval
 MANY_MATVECS = 48
@@ -182,7 +183,9 @@ def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch
     with stage("checks") as report:
         operator_check = check_operator(operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(hessian, spawn(generator), report, settings.checked_views)
-    budget = Budget(settings.seconds, _unasked(settings), generator, stage)
+    wanted = settings.power, settings.density_matvecs, settings.probe_steps, settings.depth
+    unasked = [name for name, each in zip(OPTIONAL, wanted, strict=True) if not each]
+    budget = Budget(settings.seconds, unasked, generator, stage)
     with budget.stage("traces") as share:
         allowed = replace(settings.traces, max_seconds=share.seconds)
         traces = exact_traces(objective, share.generator, allowed, share.report, samples=settings.trace_samples)
@@ -227,16 +230,6 @@ def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch
     )
 
 
-def _unasked(settings: ProbeSettings) -> list[str]:
-    optional = {
-        "power iteration": settings.power,
-        "density": settings.density_matvecs,
-        "finite probe": settings.probe_steps,
-        "depth": settings.depth,
-    }
-    return [name for name, wanted in optional.items() if not wanted]
-
-
 def _linearised(objective: SceneObjective, report: Progress) -> tuple[Tensor, float, float]:
     """The gradient, the loss, and the seconds that rendering it takes; for the first render the kernels may compile."""
     report(0, 1, f"{len(objective.views)} views")
@@ -265,9 +258,8 @@ def _density(
     where they are too few."""
     matvecs = int(min(settings.density_matvecs, share.seconds / each))
     starts = FEWEST_STARTS if matvecs < MANY_MATVECS else None
-    batch, longest = (
-        (MOST_AT_ONCE, room // (MOST_AT_ONCE + 1)) if room > FEWEST_STEPS * MOST_AT_ONCE else (1, room // 2)
-    )
+    batch = MOST_AT_ONCE if room > FEWEST_STEPS * MOST_AT_ONCE else 1
+    longest = room // (batch + 1)
     if min(matvecs // FEWEST_STARTS, longest) < FEWEST_STEPS:
         share.notes.append(
             f"the spectral density was left out: time and memory allowed {matvecs} products in runs of {longest}"

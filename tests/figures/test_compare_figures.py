@@ -33,7 +33,7 @@ def test_slices_share_the_smallest_window_and_the_levels(tmp_path):
 
 
 @pytest.mark.parametrize(("stretch", "aspect", "words"), [(1.0, 1.0, False), (10.0, "auto", True)])
-def test_steps_of_both_directions_look_equally_long_or_the_axes_say_that_they_differ(tmp_path, stretch, aspect, words):
+def test_steps_look_equally_long_or_the_axes_say_that_they_differ(tmp_path, stretch, aspect, words):
     pair = records(tmp_path, 1.0, 0.25)
     for record in pair.values():
         record.arrays["slice"]["y"] *= stretch
@@ -56,7 +56,7 @@ def test_a_trace_shows_its_sign_and_whether_its_interval_decides_it(tmp_path):
     assert by_value[round(traces["quats"].value or 0.0)] == ("o", RUNS[0])
 
 
-def test_a_density_is_shared_out_among_the_directions_on_both_sides_of_zero(tmp_path):
+def test_a_density_is_divided_among_the_directions_on_both_sides_of_zero(tmp_path):
     (record,) = records(tmp_path, 1.0).values()
     nodes, weights = record.arrays["spectrum"]["nodes"], record.arrays["spectrum"]["weights"]
     (values, up), (_, down) = beyond(nodes, weights), beyond(-nodes, weights)
@@ -76,7 +76,7 @@ def test_a_density_shows_how_far_its_start_vectors_lie_apart(tmp_path):
         assert float(np.asarray(line.get_ydata())[0]) == pytest.approx(weights[nodes > 0].sum())
 
 
-def test_a_side_of_which_only_ends_are_known_says_so_and_the_legend_names_them(tmp_path):
+def test_a_side_of_which_only_ends_are_known_says_so(tmp_path):
     (record,) = records(tmp_path, 1.0).values()
     record.arrays["spectrum"]["nodes"] = np.abs(record.arrays["spectrum"]["nodes"])
     figure = draw_densities({"one": record})
@@ -104,7 +104,7 @@ def test_the_numbers_along_the_steps_of_sections_stay_apart(tmp_path):
         assert all(right.x0 - left.x1 > 4 * POINT * figure.dpi for left, right in pairwise(boxes))
 
 
-def test_a_run_without_slice_or_density_is_left_out_of_those_pictures_alone(tmp_path):
+def test_a_run_without_slice_or_density_is_in_the_other_pictures(tmp_path):
     both = records(tmp_path, 1.0, 2.0)
     poor = list(both.values())[1]
     del poor.arrays["slice"], poor.arrays["spectrum"]

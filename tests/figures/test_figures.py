@@ -223,7 +223,7 @@ def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypat
     assert "without the off-screen renderer" in figure.get_supxlabel()
 
 
-def test_the_command_draws_the_folder_named_on_its_standard_input_and_nothing_without_a_name(tmp_path):
+def test_the_command_draws_the_folder_named_on_its_standard_input(tmp_path):
     folder = written(tmp_path / "probe", *synthetic()).folder
     command = [sys.executable, "-m", "figures.make_all", "--without", "surface", "--without", "slice2d", "-"]
     for said, names in (("", []), (f"{folder}\n", ["spectrum.png", "traces.png"])):

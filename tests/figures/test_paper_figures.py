@@ -49,7 +49,7 @@ def test_everything_stays_inside_the_page(runs, module):
     assert drawn.x1 <= figure.get_figwidth() + POINT and drawn.y1 <= figure.get_figheight() + POINT
 
 
-def test_contours_have_the_few_ticks_of_sections_whose_room_the_layout_knows(runs):
+def test_contours_have_the_ticks_of_the_sections(runs):
     for run, reach in zip(runs, (0.0532, 0.1005), strict=True):
         record = read_record(run / "slice-eigenvectors-2d")
         for axis in "xy":
@@ -102,7 +102,7 @@ def test_steps_have_their_unit(runs, module):
 
 
 @pytest.mark.parametrize("module", [fig1, fig7], ids=["fig1", "fig7"])
-def test_ticks_of_steps_are_apart_from_each_other_and_from_the_names_of_their_axes(runs, module):
+def test_ticks_of_steps_overlap_neither_each_other_nor_axes_names(runs, module):
     figure = module.draw(runs)
     renderer = laid_out(figure)
     for axes in figure.axes:

@@ -59,7 +59,7 @@ def test_curvatures_that_round_off_hides_set_no_limits_and_have_no_dot(tmp_path)
     assert "infinitesimal: 40.0" in labels and "hidden by round-off" in labels
 
 
-def test_a_value_that_is_hardly_known_does_not_flatten_the_others_and_shows_where_it_lies(tmp_path):
+def test_a_value_that_is_hardly_known_does_not_flatten_the_others(tmp_path):
     data, arrays = synthetic_line()
     probe = data["finite_probe"]
     probe["curvatures"][0], probe["round_off"][0] = -9000.0, 3000.0

@@ -92,7 +92,7 @@ def test_runs_at_the_same_steps_stand_symmetrically_beside_each_other():
     assert low < 1000 < 2000 < high
 
 
-def test_powers_of_ten_have_a_line_of_their_own_and_the_legend_says_what_is_open():
+def test_powers_of_ten_have_a_line_and_the_legend_says_what_is_open():
     figure = trajectory.draw(rows(1e-4).assign(run="a"))
     titles = [axes.get_title() for axes in figure.axes]
     assert "smallest eigenvalue\n(×10⁻⁶)" in titles and "largest eigenvalue\n(×10⁻⁶)" in titles
@@ -116,7 +116,7 @@ def test_of_an_index_without_any_bound_nothing_is_drawn(tmp_path):
     assert 9.0 not in drawn and {4.0, 16.0} <= set(drawn)
 
 
-def test_the_command_prints_the_first_and_last_values_and_writes_table_and_picture(tmp_path, capsys, monkeypatch):
+def test_the_command_prints_first_and_last_values_and_writes_the_files(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     runs = [run(tmp_path / "runs" / "3dgs" / "0"), run(tmp_path / "runs" / "stablegs" / "0", 3.0)]
     assert main(["trajectory", *map(str, runs)]) == 0
@@ -138,7 +138,7 @@ def test_the_command_prints_the_first_and_last_values_and_writes_table_and_pictu
         ("render_surface", "expected FIELD.npz OUT.png"),
     ],
 )
-def test_a_figures_script_that_is_given_something_else_says_what_it_expects(tmp_path, module, words):
+def test_a_figures_script_given_something_else_says_what_it_expects(tmp_path, module, words):
     given = [str(tmp_path)] if module == "trajectory" else []
     done = subprocess.run(
         [sys.executable, "-m", f"figures.{module}", *given], capture_output=True, text=True, check=False

@@ -51,7 +51,7 @@ def by_specification(objective: SceneObjective, loss: LossSettings) -> tuple[Ten
     return torch.tensor(pairs, dtype=torch.float64), traces
 
 
-def test_gradients_and_traces_are_those_of_the_dense_derivatives_of_each_view(objective):
+def test_gradients_and_traces_are_those_of_each_views_dense_derivatives(objective):
     pairs, traces = by_specification(objective, PIXELWISE)
     split, n = depth_split(objective, generator()), len(objective.active)
     expected, order = pairs[pairs.any(dim=1)].sort(dim=0).values, split.components.sort(dim=0).values
@@ -75,7 +75,7 @@ def test_with_ssim_both_traces_are_within_their_errors_over_many_seeds():
         assert float(z.square().mean()) < 3, name
 
 
-def test_ratios_are_for_one_lateral_direction_and_brackets_hold_both_intervals():
+def test_ratios_are_per_lateral_direction_and_brackets_hold_both_intervals():
     depth, lateral = (TraceEstimate.exact(name, 1, value, 0.95) for name, value in (("depth", 3.0), ("lateral", 12.0)))
     split = DepthSplit(torch.tensor([[3.0, 4.0], [0.0, 4.0], [1.0, 1.0]]), depth, lateral)
     assert split.gradient_ratio == pytest.approx(sqrt(2 * 10 / 33))
@@ -99,7 +99,7 @@ def test_steps_are_along_the_rays_or_across_them_and_as_long_as_a_pixel(objectiv
         assert 0 < int(((along * offsets).sum(dim=1) > 0).sum()) < len(along)  # both signs
 
 
-def test_probes_have_signs_along_the_rays_or_what_signs_in_space_have_across_them(objective):
+def test_probes_have_signs_along_the_rays_or_across_them(objective):
     rays = [rays_of(objective, index) for index in range(2)]
     for index, ray in enumerate(rays):
         U = _signs(objective, rays, index, [generator(0), generator(1)], KINDS)

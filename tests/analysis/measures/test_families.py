@@ -154,7 +154,7 @@ def test_every_family_is_that_of_the_dense_block_in_the_metrics_units(split, obj
     assert resolved >= (10 if operator == "hessian" else 5)
 
 
-def test_the_effect_of_the_split_brackets_the_quotient_of_the_dense_indices(split, objective, checkpoint):
+def test_the_splits_effect_brackets_the_quotient_of_dense_indices(split, objective, checkpoint):
     assert {(e.operator, e.block) for e in split.effects} == {
         (o, b) for o in ("hessian", "gauss-newton") for b in BLOCKS
     }
@@ -173,7 +173,7 @@ def matches(row, effect) -> bool:
     return (row.operator, row.block) == (effect.operator, effect.block)
 
 
-def test_a_quotient_is_undetermined_where_a_bracket_reaches_zero_or_has_no_end():
+def test_a_quotient_is_undetermined_where_a_bracket_has_0_or_no_end():
     assert str(quotient(Bracket(-6.0, -8.0, -5.0), Bracket(2.0, 2.0, 2.5))) == "-3 in [-4, -2]"
     for unknown in (Bracket(1.0, -1.0, 2.0), Bracket(1.0, 0.5, float("inf"), "why"), None):
         assert quotient(unknown, Bracket(2.0, 1.0, 3.0)).record()["low"] is None
@@ -245,7 +245,7 @@ def test_an_end_that_was_not_reached_says_so_with_its_bound(record):
     assert record.data.families[0].beyond is not None
 
 
-def test_at_80_columns_every_number_and_label_of_the_terminals_table_is_whole(record):
+def test_at_80_columns_every_number_and_label_is_whole(record):
     data = copy.deepcopy(record.data)
     wide = Index(value=-1.234e-4, low=-1.235e-4, high=-1.233e-4, note="")
     bracket = Index(value=2.5e-4, low=7.45e-4, high=1.02e4, note="")

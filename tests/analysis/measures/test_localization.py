@@ -27,7 +27,7 @@ def facing(*scales: tuple[float, float]) -> Gaussians:
     return Gaussians.pack(attributes).to(torch.float64)
 
 
-def test_conditions_are_the_ratios_of_the_squared_widths_with_and_without_the_blur() -> None:
+def test_conditions_are_ratios_of_squared_widths_with_and_without_blur() -> None:
     scales = [(0.1, 0.1), (0.4, 0.1), (0.8, 0.002), (0.8, 1e-6)]
     found = conditions(facing(*scales), [CAMERA])
     widths = torch.tensor(scales, dtype=torch.float64).square() * (FOCAL / DEPTH) ** 2

@@ -74,7 +74,7 @@ def test_the_images_of_a_scene_hardly_change_and_the_change_is_measured() -> Non
     assert control.psnr == pytest.approx(-20 * log10(control.rms))
 
 
-def test_only_opacities_and_sizes_change_and_the_split_scene_can_be_probed_again() -> None:
+def test_the_split_changes_opacities_and_sizes_alone_and_can_be_repeated() -> None:
     gaussians, views = tiny_gaussians(dtype=torch.float64), tiny_views(torch.float64)
     split = split_in_two(gaussians)
     for half in (split.select(torch.arange(12)), split.select(torch.arange(12, 24))):

@@ -29,7 +29,7 @@ def objective_in_a_world(unit: float = 1.0, apart: float = 0.0) -> SceneObjectiv
     return SceneObjective(gaussians, views, LossSettings("charbonnier"), BACKGROUND)
 
 
-def test_curvature_in_scene_units_does_not_depend_on_the_units_of_the_world():
+def test_curvature_in_scene_units_is_independent_of_world_units():
     products = []
     for unit in (1.0, 1.7):
         objective = objective_in_a_world(unit)
@@ -40,7 +40,7 @@ def test_curvature_in_scene_units_does_not_depend_on_the_units_of_the_world():
     assert relative_error(plain, products[0]) > 0.1  # in the world's own units it does
 
 
-def test_the_size_of_a_scene_is_its_depth_where_the_views_face_one_way_and_the_cameras_distance_elsewhere():
+def test_a_scenes_size_is_its_depth_or_the_distance_of_its_cameras():
     facing = objective_in_a_world()
     camera = facing.views[0].camera
     depth = ((facing.active.means - camera.centre) @ camera.forward).sort().values
@@ -65,7 +65,7 @@ def test_behind_the_first_camera_there_is_no_depth():
     assert len(before) < len(depths) and scene_size(objective) == float(before[(len(before) - 1) // 2])
 
 
-def test_one_of_three_cameras_that_looks_back_makes_a_scene_no_longer_faced_from_one_side():
+def test_one_of_three_cameras_that_looks_back_makes_a_scene_all_round():
     facing = objective_in_a_world()
     first, second = facing.views
     back = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)) @ first.camera.rotation

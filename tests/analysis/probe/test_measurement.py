@@ -36,7 +36,7 @@ DIM = 50
         (61.0, 6, None, ["left out: time and memory allowed 60 products in runs of 3"]),
     ],
 )
-def test_a_density_has_as_many_products_as_time_allows_in_runs_that_memory_has_room_for(seconds, room, shape, said):
+def test_time_and_memory_bound_the_products_of_a_density(seconds, room, shape, said):
     operator = CountingOperator(DenseOperator(torch.diag(torch.linspace(-1, 3, DIM, dtype=torch.float64))))
     run, notes = partial(spectral_density, operator), []
     share = Share(seconds, torch.Generator().manual_seed(0), lambda *_: None, notes)
@@ -52,7 +52,7 @@ def test_a_quick_slice_is_judged_by_few_points_whatever_the_time():
     assert holdouts == [settings.slice_holdout, settings.slice_holdout, 5]
 
 
-def test_every_kernel_has_worked_before_the_time_runs_and_own_blocks_are_made_once(monkeypatch):
+def test_kernels_are_compiled_before_the_time_runs_and_blocks_made_once(monkeypatch):
     """The clock is read for the budget after the first product, render, block and float64 gradient."""
     calls: list[str] = []
 
@@ -80,13 +80,13 @@ def test_every_kernel_has_worked_before_the_time_runs_and_own_blocks_are_made_on
 
 
 @pytest.mark.parametrize(("renders", "held_out", "batch"), [(100, 30, 32), (80, 20, 20), (4, 5, 5)])
-def test_a_slice_with_little_time_keeps_its_points_and_judges_them_by_fewer(renders, held_out, batch):
+def test_a_slice_with_little_time_keeps_its_points_and_holds_out_fewer(renders, held_out, batch):
     allowed = _within(ProbeSettings(), seconds=0.5 * renders, each=0.5, workers=2)
     assert (allowed.holdout, allowed.batch, allowed.workers) == (held_out, batch, 2)
     assert allowed.max_seconds == 0.5 * renders and allowed.tolerance == ProbeSettings().slice_tolerance
 
 
-def test_the_slices_model_has_the_hessians_curvature_between_its_directions():
+def test_the_slices_model_has_the_hessian_between_its_directions():
     objective = SceneObjective(
         random_gaussians(15, 1, logit=1.0).to(torch.float64), two_views(), LossSettings(), BACKGROUND.double()
     )
@@ -99,7 +99,7 @@ def test_the_slices_model_has_the_hessians_curvature_between_its_directions():
     assert off < 1e4 * torch.finfo(torch.float64).eps  # what a probe's checks ask of a product
 
 
-def test_a_search_for_the_ends_begins_with_several_directions_as_one_alone_takes_a_neighbour_for_the_end():
+def test_a_search_begun_with_several_directions_finds_the_ends():
     """The two largest values of this scene are 13% apart."""
     case = splat_cases(0, 2)["far from a fit #2"]()
     assert case.objective is not None

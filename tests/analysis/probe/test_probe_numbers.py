@@ -50,7 +50,7 @@ def test_eigenvalues_are_those_of_the_dense_hessian_within_their_residuals(recor
     assert share.low <= float(true[-1] / true.abs().sum()) <= share.high
 
 
-def test_the_literal_index_is_the_papers_power_iteration_beside_the_certain_bracket(record, dense):
+def test_the_literal_index_is_by_power_iteration_where_that_arrived(record, dense):
     _, H, _, _ = dense
     ends, literal = record.data.eigenvalues, record.data.anisotropy.literal
     true = torch.linalg.eigvalsh((H + H.T) / 2)
@@ -70,7 +70,7 @@ def test_a_power_iteration_that_did_not_arrive_gives_no_index(steps, says):
     assert None not in (index.low, index.value, index.high) and index.low <= index.value <= index.high  # pyright: ignore[reportOptionalOperand, reportOperatorIssue]
 
 
-def test_within_a_bracket_without_bound_a_power_iteration_that_ran_out_has_not_arrived():
+def test_in_an_open_bracket_a_power_iteration_that_ran_out_did_not_arrive():
     operator, generator = (
         DenseOperator(torch.diag(torch.linspace(-1e-3, 3, 400, dtype=torch.float64))),
         torch.Generator(),
@@ -84,7 +84,7 @@ def test_within_a_bracket_without_bound_a_power_iteration_that_ran_out_has_not_a
     assert literal_index(ends, arrived).note.startswith("by power iteration")
 
 
-def test_the_slice_is_made_of_true_losses_along_the_two_steepest_directions(record, dense):
+def test_the_slice_has_true_losses_along_the_two_steepest_directions(record, dense):
     objective, H, value, _ = dense
     about, arrays = record.data.slice, record.arrays["slice"]
     assert arrays["loss"].shape == arrays["model"].shape == arrays["crossed"].shape == (5, 5)

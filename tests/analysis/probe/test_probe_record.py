@@ -19,7 +19,7 @@ from splat.training.checkpoint import load_checkpoint
 from tests.analysis.probe.probed import unlimited
 
 
-def test_the_record_has_the_layout_and_says_what_was_skipped_and_from_where_it_comes(record, dense, run):
+def test_the_record_has_counts_checks_stages_and_provenance(record, dense, run):
     objective, H, value, gradient = dense
     data = record.data
     assert list(dict(data.eigenvalues.items())) == ["max", "second", "min", "power_max", "power_min"]
@@ -106,7 +106,7 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
         assert stage in said.err
 
 
-def test_a_quick_probe_leaves_the_same_pictures_out_whoever_starts_their_drawing(run, tmp_path, monkeypatch):
+def test_a_quick_probe_leaves_out_the_same_pictures_however_it_is_started(run, tmp_path, monkeypatch):
     begun, drawn = [], []
     monkeypatch.setattr(
         "analysis.console.drawing.drawing", lambda *told: begun.append(told) or nullcontext(lambda target: [])

@@ -101,7 +101,7 @@ def test_every_number_of_the_tables_is_on_the_page_with_its_error(tmp_path):
         assert expected in text
 
 
-def test_the_page_says_what_lies_in_depth_and_how_far_that_is_from_the_papers_factor(tmp_path):
+def test_the_page_sets_depth_against_the_papers_factor(tmp_path):
     data, arrays = synthetic()
     assert "along the rays" not in Page(page(tmp_path / "without", data, arrays)).text
     text = Page(page(tmp_path / "with", data | {"depth": depth_section()}, arrays)).text
@@ -172,7 +172,7 @@ def test_the_findings_names_the_attribute_that_carries_the_curvature():
     assert "Rotation carries most" in sentences(data) and "separate" not in sentences(data)
 
 
-def test_most_of_the_curvature_is_more_than_half_of_it_and_whom_the_error_does_not_separate_is_named():
+def test_most_is_over_half_and_what_the_error_does_not_separate_is_named():
     data, _ = synthetic()
     data["traces"]["means"] |= {"value": 4.1e5, "standard_error": 1e4}
     data["traces"]["quats"] |= {"value": 4e5, "standard_error": 4e4}
@@ -196,7 +196,7 @@ def test_the_findings_calls_indefinite_what_the_residual_proves(low, residual, w
     assert words in sentences(data)
 
 
-def test_an_end_that_the_budget_did_not_reach_is_a_bound_and_the_findings_says_so():
+def test_the_findings_say_where_a_budget_ended_the_search_for_an_end():
     data, _ = synthetic()
     data["eigenvalues"]["min"] |= {"reason": "tolerance"}
     assert "farther out" not in sentences(data)
@@ -229,7 +229,7 @@ def test_the_findings_says_what_was_skipped_and_what_could_not_run():
     assert "finite difference could not run (every direction crosses a sort)" in said
 
 
-def test_the_findings_says_how_much_of_the_slice_is_interpolated_and_how_well():
+def test_the_findings_say_how_much_of_the_slice_is_interpolated():
     data, _ = synthetic()
     data["slice"] |= {"evaluated_points": 80, "crossed_points": 70, "interpolation_error": 0.004, "holdout_points": 30}
     said = sentences(data)

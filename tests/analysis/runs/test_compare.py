@@ -181,9 +181,7 @@ def test_trajectories_of_other_functions_are_not_drawn_into_one_picture(runs, ca
     assert "expected runs with the same loss" in capsys.readouterr().err
 
 
-def test_a_run_without_a_record_of_its_checkpoint_is_refused_with_the_command_or_probed(
-    runs, capsys, monkeypatch, no_pictures
-):
+def test_a_run_without_a_record_is_refused_with_the_command_or_probed(runs, capsys, monkeypatch, no_pictures):
     for run in runs:
         shutil.rmtree(Path(run) / "probe")
     record(Path(runs[1]) / "probe", 1.0, iteration=ITERATIONS - 1)  # of an earlier step

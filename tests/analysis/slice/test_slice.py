@@ -141,7 +141,7 @@ def probed(folder: Path, value: float, vectors: np.ndarray, loss: LossSettings) 
     written(folder / "probe", data, {"eigenvectors": {"largest": vectors}})
 
 
-def test_eigenvectors_of_the_probe_beside_the_checkpoint_are_taken_where_they_are_its_own(run, eigen, tmp_path):
+def test_the_probes_eigenvectors_are_taken_where_they_are_the_checkpoints(run, eigen, tmp_path):
     path, scene = tmp_path / "run" / "double.pt", ["--scene", str(run.parent / "still")]
     path.parent.mkdir()
     shutil.copy(run / "double.pt", path)
@@ -193,7 +193,7 @@ def test_random_directions_are_as_long_as_each_attribute_of_each_gaussian(run, o
     assert not np.allclose(other.arrays["directions"]["vectors"], vectors)
 
 
-def test_along_the_gradient_the_slope_is_its_length_and_finite_steps_are_second_differences(run, objective, tmp_path):
+def test_along_the_gradient_slope_and_finite_steps_are_those_of_renders(run, objective, tmp_path):
     record = sliced(tmp_path / "slice", run / "double.pt", "--along", "gradient", "--points", "21")
     check_renders(record, objective)
     (direction,) = record.data.slice.directions
@@ -209,7 +209,7 @@ def test_along_the_gradient_the_slope_is_its_length_and_finite_steps_are_second_
     assert record.data.counts.renders == 3 * (record.data.slice.evaluations + probe.evaluations)
 
 
-def test_what_finite_steps_see_is_said_as_the_range_over_those_that_round_off_does_not_hide():
+def test_finite_steps_are_said_as_a_range_without_those_that_are_hidden():
     probe = synthetic_line()[0]["finite_probe"]
     said = _finite_curvature(convert(probe, FiniteProbe))
     assert "from 41.0 to 70.0, at the 3 of 4 steps that round-off does not hide (±1.00 × 10⁻⁵ to ±0.00100)" in said
@@ -221,7 +221,7 @@ def test_what_finite_steps_see_is_said_as_the_range_over_those_that_round_off_do
     )
 
 
-def test_a_line_leads_to_the_other_checkpoint_and_what_is_in_sight_there_alone(run, tmp_path):
+def test_a_line_leads_to_the_other_checkpoint_with_all_gaussians(run, tmp_path):
     for start, end in (("behind", "double"), ("double", "turned")):
         record = sliced(tmp_path / start, run / f"{start}.pt", str(run / f"{end}.pt"), "--points", "9", "--all-points")
         x, loss = record.arrays["slice"]["x"], record.arrays["slice"]["loss"]
@@ -239,7 +239,7 @@ def test_a_line_leads_to_the_other_checkpoint_and_what_is_in_sight_there_alone(r
     assert way.norm(dim=1).max() <= math.sqrt(2)  # unit quaternions that turn the same way, the shorter one
 
 
-def test_of_two_kinds_the_second_is_put_at_a_right_angle_and_keeps_its_length(run, objective, tmp_path):
+def test_of_two_kinds_the_second_is_turned_to_a_right_angle(run, objective, tmp_path):
     options = ["--along", "gradient", "--along", "eigenvectors", "--radius", "0.01", "--radius", "2", *POINTS]
     record = sliced(tmp_path / "slice", run / "double.pt", *options)
     check_renders(record, objective)

@@ -121,7 +121,7 @@ def test_all_methods_of_a_seed_come_before_the_next_seed(folder):
     assert names == ["still/3dgs/1", "still/asp only/1", "still/3dgs/0", "still/asp only/0"]
 
 
-def test_the_narrower_of_two_settings_goes_first_and_paths_are_those_of_the_file(folder):
+def test_narrower_settings_go_first_and_paths_are_those_of_the_file(folder):
     plain, asp, *_ = (cell.training for cell in read_sweep(folder / "sweep.toml").cells)
     assert plain == TrainOptions(
         folder / "still", folder / "out/still/3dgs/1", views=3, iterations=12, seed=1, checkpoint_every=5
@@ -195,7 +195,7 @@ def test_ctrl_c_stops_a_sweep_after_its_cells_have_saved(folder, tmp_path, capsy
     assert "0 of 4 cells done" in capsys.readouterr().out
 
 
-def test_a_cell_that_was_stopped_ends_with_the_same_bits_as_one_that_was_not(finished, tmp_path):
+def test_a_cell_that_was_stopped_ends_with_the_same_bits(finished, tmp_path):
     cell = finished.cells[0]
     whole = cell.out.with_name("whole")
     assert main(arguments(replace(cell.training, out=whole))) == 0

@@ -38,7 +38,7 @@ def test_an_index_of_which_only_a_bound_is_known_is_not_averaged(tmp_path):
     assert summary["saddle_n"].item() == 1 and summary["literal_n"].item() == 0
 
 
-def test_ends_whose_search_ran_out_are_said_with_the_cells_and_have_their_reason_in_the_file(tmp_path):
+def test_searches_that_ran_out_are_said_with_their_cells(tmp_path):
     data, arrays = synthetic()  # the smallest eigenvalue's ended at its time
     cells = [Cell("still", "3dgs", TrainOptions(Path("still"), out=tmp_path / str(i), seed=i)) for i in range(3)]
     for cell, reason in zip(cells, ("tolerance", "noise floor", None), strict=True):
