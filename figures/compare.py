@@ -8,7 +8,6 @@ compare_slices      the planes of the two steepest directions, cut to the steps 
 compare_sections    the loss along each of these directions, as far as each slice goes
 """
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from analysis.records.findings import attribute_name
-from analysis.records.records import Record, read_record
+from analysis.records.records import ProbeRecord, Record, read_record
+from analysis.records.run_files import COMPARISON, read_comparison
+from analysis.records.schema import Trace
 from figures.plane import Plane, plane, same_scale
 from figures.style import (
     BLACK,
@@ -38,7 +39,7 @@ from figures.style import (
     unit_suffix,
 )
 
-Records = Mapping[str, Record]
+Records = Mapping[str, Record[ProbeRecord]]
 LINES = ("-", "--", ":")  # once the colours are used up
 LEVELS = 12
 ACROSS = 3  # panels in a row
@@ -52,14 +53,14 @@ TALLEST = 3.0  # inches of a panel
 
 def draw_traces(records: Records) -> Figure:
     """A row an attribute, in it one below the other the runs."""
-    names = list(dict.fromkeys(name for record in records.values() for name in record.data["traces"]))
+    names = list(dict.fromkeys(name for record in records.values() for name in record.data.traces))
     with style():
         figure = new_figure(0.7 + 0.13 * len(names) * (len(records) + 1), 2 * COLUMN)
         axes = figure.subplots()
         for i, (look, record) in enumerate(zip(_looks(records), records.values(), strict=True)):
             for row, name in enumerate(names):
                 y = row + (i + 0.5) / (len(records) + 1) - 0.4
-                _draw_trace(axes, record.data["traces"].get(name), y, look["color"])
+                _draw_trace(axes, record.data.traces.get(name), y, look["color"])
         axes.set_xscale("log")
         axes.set_yticks(range(len(names)), [literal(attribute_name(name)) for name in names])
         axes.set_ylim(len(names) - 0.4, -0.6)
@@ -71,16 +72,17 @@ def draw_traces(records: Records) -> Figure:
     return figure
 
 
-def _draw_trace(axes: Axes, entry: Mapping | None, y: float, colour: str) -> None:
-    if entry is None or entry["value"] is None or not np.isfinite(entry["value"]) or entry["value"] == 0:
+def _draw_trace(axes: Axes, trace: Trace | None, y: float, colour: str) -> None:
+    if trace is None or not trace.value or not np.isfinite(trace.value):
         return
-    ends = [entry["value"] if entry.get(key) is None else entry[key] for key in ("low", "high")]
+    value = trace.value
+    ends = [value if end is None else end for end in (trace.low, trace.high)]
     decided = ends[0] * ends[1] > 0
     low, high = sorted(np.abs(ends))
-    smallest = abs(entry["value"]) / 10  # an interval that reaches 0 has no end on a logarithmic axis
-    axes.plot([low if decided else smallest, max(high, abs(entry["value"]))], [y, y], color=colour, linewidth=1.2)
-    face = colour if entry["value"] > 0 else "white"
-    axes.plot([abs(entry["value"])], [y], "o" if decided else "X", color=colour, markerfacecolor=face)
+    smallest = abs(value) / 10  # an interval that reaches 0 has no end on a logarithmic axis
+    axes.plot([low if decided else smallest, max(high, abs(value))], [y, y], color=colour, linewidth=1.2)
+    face = colour if value > 0 else "white"
+    axes.plot([abs(value)], [y], "o" if decided else "X", color=colour, markerfacecolor=face)
 
 
 def draw_densities(records: Records) -> Figure:
@@ -91,15 +93,15 @@ def draw_densities(records: Records) -> Figure:
         figure = new_figure(2.6, 2 * COLUMN)
         panels, ends = figure.subplots(1, 2, sharey=True), []
         for look, record in zip(_looks(records), records.values(), strict=True):
-            spectrum, found = record.arrays.get("spectrum", {}), record.data["eigenvalues"]
-            for axes, sign, end in zip(panels, (-1, 1), ("min", "max"), strict=True):
+            spectrum, found = record.arrays.get("spectrum", {}), record.data.eigenvalues
+            for axes, sign, end in zip(panels, (-1, 1), (found.min, found.max), strict=True):
                 if "nodes" in spectrum and (sign * spectrum["nodes"] > 0).any():
                     nodes, weights = sign * spectrum["nodes"], spectrum["weights"]
                     axes.step(*beyond(nodes, weights), where="pre", **look)
                     for one in range(len(nodes)):
                         axes.step(*beyond(nodes[one : one + 1], weights[one : one + 1]), where="pre", **look, **ALONE)
-                if sign * (found[end]["value"] or 0) > 0:
-                    ends.append(axes.axvline(sign * found[end]["value"], color=look["color"], **END))
+                if sign * (end.value or 0.0) > 0:
+                    ends.append(axes.axvline(sign * (end.value or 0.0), color=look["color"], **END))
         for axes, words in zip(panels, ("down", "up"), strict=True):
             axes.set(xscale="log", yscale="log", xlabel="|curvature| (loss per squared parameter unit)")
             axes.set_title(f"Directions that curve {words}", loc="left")
@@ -112,7 +114,7 @@ def draw_densities(records: Records) -> Figure:
         for axes in panels:
             axes.set_xlim(max(limits[:, 0].min(), top * 1e-8), top)
         panels[0].invert_xaxis()
-        most = max(record.data["counts"]["active_parameters"] for record in records.values())
+        most = max(record.data.counts.active_parameters for record in records.values())
         panels[0].set_ylim(0.5 / most, 2)  # one direction is a share of 1 / parameters
         panels[0].set_ylabel("share of directions\nat least so curved")
         _legend(figure, records, *[Line2D([], [], color=BLACK, label="end of the spectrum", **END)] * bool(ends))
@@ -226,11 +228,9 @@ FIGURES: dict[str, Callable[[Records], Figure]] = {
 
 def draw_comparison(folder: Path, suffix: str = "png") -> list[Path]:
     """Draw what the records of the comparison in the folder have the numbers for; returns the files."""
-    index = folder / "compare.json"
-    if not index.is_file():
-        raise FileNotFoundError(f"expected a folder written by `landscape compare` (with compare.json), got {folder}")
-    named = json.loads(index.read_text(encoding="utf-8"))["runs"]
-    records = {label: read_record(path) for label, path in named.items()}
+    if not (folder / COMPARISON).is_file():
+        raise FileNotFoundError(f"expected a folder written by `landscape compare` (with {COMPARISON}), got {folder}")
+    records = {label: read_record(path, ProbeRecord) for label, path in read_comparison(folder).runs.items()}
     arrays = [record.arrays for record in records.values()]
     known = {"compare_densities": any("nodes" in each.get("spectrum", {}) for each in arrays)}
     known |= dict.fromkeys(("compare_slices", "compare_sections"), any("slice" in each for each in arrays))

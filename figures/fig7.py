@@ -17,11 +17,11 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
+from analysis.records.run_files import RECORDS, read_trajectory
 from figures.manifold import Scale, landscape_of, require_same_function, section, start_of, surface
 from figures.style import BLUE, RUNS, literal, new_figure, save, style
 from figures.trajectory import index_over_steps, marker_words, step_ticks
 
-RECORDS = "trajectory.csv"
 PAGE = 6.9  # inches
 BEGINNING = "start"
 BAR: dict[str, Any] = {"shrink": 0.6, "aspect": 14}  # without a name: the title above has it
@@ -94,9 +94,7 @@ def _measured(run: Path, name: str) -> pd.DataFrame:
     """The run's records of its training, under its name."""
     if not (run / RECORDS).is_file():
         raise FileNotFoundError(f"expected {RECORDS} in the run {run}, found none; train anew with --probe-every")
-    table = pd.read_csv(run / RECORDS)
-    if not {"step", "state", "literal", "literal_low", "literal_high"} <= set(table.columns):
-        raise ValueError(f"expected the records of landscape train --probe-every in {run / RECORDS}, got another table")
+    table = read_trajectory(run / RECORDS)
     table = pd.DataFrame(table[table["state"] != "skipped"]).assign(run=name)
     if table.empty:
         raise ValueError(f"expected records in {run / RECORDS}, all were skipped; train with a larger --probe-share")

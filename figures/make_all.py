@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from analysis.records.records import Record, read_record
+from analysis.records.records import ProbeRecord, Record, read_record
 from figures import slice1d, slice2d, spectrum, surface, traces
 from figures.style import folder_script, save
 
@@ -22,8 +22,8 @@ FIGURES = {
 
 def recorded_figures(record: Record) -> tuple[str, ...]:
     """Names of the figures that the record has the numbers for."""
-    axes = len(record.data["slice"]["directions"]) if record.data.get("slice") and "slice" in record.arrays else 0
-    known = {"traces": "traces" in record.data, "spectrum": "spectrum" in record.arrays}
+    axes = len(record.data.slice.directions) if record.data.slice and "slice" in record.arrays else 0
+    known = {"traces": isinstance(record.data, ProbeRecord), "spectrum": "spectrum" in record.arrays}
     known |= {"slice1d": axes == 1, "slice2d": axes == 2, "surface": axes == 2}
     return tuple(name for name in FIGURES if known[name])
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from analysis.records.records import PROBE, SLICE, Record, read_record
+from analysis.records.records import ProbeRecord, Record, SliceRecord, read_record
 from analysis.records.run_files import CHECKPOINT
 from figures.plane import Plane, plane
 from figures.style import BLACK, FIELD_MAP, MISSING, exponent_of, literal, unit_suffix
@@ -26,7 +26,10 @@ from figures.style import BLACK, FIELD_MAP, MISSING, exponent_of, literal, unit_
 START = "start"
 INNER = 0.65  # of the reach of a surface: no tick farther out
 ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
-SLICES = (("slice-eigenvectors-2d", SLICE), ("probe", PROBE))  # beside a checkpoint, the first that is there
+SLICES = (
+    ("slice-eigenvectors-2d", SliceRecord),
+    ("probe", ProbeRecord),
+)  # beside a checkpoint, the first that is there
 LEVELS = 10
 NAMES = ("e₁", "e₂")
 FUNCTION = {"views": "training views", "sizes": "sizes of the views", "loss": "loss", "background": "background"}
@@ -86,10 +89,12 @@ def through_centre(landscape: Plane, axis: int) -> tuple[np.ndarray, np.ma.Maske
 
 def require_same_function(runs: Sequence[Path]) -> None:
     """ValueError where the runs' landscapes are those of different functions; what an older record lacks is not compared."""
-    records = [_record_of(run).data for run in runs]
-    found = [record.get("objective", {}) | {"views": record["provenance"].get("views")} for record in records]
+    records = {run: _record_of(run).data for run in runs}
     for key, what in FUNCTION.items():
-        known = {run: each[key] for run, each in zip(runs, found, strict=True) if each.get(key) is not None}
+        found = {
+            run: getattr(data.provenance if key == "views" else data.objective, key) for run, data in records.items()
+        }
+        known = {run: value for run, value in found.items() if value}
         for run, value in known.items():
             first, of_first = next(iter(known.items()))
             if value != of_first:
@@ -111,10 +116,10 @@ def _record_of(run: Path) -> Record:
     if not (run / CHECKPOINT).is_file():
         raise FileNotFoundError(f"expected a run of `landscape train` in {run}, found no {CHECKPOINT} there")
     for name, kind in SLICES:
-        if (run / name / kind.file).is_file():
-            found = read_record(run / name)
-            directions = found.data["slice"]["directions"] if found.data["slice"] else ()
-            if tuple(direction["name"] for direction in directions) != NAMES:
+        if (run / name / kind.FILE).is_file():
+            found = read_record(run / name, kind)
+            directions = found.data.slice.directions if found.data.slice else ()
+            if tuple(direction.name for direction in directions) != NAMES:
                 raise ValueError(
                     f"expected a slice along {' and '.join(NAMES)} in {run / name}, got others; {_slice(run)}"
                 )

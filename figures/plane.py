@@ -7,12 +7,11 @@ evaluated   a point that is a true render; the others are interpolated
 crossed     a render whose order of splats or set of visible ones is not the centre's: the loss may jump on the way there
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from analysis.records import schema
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
 from figures.style import exponent_of, literal, unit_suffix
@@ -78,13 +77,13 @@ class Plane:
 
 def plane(record: Record) -> Plane:
     """The slice of a record.  Raises ValueError where none was recorded, or none of its points is finite."""
-    about = record.data.get("slice")
+    about = record.data.slice
     if about is None or "slice" not in record.arrays:
         raise ValueError(f"expected a recorded slice in {record.folder / 'slice.npz'}, got none; probe with a slice")
     arrays = record.arrays["slice"]
     if "y" not in arrays:
         raise ValueError(f"expected a slice over a plane in {record.folder / 'slice.npz'}, got one along a line")
-    changes = [arrays[name] - about["center_loss"] for name in ("loss", "model") if name in arrays]
+    changes = [arrays[name] - about.center_loss for name in ("loss", "model") if name in arrays]
     if not np.isfinite(changes[0]).any():
         raise ValueError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
     exponent = exponent_of(changes[0])
@@ -92,7 +91,7 @@ def plane(record: Record) -> Plane:
     common = exponent_of(arrays["x"], arrays["y"])
     directions = [
         direction(d, steps, common if _alike(arrays) else exponent_of(steps))
-        for d, steps in zip(about["directions"], (arrays["x"], arrays["y"]), strict=True)
+        for d, steps in zip(about.directions, (arrays["x"], arrays["y"]), strict=True)
     ]
     return Plane(
         *directions,
@@ -100,16 +99,16 @@ def plane(record: Record) -> Plane:
         model=masked[1] if len(masked) == 2 else None,
         crossed=arrays.get("crossed"),
         evaluated=arrays.get("evaluated", np.ones(arrays["loss"].shape, bool)),
-        interpolation_error=about.get("interpolation_error", 0.0),
+        interpolation_error=about.interpolation_error,
         exponent=exponent,
-        loss_scale=about["loss_scale"],
+        loss_scale=about.loss_scale,
     )
 
 
-def direction(about: Mapping[str, Any], steps: np.ndarray, exponent: int) -> Direction:
+def direction(about: schema.Direction, steps: np.ndarray, exponent: int) -> Direction:
     """An axis as it was recorded."""
-    scale = literal(about.get("scale", Direction.scale))
-    return Direction(literal(about["name"]), about["curvature"], about["unit"], steps, exponent, scale)
+    curvature, unit = (np.nan if number is None else number for number in (about.curvature, about.unit))
+    return Direction(literal(about.name), curvature, unit, steps, exponent, literal(about.scale or Direction.scale))
 
 
 def _alike(arrays: dict[str, np.ndarray]) -> bool:

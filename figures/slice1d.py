@@ -17,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from analysis.records.findings import resolved
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
+from analysis.records.schema import FiniteProbe, Slice
 from figures.plane import Direction, direction
 from figures.slice2d import CROSSED, RENDERED
 from figures.style import BLACK, BLUE, VERMILION, exponent_of, new_figure, script, style, unit_suffix
@@ -27,13 +28,13 @@ SHORT = 0.25  # of a value: a bar within which it sets the limits
 
 def draw(record: Record) -> Figure:
     """The slice along a line.  Raises ValueError where none was recorded, or none of its points is finite."""
-    about = record.data.get("slice")
-    if about is None or len(about["directions"]) != 1 or "slice" not in record.arrays:
+    about = record.data.slice
+    if about is None or len(about.directions) != 1 or "slice" not in record.arrays:
         raise ValueError(f"expected a slice along a line in {record.folder}, got none; slice with --dimension 1")
-    arrays, probe = record.arrays["slice"], record.data.get("finite_probe")
+    arrays, probe = record.arrays["slice"], record.data.finite_probe
     if not np.isfinite(arrays["loss"]).any():
         raise ValueError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
-    along = direction(about["directions"][0], arrays["x"], exponent_of(arrays["x"]))
+    along = direction(about.directions[0], arrays["x"], exponent_of(arrays["x"]))
     with style():
         figure = new_figure(2.6 if probe is None else 5.0)
         parts = figure.subfigures(1 if probe is None else 2, 1, squeeze=False)[:, 0]
@@ -46,8 +47,8 @@ def draw(record: Record) -> Figure:
     return figure
 
 
-def _draw_loss(axes: Axes, along: Direction, about: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    change = np.ma.masked_invalid(arrays["loss"] - about["center_loss"])
+def _draw_loss(axes: Axes, along: Direction, about: Slice, arrays: dict[str, np.ndarray]) -> None:
+    change = np.ma.masked_invalid(arrays["loss"] - about.center_loss)
     exponent = exponent_of(change.compressed())
     change /= 10.0**exponent
     known = arrays.get("evaluated", np.ones(change.shape, bool))
@@ -57,7 +58,7 @@ def _draw_loss(axes: Axes, along: Direction, about: dict[str, Any], arrays: dict
     if crossed.any():
         axes.plot(along.scaled[crossed], change[crossed], **{**CROSSED, **DOT}, label="render, order changed")
     if "model" in arrays:
-        model = (arrays["model"] - about["center_loss"]) / 10.0**exponent
+        model = (arrays["model"] - about.center_loss) / 10.0**exponent
         low, high = axes.get_ylim()
         axes.plot(along.scaled, model, "--", color=VERMILION, linewidth=0.9, label="quadratic model")
         axes.set_ylim(low, high)
@@ -68,7 +69,7 @@ def _draw_loss(axes: Axes, along: Direction, about: dict[str, Any], arrays: dict
     axes.grid(True)
     axes.set_title("Loss along a line through the checkpoint", loc="left")
     step = along.unit / 10.0**along.exponent
-    if about["directions"][0].get("kind") == "line":
+    if about.directions[0].kind == "line":
         axes.axvline(1, color="0.7", linewidth=0.5, zorder=0)
         axes.secondary_xaxis("top").set_xticks([0, 1], ["this checkpoint", "the other"])
     elif np.isfinite(step) and step > 0:
@@ -77,19 +78,16 @@ def _draw_loss(axes: Axes, along: Direction, about: dict[str, Any], arrays: dict
         upper.set_xlabel("steps in curvature units")
 
 
-def _draw_curvatures(axes: Axes, along: Direction, probe: dict[str, Any]) -> None:
-    steps, values, bounds = (np.array(probe[name], float) for name in ("steps", "curvatures", "round_off"))
-    crossed = np.array(probe["crossed"] or [False] * len(steps))
-    exact = probe["infinitesimal"]
+def _draw_curvatures(axes: Axes, along: Direction, probe: FiniteProbe) -> None:
+    steps, values, bounds = (np.array(each, float) for each in (probe.steps, probe.curvatures, probe.round_off))
+    crossed = np.array(probe.crossed or [False] * len(steps))
+    exact = np.nan if probe.infinitesimal is None else probe.infinitesimal
     axes.axhline(exact, color=VERMILION, linewidth=0.9, label=f"infinitesimal: {quantity(exact)}")
     sure = np.array(resolved(probe))
     if not sure.all():
         hidden: dict[str, Any] = {"fmt": "none", "ecolor": "0.8", "elinewidth": 1.2, "label": "hidden by round-off"}
         axes.errorbar(steps[~sure], values[~sure], bounds[~sure], **hidden)
-    for where, face, label in (
-        (~crossed, BLUE, "finite steps"),
-        (crossed, "white", "finite steps, order changed"),
-    ):
+    for where, face, label in ((~crossed, BLUE, "finite steps"), (crossed, "white", "finite steps, order changed")):
         if (where & sure).any():
             drawn: dict[str, Any] = {"color": BLUE, "markerfacecolor": face, "markersize": 3.5, "elinewidth": 0.8}
             axes.errorbar(*(each[where & sure] for each in (steps, values, bounds)), fmt="o", label=label, **drawn)

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from analysis.records.quantities import measured, power_of_ten
-from analysis.records.records import Record
+from analysis.records.records import ProbeRecord, Record
 from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, script, style
 
 DECADES = 5  # shown on either side of 0
@@ -25,7 +25,7 @@ DIRECTIONS: dict[str, Any] = {"color": BLACK, "linewidth": 0.7}
 CURVATURE: dict[str, Any] = {"color": VERMILION, "linewidth": 0.7}
 
 
-def draw(record: Record) -> Figure:
+def draw(record: Record[ProbeRecord]) -> Figure:
     """The spectrum of one record.  Raises ValueError where no spectrum was recorded."""
     if "spectrum" not in record.arrays:
         raise ValueError(f"expected the arrays ritz_values and residuals in {record.folder / 'spectrum.npz'}, got none")
@@ -63,9 +63,9 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
     axes.grid(True)
 
 
-def _label_ends(axes: Axes, record: Record) -> None:
-    ends = record.data["eigenvalues"]
-    lines = [f"{name} {measured(ends[name]['value'], ends[name]['residual'])}" for name in ("max", "min")]
+def _label_ends(axes: Axes, record: Record[ProbeRecord]) -> None:
+    ends = {"max": record.data.eigenvalues.max, "min": record.data.eigenvalues.min}
+    lines = [f"{name} {measured(end.value, end.residual)}" for name, end in ends.items()]
     axes.set_title("\n".join([axes.get_title(loc="left"), *lines]), loc="left", linespacing=1.4)
 
 
@@ -114,7 +114,7 @@ def _legend(distribution: bool) -> list[Line2D]:
 
 def main() -> None:
     """`python -m figures.spectrum RUN/probe`"""
-    script(draw, "spectrum")
+    script(draw, "spectrum", ProbeRecord)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from analysis.records.quantities import power_of_ten
-from analysis.records.records import Record, read_record
+from analysis.records.records import ProbeRecord, read_record
 
 COLUMN = 3.3
 FIELD_MAP = "cividis"
@@ -119,11 +119,11 @@ def literal(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def script(draw: Callable[[Record], Figure], name: str) -> None:
-    """The command line of one figure: `python -m figures.NAME RUN/probe [--format pdf]`."""
+def script(draw: Callable[[Any], Figure], name: str, kind: type[ProbeRecord] | None = None) -> None:
+    """The command line of one figure: `python -m figures.NAME RUN/probe [--format pdf]`.  kind: of record, None: any."""
 
     def drawn(folder: Path, suffix: str) -> list[Path]:
-        record = read_record(folder)
+        record = read_record(folder, kind)
         return [save(draw(record), record.folder / f"{name}.{suffix}")]
 
     folder_script(drawn, f"the figure {name} of a recorded probe", "probe")

@@ -5,7 +5,7 @@ diamond: the interval does not decide it).  An arrow at the left edge is a zero,
 """
 
 import math
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +15,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from analysis.records.findings import attribute_name
 from analysis.records.quantities import measured, power_of_ten, quantity
-from analysis.records.records import Record
+from analysis.records.records import ProbeRecord, Record
+from analysis.records.schema import Trace
 from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, script, style
 
 SIGNS: dict[str, dict[str, Any]] = {
@@ -26,9 +27,9 @@ SIGNS: dict[str, dict[str, Any]] = {
 }
 
 
-def draw(record: Record) -> Figure:
+def draw(record: Record[ProbeRecord]) -> Figure:
     """Traces above, tau below, one row an attribute."""
-    entries: dict[str, dict[str, Any]] = record.data["traces"]
+    entries = record.data.traces
     samples = record.arrays.get("traces", {})
     with style():
         figure = new_figure(0.75 + 0.62 * len(entries))
@@ -37,25 +38,25 @@ def draw(record: Record) -> Figure:
         _draw_traces(above, entries, samples)
         above.set_xlabel("|trace| (loss per squared parameter unit)")
         above.set_title("Trace and curvature scale by attribute", loc="left")
-        _rows(below, entries, [quantity(entry["tau"]) for entry in entries.values()])
+        _rows(below, entries, [quantity(entry.tau) for entry in entries.values()])
         _draw_taus(below, entries)
         below.set_xlabel("curvature scale τ = √(max(trace, 0) / dim)")
         figure.legend(handles=_legend(entries), loc="outside lower center", ncols=3, handletextpad=0.2, columnspacing=1)
     return figure
 
 
-def _draw_traces(axes: Axes, entries: dict[str, dict[str, Any]], samples: dict[str, np.ndarray]) -> None:
-    magnitudes = [abs(n) for e in entries.values() for n in (e["value"], e["standard_error"]) if _drawable(n)]
+def _draw_traces(axes: Axes, entries: dict[str, Trace], samples: dict[str, np.ndarray]) -> None:
+    magnitudes = [abs(n) for e in entries.values() for n in (e.value, e.standard_error) if _drawable(n)]
     left = _logarithmic(axes, magnitudes)
     for row, (name, entry) in enumerate(entries.items()):
         look = SIGNS[_sign(entry)]
         drawn = np.abs(samples.get(name, np.empty(0)))
         axes.plot(drawn, np.full(len(drawn), row), "|", color=look["color"], alpha=0.35, markersize=6, zorder=1)
-        if not _drawable(entry["value"]):
-            if entry["value"] == 0:
+        if not _drawable(entry.value):
+            if entry.value == 0:
                 _arrow(axes, left, row, look)
             continue
-        value = abs(entry["value"])
+        value = abs(entry.value)
         low, high = sorted(abs(end) for end in _interval(entry))
         low = left if _interval(entry)[0] * _interval(entry)[1] <= 0 else max(low, left)
         axes.plot([low, max(high, value)], [row, row], "-", color=look["color"], linewidth=1.4)
@@ -64,17 +65,17 @@ def _draw_traces(axes: Axes, entries: dict[str, dict[str, Any]], samples: dict[s
         axes.plot([value], [row], linestyle="none", **look)
 
 
-def _draw_taus(axes: Axes, entries: dict[str, dict[str, Any]]) -> None:
-    left = _logarithmic(axes, [entry["tau"] for entry in entries.values() if _drawable(entry["tau"])])
+def _draw_taus(axes: Axes, entries: dict[str, Trace]) -> None:
+    left = _logarithmic(axes, [entry.tau for entry in entries.values() if _drawable(entry.tau)])
     for row, entry in enumerate(entries.values()):
         look = SIGNS[_sign(entry)]
-        if entry["tau"] == 0:
+        if entry.tau == 0:
             _arrow(axes, left, row, look)
-        elif _drawable(entry["tau"]):
-            axes.plot([entry["tau"]], [row], linestyle="none", **look)
+        elif _drawable(entry.tau):
+            axes.plot([entry.tau], [row], linestyle="none", **look)
 
 
-def _rows(axes: Axes, entries: dict[str, dict[str, Any]], numbers: list[str]) -> None:
+def _rows(axes: Axes, entries: dict[str, Trace], numbers: list[str]) -> None:
     axes.set_yticks(
         range(len(entries)), [f"{literal(attribute_name(k))}\n{n}" for k, n in zip(entries, numbers, strict=True)]
     )
@@ -101,35 +102,34 @@ def _arrow(axes: Axes, left: float, row: int, look: dict[str, Any]) -> None:
     axes.plot([left], [row], linestyle="none", clip_on=False, zorder=5, **{**look, "marker": "<"})
 
 
-def _sign(entry: dict[str, Any]) -> str:
-    return "undetermined" if entry["value"] is None or math.isnan(entry["value"]) else entry["sign"]
+def _sign(trace: Trace) -> str:
+    return "undetermined" if trace.value is None or math.isnan(trace.value) else trace.sign
 
 
-def _signed(entry: dict[str, Any]) -> str:
-    return measured(entry["value"], entry["standard_error"])
+def _signed(trace: Trace) -> str:
+    return measured(trace.value, trace.standard_error)
 
 
-def _interval(entry: dict[str, Any]) -> tuple[float, float]:
+def _interval(trace: Trace) -> tuple[float, float]:
     """The recorded interval; where there is none, one standard error to either side."""
-    low, high = entry.get("low"), entry.get("high")
-    if low is None or high is None or not math.isfinite(high - low):
-        error = entry["standard_error"] if _drawable(entry["standard_error"]) else 0.0
-        low, high = entry["value"] - error, entry["value"] + error
-    return low, high
+    if trace.low is not None and trace.high is not None and math.isfinite(trace.high - trace.low):
+        return trace.low, trace.high
+    value, error = trace.value or 0.0, trace.standard_error if _drawable(trace.standard_error) else 0.0
+    return value - error, value + error
 
 
-def _drawable(number: float | None) -> bool:
+def _drawable(number: float | None) -> TypeGuard[float]:
     return number is not None and math.isfinite(number) and number != 0
 
 
-def _legend(entries: dict[str, dict[str, Any]]) -> list[Line2D]:
+def _legend(entries: dict[str, Trace]) -> list[Line2D]:
     present = {_sign(entry) for entry in entries.values()}
     return [Line2D([], [], linestyle="none", label=sign, **look) for sign, look in SIGNS.items() if sign in present]
 
 
 def main() -> None:
     """`python -m figures.traces RUN/probe`"""
-    script(draw, "traces")
+    script(draw, "traces", ProbeRecord)
 
 
 if __name__ == "__main__":

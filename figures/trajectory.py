@@ -22,9 +22,9 @@ from matplotlib.transforms import Affine2D
 
 from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.quantities import power_of_ten
+from analysis.records.run_files import ENDS, read_trajectory
 from figures.style import BLACK, RUNS, exponent_of, literal, new_figure, save, style, unit_suffix  # fmt: skip
 
-ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
 INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
 UNITS = "traces, eigenvalues: loss per squared parameter unit"
 PANEL = 1.12  # inches of height
@@ -182,11 +182,8 @@ def main() -> None:
         )
         sys.exit(2)
     try:
-        figure = draw(pd.read_csv(arguments.table))
+        figure = draw(read_trajectory(arguments.table))
         print(save(figure, arguments.table.with_suffix(f".{arguments.format}")))
-    except KeyError as error:
-        print(f"expected trajectories.csv as written by landscape trajectory, got none of its {error}", file=sys.stderr)
-        sys.exit(2)
     except (FileNotFoundError, ValueError) as error:
         print(error, file=sys.stderr)
         sys.exit(2)

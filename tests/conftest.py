@@ -1,7 +1,7 @@
 """Fixtures that several folders share."""
 
 import os
-from importlib.util import find_spec
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,9 +9,6 @@ import torch
 from torch import Tensor
 
 from tests.ptx import driver
-
-if not torch.cuda.is_available() and find_spec("triton"):
-    driver.install()
 
 # the processes of a run share the cores
 torch.set_num_threads(max(1, torch.get_num_threads() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
@@ -39,11 +36,19 @@ def lego() -> Path:
 
 
 @pytest.fixture
-def device(monkeypatch: pytest.MonkeyPatch) -> torch.device:
-    """Where the kernels for GPUs run: a GPU, or else the CPU with `tests.ptx`, in memory that holds NaN until it is written."""
+def emulator() -> Iterator[None]:
+    """Kernels for GPUs run on the CPU, by `tests.ptx`."""
     pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip install -e '.[gpu]'")
+    with driver.emulator():
+        yield
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> torch.device:
+    """Where the kernels for GPUs run: a GPU, or else the CPU with `emulator`, in memory that holds NaN until it is written."""
     if torch.cuda.is_available():
         return torch.device("cuda")
+    request.getfixturevalue("emulator")
     for owner, name in ((torch, "empty"), (torch, "empty_like"), (Tensor, "new_empty")):
         monkeypatch.setattr(owner, name, driver.unwritten(getattr(owner, name)))
     return torch.device("cpu")

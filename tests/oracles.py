@@ -28,10 +28,7 @@ def opencv_distortion(x: np.ndarray, y: np.ndarray, terms: Mapping[str, float]) 
     k1, k2, k3, p1, p2 = (terms.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+    return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
 
 
 def distorted_picture(

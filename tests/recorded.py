@@ -1,17 +1,38 @@
 """Synthetic records for the tests of what reads records: a quartic valley with known numbers."""
 
+import copy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from analysis.console.budget import NEEDS_DENSITY
+from analysis.records.json_files import fitted, plain
 from analysis.records.provenance import provenance
+from analysis.records.records import ProbeRecord, Record, SliceRecord, read_record, record_folder, write_record
+from analysis.records.tables import NEEDS_DENSITY
 
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
 
+def probe_of(data: dict[str, Any]) -> ProbeRecord:
+    """The record of a probe with this data."""
+    return fitted(copy.deepcopy(data) | {"arrays": {}}, ProbeRecord, "a record", "")
+
+
+def slice_of(data: dict[str, Any]) -> SliceRecord:
+    return fitted(copy.deepcopy(data) | {"arrays": {}}, SliceRecord, "a record", "")
+
+
+def written(folder: Path, data: dict[str, Any], arrays: dict[str, dict[str, np.ndarray]]) -> Record[Any]:
+    """The record in a folder: of a probe, or of a slice where there are no traces."""
+    record = probe_of(data) if "traces" in data else slice_of(data)
+    with record_folder(folder, type(record)) as partial:
+        write_record(partial, record, arrays)
+    return read_record(folder)
+
+
 def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:
-    """(data, arrays) as `write_record` takes them; every curvature is multiplied by `scale`."""
+    """(data, arrays) of a probe, for `written`; every curvature is multiplied by `scale`."""
     random = np.random.default_rng(seed)
     traces, samples = {}, {}
     for attribute, value in zip(ATTRIBUTES, (4.1e5, 8.3e3, 52.0, -310.0, 12.0), strict=True):
@@ -49,7 +70,7 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
             "sh_degree_stored": 3,
             "sh_degree_active": 0,
             "views": 3,
-            "matvecs": 140,
+            "products": 140,
         },
         "checks": {
             "symmetry": {"value": 3e-7, "bound": 1e-5, "passed": True},
@@ -63,7 +84,7 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
         },
         "timing": {"load": 0.4, "linearise": 0.9, "traces": 8.2, "eigenvalues": 21.5, "slice": 14.0, "total": 45.0},
         "notes": ["SH bands 1 to 3 are not in use and were left out"],
-        "provenance": provenance(seed, lanes=16, checkpoint="checkpoint.pt", scene="fern", iteration=2000),
+        "provenance": plain(provenance(seed, lanes=16, checkpoint="checkpoint.pt", scene="fern", iteration=2000)),
     }
     arrays = {
         "traces": samples,
@@ -80,14 +101,15 @@ def synthetic(scale: float = 1.0, seed: int = 0) -> tuple[dict[str, Any], dict[s
 
 def depth_section(ratio: float | None = 0.0068) -> dict[str, Any]:
     """The section of a record that has positions split into depth and lateral."""
-    trace = {"value": 3.9e-4, "standard_error": 1e-5}
+    known = {"sign": "positive", "dim": 3000, "probes": 16, "method": "exact"}
+    trace = {"value": 3.9e-4, "standard_error": 1e-5, **known}
     rise = {"depth": 1.4e-4, "depth_error": 1e-5, "depth_crossed": 0.75, "lateral": 5e-4, "lateral_error": 2e-6}
     rows = [{"pixels": 0.1, "ratio": 0.28, "ratio_error": 0.02, "lateral_crossed": 0.5, **rise}]
     return {
         "gradient_ratio": ratio,
         "gradient_median": ratio,
         "pairs": 23054,
-        "curvature": {"depth": trace, "lateral": {"value": 20.4, "standard_error": 0.3}},
+        "curvature": {"depth": trace, "lateral": {"value": 20.4, "standard_error": 0.3, **known}},
         "curvature_ratio": {"value": 3.8e-5, "low": 3.7e-5, "high": 3.9e-5, "note": ""},
         "rises": rows,
     }

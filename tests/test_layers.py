@@ -14,9 +14,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_ROOMS = 9
+METHODS = "splat.training.methods.methods"  # its example is in the docstring of the module
 ORDER = {
     "": "landscape splat analysis figures",
-    "landscape": "linalg probes results operators traces eigen spectrum slices",
+    "landscape": "errors linalg probes results operators traces eigen spectrum slices",
     "splat": "model backend projection losses raster render scenes curvature training",
     "analysis": "records console measures train probe slice runs bench commands",
 }
@@ -140,3 +141,33 @@ def test_figures_need_no_torch():
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr or "figures imported torch"
+
+
+@pytest.mark.parametrize(
+    ("program", "unwanted"),
+    [
+        (
+            "import landscape; [getattr(landscape, name) for name in landscape.__all__]",
+            "pandas matplotlib rich pycolmap",
+        ),
+        ("import splat", "torch numba pycolmap splat.model"),
+        ("from analysis.commands.cli import main; main(['--help'])", "splat torch landscape.operators"),
+    ],
+)
+def test_what_starts_fast_does_not_import_what_is_slow(program, unwanted):
+    program = f"import sys\ntry:\n    {program}\nexcept SystemExit: pass\n"
+    program += f"print('imported', *(name for name in {unwanted.split()} if name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1:] == ["imported"], done.stdout[-200:] + done.stderr
+
+
+def test_the_short_names_of_splat_are_few_and_each_shows_an_example():
+    import splat
+
+    names = dir(splat)
+    assert 10 <= len(names) <= 20
+    for name in names:
+        value = getattr(splat, name)
+        documented = sys.modules[METHODS] if name == "METHODS" else value
+        assert ">>>" in (documented.__doc__ or ""), name
+        assert name in (splat.__doc__ or ""), name

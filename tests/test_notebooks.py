@@ -43,11 +43,11 @@ def test_a_notebook_runs_and_every_number_is_one(story):
 
 def test_the_comparison_trains_both_methods_and_gives_every_trace_with_its_error(story):
     printed, names = story
-    for attribute in names["ATTRIBUTES"]:
+    for attribute in names["start"].attributes:
         (line,) = [line for line in printed.splitlines() if line.startswith(attribute)]
         assert line.count("±") == 2
     plain, stable = (names["trained"][name] for name in ("3DGS", "StableGS"))
-    assert stable.regularizer.history and not plain.regularizer.history  # it has probed
+    assert stable.method.history and not plain.method.history  # it has probed
     assert not (len(stable.gaussians) == len(plain.gaussians) and stable.gaussians.flat.equal(plain.gaussians.flat))
 
 

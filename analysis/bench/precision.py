@@ -74,7 +74,7 @@ def same_decisions(gaussians: Gaussians, view: View, settings: RenderSettings) -
 def _cleared(view: View, gaussians: Gaussians, workload: Workload, settings: RenderSettings) -> View:
     """The view with its picture moved away from the image where a residual's sign is in doubt."""
     raster = rasterize_view(gaussians.to(torch.float64), view.camera, workload.background.double(), settings)
-    image = torch.as_tensor(raster.crop(raster.planes[:3])).cpu()
+    image = raster.crop(raster.planes[:3]).cpu()
     residual = image - view.image.double()
     side = torch.where(residual < 0, -1.0, 1.0)
     return replace(view, image=(image - side * residual.abs().clamp_min(CLEAR)).float())

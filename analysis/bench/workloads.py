@@ -1,15 +1,15 @@
-"""What the benchmarks run on: random splats for the kernels by themselves, views of a scene for everything."""
+"""What a bench measures: Gaussians with the views that they are compared with, of a scene, a checkpoint or made up."""
 
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -18,12 +18,10 @@ from splat.scenes.splits import split_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.view import View
 from splat.scenes.write import write_transforms_scene
-from splat.training.checkpoint import SceneReference, load_checkpoint, save_checkpoint
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.scene_reference import SceneReference
 from splat.training.start import gaussians_from_points
 from splat.training.state import TrainConfig, Training
-
-TANGENTS = (1, 4)
-BACKGROUND = (0.1, 0.2, 0.3)
 
 
 @dataclass(frozen=True)
@@ -40,47 +38,12 @@ class Size:
         match = re.fullmatch(r"(\d+)(k?)@(\d+)x(\d+)", text)
         size = cls(int(match[1]) * (1000 if match[2] else 1), int(match[3]), int(match[4])) if match else None
         if size is None or min(size.count, size.width, size.height) < 1:
-            raise ValueError(f"expected a size as GAUSSIANS@WIDTHxHEIGHT, e.g. 10k@504x378, got {text!r}")
+            raise InputError(f"expected a size as GAUSSIANS@WIDTHxHEIGHT, e.g. 10k@504x378, got {text!r}")
         return size
 
     def __str__(self) -> str:
         count = f"{self.count // 1000}k" if self.count % 1000 == 0 else str(self.count)
         return f"{count}@{self.width}x{self.height}"
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """Random splats (n, 9) with their depths, cotangents (1 + K, 3, h, w) and directions (n, K, 9)."""
-
-    size: Size
-    splats: np.ndarray
-    depths: np.ndarray
-    cotangents: np.ndarray
-    directions: np.ndarray
-
-
-def random_splats(size: Size, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Splats (n, 9) and depths: spread evenly, the smaller standard deviation about 2.5 px, three in a hundred large."""
-    n = size.count
-    means = rng.uniform(-5, [size.width + 5, size.height + 5], (n, 2))
-    large = rng.random(n) < 0.03
-    minor = np.where(large, rng.uniform(15, 30, n), rng.lognormal(np.log(2.5), 0.5, n))
-    major = np.clip(minor * rng.lognormal(0, 0.5, n), np.where(large, 8, 0.3), np.where(large, 35, 40))
-    minor, angle = np.clip(minor, 0.3, 40), rng.uniform(0, np.pi, n)
-    cos, sin = np.cos(angle), np.sin(angle)
-    xx, yy = cos**2 * minor**2 + sin**2 * major**2 + 0.3, sin**2 * minor**2 + cos**2 * major**2 + 0.3
-    xy = cos * sin * (minor**2 - major**2)
-    conics = np.stack([yy, -xy, xx], axis=1) / (xx * yy - xy**2)[:, None]
-    rest = [rng.uniform(0.05, 0.95, (n, 1)), rng.random((n, 3))]
-    return np.concatenate([means, conics, *rest], axis=1).astype(np.float32), rng.uniform(1, 10, n).astype(np.float32)
-
-
-def splat_problem(size: Size, splats: np.ndarray, depths: np.ndarray, rng: np.random.Generator) -> Problem:
-    """Random cotangents and directions for splats; a direction's parts have the scale of what they move."""
-    K = max(TANGENTS)
-    cotangents = rng.standard_normal((1 + K, 3, size.height, size.width), np.float32)
-    scales = np.array([1, 1, 0.01, 0.01, 0.01, 0.1, 0.3, 0.3, 0.3], np.float32)
-    return Problem(size, splats, depths, cotangents, scales * rng.standard_normal((len(splats), K, 9), np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +119,7 @@ def workload_of(path: Path, images: str | None = None, downscale: float = 1.0) -
         return Workload(name, checkpoint.training.gaussians, views, scene.background, config.loss, config.render)
     scene = load_scene(path, images, downscale)
     if scene.points is None:
-        raise ValueError(f"expected a scene with points, got {path} without any; train it and give the checkpoint")
+        raise InputError(f"expected a scene with points, got {path} without any; train it and give the checkpoint")
     views = tuple(scene.load(split_scene(scene, 3).train))
     gaussians = gaussians_from_points(scene.points, scene.frames, sh_degree=3)
     return Workload(f"{scene.name}, start", gaussians, views, scene.background)

@@ -1,33 +1,25 @@
-"""The `landscape` command: subcommands, and how errors become exit codes.
+"""The `landscape` command: its subcommands.
 
-    0    done
-    1    a self-check failed under --strict, or a cell of a sweep failed
-    2    bad input: one sentence on stderr that says what was expected, what came and what to do
-    130  interrupted with Ctrl-C or SIGTERM
-
-Every subcommand imports what it needs when it runs, so that `landscape --help` does not wait for torch.
+Every subcommand imports what it needs when it runs, so that `landscape --help` does not wait for torch.  For exit codes see
+`analysis.console.failures`.
 """
 
 import gc
-import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated, NoReturn
 
 import tyro
 
-from analysis.console.options import (
-    BenchOptions,
-    CompareOptions,
-    DemoOptions,
-    ProbeOptions,
-    SfmOptions,
-    SliceOptions,
-    SweepOptions,
-    TrainOptions,
-    TrajectoryOptions,
-)
+from analysis.bench.options import BenchOptions
+from analysis.commands.options import DemoOptions, SfmOptions
+from analysis.console.failures import report
+from analysis.probe.options import ProbeOptions
+from analysis.runs.options import CompareOptions, SweepOptions, TrajectoryOptions
+from analysis.slice.options import SliceOptions
+from analysis.train.options import TrainOptions
 
+DEBUG = "--debug"
 Options = (
     Annotated[SfmOptions, tyro.conf.subcommand("sfm")]
     | Annotated[TrainOptions, tyro.conf.subcommand("train")]
@@ -42,39 +34,32 @@ Options = (
 
 
 def command() -> NoReturn:
-    """`main` in a process of its own, which ends with its exit code.
+    """Run `main` in a process of its own, and end it with the exit code.
 
-    The libraries' objects live as long as the process: to look for garbage among them while they are loaded, and to take them
-    apart at the end, would take three quarters of a second.
+    The libraries' objects live as long as the process, so Python is told not to look for garbage among them.
     """
     gc.set_threshold(100_000)
     code = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+    gc.freeze()
+    sys.exit(code)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; arguments: those of the command line where None.  Returns the exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug, arguments = DEBUG in arguments, [word for word in arguments if word != DEBUG]
     options = tyro.cli(
         Options,  # pyright: ignore[reportArgumentType]
         prog="landscape",
-        description="See the loss landscape of a 3D Gaussian Splatting scene.",
+        description=f"See the loss landscape of a 3D Gaussian Splatting scene.\n{DEBUG}, before or after the subcommand, shows "
+        "where in the program an error came up.",
         args=arguments,
         config=(tyro.conf.DisallowNone,),
     )
     try:
         return run(options, arguments)
-    except (ValueError, OSError) as error:
-        text = str(error)
-        if isinstance(error, OSError) and error.strerror and error.filename:  # the system's own words
-            text = f"cannot use {error.filename}: {error.strerror}"
-        print(f"landscape: {' '.join(text.split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("landscape: interrupted", file=sys.stderr)
-        return 130
+    except (Exception, KeyboardInterrupt) as error:
+        return report(error, ["landscape", *arguments], debug)
 
 
 def run(options: Options, arguments: Sequence[str]) -> int:

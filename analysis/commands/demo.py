@@ -10,10 +10,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from analysis.console.options import DemoOptions, ProbeOptions, TrainOptions
+from analysis.commands.options import DemoOptions
 from analysis.probe.command import run_probe
+from analysis.probe.options import ProbeOptions
 from analysis.records.run_files import CHECKPOINT
 from analysis.train.command import run_training
+from analysis.train.options import TrainOptions
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 

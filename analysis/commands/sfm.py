@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from analysis.console.options import SfmOptions
+from analysis.commands.options import SfmOptions
 from splat.scenes.sfm.sfm import Mapped, Stage, scene_from_photos
 
 STAGES: dict[Stage, str] = {

@@ -22,7 +22,6 @@ SHARES = {
     "slice": 4.0,
     "depth": 2.0,
 }
-NEEDS_DENSITY = "needs the spectral density, which was left out"  # said of an index
 # what is said of a stage that was not asked for
 LEFT_OUT = {
     "density": "the spectral density was left out, and the indices that need it",

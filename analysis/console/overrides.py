@@ -12,7 +12,10 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from splat.training.state import Method, TrainConfig
+from landscape.errors import InputError
+from splat.model.settings import current_settings
+from splat.model.typed import leaves
+from splat.training.state import MethodSettings, TrainConfig
 
 T = TypeVar("T")
 
@@ -23,23 +26,11 @@ def assignments(texts: Sequence[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     for (key, equals, value), text in zip(pairs, texts, strict=True):
         if not (key.strip() and equals):
-            raise ValueError(f"expected KEY=VALUE, as in gamma=0.5, got {text!r}")
+            raise InputError(f"expected KEY=VALUE, as in gamma=0.5, got {text!r}")
         if key.strip() in found:
-            raise ValueError(f"expected each KEY once, got --set {key.strip()} twice; leave one out")
+            raise InputError(f"expected each KEY once, got --set {key.strip()} twice; leave one out")
         found[key.strip()] = value.strip()
     return found
-
-
-def leaves(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested settings as one level, by their dotted names.
-
-    >>> leaves({"probe": {"gamma": 0.5}, "viewpoint.parallax": False})
-    {'probe.gamma': 0.5, 'viewpoint.parallax': False}
-    """
-    result = {}
-    for key, value in settings.items():
-        result |= {f"{key}.{name}": v for name, v in leaves(value).items()} if isinstance(value, dict) else {key: value}
-    return result
 
 
 def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
@@ -47,12 +38,16 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
 
     >>> overridden(TrainConfig(), {"densify.every": "50"}).densify.every
     50
+    >>> overridden(TrainConfig(), {"render.sums": "ordered"}).render.accumulation  # an older word for it
+    'deterministic'
     """
     own = _settable(TrainConfig)
     for key, value in changes.items():
+        if key == "render.sums":
+            key, value = "render.accumulation", current_settings({"sums": value})["accumulation"]
         path = key.split(".")
         if path[0] not in own + _settable(type(config.method)):
-            raise ValueError(
+            raise InputError(
                 f"expected a setting of the training ({', '.join(_names(config))}) or of the method {config.method.name} "
                 f"({', '.join(_names(config.method)) or 'which has none'}), got {key!r}"
             )
@@ -60,7 +55,7 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     return config
 
 
-def _names(settings: TrainConfig | Method) -> list[str]:
+def _names(settings: TrainConfig | MethodSettings) -> list[str]:
     """Of every single setting, but for the method's among the training's."""
     return [name for name in leaves(asdict(settings)) if name != "name" and not name.startswith("method.")]
 
@@ -72,15 +67,15 @@ def _settable(kind: type) -> list[str]:
 def _changed(settings: T, path: list[str], value: Any, key: str) -> T:
     hints, settable = get_type_hints(type(settings)), _settable(type(settings))
     if path[0] not in settable:
-        raise ValueError(f"expected a setting among {', '.join(settable)}, got {path[0]!r} in {key!r}")
+        raise InputError(f"expected a setting among {', '.join(settable)}, got {path[0]!r} in {key!r}")
     now = getattr(settings, path[0])
     if is_dataclass(now):
         if not path[1:]:
             inner = f"{key}.{fields(now)[0].name}"
-            raise ValueError(f"expected the name of a single setting, as in {inner}, got {key!r}")
+            raise InputError(f"expected the name of a single setting, as in {inner}, got {key!r}")
         return replace(settings, **{path[0]: _changed(now, path[1:], value, key)})  # pyright: ignore[reportCallIssue, reportArgumentType]
     if path[1:]:
-        raise ValueError(f"expected {path[0]!r} to be the last name in {key!r}: it is a single setting")
+        raise InputError(f"expected {path[0]!r} to be the last name in {key!r}: it is a single setting")
     return replace(settings, **{path[0]: read_value(value, hints[path[0]], key)})  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
@@ -91,7 +86,7 @@ def read_value(value: Any, hint: Any, key: str) -> Any:
         if value is None or value == "none":
             return _require(NoneType in options, None, hint, value, key)
         for option in (option for option in options if option is not NoneType):
-            with suppress(ValueError):
+            with suppress(InputError):
                 return read_value(value, option, key)
         return _require(False, None, hint, value, key)
     if kind is Literal:
@@ -118,7 +113,7 @@ def read_value(value: Any, hint: Any, key: str) -> Any:
 
 def _require(good: bool, read: Any, hint: Any, value: Any, key: str) -> Any:
     if not good:
-        raise ValueError(f"expected {_words(hint)} for {key}, got {value!r}")
+        raise InputError(f"expected {_words(hint)} for {key}, got {value!r}")
     return read
 
 

@@ -3,20 +3,18 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
 from analysis.console.drawing import Draw, draw
 from analysis.console.stages import Stages
-from analysis.records.records import Kind, write_data, write_record
+from analysis.records.records import ProbeRecord, SliceRecord, write_data, write_record
 
 
 def write_with_pictures(
     folder: Path,
-    data: dict[str, Any],
+    data: ProbeRecord | SliceRecord,
     arrays: Mapping[str, Mapping[str, np.ndarray]],
-    kind: Kind,
     stages: Stages,
     start: float,
     drawn: Draw | None = None,
@@ -26,13 +24,13 @@ def write_with_pictures(
 
     drawn: draws the pictures, where `drawing` has begun with it; else options: of the command that draws them.
     """
-    data["timing"] = {"total": perf_counter() - start}
-    write_record(folder, data, arrays, kind)
+    data.timing = {"total": perf_counter() - start}
+    write_record(folder, data, arrays)
     with stages.stage("pictures"):
         try:
-            data["notes"] += draw("make_all", folder, *options) if drawn is None else drawn(folder)
+            data.notes += draw("make_all", folder, *options) if drawn is None else drawn(folder)
         except RuntimeError as error:  # the numbers stand without pictures
-            data["notes"].append(" ".join(str(error).split()))
+            data.notes.append(" ".join(str(error).split()))
     # the pictures are drawn from the record; only now is it known how long they took
-    data["timing"] = {**stages.timing, "total": perf_counter() - start}
-    write_data(folder, data, arrays, kind)
+    data.timing = {**stages.timing, "total": perf_counter() - start}
+    write_data(folder, data)

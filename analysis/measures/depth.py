@@ -19,17 +19,22 @@ pixels where it is across: px |mean - centre| / f.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import inf, nan
+from time import monotonic
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Float64
+from msgspec import convert
 from torch import Tensor
 
+from analysis.console.budget import Share
+from analysis.records.schema import Depth, Rise
+from landscape.errors import InputError
 from landscape.probes import draw_probes
-from landscape.results import Bracket, Progress
+from landscape.results import Bracket, Progress, finite_or_none
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import TraceSettings
 from splat.curvature.objective import SceneObjective
@@ -78,20 +83,60 @@ class DepthSplit:
 class DepthRises:
     """Rises of the loss by steps along and across the rays (columns: KINDS), rows by length.
 
-    steps: px.  errors: standard errors of the means over draws.  crossed: in which share of the renders the order of the splats
-    or the set of visible ones was another.
+    steps: px.  errors: standard errors of the means over draws.  discontinuous: the share of renders in which the order of the
+    splats, or the set of visible ones, differs from that at the start.
     """
 
     steps: tuple[float, ...]
     values: Float64[Tensor, "s 2"]
     errors: Float64[Tensor, "s 2"]
-    crossed: Float64[Tensor, "s 2"]
+    discontinuous: Float64[Tensor, "s 2"]
 
     @property
     def ratios(self) -> tuple[Float64[Tensor, " s"], Float64[Tensor, " s"]]:
         """Depth over lateral, with standard errors."""
         (depth, lateral), relative = self.values.unbind(dim=1), self.errors / self.values
         return depth / lateral, (depth / lateral).abs() * relative.square().sum(dim=1).sqrt()
+
+    def rows(self) -> list[Rise]:
+        """As a record has them; what is not finite is None."""
+        columns: dict[str, Sequence[float]] = dict(zip(("ratio", "ratio_error"), (x.tolist() for x in self.ratios)))
+        for kind, name in enumerate(KINDS):
+            for suffix, table in (("", self.values), ("_error", self.errors), ("_crossed", self.discontinuous)):
+                columns[f"{name}{suffix}"] = table[:, kind].tolist()
+        numbers = [
+            {name: finite_or_none(column[i]) for name, column in columns.items()} for i in range(len(self.steps))
+        ]
+        return [convert({"pixels": step, **row}, Rise) for step, row in zip(self.steps, numbers, strict=True)]
+
+
+def measure_depth(
+    objective: SceneObjective, traces: TraceSettings, steps: tuple[float, ...], render: float, share: Share
+) -> Depth:
+    """The stage `depth` of a probe.  steps: px; their rises are left out where time is short.
+
+    render: seconds, of all views.
+    """
+    end = monotonic() + share.seconds
+    found = depth_split(objective, share.generator, replace(traces, max_seconds=share.seconds / 2), share.report)
+    rises = []
+    if (2 * len(KINDS) * DRAWS * len(steps) + 1) * render <= end - monotonic():
+        rises = depth_rises(objective, share.generator, steps, progress=share.report).rows()
+    else:
+        share.notes.append(
+            "finite steps along the rays were left out: their renders would have taken more than their time"
+        )
+    return convert(
+        {
+            "gradient_ratio": finite_or_none(found.gradient_ratio),
+            "gradient_median": finite_or_none(found.median_ratio),
+            "pairs": len(found.components),
+            "curvature": {"depth": found.depth.record(), "lateral": found.lateral.record()},
+            "curvature_ratio": found.curvature_ratio.record(),
+            "rises": rises,
+        },
+        Depth,
+    )
 
 
 def depth_split(
@@ -108,13 +153,13 @@ def depth_split(
         components.append(along_and_across(view.gradient[objective.blocks["means"]].view(-1, 3), ray))
         for part, gauss_newton in enumerate(parts):
             own[:, part] += _split_traces(view.block_diagonal(gauss_newton=gauss_newton).geometry[:, :3, :3], ray).cpu()
-    pairs = objective.stacked(torch.stack(components, dim=1)).flatten(0, 1)
+    pairs = objective.gather_rows(torch.stack(components, dim=1)).flatten(0, 1)
     dims = (len(objective.active), LATERAL_DIRECTIONS * len(objective.active))
     traces = [
         SampledTrace(
             kind, dim, known, pixelwise[0] if pixelwise else None, settings, settings.min_probes, settings.max_probes
         )
-        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean(own).tolist(), strict=True)
+        for kind, dim, (known, *pixelwise) in zip(KINDS, dims, objective.mean_over_views(own).tolist(), strict=True)
     ]
     found = sampled_traces(objective, generator, partial(_signs, objective, rays), traces, progress)
     return DepthSplit(pairs[pairs.any(dim=1)], **found)
@@ -129,9 +174,9 @@ def depth_rises(
 ) -> DepthRises:
     """What steps along and across the rays do to the loss.  steps: px; draws: of all directions and signs, 2 or more."""
     if draws < 2:
-        raise ValueError(f"expected at least 2 draws, got {draws}")
+        raise InputError(f"expected at least 2 draws, got {draws}")
     seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
-    rises, crossed = torch.zeros(2, len(steps), len(KINDS), draws, dtype=torch.float64)
+    rises, discontinuous = torch.zeros(2, len(steps), len(KINDS), draws, dtype=torch.float64)
     for index, number in enumerate(objective.view_numbers):
         center, piece = objective.evaluate_view(index, objective.active)
         for draw, seed in enumerate(seeds):
@@ -140,13 +185,13 @@ def depth_rises(
                 for kind, direction in enumerate(directions):
                     ends = [_moved(objective, index, sign * step * direction) for sign in (1, -1)]
                     rises[s, kind, draw] += sum(loss for loss, _ in ends) / 2 - center
-                    crossed[s, kind, draw] += sum(order != piece for _, order in ends) / 2
+                    discontinuous[s, kind, draw] += sum(order != piece for _, order in ends) / 2
             if progress:
                 progress(
                     index * draws + draw + 1, len(objective.views) * draws, "finite steps along and across the rays"
                 )
-    rises, crossed = objective.mean(rises), objective.mean(crossed)
-    return DepthRises(tuple(steps), rises.mean(dim=2), rises.std(dim=2) / draws**0.5, crossed.mean(dim=2))
+    rises, discontinuous = objective.mean_over_views(rises), objective.mean_over_views(discontinuous)
+    return DepthRises(tuple(steps), rises.mean(dim=2), rises.std(dim=2) / draws**0.5, discontinuous.mean(dim=2))
 
 
 def rays_of(objective: SceneObjective, index: int) -> Float[Tensor, "n 3"]:

@@ -1,9 +1,8 @@
 """The anisotropy families of a checkpoint: of all attributes together and of each, of the Hessian and of Gauss-Newton.
 
 Curvature is compared in the units of a metric (`analysis.measures.units`): D H D.  The split control
-(`analysis.measures.split_control`)
-measures the same of the scene with every Gaussian split into two coincident halves.  Its images are nearly the same, so what an
-index changes by is what the number of Gaussians alone does to it.
+(`analysis.measures.split_control`) measures the same of the scene with every Gaussian split into two coincident halves.  Its
+images are nearly the same, so what an index changes by is what the number of Gaussians alone does to it.
 
     scene       "trained": the checkpoint; "split": every Gaussian of it that a view sees, split in two
     operator    "hessian", exact, or "gauss-newton"
@@ -19,18 +18,22 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
 from time import monotonic
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
+from msgspec import UNSET, convert, structs
 from torch import Tensor
 
 from analysis.console.budget import Stage
 from analysis.measures.memory import basis_within, vectors_within
 from analysis.measures.split_control import SplitControl, split_control
 from analysis.measures.units import Metric, optimiser_units, scene_size, scene_units
+from analysis.records import schema
+from analysis.records.records import ProbeRecord
 from landscape import Bracket, Family, FamilySettings, ScaledOperator, families
 from landscape.eigen.pairs import EigenEnds
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, finished
 from landscape.probes import split
 from landscape.results import Progress, finite_or_none
@@ -44,7 +47,7 @@ from splat.curvature.traces import exact_traces
 from splat.training.state import Training
 
 SceneName = Literal["trained", "split"]
-OPERATORS = {"hessian": False, "gauss-newton": True}  # name -> gauss_newton
+OPERATORS: dict[schema.Operator, bool] = {"hessian": False, "gauss-newton": True}  # name -> gauss_newton
 PARTS = 6  # the whole and five attributes
 FEWEST_STEPS = 2  # that make a density
 TRACE_SAMPLES = 8  # of SSIM's coupling: to a few percent, within which start vectors do not know it
@@ -66,7 +69,7 @@ class FamilyOptions:
 
     def __post_init__(self) -> None:
         if not (self.seconds > 0 and self.memory > 0):
-            raise ValueError(
+            raise InputError(
                 f"expected seconds and memory above 0 for the families, got {self.seconds} and {self.memory}"
             )
 
@@ -76,61 +79,57 @@ class FamilyRow:
     """One family and what it is of.  dim: rows of the operator, those of the null space (see `Family.rank`) counted."""
 
     scene: SceneName
-    operator: str
+    operator: schema.Operator
     block: str
     gaussians: int
     dim: int
     family: Family
 
-    def record(self) -> dict[str, Any]:
+    def record(self, metric: Metric, unit: str) -> schema.Family:
         found, ends = self.family, self.family.ends
-        return {
-            "operator": self.operator,
-            "block": self.block,
-            "split": self.scene == "split",
-            "gaussians": self.gaussians,
-            "dim": self.dim,
-            "rank": found.rank,
-            "lambda_max": ends.largest.record(),
-            "lambda_min": ends.smallest.record(),
-            "beyond": finite_or_none(ends.beyond),
-            "indices": found.indices.record(),
-            "starts": len(found.density.nodes),
-            "steps": found.density.nodes.shape[1],
-            "matvecs": ends.matvecs + found.density.matvecs,
-        }
-
-
-@dataclass(frozen=True)
-class Effect:
-    """What the split does to one index: split over trained; value is None where one of the two is not determined."""
-
-    operator: str
-    block: str
-    index: str
-    factor: Bracket
-
-    def record(self) -> dict[str, Any]:
-        return {"operator": self.operator, "block": self.block, "index": self.index, **self.factor.record()}
+        return schema.Family(
+            metric=metric,
+            unit=unit,
+            operator=self.operator,
+            block=self.block,
+            split=self.scene == "split",
+            gaussians=self.gaussians,
+            dim=self.dim,
+            rank=found.rank,
+            lambda_max=convert(ends.largest.record(), schema.End),
+            lambda_min=convert(ends.smallest.record(), schema.End),
+            beyond=finite_or_none(ends.beyond),
+            indices=convert(found.indices.record(), schema.Anisotropy),
+            starts=len(found.density.nodes),
+            steps=found.density.nodes.shape[1],
+            matvecs=ends.matvecs + found.density.matvecs,
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class FamilyFindings:
     """unit: what the metric's units are, in words; control and effects: None and empty without the split control."""
 
-    metric: Metric
-    unit: str
     rows: tuple[FamilyRow, ...]
     control: SplitControl | None
-    effects: tuple[Effect, ...]
+    effects: tuple[schema.Effect, ...]
     notes: tuple[str, ...]
+    metric: Metric
+    unit: str
 
-    def record(self) -> dict[str, Any]:
-        """The keys that this adds to a record's data (see `analysis.records.records`)."""
-        found = {"families": [{"metric": self.metric, "unit": self.unit, **row.record()} for row in self.rows]}
-        if self.control is None:
-            return found
-        return {**found, "split_control": {**self.control.record(), "effects": [e.record() for e in self.effects]}}
+    def added_to(self, record: ProbeRecord) -> ProbeRecord:
+        """The record of a probe with the families, what the split does to them, and what was left out."""
+        families, control = [row.record(self.metric, self.unit) for row in self.rows], UNSET
+        if split := self.control:
+            psnr = split.psnr if split.rms else None
+            control = schema.SplitControl(
+                gaussians=len(split.gaussians),
+                rms=split.rms,
+                largest=split.largest,
+                psnr=psnr,
+                effects=list(self.effects),
+            )
+        return structs.replace(record, families=families, split_control=control, notes=[*record.notes, *self.notes])
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Nodes and weights of every density."""
@@ -151,10 +150,8 @@ def measure_families(
 ) -> FamilyFindings:
     """Every family of the scene and, if asked for, of the split scene.
 
-
-    training: that of the checkpoint; stage: see `analysis.console.stages`; ends: of the objective's Hessian in the
-    stored parameters,
-    where they have been looked for.
+    training: that of the checkpoint; stage: see `analysis.console.stages`; ends: of the objective's Hessian in the stored
+    parameters, where they have been looked for.
     """
     scenes: dict[SceneName, SceneObjective] = {"trained": objective}
     control, notes = None, []
@@ -163,10 +160,10 @@ def measure_families(
             control = split_control(
                 objective.active, [view.camera for view in objective.views], objective.background, objective.settings
             )
-            scenes["split"] = _with(objective, control, training)
+            scenes["split"] = _with(objective, control)
     clock = _Clock(options.seconds, {name: len(scene.active) for name, scene in scenes.items()})
     unit, scale = _metric(options.metric, objective, training)
-    streams: dict[tuple[SceneName, str], torch.Generator] = {
+    streams: dict[tuple[SceneName, schema.Operator], torch.Generator] = {
         (scene, operator): split(generator)
         for scene in scenes  # the trained one first: its numbers are the same without the split control
         for operator in OPERATORS
@@ -180,13 +177,13 @@ def measure_families(
             measured = _of_operator(hessian, D, known, options, stream, partial(clock.share, scene), report, notes)
             count = len(scenes[scene].active)
             rows += [FamilyRow(scene, operator, block, count, dim, found) for block, dim, found in measured]
-    return FamilyFindings(options.metric, unit, tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)))
+    return FamilyFindings(tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)), options.metric, unit)
 
 
-def _with(objective: SceneObjective, control: SplitControl, training: Training) -> SceneObjective:
+def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:
     """The same loss over the same views of the split Gaussians."""
-    loss = training.config.loss
-    return SceneObjective(control.gaussians, objective.views, loss, objective.background, objective.settings)
+    settings = objective.loss_settings, objective.background, objective.settings
+    return SceneObjective(control.gaussians, objective.views, *settings)
 
 
 class _Clock:
@@ -213,7 +210,7 @@ def _metric(
         return f"positions in units of the scene's size, {size:.4g} world units", lambda scene: scene_units(scene, size)
     rates, extent = training.config.rates, training.extent
     if not (optimiser_units(objective, rates, extent) > 0).all():
-        raise ValueError(f"expected learning rates above 0 for the optimiser's metric, got {rates}")
+        raise InputError(f"expected learning rates above 0 for the optimiser's metric, got {rates}")
     words = (
         f"steps of the training's first learning rates: position {rates.position * extent:.3g} (extent {extent:.4g}), "
         f"log scale {rates.log_scales:.3g}, rotation {rates.quats:.3g}, opacity {rates.opacity_logits:.3g}, "
@@ -234,7 +231,7 @@ def _of_operator(
 ) -> list[tuple[str, int, Family]]:
     """(block, dim, family) of the whole and of every attribute of one operator.  ends: of the whole, where known."""
     operator = hessian if scale is None else ScaledOperator(hessian, scale)
-    spaces, found = active_spaces(hessian, scale), []
+    spaces, found = active_spaces(hessian.objective, hessian.projector, scale), []
     traces = _traces(hessian, scale, split(generator))
     each = _seconds_a_product(operator, options.family.batch, hessian.objective) if options.seconds < inf else 0.0
     names = [WHOLE, *hessian.blocks]
@@ -280,7 +277,7 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnd
     known = BlockEigenvectors(objective, own, pixelwise, None if name == WHOLE else name, scale)
     if hessian.gauss_newton or name == "means":
         return Lead(known.steepest(1, 0))
-    return Lead(known.leads())
+    return Lead(known.warm_start())
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: SceneObjective) -> float:
@@ -311,7 +308,7 @@ def _fitted(
     return replace(settings, eigen=eigen, batch=batch, steps=min(steps, settings.steps))
 
 
-def _effects(rows: list[FamilyRow]) -> tuple[Effect, ...]:
+def _effects(rows: list[FamilyRow]) -> tuple[schema.Effect, ...]:
     """Index by index, the split scene's over the trained one's."""
     split_rows = {(row.operator, row.block): row.family for row in rows if row.scene == "split"}
     effects = []
@@ -320,8 +317,9 @@ def _effects(rows: list[FamilyRow]) -> tuple[Effect, ...]:
         if row.scene == "split" or after is None:
             continue
         for index, before in vars(row.family.indices).items():
-            factor = quotient(getattr(after.indices, index), before)
-            effects.append(Effect(row.operator, row.block, index, factor))
+            factor = quotient(getattr(after.indices, index), before).record()
+            about = {"operator": row.operator, "block": row.block, "index": index}
+            effects.append(convert(about | factor, schema.Effect))
     return tuple(effects)
 
 

@@ -14,6 +14,7 @@ places on any step and have their means held still.
 
 from collections.abc import Hashable
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -25,7 +26,6 @@ from landscape.results import Progress
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import loss_against, view_loss
-from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import project
 from splat.render.autograd import rasterize_by_kernel
@@ -34,25 +34,26 @@ STEPS = (1e-10, 3e-10, 3e-11)  # per parameter; means in units of their spread
 
 
 def check_against_gradient(
-    hessian: SceneHessian,
-    loss: LossSettings,
-    generator: torch.Generator,
-    progress: Progress | None = None,
-    views: int | None = None,
+    hessian: SceneHessian, generator: torch.Generator, progress: Progress | None = None, views: int | None = None
 ) -> DerivativeCheck:
-    """The relative error of H v for one random v.  loss: the objective's.  views: of the first so many alone; None: of all."""
-    objective = hessian.objective if views is None else hessian.objective.of_views(views)
-    operator = ProjectedOperator(SceneHessian(objective, keep_null=True), hessian.project)
+    """The relative error of H v for one random v.
+
+    views: how many to take, from the first of this process; all by default.  For some views, P leaves out the quaternions'
+    lengths alone: what is flat for all views together need not be flat for each.
+    """
+    objective = hessian.objective
+    leave_out = hessian.project if views is None else partial(_without_lengths, objective.active)
+    operator = ProjectedOperator(SceneHessian(objective, keep_null=True, count=views), leave_out)
     double = objective.active.to(torch.float64)
     background, settings = objective.background.double(), objective.settings
     direction = operator.project(_direction(objective, generator)[:, None])[:, 0]
-    losses = [loss_against(view.image, loss, double.flat) for view in objective.views]
+    losses = [loss_against(view.image, objective.loss_settings, double.flat) for view in objective.views[:views]]
     done = 0
 
     def gradient(theta: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
         nonlocal done
         flat, total = theta.detach().requires_grad_(), torch.zeros_like(theta)
-        for view, of_view in zip(objective.views, losses, strict=True):
+        for view, of_view in zip(objective.views[:views], losses, strict=True):
             size = view.camera.width, view.camera.height
             splats = project(double.with_flat(flat), view.camera, settings)
             splats = replace(splats, depths=splats.depths.detach())  # for the order alone
@@ -61,23 +62,24 @@ def check_against_gradient(
         done += 1
         if progress:
             progress(done, 2 * len(STEPS), "gradients in double precision")
-        return _without_lengths(objective.mean(total), double)
+        return _without_lengths(double, objective.mean_over_views(total)[:, None])[:, 0]
 
     def order(theta: Float[Tensor, " p"]) -> Hashable:
         means = double.with_flat(theta).means.cpu()
-        cameras = (view.camera for view in objective.views)
+        cameras = (view.camera for view in objective.views[:views])
         depths = torch.stack([(means - camera.centre) @ camera.forward for camera in cameras])
-        return objective.joined(hash(depths.argsort(dim=1, stable=True).numpy().tobytes()))
+        return objective.gather_pieces(hash(depths.argsort(dim=1, stable=True).numpy().tobytes()))
 
     enough = ROUND_OFFS * torch.finfo(torch.float32).eps  # what a probe asks for
     return check_gradient(operator, gradient, double.flat, direction, STEPS, order, enough)
 
 
-def _without_lengths(gradient: Float[Tensor, " p"], gaussians: Gaussians) -> Float[Tensor, " p"]:
-    """The gradient, which has no other null directions, without its components along the (unit) quaternions."""
-    turns = gaussians.with_flat(gradient).quats
-    turns -= gaussians.quats * (gaussians.quats * turns).sum(dim=1, keepdim=True)
-    return gradient
+def _without_lengths(gaussians: Gaussians, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+    """V without its components along the (unit) quaternions: the only null directions in which a gradient has any."""
+    V, q = V.clone(), gaussians.quats[:, :, None]
+    quats = V[gaussians.blocks["quats"]].view(len(gaussians), 4, -1)
+    quats -= q * (q * quats).sum(dim=1, keepdim=True)
+    return V
 
 
 def _direction(objective: SceneObjective, generator: torch.Generator) -> Float[Tensor, " p"]:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from analysis.records.schema import LivesOn
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -26,30 +27,6 @@ class Conditions:
 
     rendered: Float64[Tensor, " n"]
     bare: Float64[Tensor, " n"]
-
-
-@dataclass(frozen=True)
-class Localization:
-    """Where a vector lives.  needles, needles_bare: shares of mass on needles; heaviest: index and share, largest first."""
-
-    attributes: dict[str, float]
-    participation: float
-    needles: float
-    needles_bare: float
-    needle_count: int
-    needle_bare_count: int
-    heaviest: tuple[tuple[int, float], ...]
-
-    def record(self) -> dict[str, object]:
-        return {
-            "attributes": self.attributes,
-            "participation": self.participation,
-            "needles": self.needles,
-            "needles_bare": self.needles_bare,
-            "needle_count": self.needle_count,
-            "needle_bare_count": self.needle_bare_count,
-            "heaviest": [[index, share] for index, share in self.heaviest],
-        }
 
 
 def mass_shares(vector: Float[Tensor, " p"], blocks: Mapping[str, slice]) -> dict[str, float]:
@@ -97,9 +74,7 @@ def conditions(
     return Conditions(rendered, bare)
 
 
-def localize(
-    vector: Float[Tensor, " p"], gaussians: Gaussians, conditions: Conditions, heaviest: int = 10
-) -> Localization:
+def localize(vector: Float[Tensor, " p"], gaussians: Gaussians, conditions: Conditions, heaviest: int = 10) -> LivesOn:
     """Where a vector laid out like `gaussians.flat` lives; conditions: of the same Gaussians."""
     mass = masses(vector, gaussians)
     if len(conditions.rendered) != len(gaussians):
@@ -107,12 +82,12 @@ def localize(
     share = mass / mass.sum()
     needles, bare = conditions.rendered > NEEDLE, conditions.bare > NEEDLE
     top = share.topk(min(heaviest, len(share)))
-    return Localization(
+    return LivesOn(
         attributes=mass_shares(vector, gaussians.blocks),
         participation=participation(mass),
         needles=float(share[needles].sum()),
         needles_bare=float(share[bare].sum()),
         needle_count=int(needles.sum()),
         needle_bare_count=int(bare.sum()),
-        heaviest=tuple(zip(top.indices.tolist(), top.values.tolist(), strict=True)),
+        heaviest=list(zip(top.indices.tolist(), top.values.tolist(), strict=True)),
     )

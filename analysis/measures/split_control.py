@@ -46,10 +46,6 @@ class SplitControl:
         """Of the split scene's images against the given scene's, dB."""
         return -20 * log10(self.rms) if self.rms else inf
 
-    def record(self) -> dict[str, float | int | None]:
-        psnr = self.psnr if self.rms else None
-        return {"gaussians": len(self.gaussians), "rms": self.rms, "largest": self.largest, "psnr": psnr}
-
 
 def halves(opacity: Float64[Tensor, " n"]) -> tuple[Float64[Tensor, " n"], Float64[Tensor, " n"]]:
     """Opacity x and sharpness k of two coincident halves of a Gaussian.
@@ -112,4 +108,4 @@ def split_control(
 
 def _image(gaussians: Gaussians, camera: Camera, background: Tensor, settings: RenderSettings) -> Tensor:
     raster = rasterize_view(gaussians, camera, background, settings)
-    return torch.as_tensor(raster.crop(raster.planes[:3])).double()
+    return raster.crop(raster.planes[:3]).double()

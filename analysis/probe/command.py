@@ -3,36 +3,31 @@
 The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.
 """
 
-import shlex
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from math import inf, isfinite
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from rich.console import Console
 
 from analysis.console.drawing import Draw
-from analysis.console.options import ProbeOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.measurement import ProbeSettings, measure
-from analysis.probe.record import probe_arrays, probe_data
-from analysis.probe.skips import estimator_skips, product_skips
-from analysis.probe.table import probe_table
-from analysis.records.family_table import family_table
-from analysis.records.findings import verdict
-from analysis.records.provenance import provenance, require_seed
-from analysis.records.records import FILE, PROBE, Record, record_folder, require_replaceable
-from landscape.operators.distributed import Ranks, torchrun_ranks
+from analysis.probe.options import ProbeOptions
+from analysis.probe.record import probe_arrays, probe_record, provenance_of
+from analysis.records.findings import findings
+from analysis.records.provenance import require_seed
+from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
+from analysis.records.tables import family_table, probe_table
+from landscape.errors import InputError
+from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import split
-from splat.backend.cpu.simd import lanes_of
 from splat.backend.device import device_named
-from splat.curvature.distributed import DistributedObjective
 from splat.curvature.objective import SceneObjective
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint, load_checkpoint
@@ -61,7 +56,7 @@ def _run(
     out = options.out or options.checkpoint.parent / "probe"
     settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
     if ranks is not None and family_options is not None:
-        raise ValueError(
+        raise InputError(
             "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
         )
     writes = ranks is None or ranks.rank == 0
@@ -75,53 +70,54 @@ def _run(
         objective = scene_objective(checkpoint, scene, ranks)
     console.print(_introduction(scene, checkpoint, objective), highlight=False)
     with stages:
-        loss = checkpoint.training.config.loss
         generator = torch.Generator(device).manual_seed(options.seed)
-        findings = measure(objective, loss, settings, generator, stages.stage)
-        data = probe_data(findings, objective, loss)
-        with stages.stage("skips"):
-            gaussians, made = checkpoint.training.gaussians, (findings.matvecs, findings.spared)
-            skips = product_skips(objective, gaussians, *made, repetitions=settings.timings)
-            skips |= estimator_skips(findings, stages.timing)
-            data["skipped"] = {name: skip.record() for name, skip in skips.items()}
-        data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
-        arrays = probe_arrays(findings)
+        found = measure(objective, settings, generator, stages.stage)
+        made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
+        data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         if family_options is not None:
             from analysis.measures.families import measure_families
 
-            found = measure_families(
-                objective, checkpoint.training, family_options, split(generator), stages.stage, findings.ends
+            stream = split(generator)
+            families = measure_families(
+                objective, checkpoint.training, family_options, stream, stages.stage, found.ends
             )
-            data |= found.record()
-            data["notes"] += found.notes
-            data["provenance"]["families"] = asdict(family_options)
-            arrays["families"] = found.arrays()
+            data, arrays["families"] = families.added_to(data), families.arrays()
+            data.provenance.families = asdict(family_options)
         if options.quick:
-            data["notes"].append(WITHOUT_SURFACE.format(out))
+            data.notes.append(WITHOUT_SURFACE.format(out))
         if writes:
-            with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
-                surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
-                write_with_pictures(folder, data, arrays, PROBE, stages, start, drawn, options.pictures)
-                from analysis.records.report import write_report
-
-                write_report(folder, surface.result())
+            _write(out, data, arrays, stages, start, drawn, options.pictures)
     if writes:
         _conclude(data, out)
-    failed = any(check["passed"] is False for check in data["checks"].values())
+    failed = any(check.passed is False for check in data.checks.values())
     return CHECK_FAILED if options.strict and failed else 0
+
+
+def _write(
+    out: Path,
+    data: ProbeRecord,
+    arrays: Arrays,
+    stages: Stages,
+    start: float,
+    drawn: Draw | None,
+    pictures: Sequence[str],
+) -> None:
+    """The record, its pictures and its page, all at once."""
+    with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
+        surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
+        write_with_pictures(folder, data, arrays, stages, start, drawn, pictures)
+        from analysis.records.report import write_report
+
+        write_report(folder, surface.result())
 
 
 def scene_objective(
     checkpoint: Checkpoint, scene: Scene, ranks: Ranks | None = None, *, keep_unseen: bool = False
 ) -> SceneObjective:
     """The training's loss over its views, at the checkpoint; ranks: share them.  keep_unseen: see `SceneObjective`."""
-    training, names = checkpoint.training, checkpoint.scene.train
-    config, gaussians = training.config, training.gaussians
-    if ranks is None:
-        return config.objective(gaussians, scene.load(names), keep_unseen=keep_unseen)
-    background = config.background_colour(gaussians.flat.dtype)
-    views = scene.load(ranks.share(names, "training view"))
-    return DistributedObjective(gaussians, views, ranks, config.loss, background, config.render)
+    ranks = ranks or ALONE
+    training, views = checkpoint.training, scene.load(ranks.share(checkpoint.scene.train, "training view"))
+    return training.config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
 
 def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:
@@ -131,7 +127,7 @@ def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:
     seconds = settings.seconds if options.seconds is None else options.seconds
     if shared:
         if options.seconds is not None and isfinite(options.seconds):
-            raise ValueError(f"expected --seconds inf under torchrun, as without --seconds, got {options.seconds:g}")
+            raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {options.seconds:g}")
         seconds = inf
     return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=seconds)
 
@@ -155,42 +151,23 @@ def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjectiv
     )
 
 
-def _provenance(
-    options: ProbeOptions, command: Sequence[str], settings: ProbeSettings, checkpoint: Checkpoint, scene: Scene
-) -> dict[str, Any]:
-    dtype = checkpoint.training.gaussians.flat.dtype
-    return provenance(
-        options.seed,
-        lanes=lanes_of(np.float32),
-        checkpoint=str(options.checkpoint),
-        scene=scene.name,
-        scene_folder=str(scene.root),
-        views=list(checkpoint.scene.train),
-        iteration=checkpoint.training.step,
-        dtype=str(dtype).removeprefix("torch."),
-        threads=torch.get_num_threads(),
-        command=shlex.join(command),
-        settings=asdict(settings),
-    )
-
-
-def _embedded_surface(record: Record) -> str:
+def _embedded_surface(record: Record[ProbeRecord]) -> str:
     from analysis.records.report import embedded_surface  # a quarter of a second of imports
 
     return embedded_surface(record)
 
 
-def _conclude(data: dict[str, Any], out: Path) -> None:
+def _conclude(data: ProbeRecord, out: Path) -> None:
     """The table, what was not reached or failed, and the files to open."""
     from analysis.records.report import FILE as REPORT
 
     console = Console()
     console.print(probe_table(data))
-    if "families" in data:
+    if data.families:
         console.print(family_table(data))
-    for line in verdict(data):
+    for line in findings(data):
         if line.level != "fact":
             console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False)
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-    console.print(f"{data['timing']['total']:.1f} s; open {out / REPORT}", soft_wrap=True, highlight=False)
-    console.print(f"pictures: {pictures}; numbers: {FILE}, in {out}", soft_wrap=True, highlight=False)
+    console.print(f"{data.timing['total']:.1f} s; open {out / REPORT}", soft_wrap=True, highlight=False)
+    console.print(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", soft_wrap=True, highlight=False)

@@ -1,22 +1,19 @@
 """What `landscape probe` measures at one point of a scene's loss, stage by stage.
 
-    linearise           every view held still, every Gaussian's own block of H, a first render
+    linearise           every view's derivatives, each Gaussian's own block of H, a first render
     checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
     traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
-    eigenvalues         the two largest and the smallest, led by the blocks of single Gaussians
-    (`splat.curvature.block_eigenvectors`)
-    power iteration     both ends as the paper takes them; not in a quick probe, whose few products do not take it there
-    density             stochastic Lanczos quadrature, for sums and quantiles of |lambda|; not in a quick probe, whose few
-                        products would leave them known to a factor of 1000
-    finite probe        the second difference of the loss along the first eigenvector, over a range of steps; not in a quick
-                        probe
+    eigenvalues         the two largest and the smallest; the search begins at `splat.curvature.block_eigenvectors`
+    power iteration *   both ends as the paper takes them
+    density *           stochastic Lanczos quadrature, for sums and quantiles of |lambda|
+    finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
     slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
-    depth               the positions' gradient and curvature along the rays and across them, and what finite steps there do to
-                        the loss; not in a quick probe
+    depth *             the positions' gradient and curvature along the rays and across them, and what finite steps there do
 
-Every kernel has worked once when the checks are done: what follows compiles nothing.  The estimators stop at their
-tolerance, at their budget of products, or when their share of the time is spent; each result says which.  Time that a stage
-leaves goes to the later ones.  The numbers depend on the seed alone unless time ran out.
+* not in a quick probe, which has too few products for them.  Every kernel has worked once when the checks are done: what
+follows compiles nothing.  The estimators stop at their tolerance, at their budget of products, or when their share of the time
+is spent; each result says which.  Time that a stage leaves goes to the later ones.  The numbers depend on the seed alone unless
+time ran out.
 """
 
 from collections.abc import Callable, Hashable
@@ -30,9 +27,10 @@ from torch import Tensor
 
 from analysis.console.budget import Budget, Share, Stage
 from analysis.measures.depth import STEPS as DEPTH_STEPS
+from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import check_against_gradient
 from analysis.measures.memory import basis_within, vectors_within
-from analysis.probe.depth_stage import DepthFindings, measure_depth
+from analysis.records.schema import Depth
 from landscape import (
     CountingOperator,
     DerivativeCheck,
@@ -52,6 +50,7 @@ from landscape import (
     spectral_density,
     symmetric_axis,
 )
+from landscape.errors import InputError
 from landscape.probes import split
 from landscape.results import Progress
 from landscape.slices.finite_probe import NOISE_POINTS, STEPS, FiniteProbe, finite_probe
@@ -65,7 +64,6 @@ from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
-from splat.losses.reference import LossSettings
 
 FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density and along a side of a slice that are worth their time
 FEWEST_STARTS = 3  # of a density of less than MANY_MATVECS; two have three times the interval
@@ -89,7 +87,6 @@ class ProbeSettings:
     probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
         noise of a render.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
-    timings: how often each product is timed that tells what a skip saves; 0: that is not told.
     seconds: for all estimators together.  memory: GiB for the vectors of a basis.
     """
 
@@ -109,19 +106,18 @@ class ProbeSettings:
     depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=64))
     depth_steps: tuple[float, ...] = DEPTH_STEPS
     noise_points: int = NOISE_POINTS
-    timings: int = 3
     seconds: float = 45.0
     memory: float = 2.0
 
     def __post_init__(self) -> None:
         if self.slice_points < FEWEST_POINTS or self.slice_points % 2 == 0:
-            raise ValueError(
+            raise InputError(
                 f"expected an odd number of at least {FEWEST_POINTS} slice points, got {self.slice_points}"
             )
         if not (self.slice_radius > 0 and self.slice_rise > 0):
-            raise ValueError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
+            raise InputError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
         if not (self.seconds > 0 and self.memory > 0):
-            raise ValueError(f"expected seconds and memory > 0, got {self.seconds} and {self.memory}")
+            raise InputError(f"expected seconds and memory > 0, got {self.seconds} and {self.memory}")
 
     @classmethod
     def quick(cls) -> "ProbeSettings":
@@ -138,7 +134,6 @@ class ProbeSettings:
             slice_holdout=FEWEST_HELD_OUT,
             probe_steps=(),
             depth=None,
-            timings=0,
             seconds=12.0,
         )
 
@@ -153,7 +148,7 @@ class PlaneSlice:
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
+class Measured:
     """What was measured; density, finite, depth and plane are None where a note says why, power where it was not asked for.
 
     matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
@@ -169,7 +164,7 @@ class Findings:
     power: EigenEnds | None
     density: SpectralDensity | None
     finite: FiniteProbe | None
-    depth: DepthFindings | None
+    depth: Depth | None
     plane: PlaneSlice | None
     matvecs: int
     spared: int
@@ -177,25 +172,22 @@ class Findings:
     notes: tuple[str, ...]
 
 
-def measure(
-    objective: SceneObjective, loss: LossSettings, settings: ProbeSettings, generator: torch.Generator, stage: Stage
-) -> Findings:
-    """Run every stage.  loss: the objective's; stage(name): see `analysis.console.stages`."""
+def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch.Generator, stage: Stage) -> Measured:
+    """Run every stage.  stage(name): see `analysis.console.stages`."""
     with stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
-        gradient = _linearised_gradient(objective, report)
-        own = objective.gaussian_blocks
-        value, render = _rendered(objective)
+        gradient, value, render = _linearised(objective, report)
+        blocks = objective.gaussian_blocks
     with stage("checks") as report:
         operator_check = check_operator(operator, split(generator), settings.checked_vectors)
-        gradient_check = check_against_gradient(hessian, loss, split(generator), report, settings.checked_views)
+        gradient_check = check_against_gradient(hessian, split(generator), report, settings.checked_views)
     budget = Budget(settings.seconds, _unasked(settings), generator, stage)
     with budget.stage("traces") as share:
         allowed = replace(settings.traces, max_seconds=share.seconds)
         traces = exact_traces(objective, share.generator, allowed, share.report, samples=settings.trace_samples)
     with budget.stage("eigenvalues") as share:
-        eigen, start = _search(operator, settings, share), BlockEigenvectors(objective, *own).leads()
+        eigen, start = _search(operator, settings, share), BlockEigenvectors(objective, *blocks).warm_start()
         timed = CountingOperator(operator)
         ends = extreme_eigenpairs(timed, share.generator, eigen, start, share.report)
     power = density = finite = depth = None
@@ -216,7 +208,7 @@ def measure(
     if settings.depth is not None:
         with budget.stage("depth") as share:
             depth = measure_depth(objective, settings.depth, settings.depth_steps, render, share)
-    return Findings(
+    return Measured(
         value=value,
         gradient_norm=float(gradient.double().norm()),
         operator_check=operator_check,
@@ -229,7 +221,7 @@ def measure(
         depth=depth,
         plane=plane,
         matvecs=operator.matvecs,
-        spared=hessian.spared,
+        spared=hessian.views.spared,
         rank=hessian.rank,
         notes=tuple(budget.notes),
     )
@@ -245,11 +237,14 @@ def _unasked(settings: ProbeSettings) -> list[str]:
     return [name for name, wanted in optional.items() if not wanted]
 
 
-def _linearised_gradient(objective: SceneObjective, report: Progress) -> Tensor:
+def _linearised(objective: SceneObjective, report: Progress) -> tuple[Tensor, float, float]:
+    """The gradient, the loss, and the seconds that rendering it takes; for the first render the kernels may compile."""
     report(0, 1, f"{len(objective.views)} views")
-    gradient = objective.gradient
+    gradient, center = objective.gradient, objective.active.flat
     report(1, 1, f"{len(objective.views)} views")
-    return gradient
+    objective.loss(center)
+    start = monotonic()
+    return gradient, objective.loss(center), monotonic() - start
 
 
 def _search(operator: CountingOperator, settings: ProbeSettings, share: Share) -> EigenSettings:
@@ -281,13 +276,6 @@ def _density(
     if matvecs < settings.density_matvecs:
         share.notes.append(f"the spectral density took {matvecs} products instead of {settings.density_matvecs}")
     return run(share.generator, progress=share.report, matvecs=matvecs, starts=starts, longest=longest, batch=batch)
-
-
-def _rendered(objective: SceneObjective) -> tuple[float, float]:
-    """The loss at the centre, and the seconds that rendering it takes; for the first render the kernels may compile."""
-    objective.loss(objective.active.flat)
-    start = monotonic()
-    return objective.loss(objective.active.flat), monotonic() - start
 
 
 def _finite(
@@ -327,7 +315,7 @@ def _plane(
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
-    workers = 1 if objective.collective or by_triton(center) else thread_count()
+    workers = 1 if objective.ranks.size > 1 or by_triton(center) else thread_count()
     allowed = _within(settings, share.seconds, render, workers)
     evaluate = evaluation(objective, allowed.workers)
     # Ritz vectors: H between any two of them is their values' diagonal matrix

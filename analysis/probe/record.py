@@ -1,66 +1,105 @@
-"""What a probe found as the `data` and `arrays` of a record (the keys are those of `analysis.records.records`)."""
+"""What a probe measured as a record (`analysis.records.records.ProbeRecord`) and its arrays."""
 
-from collections.abc import Mapping
-from dataclasses import replace
-from math import isfinite, isnan, sqrt
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from math import isfinite, isnan, nan
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from msgspec import convert
 
-from analysis.console.budget import NEEDS_DENSITY
 from analysis.measures.localization import conditions, localize, mass_shares
-from analysis.probe.measurement import Findings, PlaneSlice
-from landscape import EigenEnds, Eigenpairs, SpectralDensity, TraceEstimate, anisotropy, literal
+from analysis.probe.measurement import Measured, PlaneSlice
+from analysis.records import schema
+from analysis.records.provenance import Provenance, provenance
+from analysis.records.records import Check, Counts, ProbeRecord, Skip
+from analysis.records.tables import NEEDS_DENSITY
+from landscape import EigenEnds, Eigenpairs, anisotropy, literal
 from landscape.operators.checks import ROUND_OFFS
+from landscape.results import Bracket
+from landscape.slices.slice import Slice as Grid
 from landscape.spectrum.quantiles import quantile
+from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import ActiveCounts, SceneObjective
+from splat.curvature.traces import curvature_scale
 from splat.losses.reference import LossSettings
+from splat.scenes.scene import Scene
+from splat.training.checkpoint import Checkpoint
 
 NAMES = ("e₁", "e₂")  # of the slice's directions
 QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
-def probe_data(findings: Findings, objective: SceneObjective, loss: LossSettings) -> dict[str, Any]:
-    """All scalars save timing and provenance."""
-    return {
-        "objective": {
-            **objective_of(objective, loss),
-            "operator": "hessian",
-            "value": findings.value,
-            "gradient_norm": findings.gradient_norm,
-        },
-        "traces": {name: _trace(trace) for name, trace in findings.traces.items()},
-        "eigenvalues": _eigenvalues(findings, objective),
-        "anisotropy": _anisotropy(findings),
-        "quantiles": _quantiles(findings.density),
-        "finite_probe": None if findings.finite is None else {"direction": NAMES[0], **findings.finite.record()},
-        "depth": None if findings.depth is None else findings.depth.record(),
-        "slice": None if findings.plane is None else _slice(findings.plane, findings.ends.largest),
-        "counts": {**counts(objective.counts), **_work(findings, objective)},
-        "checks": _checks(findings),
-        "notes": list(findings.notes),
+def probe_record(
+    found: Measured, objective: SceneObjective, made: Provenance, timing: Mapping[str, float]
+) -> ProbeRecord:
+    """All numbers that are no arrays, without the families.  timing: seconds of the stages so far."""
+    density = found.density
+    return ProbeRecord(
+        objective=objective_of(objective, found.value, found.gradient_norm),
+        traces={name: _trace(trace.record()) for name, trace in found.traces.items()},
+        eigenvalues=_eigenvalues(found, objective),
+        anisotropy=_anisotropy(found),
+        quantiles=None
+        if density is None
+        else {f"{share:g}": index_of(quantile(density, share)) for share in QUANTILES},
+        finite_probe=None
+        if found.finite is None
+        else convert({**found.finite.record(), "direction": NAMES[0]}, schema.FiniteProbe),
+        depth=found.depth,
+        slice=None if found.plane is None else _slice(found.plane, found.ends.largest),
+        counts=_counts(found, objective),
+        checks=_checks(found),
+        notes=list(found.notes),
+        skipped=_skipped(found, objective, timing),
+        provenance=made,
+        timing=dict(timing),
+    )
+
+
+def probe_arrays(found: Measured) -> dict[str, dict[str, np.ndarray]]:
+    """The arrays, by file (`analysis.records.records.ARRAYS`)."""
+    assert found.ends.ritz is not None
+    values, residuals = found.ends.ritz.numpy()
+    arrays = {
+        "traces": {name: trace.samples.numpy() for name, trace in found.traces.items()},
+        "spectrum": {"ritz_values": values, "residuals": residuals},
+        "eigenvectors": {"largest": found.ends.largest.vectors.cpu().numpy()},
     }
-
-
-def probe_arrays(findings: Findings) -> dict[str, dict[str, np.ndarray]]:
-    """The arrays, by file."""
-    arrays = {"traces": {name: trace.samples.numpy() for name, trace in findings.traces.items()}}
-    assert findings.ends.ritz is not None
-    values, residuals = findings.ends.ritz.numpy()
-    arrays["spectrum"] = {"ritz_values": values, "residuals": residuals}
-    arrays["eigenvectors"] = {"largest": findings.ends.largest.vectors.cpu().numpy()}
-    if findings.density is not None:
-        arrays["spectrum"] |= dict(
-            zip(("nodes", "weights"), (x.numpy() for x in findings.density.table()), strict=True)
-        )
-    if findings.plane is not None:
-        plane = findings.plane.slice
-        x, y = plane.coordinates
-        arrays["slice"] = {"x": x.numpy(), "y": y.numpy(), "loss": plane.loss.numpy()}
-        optional = {"model": plane.model, "crossed": plane.crossed, "evaluated": plane.evaluated}
-        arrays["slice"] |= {name: array.numpy() for name, array in optional.items() if array is not None}
+    if found.density is not None:
+        arrays["spectrum"] |= dict(zip(("nodes", "weights"), (x.numpy() for x in found.density.table()), strict=True))
+    if found.plane is not None:
+        arrays["slice"] = grid_arrays(found.plane.slice)
     return arrays
+
+
+def grid_arrays(grid: Grid) -> dict[str, np.ndarray]:
+    """The arrays of a slice."""
+    known = dict(zip("xy", grid.coordinates, strict=False))
+    known |= {"loss": grid.loss, "model": grid.model, "crossed": grid.crossed, "evaluated": grid.evaluated}
+    return {name: array.numpy() for name, array in known.items() if array is not None}
+
+
+def provenance_of(
+    seed: int, path: Path, command: Sequence[str], settings: Any, checkpoint: Checkpoint, scene: Scene
+) -> Provenance:
+    """Where the numbers of a probe or a slice come from.  path: of the checkpoint; settings: a dataclass; command: as typed."""
+    return provenance(
+        seed,
+        lanes=lanes_of(np.float32),
+        checkpoint=str(path),
+        scene=scene.name,
+        scene_folder=str(scene.root),
+        views=list(checkpoint.scene.train),
+        iteration=checkpoint.training.step,
+        dtype=str(checkpoint.training.gaussians.flat.dtype).removeprefix("torch."),
+        threads=torch.get_num_threads(),
+        command=shlex.join(command),
+        settings=asdict(settings),
+    )
 
 
 def loss_name(loss: LossSettings) -> str:
@@ -76,56 +115,59 @@ def loss_name(loss: LossSettings) -> str:
     return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM)"
 
 
-def objective_of(objective: SceneObjective, loss: LossSettings) -> dict[str, Any]:
-    """What, beside the training views, makes the function whose curvature is measured."""
-    return {
-        "loss": loss_name(loss),
-        "sizes": [[view.camera.width, view.camera.height] for view in objective.views],
-        "background": objective.background.tolist(),
-    }
+def objective_of(objective: SceneObjective, value: float, gradient_norm: float) -> schema.Objective:
+    return schema.Objective(
+        loss=loss_name(objective.loss_settings),
+        sizes=[(view.camera.width, view.camera.height) for view in objective.views],
+        background=tuple(objective.background.tolist()),
+        operator="hessian",
+        value=value,
+        gradient_norm=gradient_norm,
+    )
 
 
-def _trace(trace: TraceEstimate) -> dict[str, Any]:
-    sampled = trace.probes > 0
-    method = "exact, the coupling of pixels sampled with random signs" if sampled else "exact"
-    return {**trace.record(), "tau": sqrt(max(trace.value, 0.0) / trace.dim) if trace.dim else 0.0, "method": method}
+def index_of(bracket: Bracket) -> schema.Index:
+    return convert(bracket.record(), schema.Index)
 
 
-def _eigenvalues(findings: Findings, objective: SceneObjective) -> dict[str, dict[str, Any]]:
-    ends, power, gaussians = findings.ends, findings.power, objective.active
+def _trace(numbers: Mapping[str, Any]) -> schema.Trace:
+    method = "exact, the coupling of pixels sampled with random signs" if numbers["probes"] else "exact"
+    tau = curvature_scale(numbers["value"] or 0.0, numbers["dim"], 1, "active")
+    return convert({**numbers, "tau": tau, "method": method}, schema.Trace)
+
+
+def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalues:
+    ends, power, gaussians = found.ends, found.power, objective.active
     needles = conditions(gaussians, [view.camera for view in objective.views], objective.settings)
-    exact = {"max": (ends.largest, 0), "second": (ends.largest, 1), "min": (ends.smallest, 0)}
-    rows = {}
-    for name, (pairs, index) in exact.items():
-        where = localize(pairs.vectors[:, index], gaussians, needles)
-        rows[name] = {**_pair(ends, pairs, index, gaussians.blocks), "lives_on": where.record()}
+
+    def eigenvalue(of: EigenEnds, pairs: Eigenpairs, index: int = 0) -> schema.Eigenvalue:
+        shares = mass_shares(pairs.vectors[:, index], gaussians.blocks)
+        return schema.Eigenvalue(**pairs.record(index), matvecs=of.matvecs, method=of.method, shares=shares)  # pyright: ignore[reportArgumentType]
+
+    def exact(pairs: Eigenpairs, index: int) -> schema.Eigenvalue:
+        found_end = eigenvalue(ends, pairs, index)
+        found_end.lives_on = localize(pairs.vectors[:, index], gaussians, needles)
+        return found_end
+
+    largest, smallest = ends.largest, ends.smallest
+    rows = schema.Eigenvalues(max=exact(largest, 0), second=exact(largest, 1), min=exact(smallest, 0))
     if power is not None:
-        rows["power_max"] = _pair(power, power.largest, 0, gaussians.blocks)
-        rows["power_min"] = _pair(power, power.smallest, 0, gaussians.blocks)
+        rows.power_max, rows.power_min = eigenvalue(power, power.largest), eigenvalue(power, power.smallest)
     return rows
 
 
-def _pair(ends: EigenEnds, pairs: Eigenpairs, index: int, blocks: Mapping[str, slice]) -> dict[str, Any]:
-    shares = mass_shares(pairs.vectors[:, index], blocks)
-    return {**pairs.record(index), "matvecs": ends.matvecs, "method": ends.method, "shares": shares}
+def _anisotropy(found: Measured) -> schema.Anisotropy:
+    """All indices; those that need the density are undetermined without it."""
+    family = anisotropy(found.ends, found.density)
+    left_out = schema.Index(value=None, low=None, high=None, note=NEEDS_DENSITY)
+    known = {name: getattr(family, name) for name in schema.INDICES}
+    indices = schema.Anisotropy(**{name: index_of(bracket) if bracket else left_out for name, bracket in known.items()})
+    if found.power is not None:
+        indices.literal = literal_index(found.ends, found.power)
+    return indices
 
 
-def _quantiles(density: SpectralDensity | None) -> dict[str, dict[str, Any]] | None:
-    """Of the eigenvalues, those of the exact null space left out."""
-    if density is None:
-        return None
-    return {f"{share:g}": quantile(density, share).record() for share in QUANTILES}
-
-
-def _anisotropy(findings: Findings) -> dict[str, dict[str, Any]]:
-    family: dict[str, Any] = anisotropy(findings.ends, findings.density).record()
-    if findings.power is not None:
-        family["literal"] = literal_index(findings.ends, findings.power)
-    left_out = {"value": None, "low": None, "high": None, "note": NEEDS_DENSITY}
-    return {**family, **{name: left_out for name in ("share", "effective_rank", "mass_quantile") if name not in family}}
-
-
-def literal_index(ends: EigenEnds, power: EigenEnds) -> dict[str, Any]:
+def literal_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
     """The paper's index from its power iteration, where that arrived within the certain bracket; else that of the ends.
 
     Everything lies within a bracket without bound: there it has arrived where it stopped by itself.
@@ -138,66 +180,99 @@ def literal_index(ends: EigenEnds, power: EigenEnds) -> dict[str, Any]:
         value, note = certain.value, f"by {method}: the paper's power iteration did not arrive"
     if certain.note not in ("definite", "indefinite"):
         note += f" ({certain.note})"
-    return {**replace(certain, value=value).record(), "note": note}
+    return index_of(replace(certain, value=value, note=note))
 
 
-def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> dict[str, Any]:
-    found = plane.slice
-    x, y = (float(axis.abs().max()) for axis in found.coordinates)
+def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
+    x, y = (float(axis.abs().max()) for axis in plane.slice.coordinates)
     units = [reach / unit for reach, unit in zip((x, y), plane.units, strict=True)]
-    return {
-        "directions": [
-            {"name": name, "curvature": float(value), "residual": float(residual), "unit": unit}
-            for name, value, residual, unit in zip(NAMES, pairs.values, pairs.residuals, plane.units, strict=False)
+    numbers = zip(NAMES, pairs.values.tolist(), pairs.residuals.tolist(), plane.units, strict=False)
+    return schema.Slice(
+        directions=[
+            schema.Direction(name=name, curvature=value, residual=error, unit=unit)
+            for name, value, error, unit in numbers
         ],
-        "loss_scale": plane.loss_scale,
-        **found.record(),
-        "note": f"±{units[0]:.3g} curvature units each way: ±{x:.3g} along e₁ and ±{y:.3g} along e₂, parameter units",
+        loss_scale=plane.loss_scale,
+        **plane.slice.record(),  # pyright: ignore[reportArgumentType]
+        note=f"±{units[0]:.3g} curvature units each way: ±{x:.3g} along e₁ and ±{y:.3g} along e₂, parameter units",
+    )
+
+
+def counts_of(active: ActiveCounts, **work: int) -> Counts:
+    """work: the other fields of `Counts`."""
+    return Counts(
+        gaussians=active.gaussians,
+        visible_gaussians=active.active_gaussians,
+        skipped_gaussians=active.gaussians - active.active_gaussians,
+        parameters=active.parameters,
+        active_parameters=active.active_parameters,
+        skipped_quaternion_lengths=active.radial_quaternions,
+        sh_degree_stored=active.sh_degree,
+        sh_degree_active=active.active_sh_degree,
+        views=active.views,
+        **work,
+    )
+
+
+def _counts(found: Measured, objective: SceneObjective) -> Counts:
+    renders = 0 if found.plane is None else found.plane.slice.evaluations * objective.counts.views
+    kept = objective.linearized.kept
+    return counts_of(
+        objective.counts, rank=found.rank, views_kept_linearised=kept, products=found.matvecs, renders=renders
+    )
+
+
+def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, float]) -> dict[str, Skip]:
+    """What products of the exact Hessian leave out, over all views, and what estimators that had finished left undone.
+
+    The latter's time is that of as many samples or renders as were made.  Products on the GPU also leave out the tiles in which
+    their vectors move nothing, which is not counted.
+    """
+    counts, probes = objective.counts, [trace.probes for trace in found.traces.values()]
+
+    def total(count: int) -> int:
+        """Over the views of all processes."""
+        return int(objective.ranks.sum(torch.tensor(count)))
+
+    products = {
+        "gaussians_out_of_sight": counts.gaussians - counts.active_gaussians,
+        "sh_bands_not_in_use": (counts.sh_degree + 1) ** 2 - (counts.active_sh_degree + 1) ** 2,
+        "entries_behind_opaque_fronts": total(sum(view.intersections_behind for view in objective.linearized)),
+        "tiles_of_zero_cotangent": total(sum(view.dark_tiles for view in objective.linearized)),
+        "products_of_views_not_concerned": total(found.spared),
     }
 
+    def undone(count: int, made: int, seconds: float) -> Skip:
+        return Skip(count=count, seconds_saved=count * seconds / made if made else nan)
 
-def counts(active: ActiveCounts) -> dict[str, int]:
-    return {
-        "gaussians": active.gaussians,
-        "visible_gaussians": active.active_gaussians,
-        "skipped_gaussians": active.gaussians - active.active_gaussians,
-        "parameters": active.parameters,
-        "active_parameters": active.active_parameters,
-        "skipped_quaternion_lengths": active.radial_quaternions,
-        "sh_degree_stored": active.sh_degree,
-        "sh_degree_active": active.active_sh_degree,
-        "views": active.views,
-    }
+    skips = {name: Skip(count=count, seconds_saved=None) for name, count in products.items()}
+    samples = sum(max(probes) - count for count in probes)
+    skips["samples_of_finished_traces"] = undone(samples, sum(probes), timing["traces"])
+    if found.plane is not None:
+        grid = found.plane.slice
+        predicted = grid.loss.numel() - int(grid.evaluated.sum())
+        skips["points_of_the_slice_predicted"] = undone(predicted, grid.evaluations, timing["slice"])
+    return skips
 
 
-def _work(findings: Findings, objective: SceneObjective) -> dict[str, int]:
-    return {
-        "rank": findings.rank,
-        "views_kept_linearised": objective.memory_plan.kept,
-        "products": findings.matvecs,
-        "renders": 0 if findings.plane is None else findings.plane.slice.evaluations * objective.counts.views,
-    }
-
-
-def _checks(findings: Findings) -> dict[str, dict[str, Any]]:
-    operator, derivative = findings.operator_check, findings.gradient_check
-    bound = operator.tolerance
-    close = max(bound, ROUND_OFFS * torch.finfo(torch.float32).eps)  # differences are not much better in float64
+def _checks(found: Measured) -> dict[str, Check]:
+    operator, derivative = found.operator_check, found.gradient_check
+    # differences are not much better in float64
+    close = max(operator.tolerance, ROUND_OFFS * torch.finfo(torch.float32).eps)
     steps = len(derivative.steps) + derivative.skipped
     skipped = f"the order of the splats changed on {derivative.skipped} of {steps} steps"
-    ran = not isnan(derivative.error)
+    if isnan(derivative.error):
+        difference = Check(value=None, bound=close, passed=None, note=skipped)
+    else:
+        note = f"gradients {derivative.step:.0e} apart, {skipped}"
+        difference = Check(value=derivative.error, bound=close, passed=derivative.error <= close, note=note)
     return {
-        "symmetry": _check(operator.symmetry, bound),
-        "round_off": _check(operator.noise, bound),
+        "symmetry": _check(operator.symmetry, operator.tolerance),
+        "round_off": _check(operator.noise, operator.tolerance),
         "finiteness": _check(0.0 if operator.finite else 1.0, 0.0),
-        "finite_difference": {
-            "value": derivative.error if ran else None,
-            "bound": close,
-            "passed": derivative.error <= close if ran else None,
-            "note": f"gradients {derivative.step:.0e} apart, {skipped}" if ran else skipped,
-        },
+        "finite_difference": difference,
     }
 
 
-def _check(value: float, bound: float) -> dict[str, Any]:
-    return {"value": value, "bound": bound, "passed": value <= bound}
+def _check(value: float, bound: float) -> Check:
+    return Check(value=value, bound=bound, passed=value <= bound)

@@ -7,27 +7,56 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from msgspec import UNSET, Struct
+
+from analysis.records.schema import Maybe
+from landscape.errors import InputError
+
 PACKAGES = ("splat-landscape", "torch", "numpy", "scipy", "numba", "matplotlib", "pyvista", "plotly")
+
+
+class Machine(Struct, kw_only=True):
+    """cores: those that the process may use.  lanes: float32 numbers in a SIMD vector of the kernels; None: not known."""
+
+    cpu: str
+    cores: int | None = None
+    lanes: int | None = None
+    system: str = ""
+
+
+class Provenance(Struct, kw_only=True):
+    """Where the numbers come from.  versions: of Python and packages, None for what is not installed.
+
+    other: the checkpoint at the other end of a line.  settings: of the command; families: those of the families.
+    """
+
+    created: str
+    seed: int
+    versions: dict[str, str | None]
+    machine: Machine
+    checkpoint: Maybe[str] = UNSET
+    other: Maybe[str | None] = UNSET
+    scene: Maybe[str] = UNSET
+    scene_folder: Maybe[str] = UNSET
+    views: Maybe[list[str] | None] = UNSET
+    iteration: Maybe[int] = UNSET
+    dtype: Maybe[str] = UNSET
+    threads: Maybe[int] = UNSET
+    command: Maybe[str] = UNSET
+    settings: Maybe[dict[str, Any]] = UNSET
+    families: Maybe[dict[str, Any]] = UNSET
 
 
 def require_seed(seed: int) -> None:
     """ValueError where it is out of range."""
     if not 0 <= seed < 2**63:
-        raise ValueError(f"expected a seed in [0, 2^63), got {seed}")
+        raise InputError(f"expected a seed in [0, 2^63), got {seed}")
 
 
-def provenance(seed: int, *, lanes: int | None = None, **more: Any) -> dict[str, Any]:
-    """The `provenance` of a record (see `analysis.records.records`); `more` (checkpoint, scene, ...) is added as it is.
-
-    lanes: float32 numbers in one SIMD vector of the kernels that ran, where known.
-    """
-    return {
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "seed": seed,
-        "versions": versions(),
-        "machine": machine(lanes),
-        **more,
-    }
+def provenance(seed: int, *, lanes: int | None = None, **more: Any) -> Provenance:
+    """Of now and here.  lanes: as in `Machine`; more: the other fields of `Provenance`."""
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    return Provenance(created=created, seed=seed, versions=versions(), machine=machine(lanes), **more)
 
 
 def versions() -> dict[str, str | None]:
@@ -41,14 +70,10 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def machine(lanes: int | None = None) -> dict[str, Any]:
+def machine(lanes: int | None = None) -> Machine:
     """The processor, how many of its cores this process may use, and the system."""
-    return {
-        "cpu": _cpu_name(),
-        "cores": usable_cores(),
-        "lanes": lanes,
-        "system": f"{platform.system()} {platform.machine()}",
-    }
+    system = f"{platform.system()} {platform.machine()}"
+    return Machine(cpu=_cpu_name(), cores=usable_cores(), lanes=lanes, system=system)
 
 
 def usable_cores() -> int:

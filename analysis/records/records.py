@@ -1,187 +1,172 @@
-"""Record folders: what a probe found, written so that a crash never leaves a mixture, and read back with clear errors.
+"""Record folders: what a probe or a slice found, written so that a crash never leaves a mixture, and checked on reading.
 
-A record is a folder `RUN/probe/` with `probe.json` (every number), one `.npz` per group of arrays, and whatever
-pictures and pages were drawn from them.  `record_folder` makes the whole folder appear at once.  Needs no torch.
-Folders of `landscape slice` are made alike, with `slice.json`, whose keys `analysis.slice.record` lists.
+    RUN/probe/probe.json, RUN/slice-.../slice.json    every number: `ProbeRecord`, `SliceRecord`
+    GROUP.npz                                         one for each group of arrays: ARRAYS
+    *.png, report.html                                drawn from these
 
-Numbers.  `probe.json` is strict JSON.  What is not finite is a string, "NaN", "Infinity" or "-Infinity" (the convention
-of protobuf's JSON), and comes back as a float.  `null` means *not determined*, and the `note` beside it says why.
-Losses are dimensionless; curvatures are loss per squared parameter unit, with respect to the stored parameters.
-
-Keys (frozen: within a format version keys may be added, none renamed or removed; * marks those that must be there):
-
-format*           name*, version*: see `FORMAT`
-objective         loss: its name; sizes: [width, height] of each view; background: [r, g, b];
-                  operator: "hessian" or "gauss-newton"; value: L at the checkpoint; gradient_norm: |dL/dTheta|
-traces*           one entry per attribute (means, log_scales, quats, opacity_logits, sh):
-    value*            trace of the attribute's diagonal block over its active parameters
-    standard_error*   of value; 0 where the method is exact
-    low, high         the ends of the interval at `confidence`, e.g. 0.95
-    confidence
-    sign*             "positive", "negative", "zero", or "undetermined" where the interval does not decide it
-    tau*              sqrt(max(value, 0) / dim): the attribute's curvature scale
-    dim*              parameters over which tau takes the mean
-    probes*           probe vectors used; 0 where the method is exact
-    matvecs           products H v spent
-    method*           "exact", or "exact, the coupling of pixels sampled with random signs"
-    reason            why it stopped: "tolerance", "noise floor", "matvec budget", "time budget" or "exact"
-    note              why value is null, what was capped, ...
-eigenvalues*      max*, second, min* (of the active operator, signed) and power_max, power_min (the paper's power iteration):
-    value*            the eigenvalue (Ritz value)
-    residual*         |H v - value v| with |v| = 1: a true eigenvalue lies within it
-    vector_error      about the sine of the angle between v and the true eigenvector
-    method, matvecs, reason, note     as for the traces
-    shares            attribute -> share of the eigenvector's squared mass
-    lives_on          where the eigenvector lives (`analysis.measures.localization`): attributes: its shares; participation:
-    over how
-                      many Gaussians; needles, needles_bare: share of mass on Gaussians with kappa > 100, with and without
-                      the blur of 0.3 px^2, and needle_count, needle_bare_count: how many those are; heaviest: [index, share]
-anisotropy*       literal, saddle, share, effective_rank, mass_quantile, each with:
-    value*, low*, high*   the index and its bracket; null where undefined (see note) or unbounded
-    note*             why, or ""
-quantiles         null, or share -> the eigenvalue that this share of all active ones does not exceed: value, low, high, note
-finite_probe      null, or the second difference (L(+d v) + L(-d v) - 2 L) / d^2 along the direction named, for all of:
-    steps, curvatures, round_off, truncation    d, the second difference, bounds of its errors
-    crossed           at which steps the order of the splats or the set of visible ones changed
-    infinitesimal     v.H v;  center_loss, noise: L and the standard deviation of one evaluation's error
-    best              index of the step with the least error of those that cross nothing; null without any
-    evaluations       renders of all views
-depth             absent, null, or the positions along the rays against one direction across them (`analysis.measures.depth`):
-    gradient_ratio, gradient_median    of the root mean square gradients; the median over `pairs` of a Gaussian and a view
-    curvature         depth, lateral: traces, as above without tau
-    curvature_ratio   of the mean curvatures: value, low, high, note
-    rises             a row a length of finite steps: pixels; depth, lateral: rises of the loss, with _error and _crossed, the
-                      share of the renders with another order of the splats or set of visible ones; ratio, ratio_error
-families          absent, or rows of the anisotropy families (`analysis.measures.families`), each with: operator ("hessian" or
-                  "gauss-newton"), block ("all" or an attribute), metric and unit, split (whether of the split scene),
-                  gaussians, dim, rank (dim without the exact null space); lambda_max, lambda_min: value, residual,
-                  ...;
-                  beyond: how far outside an end that ran out of its budget may lie (see
-                  `landscape.eigen.eigen.pairs.EigenEnds`);
-                  indices: as anisotropy; starts, steps of the density; matvecs
-split_control     absent, or gaussians; rms, largest, psnr of the images' change; effects: operator, block, index, and value,
-                  low, high, note of the split scene's index over the trained scene's
-slice             null, or:
-    directions*       two of {name*, curvature*, residual, unit*}: the unit vectors of the x and the y axis, the
-                      curvature along each, and `unit` = sqrt(2 loss_scale / |curvature|), in parameter units
-    loss_scale*       a change of loss: along a direction the curvature alone makes it within one `unit`
-    center_loss*      L at the centre, a render of the slice's own
-    points, evaluated_points, crossed_points    of the grid: all, and those that `evaluated` and `crossed` (below) mark
-    evaluations       renders of all views that the slice took
-    interpolation_error       the largest error of predictions at random points, as a share of the range of the evaluated
-                      losses; 0 where all points are evaluated, null where a prediction met a loss that is not finite
-    holdout_points, share_beyond    how many random points; with 95% confidence at most this share of the points that were
-                      not evaluated before them is off by more than interpolation_error
-    reason            why no more points were evaluated: "tolerance", "evaluation budget", "time budget" or "exact"
-    note
-counts*           gaussians*, visible_gaussians*, parameters*, active_parameters*, sh_degree_stored*,
-sh_degree_active*,
-                  views*; any further integer under a name that says what was counted
-skipped           what the scene did not need (`analysis.probe.skips`) -> count, seconds_saved (measured, not
-reproducible; null: not)
-checks*           symmetry, round_off, finiteness, finite_difference, each with:
-    value*, bound*    what was measured and what it must not exceed
-    passed*           true, false, or null where the check could not run (see note)
-
-    note
-timing*           stage -> seconds, in the order run; total*
-notes             sentences: what was skipped, capped, or not reached
-provenance*       created*, seed*, versions*, machine* (see `analysis.records.provenance`); checkpoint, scene,
-scene_folder, views,
-                  iteration, dtype, threads, command, settings; families: the settings of these, where they were measured
-arrays*           written by `write_record`: group -> name -> shape, one file `group.npz` each
-
-Arrays (all optional):
-
-spectrum          ritz_values [k], residuals [k]: approximate eigenvalues, the two ends among them; and, where the
-                  density was estimated, nodes, weights [starts, steps + known]: a quadrature for each start vector, the
-                  eigenvalues that are known among the nodes of all
-eigenvectors      largest [parameters, k]: unit vectors of the k largest eigenvalues, of the Gaussians in sight
-traces            attribute -> [probes]: the samples whose mean is the trace
-families          SCENE.OPERATOR.BLOCK.nodes and .weights [starts, steps + known]: the quadrature of each family's density
-slice             x [nx], y [ny]: steps along the two directions in parameter units; loss [nx, ny]: L at each point;
-                  evaluated [nx, ny]: true where it is a true render, false where it is interpolated (absent: all are
-                  renders); where known, model [nx, ny]: the quadratic model there, and crossed [nx, ny]: true where a
-                  render's order of the splats or set of visible ones is not that of the centre (false and not known
-                  where interpolated)
+`record_folder` makes the whole folder appear at once.  Needs no torch.
 """
 
-import json
-import math
 import os
 import secrets
 import shutil
 import time
-import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
+from msgspec import UNSET, Struct, field
+
+from analysis.records import schema
+from analysis.records.json_files import decoded, encoded, fitted, json_text, plain, plain_json
+from analysis.records.provenance import Provenance
+from analysis.records.schema import Count, Maybe, Number
+from landscape.errors import InputError
+
+ARRAYS = {
+    "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
+    "eigenvectors": {"largest": "parameters k"},
+    "traces": {"*": "probes?"},
+    "families": {"*": "starts steps?"},
+    "slice": {"x": "nx", "y": "ny?", "loss": "grid", "model": "grid?", "evaluated": "grid?", "crossed": "grid?"},
+    "directions": {"vectors": "parameters d"},
+}
+"""Group, a file `GROUP.npz` each -> name -> shape; ?: may be absent, as any group may.
+
+spectrum      ritz_values, residuals: approximate eigenvalues, the two ends among them; where the density was estimated also
+              nodes, weights: a quadrature for each start vector, eigenvalues that are known among the nodes of all
+eigenvectors  unit vectors of the k largest eigenvalues, of the Gaussians in sight
+traces        ATTRIBUTE: the samples whose mean is the trace
+families      SCENE.OPERATOR.BLOCK.nodes and .weights: the quadrature of each family's density
+slice         x, y: increasing steps along the directions; loss: L on the grid, [nx, ny] or, along a line, [nx]; model: the
+              quadratic model there; evaluated (boolean): true where loss is a render, false where it is interpolated (absent:
+              all are renders); crossed (boolean): true where a render's order of the splats or set of visible ones is not that
+              of the centre; false and not known where interpolated
+directions    of a `landscape slice`: its directions as columns, of the Gaussians in sight or, for a line, of all
+"""
+BOOLEAN = {"evaluated", "crossed"}
 
 
-@dataclass(frozen=True)
-class Kind:
-    """The records of one subcommand.  sections: objects that must be there; axes: how many directions a slice may have."""
+class Format(Struct, frozen=True):
+    """name: "landscape probe" or "landscape slice"."""
 
-    command: str
+    name: str
     version: int
-    sections: tuple[str, ...]
-    axes: tuple[int, ...]
-
-    @property
-    def file(self) -> str:
-        return f"{self.command}.json"
-
-    @property
-    def format(self) -> dict[str, str | int]:
-        return {"name": f"landscape {self.command}", "version": self.version}
 
 
-_EVERY = ("counts", "timing", "provenance", "arrays")
-PROBE = Kind("probe", 1, ("traces", "eigenvalues", "anisotropy", "checks", *_EVERY), axes=(2,))
-SLICE = Kind("slice", 1, ("objective", "slice", *_EVERY), axes=(1, 2))
-FILE, FORMAT = PROBE.file, PROBE.format
+class Counts(Struct, kw_only=True):
+    """visible_gaussians: that touch a pixel.  active_parameters: of these, without SH bands that are not in use and the
+    lengths of quaternions.  rank: of the active operator.  products: H v made.  renders: of single views.
+    """
 
-_REQUIRED = {
-    "traces": ("value", "standard_error", "tau", "dim", "probes", "sign", "method"),
-    "eigenvalues": ("value", "residual"),
-    "anisotropy": ("value", "low", "high", "note"),
-    "checks": ("value", "bound", "passed"),
-}
-_REQUIRED_KEYS = {
-    "eigenvalues": ("max", "min"),
-    "counts": (
-        "gaussians",
-        "visible_gaussians",
-        "parameters",
-        "active_parameters",
-        "sh_degree_stored",
-        "sh_degree_active",
-        "views",
-    ),
-    "timing": ("total",),
-    "provenance": ("created", "seed", "versions", "machine"),
-}
-_POINTS = ("points", "evaluated_points", "crossed_points", "holdout_points")
-_NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+    gaussians: Count
+    visible_gaussians: Count
+    skipped_gaussians: Count = 0
+    parameters: Count
+    active_parameters: Count
+    skipped_quaternion_lengths: Count = 0
+    sh_degree_stored: Count
+    sh_degree_active: Count
+    views: Count
+    rank: Maybe[Count] = UNSET
+    views_kept_linearised: Maybe[Count] = UNSET
+    products: Count = 0
+    renders: Count = 0
+
+
+class Check(Struct, kw_only=True):
+    """value: what was measured; bound: what it must not exceed; passed: None where the check could not run (see note)."""
+
+    value: Number
+    bound: Number
+    passed: bool | None
+    note: Maybe[str] = UNSET
+
+
+class Skip(Struct, kw_only=True):
+    """What the scene did not need.  seconds_saved: about, by the time of what was done; None where that is not known."""
+
+    count: Count
+    seconds_saved: Number
+
+
+Shapes = dict[str, dict[str, list[Count]]]
+
+
+class ProbeRecord(Struct, kw_only=True):
+    """What `landscape probe` found.
+
+    traces: by attribute (means, log_scales, quats, opacity_logits, sh).  quantiles: share -> the eigenvalue that this share of
+    all active ones does not exceed; None without a density.  finite_probe, depth, slice: None where they were left out.
+    skipped: by what was skipped.  checks: symmetry, round_off, finiteness, finite_difference.  timing: stage -> seconds, in the
+    order run, and "total".  notes: sentences on what was skipped, capped, or not reached.  arrays: group -> name -> shape.
+    """
+
+    COMMAND: ClassVar[str] = "probe"
+    FILE: ClassVar[str] = "probe.json"
+    FORMAT: ClassVar[Format] = Format("landscape probe", 1)
+
+    format: Format = FORMAT
+    objective: schema.Objective = field(default_factory=schema.Objective)
+    traces: dict[str, schema.Trace]
+    eigenvalues: schema.Eigenvalues
+    anisotropy: schema.Anisotropy
+    quantiles: dict[str, schema.Index] | None = None
+    finite_probe: schema.FiniteProbe | None = None
+    depth: schema.Depth | None = None
+    slice: schema.Slice | None = None
+    counts: Counts
+    checks: dict[str, Check]
+    notes: list[str] = []
+    skipped: dict[str, Skip] = {}
+    provenance: Provenance
+    families: Maybe[list[schema.Family]] = UNSET
+    split_control: Maybe[schema.SplitControl] = UNSET
+    timing: dict[str, float]
+    arrays: Shapes = {}
+
+    def __post_init__(self) -> None:
+        if self.slice and len(self.slice.directions) != 2:
+            raise ValueError(f"expected 2 slice.directions, got {len(self.slice.directions)}")
+
+
+class SliceRecord(Struct, kw_only=True):
+    """What `landscape slice` found; fields as in `ProbeRecord`.  finite_probe: along a line; None with two directions."""
+
+    COMMAND: ClassVar[str] = "slice"
+    FILE: ClassVar[str] = "slice.json"
+    FORMAT: ClassVar[Format] = Format("landscape slice", 1)
+
+    format: Format = FORMAT
+    objective: schema.Objective
+    slice: schema.Slice
+    finite_probe: schema.FiniteProbe | None = None
+    counts: Counts
+    notes: list[str] = []
+    provenance: Provenance
+    timing: dict[str, float]
+    arrays: Shapes = {}
+
+
+Data = TypeVar("Data", bound=ProbeRecord | SliceRecord)
+Arrays = dict[str, dict[str, np.ndarray]]
 _ABANDONED_AFTER = 3600.0  # seconds; filling a folder takes seconds: an older partial one is a killed process's
 
 
 @dataclass(frozen=True)
-class Record:
-    """A record as read: `data` is its JSON with non-finite numbers as floats, `arrays` is group -> name -> array."""
+class Record(Generic[Data]):
+    """A record as read; arrays: group -> name -> array."""
 
     folder: Path
-    data: dict[str, Any]
-    arrays: dict[str, dict[str, np.ndarray]]
+    data: Data
+    arrays: Arrays
 
 
 @contextmanager
-def record_folder(folder: str | Path, kind: Kind = PROBE) -> Iterator[Path]:
+def record_folder(folder: str | Path, kind: type[ProbeRecord | SliceRecord] = ProbeRecord) -> Iterator[Path]:
     """A new, empty folder that becomes `folder` when the block ends, all at once; nothing changes if the block fails.
 
     An old record at `folder` is replaced.  Killed at any point, `folder` is the old record, the new one, or (between
@@ -210,196 +195,137 @@ def record_folder(folder: str | Path, kind: Kind = PROBE) -> Iterator[Path]:
     shutil.rmtree(previous, ignore_errors=True)
 
 
-def write_record(
-    folder: str | Path, data: Mapping[str, Any], arrays: Mapping[str, Mapping[str, np.ndarray]], kind: Kind = PROBE
-) -> Path:
+def write_record(folder: str | Path, data: ProbeRecord | SliceRecord, arrays: Mapping[str, Mapping[str, Any]]) -> Path:
     """Write the JSON and the arrays into `folder` (which `record_folder` gave); returns the path of the JSON.
 
-    `data` holds the keys of the module's glossary save `format` and `arrays`, which are added here.
-    Raises ValueError where a required key is missing or a value has no place in JSON.
+    Raises ValueError where a value is not what the record's type says, or an array is none of numbers.
     """
+    data.arrays = {g: {name: list(np.shape(array)) for name, array in names.items()} for g, names in arrays.items()}
+    path = write_data(folder, data)
     for group, names in arrays.items():
         numeric: dict[str, Any] = {name: np.asarray(array) for name, array in names.items()}
         if objects := [name for name, array in numeric.items() if array.dtype.hasobject]:
-            raise ValueError(f"expected numbers in the array {group}.{objects[0]}, got objects")
+            raise InputError(f"expected numbers in the array {group}.{objects[0]}, got objects")
         # not compressed: eigenvectors, by far the largest, would take a tenth of a second for 2% less
         np.savez(Path(folder) / f"{group}.npz", **numeric)
-    return write_data(folder, data, arrays, kind)
+    return path
 
 
-def write_data(
-    folder: str | Path, data: Mapping[str, Any], arrays: Mapping[str, Mapping[str, np.ndarray]], kind: Kind = PROBE
-) -> Path:
+def write_data(folder: str | Path, data: ProbeRecord | SliceRecord) -> Path:
     """The JSON alone, anew, of a record whose arrays are in `folder`; else as `write_record`."""
-    shapes = {group: {name: list(np.shape(array)) for name, array in names.items()} for group, names in arrays.items()}
-    whole = {"format": kind.format, **data, "arrays": shapes}
-    check_layout(whole, kind)
-    text = json.dumps(_encoded(whole, ""), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    path = Path(folder) / kind.file
+    content = encoded(plain(data))
+    fitted(decoded(content), type(data), "a record that cannot be read again", "")
+    path = Path(folder) / data.FILE
     temporary = path.with_suffix(".json.tmp")
-    temporary.write_text(text, encoding="utf-8")
+    temporary.write_text(json_text(content), encoding="utf-8")
     temporary.replace(path)
     return path
 
 
-def read_record(folder: str | Path) -> Record:
-    """Read the record in `folder` (or the JSON given).  FileNotFoundError or ValueError say what is wrong."""
+def read_record(folder: str | Path, kind: type[Data] | None = None) -> Record[Data]:
+    """Read the record in `folder` (or the JSON given).  FileNotFoundError or ValueError say what is wrong.
+
+    kind: of the record; None: of that which is there.
+    """
     folder = Path(folder)
-    folder = folder.parent if folder.name in (PROBE.file, SLICE.file) else folder
-    kind = SLICE if (folder / SLICE.file).is_file() else PROBE
-    path = folder / kind.file
+    folder = folder.parent if folder.name in (ProbeRecord.FILE, SliceRecord.FILE) else folder
+    found = kind or cast(type[Data], SliceRecord if (folder / SliceRecord.FILE).is_file() else ProbeRecord)
+    path, again = folder / found.FILE, f"{found.COMMAND} again"
     if not path.is_file():
-        raise FileNotFoundError(_why_not_found(folder))
-    again = f"{kind.command} again"
-    try:
-        raw = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
-    except ValueError as error:
-        raise ValueError(
-            f"expected JSON in {path}, got a file that is damaged or truncated ({error}); {again}"
-        ) from None
+        raise FileNotFoundError(_why_not_found(folder, found.COMMAND, found.FILE))
+    what = f"a record of `landscape {found.COMMAND}`"
+    raw = plain_json(path, what, again)
     match raw:
-        case {"format": {"name": name, "version": version}} if name == kind.format["name"]:
+        case {"format": {"name": found.FORMAT.name, "version": int(version)}}:
             pass
         case _:
-            raise ValueError(
-                f'expected a record of `landscape {kind.command}` in {path}, got JSON without "format": {kind.format}'
-            )
-    if not isinstance(version, int) or version > kind.version:
-        raise ValueError(
-            f"expected a record of format version {kind.version} or older in {path}, got version {version}; "
-            f"update splat-landscape or {kind.command} the checkpoint again"
+            raise InputError(f'expected {what} in {path}, got JSON without "format": {plain(found.FORMAT)}; {again}')
+    if version > found.FORMAT.version:
+        raise InputError(
+            f"expected a record of format version {found.FORMAT.version} or older in {path}, got version {version}; "
+            f"update splat-landscape, or {again}"
         )
-    try:
-        check_layout(raw, kind)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}; {again}") from None
-    arrays = {group: _read_arrays(folder / f"{group}.npz", shapes, kind) for group, shapes in raw["arrays"].items()}
-    return Record(folder, decoded(raw), arrays)
+    data = fitted(raw, found, str(path), again)
+    arrays = {group: _read_arrays(folder, group, data.arrays[group], again) for group in ARRAYS if group in data.arrays}
+    if data.slice and "slice" in arrays and arrays["slice"]["loss"].ndim != len(data.slice.directions):
+        raise InputError(
+            f"{path}: expected a direction for each axis of the slice, got {len(data.slice.directions)}; {again}"
+        )
+    return Record(folder, data, arrays)
 
 
-def check_layout(data: Mapping[str, Any], kind: Kind = PROBE) -> None:
-    """Raise ValueError naming the first required key of the module's glossary that `data` lacks."""
-    for section in kind.sections:
-        entries = data.get(section)
-        if not isinstance(entries, Mapping):
-            raise ValueError(f'expected an object "{section}", got {type(entries).__name__}')
-        missing = [f"{section}.{key}" for key in _REQUIRED_KEYS.get(section, ()) if key not in entries]
-        for name, entry in entries.items():
-            required = _REQUIRED.get(section, ())
-            if required and not isinstance(entry, Mapping):
-                raise ValueError(f'expected an object "{section}.{name}", got {type(entry).__name__}')
-            missing += [f"{section}.{name}.{key}" for key in required if key not in entry]
-        if missing:
-            raise ValueError(f'expected the key "{missing[0]}", got none')
-    _require_numbers(data["counts"], "counts", _REQUIRED_KEYS["counts"])
-    notes = data.get("notes", [])
-    if not isinstance(notes, list | tuple) or not all(isinstance(note, str) for note in notes):
-        raise ValueError(f'expected a list of sentences "notes", got {notes!r}')
-    for group, shapes in data["arrays"].items():
-        if not isinstance(shapes, Mapping):
-            raise ValueError(f'expected shapes by name at "arrays.{group}", got {type(shapes).__name__}')
-    if data.get("slice") is not None:
-        _check_slice(data["slice"], kind)
-
-
-def _require_numbers(entries: Mapping[str, Any], section: str, keys: Iterable[str]) -> None:
-    """Those of the keys that are there."""
-    for key in keys:
-        if not isinstance(entries.get(key, 0), Real):
-            raise ValueError(f'expected a number "{section}.{key}", got {entries[key]!r}')
-
-
-def _check_slice(plane: Any, kind: Kind) -> None:
-    if not isinstance(plane, Mapping):
-        raise ValueError(f'expected an object "slice", got {type(plane).__name__}')
-    found = plane.get("directions")
-    directions = found if isinstance(found, list | tuple) else ()
-    if not {"loss_scale", "center_loss"} <= set(plane) or len(directions) not in kind.axes:
-        axes = " or ".join(map(str, kind.axes))
-        raise ValueError(f'expected "slice" to hold "loss_scale", "center_loss" and {axes} "directions"')
-    _require_numbers(plane, "slice", _POINTS)
-    for direction in directions:
-        if not isinstance(direction, Mapping):
-            raise ValueError(f'expected objects in "slice.directions", got {type(direction).__name__}')
-        if missing := {"name", "curvature", "unit"} - set(direction):
-            raise ValueError(f'expected the key "slice.directions.{min(missing)}", got none')
-
-
-def _encoded(value: Any, where: str) -> Any:
-    """`value` as plain JSON types; ValueError names the key of what is none."""
-    match value:
-        case None | bool() | int():
-            return value
-        case np.bool_() | np.integer():
-            return value.item()
-        case float() | np.floating():
-            number = float(value)
-            return (
-                number if math.isfinite(number) else ("NaN" if math.isnan(number) else f"{'-' * (number < 0)}Infinity")
-            )
-        case str():
-            if value in _NOT_FINITE:
-                raise ValueError(f'expected text at "{where}", got "{value}", which would be read back as a number')
-            return value
-        case Path():
-            return str(value)
-        case Mapping():
-            if wrong := [key for key in value if not isinstance(key, str)]:
-                raise ValueError(f'expected text as keys of "{where}", got {wrong[0]!r}')
-            return {key: _encoded(item, f"{where}.{key}".lstrip(".")) for key, item in value.items()}
-        case list() | tuple():
-            return [_encoded(item, f"{where}[{i}]") for i, item in enumerate(value)]
-    raise ValueError(
-        f'expected a number, text, list or mapping at "{where}", got {type(value).__name__}; arrays belong in an .npz'
-    )
-
-
-def decoded(value: Any) -> Any:
-    """JSON with non-finite numbers as floats."""
-    match value:
-        case str():
-            return _NOT_FINITE.get(value, value)
-        case dict():
-            return {key: decoded(item) for key, item in value.items()}
-        case list():
-            return [decoded(item) for item in value]
-    return value
-
-
-def _read_arrays(path: Path, shapes: Mapping[str, list[int]], kind: Kind) -> dict[str, np.ndarray]:
-    again = f"{kind.command} again"
+def _read_arrays(folder: Path, group: str, shapes: Mapping[str, list[int]], again: str) -> dict[str, np.ndarray]:
+    """The arrays of a group that the record names.  ValueError or FileNotFoundError where one is not as ARRAYS has it."""
+    path = folder / f"{group}.npz"
+    shapes = {name: shape for name, shape in shapes.items() if name in ARRAYS[group] or "*" in ARRAYS[group]}
     if not path.is_file():
-        raise FileNotFoundError(f"expected the arrays of {kind.file} in {path}, got no such file; {again}")
+        raise FileNotFoundError(f"expected the arrays of the record in {path}, got no such file; {again}")
+    with (
+        path.open("rb") as stream,
+        refusing_damage("arrays", path, again),
+        np.load(stream, allow_pickle=False) as archive,
+    ):
+        arrays = {name: archive[name] for name in shapes if name in archive.files}
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"expected arrays in {path}, got a damaged or truncated file ({error}); {again}") from None
-    for name, shape in shapes.items():
-        got = list(arrays[name].shape) if name in arrays else None
-        if got != shape:
-            raise ValueError(f"expected {name} of shape {shape} in {path}, got {got}; {again}")
+        _require_arrays(group, arrays, shapes)
+    except ValueError as error:
+        raise InputError(f"expected the arrays of the record in {path}, got {error}; {again}") from None
     return arrays
 
 
-def _why_not_found(folder: Path) -> str:
-    expected = f"expected a folder written by `landscape probe` (with {FILE}), got {folder}, "
-    if (folder / "probe" / FILE).is_file():
+@contextmanager
+def refusing_damage(what: str, path: Path, remedy: str) -> Iterator[None]:
+    """ValueError that names the file for whatever reading its bytes raises: numpy and zipfile may raise nearly anything."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise InputError(f"expected {what} in {path}, got a damaged file ({error}); {remedy}") from None
+
+
+def _require_arrays(group: str, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, list[int]]) -> None:
+    """ValueError says what is not as the record's shapes and ARRAYS have it."""
+    sizes: dict[str, int] = {}
+    for name, shape in shapes.items():
+        if name not in arrays:
+            raise ValueError(f"no {name}")
+        array, kind = arrays[name], "boolean" if name in BOOLEAN else "floating"
+        if array.shape != tuple(shape):
+            raise ValueError(f"{name} of shape {list(array.shape)} instead of {shape}")
+        if not np.issubdtype(array.dtype, np.bool_ if name in BOOLEAN else np.floating):
+            raise ValueError(f"{name} of {array.dtype} instead of {kind} values")
+    for name, axes in ARRAYS[group].items():
+        if name == "*" or (name not in arrays and axes.endswith("?")):
+            continue
+        words = axes.removesuffix("?").replace("grid", "nx ny" if "y" in arrays else "nx").split()
+        shape = arrays[name].shape if name in arrays else ()
+        if len(shape) != len(words) or any(sizes.setdefault(word, n) != n or not n for word, n in zip(words, shape)):
+            raise ValueError(f"{name} of shape {list(shape)} instead of [{', '.join(words)}], with {sizes}")
+        if name in ("x", "y") and not (np.diff(arrays[name]) > 0).all():
+            raise ValueError(f"steps {name} that do not increase")
+    if ("nodes" in arrays) != ("weights" in arrays):
+        raise ValueError("nodes without weights, or weights without nodes")
+
+
+def _why_not_found(folder: Path, command: str, file: str) -> str:
+    expected = f"expected a folder written by `landscape {command}` (with {file}), got {folder}, "
+    if (folder / "probe" / ProbeRecord.FILE).is_file():
         return f"{expected}which is a run; name {folder / 'probe'}"
     if (previous := folder.with_name(f".{folder.name}.previous")).is_dir():
-        return f"{expected}whose replacement was interrupted; rename {previous} to {folder.name}, or probe again"
+        return f"{expected}whose replacement was interrupted; rename {previous} to {folder.name}, or {command} again"
     state = "which has none" if folder.is_dir() else "which is a file" if folder.exists() else "which does not exist"
-    return f"{expected}{state}; run `landscape probe CHECKPOINT` first"
+    return f"{expected}{state}; run `landscape {command} CHECKPOINT` first"
 
 
-def require_replaceable(folder: Path, kind: Kind = PROBE) -> None:
+def require_replaceable(folder: Path, kind: type[ProbeRecord | SliceRecord] = ProbeRecord) -> None:
     """Replacing deletes: raise ValueError unless folder is absent, empty or an older record of this kind."""
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / kind.file).is_file():
-        raise ValueError(
-            f"expected an empty folder or an older record to replace, got {folder} without {kind.file}; move it away"
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / kind.FILE).is_file():
+        raise InputError(
+            f"expected an empty folder or an older record to replace, got {folder} without {kind.FILE}; move it away"
         )
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"expected a folder to write a record to, got the file {folder}; move it away")
+        raise InputError(f"expected a folder to write a record to, got the file {folder}; move it away")
 
 
 def _clean_up_after_kills(folder: Path, previous: Path) -> None:
@@ -408,7 +334,3 @@ def _clean_up_after_kills(folder: Path, previous: Path) -> None:
     for partial in folder.parent.glob(f".{folder.name}.partial-*"):
         if time.time() - partial.stat().st_mtime > _ABANDONED_AFTER:
             shutil.rmtree(partial, ignore_errors=True)
-
-
-def _refuse_constant(constant: str) -> float:
-    raise ValueError(f"{constant} is not JSON")

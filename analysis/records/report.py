@@ -15,10 +15,12 @@ import plotly.graph_objects as go
 import plotly.io
 from plotly.offline import get_plotlyjs
 
-from analysis.records.family_table import INDICES, family_lines
-from analysis.records.findings import attribute_name, verdict
+from analysis.records.findings import attribute_name, findings
+from analysis.records.json_files import plain
 from analysis.records.quantities import limits, measured, quantity
-from analysis.records.records import Record, read_record
+from analysis.records.records import ProbeRecord, Record, read_record
+from analysis.records.schema import INDICES
+from analysis.records.tables import family_lines
 
 FILE = "report.html"
 PICTURES = {
@@ -35,7 +37,7 @@ def write_report(folder: str | Path, surface: str | None = None) -> Path:
     surface: `embedded_surface` of the record, where it is known already.  The page replaces an older one at once.  Raises
     FileNotFoundError or ValueError as `read_record` does.
     """
-    record = read_record(folder)
+    record = read_record(folder, ProbeRecord)
     path = record.folder / FILE
     temporary = path.with_suffix(".html.tmp")
     temporary.write_text(render_report(record, surface), encoding="utf-8")
@@ -54,7 +56,7 @@ def template_environment() -> jinja2.Environment:
     )
 
 
-def render_report(record: Record, surface: str | None = None) -> str:
+def render_report(record: Record[ProbeRecord], surface: str | None = None) -> str:
     """The page as text; surface: as for `write_report`."""
     environment = template_environment()
     environment.filters |= {
@@ -67,7 +69,9 @@ def render_report(record: Record, surface: str | None = None) -> str:
     surface = embedded_surface(record) if surface is None else surface
     return environment.get_template("report.html.jinja").render(
         data=record.data,
-        verdict=verdict(record.data),
+        counts=plain(record.data.counts),
+        provenance=plain(record.data.provenance),
+        findings=findings(record.data),
         pictures=pictures_in(record.folder, PICTURES),
         families=family_lines(record.data),
         indices=INDICES,
@@ -76,9 +80,9 @@ def render_report(record: Record, surface: str | None = None) -> str:
     )
 
 
-def interactive_surface(record: Record) -> go.Figure | None:
+def interactive_surface(record: Record[ProbeRecord]) -> go.Figure | None:
     """The recorded slice as a surface to turn and zoom, with the quadratic model where known; None without a slice."""
-    about = record.data.get("slice")
+    about = record.data.slice
     if about is None or "slice" not in record.arrays:
         return None
     arrays = record.arrays["slice"]
@@ -86,13 +90,13 @@ def interactive_surface(record: Record) -> go.Figure | None:
     figure = go.Figure()
     for name, label, colours, opacity in layers:
         if name in arrays:
-            change = np.where(np.isfinite(arrays[name]), arrays[name], np.nan) - about["center_loss"]
+            change = np.where(np.isfinite(arrays[name]), arrays[name], np.nan) - about.center_loss
             figure.add_surface(
                 x=arrays["x"], y=arrays["y"], z=change.T, name=label, colorscale=colours, opacity=opacity,
                 showscale=name == "loss", showlegend=True, visible=True if name == "loss" else "legendonly",
                 colorbar={"exponentformat": "power", "len": 0.8},
             )  # fmt: skip
-    names = [_plain(direction["name"]) for direction in about["directions"]]
+    names = [_escaped(direction.name) for direction in about.directions]
     figure.update_layout(
         scene={
             "xaxis_title": f"step along {names[0]}",
@@ -109,7 +113,7 @@ def interactive_surface(record: Record) -> go.Figure | None:
     return figure
 
 
-def embedded_surface(record: Record) -> str:
+def embedded_surface(record: Record[ProbeRecord]) -> str:
     """`interactive_surface` as a part of a page, empty without a slice."""
     figure = interactive_surface(record)
     if figure is None:
@@ -119,7 +123,7 @@ def embedded_surface(record: Record) -> str:
     return plotly.io.to_html(figure, full_html=False, include_plotlyjs=False, div_id="surface", config=settings)
 
 
-def _plain(text: str) -> str:
+def _escaped(text: str) -> str:
     """plotly reads some tags in its texts; a record's text has none to be read."""
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 

@@ -1,73 +1,114 @@
-"""The files of a run: their names, and its scores and seconds, small JSON files.
+"""The files beside a run's checkpoint: their names, their layout, and how they are read.
+
+    RUN/metrics.json      Scores, written by `analysis/train/command.py`
+    RUN/seconds.json      Seconds, written by `analysis/train/training_time.py`
+    RUN/trajectory.csv    a row for each record along the training, written by `analysis/train/trajectory.py`
+    OUT/compare.json      Comparison, written by `landscape compare`
 
 What is damaged is refused by the name of the file, with what to do.  Needs no torch.
 """
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
-from types import UnionType
-from typing import Any
+from typing import TYPE_CHECKING
 
-from analysis.records.records import decoded
+from msgspec import Struct
 
-RECORDS = "trajectory.csv"  # in a run
+from analysis.records.findings import ATTRIBUTES
+from analysis.records.json_files import read_json
+from analysis.records.schema import INDICES, Count, Number
+from landscape.errors import InputError
 
+if TYPE_CHECKING:
+    import pandas as pd
 
-NO_TIME = "no time"  # how the note of a record begins that was skipped for that
-
-
-CHECKPOINT, METRICS, SECONDS = "checkpoint.pt", "metrics.json", "seconds.json"
-NUMBER, MAYBE = int | float, int | float | None
-_OF_VIEWS = {"psnr": MAYBE, "ssim": MAYBE, "lpips": MAYBE}
-_METRICS = {
-    "gaussians": int,
-    "train": _OF_VIEWS,
-    "test": _OF_VIEWS,
-    "seconds": {"wall": MAYBE, "cpu": MAYBE, "threads": MAYBE},
-}
-_SECONDS = {"step": int, "wall": NUMBER, "cpu": NUMBER, "threads": int | None}
-_SCORE_AGAIN = "remove it and repeat the training's command with --resume, which scores again"
-_FORGET = "remove it: nothing but the time until its last checkpoint is lost"
-
-
-def read_scores(run: Path) -> dict[str, Any]:
-    """`metrics.json` of a run, see `analysis/train/command.py`; "Infinity" is read as the number."""
-    return _read(run / METRICS, _METRICS, "the scores of landscape train", _SCORE_AGAIN)
+CHECKPOINT, METRICS, SECONDS, RECORDS, COMPARISON = (
+    "checkpoint.pt", "metrics.json", "seconds.json", "trajectory.csv", "compare.json",
+)  # fmt: skip
+NO_TIME = "no time"  # how the note of a record of a trajectory begins that was skipped for that
+STATES = ("whole", "cut", "skipped")  # of a record of a trajectory
+TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy
+ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
+NUMBERS = (  # columns of a trajectory, empty where not determined; others may be there too
+    *(f"trace_{name}{part}" for name in ATTRIBUTES for part in ("", "_error", "_low", "_high")),
+    *(f"{name}{part}" for name in ENDS for part in ("", "_error")),
+    *(f"{name}{part}" for name in TRAJECTORY_INDICES for part in ("", "_low", "_high")),
+)
+_TRAJECTORY = "the records of landscape train --probe-every"
 
 
-def read_seconds(run: Path) -> dict[str, Any]:
-    """`seconds.json` of a run, see `analysis/train/training_time.py`."""
-    found = _read(run / SECONDS, _SECONDS, "the seconds of a training", _FORGET)
-    return {key: found.get(key) for key in _SECONDS}
+class ViewScores(Struct, kw_only=True):
+    """Means over views; psnr in dB, infinite for perfect images; lpips: None where it cannot be computed."""
+
+    psnr: Number = None
+    ssim: Number = None
+    lpips: Number = None
 
 
-def _read(path: Path, layout: Mapping[str, Any], what: str, remedy: str) -> dict[str, Any]:
-    """The object in a file.  ValueError where it is none, or where what it holds is not what the layout says."""
+class Clock(Struct, kw_only=True):
+    """Seconds by the clock and of all processors together; threads that a kernel might use, None where that changed."""
+
+    wall: Number = None
+    cpu: Number = None
+    threads: Number = None
+
+
+class Scores(Struct, kw_only=True):
+    """What a training came to; test: None without held-out views."""
+
+    gaussians: Count
+    train: ViewScores | None = None
+    test: ViewScores | None = None
+    seconds: Clock | None = None
+
+
+class Seconds(Struct, kw_only=True):
+    """How long the steps of a training took until its last checkpoint, at `step`; fields as in `Clock`."""
+
+    step: Count
+    wall: float
+    cpu: float
+    threads: int | None = None
+
+
+class Comparison(Struct, kw_only=True):
+    """runs: label -> folder of the run's record."""
+
+    runs: dict[str, str]
+
+
+def read_scores(run: Path) -> Scores:
+    remedy = "remove it and repeat the training's command with --resume, which scores again"
+    return read_json(run / METRICS, Scores, "the scores of landscape train", remedy)
+
+
+def read_seconds(run: Path) -> Seconds:
+    remedy = "remove it: nothing but the time until its last checkpoint is lost"
+    return read_json(run / SECONDS, Seconds, "the seconds of a training", remedy)
+
+
+def read_comparison(folder: Path) -> Comparison:
+    return read_json(folder / COMPARISON, Comparison, "the runs of landscape compare", "compare again")
+
+
+def read_trajectory(path: Path) -> "pd.DataFrame":
+    """The rows of a trajectory, whose steps and NUMBERS are numbers.  ValueError names the file and the column."""
+    import pandas as pd  # a third of a second of imports
+
     try:
-        data = decoded(json.loads(path.read_text(encoding="utf-8")))
-    except ValueError as error:
-        raise ValueError(f"expected {what} in {path}, got a damaged file ({error}); {remedy}") from None
-    if not isinstance(data, dict):
-        raise ValueError(f"expected {what} in {path}, got {data!r} instead of an object; {remedy}")
-    if wrong := _wrong(data, layout, ""):
-        raise ValueError(f"expected {what} in {path}, got {wrong}; {remedy}")
-    return data
-
-
-def _wrong(value: Any, layout: type | UnionType | Mapping[str, Any], where: str) -> str:
-    """What is not as the layout says, and where; empty where all is.
-
-    layout: a type, or a key's own layout in an object, which may be null or missing; keys that it does not name pass.
-
-    >>> _wrong({"step": 3, "test": {"psnr": "high"}}, {"step": int, "test": {"psnr": float | None}}, "")
-    "'high' as test.psnr"
-    """
-    if not isinstance(layout, Mapping):
-        return "" if isinstance(value, layout) else f"{value!r} as {where}"
-    if value is None:
-        return ""
-    if not isinstance(value, dict):
-        return f"{value!r} as {where}"
-    found = (_wrong(value.get(key), part, f"{where}.{key}".lstrip(".")) for key, part in layout.items())
-    return next(filter(None, found), "")
+        table = pd.read_csv(path)
+    except (ValueError, OverflowError) as error:  # pandas names no file
+        raise InputError(f"expected {_TRAJECTORY} in {path}, got {error}") from None
+    for name in ("state", "step", "gaussians", *NUMBERS):
+        if name not in table:
+            raise InputError(f"expected {_TRAJECTORY} in {path}, got no column {name}")
+        column = pd.Series(table[name])
+        if name == "state":
+            wrong, what = ~column.isin(STATES), " or ".join(STATES)
+        else:
+            numbers = pd.Series(pd.to_numeric(column, errors="coerce"))
+            wrong, what = numbers.isna() & (column.notna() | (name in ("step", "gaussians"))), "a number"
+            table[name] = numbers
+        if wrong.any():
+            row = int(wrong.to_numpy().argmax())
+            raise InputError(f"expected {what} as {name} in {path}, got {column.iloc[row]!r} in row {row + 1}")
+    return table

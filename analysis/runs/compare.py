@@ -9,7 +9,6 @@ What must be the same for curvatures to be comparable at all is demanded: the lo
 must be kept in mind beside that is said: other starts, steps, budgets, checks that failed, numbers of Gaussians.
 """
 
-import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,18 +16,22 @@ from typing import Any
 
 from rich.console import Console
 
-from analysis.runs.compare_table import Run, compare_table, comparison, frame
 from analysis.console.drawing import draw
-from analysis.console.options import CompareOptions, DeviceName, ProbeOptions
+from analysis.console.options import DeviceName
 from analysis.console.overrides import leaves
-from analysis.records.quantities import quantity
-from analysis.records.records import FILE, read_record
-from analysis.records.report import pictures_in, template_environment
-from analysis.records.run_files import CHECKPOINT, METRICS, read_scores
+from analysis.probe.options import ProbeOptions
 from analysis.records.findings import of_budgets
+from analysis.records.json_files import json_text, plain
+from analysis.records.quantities import quantity
+from analysis.records.records import ProbeRecord, read_record
+from analysis.records.report import pictures_in, template_environment
+from analysis.records.run_files import CHECKPOINT, COMPARISON, METRICS, Comparison, Scores, read_scores
+from analysis.runs.compare_table import Run, compare_table, comparison, frame
+from analysis.runs.options import CompareOptions
+from landscape.errors import InputError
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
-PAGE, TABLE, INDEX, PROBE = "compare.html", "compare.csv", "compare.json", "probe"
+PAGE, TABLE, PROBE = "compare.html", "compare.csv", "probe"
 PICTURES = {
     "compare_traces": "Traces by attribute, with their intervals. Filled: positive; open: negative; crossed: not decided.",
     "compare_densities": "How many directions are at least so curved, down (left) and up (right). Thin: each start "
@@ -49,13 +52,13 @@ def run_compare(options: CompareOptions) -> int:
     missing = [path for path, checkpoint in zip(options.runs, checkpoints) if not probed(path, checkpoint)]
     if missing and not options.probe:
         again = "; ".join(f"landscape probe {path / CHECKPOINT}" for path in missing)
-        raise ValueError(
+        raise InputError(
             f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
         )
     for path in missing:
         _probe(path, options.device)
     runs = [
-        Run(path, label, checkpoint, _metrics(path), read_record(path / PROBE).data)
+        Run(path, label, checkpoint, _scores(path), read_record(path / PROBE, ProbeRecord).data)
         for path, label, checkpoint in zip(options.runs, labels, checkpoints)
     ]
     out = options.out or common / "compare"
@@ -66,7 +69,7 @@ def run_compare(options: CompareOptions) -> int:
 def _folders(runs: Sequence[Path]) -> list[Path]:
     folders = [run.resolve() for run in runs]
     if len(set(folders)) < 2 or len(set(folders)) < len(folders):
-        raise ValueError(f"expected at least two runs, each once, got {', '.join(map(str, runs)) or 'none'}")
+        raise InputError(f"expected at least two runs, each once, got {', '.join(map(str, runs)) or 'none'}")
     return folders
 
 
@@ -82,7 +85,7 @@ def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> No
         first = of(checkpoints[0])
         for label, checkpoint in zip(labels, checkpoints, strict=True):
             if of(checkpoint) != first:
-                raise ValueError(
+                raise InputError(
                     f"expected runs with the same {what}, as their curvatures are not comparable else, got {first} in "
                     f"{labels[0]} and {of(checkpoint)} in {label}; compare them apart"
                 )
@@ -90,9 +93,9 @@ def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> No
 
 def probed(run: Path, checkpoint: Checkpoint) -> bool:
     """Whether the run has a record of this checkpoint's step."""
-    if not (run / PROBE / FILE).is_file():
+    if not (run / PROBE / ProbeRecord.FILE).is_file():
         return False
-    return read_record(run / PROBE).data["provenance"].get("iteration") == checkpoint.training.step
+    return read_record(run / PROBE, ProbeRecord).data.provenance.iteration == checkpoint.training.step
 
 
 def _probe(run: Path, device: DeviceName) -> None:
@@ -102,27 +105,27 @@ def _probe(run: Path, device: DeviceName) -> None:
     run_probe(ProbeOptions(path, device=device), ["landscape", "probe", str(path), "--device", device])
 
 
-def _metrics(run: Path) -> dict[str, Any]:
-    """Nothing of a run that was stopped before it was scored."""
-    return read_scores(run) if (run / METRICS).is_file() else {}
+def _scores(run: Path) -> Scores | None:
+    """None of a run that was stopped before it was scored."""
+    return read_scores(run) if (run / METRICS).is_file() else None
 
 
 def cautions(runs: Sequence[Run]) -> list[str]:
     """What differs between the runs, or is missing from some, that a reader has to keep in mind."""
     settings: dict[str, Callable[[Run], Any]] = {
-        "scene": lambda run: run.data["provenance"].get("scene"),
+        "scene": lambda run: run.data.provenance.scene,
         "steps": lambda run: run.checkpoint.training.step,
         "start": lambda run: getattr(run.checkpoint.scene, "start", None),
         "seed": lambda run: run.checkpoint.training.config.seed,
         "held-out views": lambda run: run.checkpoint.scene.test,
         "random background": lambda run: run.checkpoint.training.config.random_background,
-        "precision": lambda run: run.data["provenance"].get("dtype"),
+        "precision": lambda run: run.data.provenance.dtype,
     }
     lines = [f"The {what} are not the same." if what.endswith("s") else f"The {what} is not the same."
              for what, of in settings.items() if any(of(run) != of(runs[0]) for run in runs)]  # fmt: skip
-    if len({row["unit"] for run in runs for row in run.data.get("families", [])}) > 1:
+    if len({row.unit for run in runs for row in run.data.families or ()}) > 1:
         lines.append("The units of the families are not the same.")
-    found = [leaves(run.data["provenance"].get("settings", {})) for run in runs]
+    found = [leaves(run.data.provenance.settings or {}) for run in runs]
     different = [
         f"{name} {', '.join(str(settings.get(name)) for settings in found)}"
         for name in dict.fromkeys(name for settings in found for name in settings)
@@ -132,11 +135,12 @@ def cautions(runs: Sequence[Run]) -> list[str]:
         order = ", ".join(run.label for run in runs)
         lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
     for run in runs:
-        failed = [name.replace("_", " ") for name, check in run.data["checks"].items() if check["passed"] is False]
+        failed = [name.replace("_", " ") for name, check in run.data.checks.items() if check.passed is False]
         lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]
-        lines += [f"{run.label}: {line.text}" for line in of_budgets(run.data["eigenvalues"])]
-        lines += [f"{run.label} was not scored." for _ in range(not run.metrics)]
-    if without := [run for run in runs if not run.data.get("split_control")]:
+        ends = {"max": run.data.eigenvalues.max.reason, "min": run.data.eigenvalues.min.reason}
+        lines += [f"{run.label}: {line.text}" for line in of_budgets(ends)]
+        lines += [f"{run.label} was not scored."] * (run.scores is None)
+    if without := [run for run in runs if not run.data.split_control]:
         lines.append(
             "Anisotropy depends on the number of Gaussians; how much, the split control says, which is missing: "
             + "; ".join(f"landscape probe {run.folder / CHECKPOINT} --split-control" for run in without)
@@ -148,14 +152,14 @@ def split_controls(runs: Sequence[Run]) -> list[str]:
     """What the split changes in the images of each run that has a split control."""
     lines = []
     for run in runs:
-        if control := run.data.get("split_control"):
-            rows = run.data.get("families", [])
-            seen = next((row["gaussians"] for row in rows if row["split"]), control["gaussians"])
-            lost = control["gaussians"] - seen
+        if control := run.data.split_control:
+            seen = next((row.gaussians for row in run.data.families or () if row.split), control.gaussians)
+            lost = (
+                f", and {control.gaussians - seen:,} of the halves touch no pixel." if seen < control.gaussians else "."
+            )
             lines.append(
-                f"{run.label}: the split into {control['gaussians']:,} halves changes the images by {quantity(control['rms'])} "
-                f"(root mean square; {quantity(control['psnr'])} dB)"
-                + (f", and {lost:,} of the halves touch no pixel." if lost else ".")
+                f"{run.label}: the split into {control.gaussians:,} halves changes the images by {quantity(control.rms)} "
+                f"(root mean square; {quantity(control.psnr)} dB){lost}"
             )
     return lines
 
@@ -166,8 +170,8 @@ def _write(runs: Sequence[Run], out: Path) -> None:
     rows, notes = comparison(runs), cautions(runs)
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode())
-    index = {"runs": {run.label: str((run.folder / PROBE).resolve()) for run in runs}}
-    write_atomically(out / INDEX, (json.dumps(index, indent=2) + "\n").encode())
+    index = Comparison(runs={run.label: str((run.folder / PROBE).resolve()) for run in runs})
+    write_atomically(out / COMPARISON, json_text(plain(index)).encode())
     try:
         draw("compare", out)
     except RuntimeError as error:  # the numbers stand without pictures
@@ -191,5 +195,5 @@ def render_page(runs: Sequence[Run], rows: Sequence[Any], notes: Sequence[str], 
         notes=notes,
         controls=split_controls(runs),
         pictures=pictures_in(out, PICTURES),
-        objective=runs[0].data.get("objective", {}),
+        objective=runs[0].data.objective,
     )

@@ -4,22 +4,24 @@ OUT/compare.csv     section, quantity, run, value, low, high, note: low and high
                     value -+ residual of an eigenvalue, of the bracket of an index
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from analysis.records.family_table import INDICES, OPERATOR_NAMES, Cell, bracketed
-from analysis.console.overrides import leaves
-from analysis.records.quantities import PLACES, SCORES, measured, quantity
 from analysis.records.findings import attribute_name
+from analysis.records.quantities import PLACES, SCORES, measured, quantity
+from analysis.records.records import ProbeRecord
+from analysis.records.run_files import ENDS, Clock, Scores
+from analysis.records.schema import INDICES, Anisotropy, Depth, Effect, End, Index, Operator, Trace
+from analysis.records.tables import OPERATOR_NAMES, Cell, bracketed, factor
+from splat.model.typed import leaves
 from splat.training.checkpoint import Checkpoint
-from splat.training.state import Method
+from splat.training.state import MethodSettings
 
 FAMILIES = "families"  # a section that only the page and the file show
 DEPTH = "depth over lateral"
@@ -27,13 +29,13 @@ DEPTH = "depth over lateral"
 
 @dataclass(frozen=True)
 class Run:
-    """A run and its probe: the folder, what it is called here, its checkpoint, and the data of metrics and record."""
+    """A run and its probe: the folder, its name here, its checkpoint, its scores (None: not scored), and the record."""
 
     folder: Path
     label: str
     checkpoint: Checkpoint
-    metrics: Mapping[str, Any]
-    data: Mapping[str, Any]
+    scores: Scores | None
+    data: ProbeRecord
 
 
 @dataclass(frozen=True)
@@ -65,69 +67,70 @@ def comparison(runs: Sequence[Run]) -> list[Row]:
 
 def _about(runs: Sequence[Run]) -> Iterable[Row]:
     configs = [run.checkpoint.training.config for run in runs]
-    seconds = [run.metrics.get("seconds") or {} for run in runs]
+    clocks = [(run.scores and run.scores.seconds) or Clock() for run in runs]
     yield Row("run", "method", tuple(_method(config.method) for config in configs))
     yield Row("run", "steps", tuple(_plain(run.checkpoint.training.step) for run in runs))
-    yield Row("run", "Gaussians", tuple(_plain(run.data["counts"]["gaussians"]) for run in runs))
-    yield Row("run", "in sight", tuple(_plain(run.data["counts"]["visible_gaussians"]) for run in runs))
-    for clock, name in (("wall", "seconds of training"), ("cpu", "seconds of all processors")):
-        yield Row("run", name, tuple(_plain(each.get(clock)) for each in seconds))
+    yield Row("run", "Gaussians", tuple(_plain(run.data.counts.gaussians) for run in runs))
+    yield Row("run", "in sight", tuple(_plain(run.data.counts.visible_gaussians) for run in runs))
+    yield Row("run", "seconds of training", tuple(_plain(clock.wall) for clock in clocks))
+    yield Row("run", "seconds of all processors", tuple(_plain(clock.cpu) for clock in clocks))
 
 
 def _scores(runs: Sequence[Run]) -> Iterable[Row]:
     for part, words in (("test", "held-out views"), ("train", "training views")):
         for key, name in SCORES.items():
-            values = [(run.metrics.get(part) or {}).get(key) for run in runs]
+            values = [getattr(getattr(run.scores, part, None), key, None) for run in runs]
             if any(value is not None for value in values):
                 yield Row(words, name, tuple(_plain(value, PLACES[key]) for value in values))
 
 
 def _curvature(runs: Sequence[Run]) -> Iterable[Row]:
-    for name in runs[0].data["traces"]:
-        entries = tuple(_trace(run.data["traces"][name]) for run in runs)
-        yield Row("trace", attribute_name(name), entries)
-    for end, words in (("max", "largest eigenvalue"), ("min", "smallest eigenvalue")):
-        yield Row("spectrum", words, tuple(_end(run.data["eigenvalues"][end]) for run in runs))
+    for name in dict.fromkeys(name for run in runs for name in run.data.traces):
+        yield Row("trace", attribute_name(name), tuple(_trace(run.data.traces.get(name)) for run in runs))
+    yield Row("spectrum", ENDS["lambda_max"], tuple(_end(run.data.eigenvalues.max) for run in runs))
+    yield Row("spectrum", ENDS["lambda_min"], tuple(_end(run.data.eigenvalues.min) for run in runs))
 
 
 def _indices(runs: Sequence[Run]) -> Iterable[Row]:
     """Each index of the whole Hessian; beneath it what the split multiplies it by, where that was measured."""
     for name in INDICES:
-        yield Row("anisotropy", name.replace("_", " "), tuple(_index(run.data["anisotropy"].get(name)) for run in runs))
-        factors = tuple(_effect(run.data, "hessian", "all", name) for run in runs)
-        if any(entry is not MISSING for entry in factors):
-            yield Row("anisotropy", "  split control", factors)
+        entries = tuple(_index(getattr(run.data.anisotropy, name) or None) for run in runs)
+        yield Row("anisotropy", name.replace("_", " "), entries)
+        yield from _split("anisotropy", runs, "hessian", "all", name)
 
 
 def _depth(runs: Sequence[Run]) -> Iterable[Row]:
     """Positions along the rays over those across them, where a run's probe has that."""
-    found = [run.data.get("depth") for run in runs]
+    found = [run.data.depth for run in runs]
     if not any(found):
         return
-    gradients = tuple(MISSING if depth is None else _plain(depth["gradient_ratio"]) for depth in found)
-    yield Row(DEPTH, "gradient", gradients)
-    curvatures = tuple(MISSING if depth is None else _index(depth["curvature_ratio"]) for depth in found)
-    yield Row(DEPTH, "curvature", curvatures)
-    lengths = dict.fromkeys(row["pixels"] for depth in found if depth for row in depth["rises"])
-    for pixels in lengths:
-        entries = tuple(_rise(depth, pixels) for depth in found)
-        yield Row(DEPTH, f"rise at {pixels:g} px", entries)
+    yield Row(DEPTH, "gradient", tuple(MISSING if depth is None else _plain(depth.gradient_ratio) for depth in found))
+    yield Row(DEPTH, "curvature", tuple(_index(depth and depth.curvature_ratio) for depth in found))
+    for pixels in dict.fromkeys(row.pixels for depth in found if depth for row in depth.rises):
+        yield Row(DEPTH, f"rise at {pixels:g} px", tuple(_rise(depth, pixels) for depth in found))
 
 
 def _families(runs: Sequence[Run]) -> Iterable[Row]:
     """Of every operator and block that a run has families of."""
-    rows = [row for run in runs for row in run.data.get("families", []) if not row["split"]]
-    for operator, block in dict.fromkeys((row["operator"], row["block"]) for row in rows):
-        for index in INDICES:
-            entries = tuple(_family(run.data, operator, block, index) for run in runs)
-            words = f"{OPERATOR_NAMES[operator]}, {attribute_name(block)}: {index.replace('_', ' ')}"
-            yield Row(FAMILIES, words, entries)
-            factors = tuple(_effect(run.data, operator, block, index) for run in runs)
-            if any(entry is not MISSING for entry in factors):
-                yield Row(FAMILIES, "  split control", factors)
+    of_runs: list[dict[tuple[Operator, str], Anisotropy]] = [
+        {(row.operator, row.block): row.indices for row in run.data.families or () if not row.split} for run in runs
+    ]
+    for operator, block in dict.fromkeys(key for rows in of_runs for key in rows):
+        for name in INDICES:
+            words = f"{OPERATOR_NAMES[operator]}, {attribute_name(block)}: {name.replace('_', ' ')}"
+            indices = [getattr(rows.get((operator, block)), name, None) or None for rows in of_runs]
+            yield Row(FAMILIES, words, tuple(_index(index) for index in indices))
+            yield from _split(FAMILIES, runs, operator, block, name)
 
 
-def _method(method: Method) -> Entry:
+def _split(section: str, runs: Sequence[Run], operator: Operator, block: str, name: str) -> Iterable[Row]:
+    """What splitting every Gaussian in two multiplies an index by, where a run has that."""
+    effects = [_effect(run.data, operator, block, name) for run in runs]
+    if any(effects):
+        yield Row(section, "  split control", tuple(_index(effect, factor(effect)) for effect in effects))
+
+
+def _method(method: MethodSettings) -> Entry:
     """Its name, and beneath it the settings that are not the published ones.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS
@@ -153,51 +156,38 @@ def _plain(value: float | str | None, places: int | None = None) -> Entry:
     return Entry(number, Cell(quantity(number) if places is None else f"{number:.{places}f}"))
 
 
-def _trace(entry: Mapping[str, Any]) -> Entry:
-    cell = Cell(measured(entry["value"], entry["standard_error"]), "", entry.get("note", ""))
-    return Entry(entry["value"], cell, entry.get("low"), entry.get("high"))
+def _trace(trace: Trace | None) -> Entry:
+    if trace is None:
+        return MISSING
+    cell = Cell(measured(trace.value, trace.standard_error), "", trace.note or "")
+    return Entry(trace.value, cell, trace.low, trace.high)
 
 
-def _end(entry: Mapping[str, Any]) -> Entry:
-    value, residual = entry["value"], entry["residual"]
-    cell = Cell(measured(value, residual), "", entry.get("reason", ""))
+def _end(end: End) -> Entry:
+    value, residual = end.value, end.residual
+    cell = Cell(measured(value, residual), "", end.reason or "")
     if value is None or residual is None:
         return Entry(value, cell)
     return Entry(value, cell, value - residual, value + residual)
 
 
-def _index(entry: Mapping[str, Any] | None) -> Entry:
-    return MISSING if entry is None else Entry(entry["value"], bracketed(entry), entry["low"], entry["high"])
+def _index(index: Index | Effect | None, cell: Cell | None = None) -> Entry:
+    """cell: how it is written, where not as `bracketed` has it."""
+    return MISSING if index is None else Entry(index.value, cell or bracketed(index), index.low, index.high)
 
 
-def _rise(depth: Mapping[str, Any] | None, pixels: float) -> Entry:
+def _rise(depth: Depth | None, pixels: float) -> Entry:
     """The ratio of the rises at steps of this length, with two standard errors."""
-    for row in depth["rises"] if depth else ():
-        if row["pixels"] == pixels and row["ratio"] is not None and row["ratio_error"] is not None:
-            ratio, error = row["ratio"], row["ratio_error"]
-            return Entry(ratio, Cell(measured(ratio, error)), ratio - 2 * error, ratio + 2 * error)
+    for row in depth.rises if depth else ():
+        if row.pixels == pixels and row.ratio is not None and row.ratio_error is not None:
+            ends = row.ratio - 2 * row.ratio_error, row.ratio + 2 * row.ratio_error
+            return Entry(row.ratio, Cell(measured(row.ratio, row.ratio_error)), *ends)
     return MISSING
 
 
-def _family(data: Mapping[str, Any], operator: str, block: str, index: str) -> Entry:
-    for row in data.get("families", []):
-        if (row["operator"], row["block"], row["split"]) == (operator, block, False):
-            return _index(row["indices"][index])
-    return MISSING
-
-
-def _effect(data: Mapping[str, Any], operator: str, block: str, index: str) -> Entry:
-    """What splitting every Gaussian in two multiplies an index by."""
-    for effect in (data.get("split_control") or {}).get("effects", []):
-        if (effect["operator"], effect["block"], effect["index"]) == (operator, block, index):
-            found = _index(effect)
-            known = found.cell.value != quantity(None)
-            return (
-                Entry(found.value, Cell(f"× {found.cell.value}", found.cell.bracket), found.low, found.high)
-                if known
-                else found
-            )
-    return MISSING
+def _effect(data: ProbeRecord, operator: Operator, block: str, name: str) -> Effect | None:
+    effects = data.split_control.effects if data.split_control else ()
+    return next((each for each in effects if (each.operator, each.block, each.index) == (operator, block, name)), None)
 
 
 def frame(rows: Sequence[Row], labels: Sequence[str]) -> pd.DataFrame:

@@ -16,20 +16,16 @@ from rich.markup import escape
 from rich.table import Table
 
 from analysis.console.drawing import draw
-from analysis.records.family_table import bracketed
-from analysis.console.options import TrajectoryOptions
-from analysis.records.quantities import measured, quantity
-from analysis.records.run_files import CHECKPOINT
 from analysis.records.findings import ATTRIBUTES, attribute_name
-from analysis.records.run_files import NO_TIME, RECORDS
+from analysis.records.quantities import measured, quantity
+from analysis.records.run_files import CHECKPOINT, ENDS, NO_TIME, RECORDS, TRAJECTORY_INDICES, read_trajectory
+from analysis.records.schema import Index
+from analysis.records.tables import bracketed
+from analysis.runs.options import TrajectoryOptions
+from landscape.errors import InputError
 
 TABLE, PICTURE = "trajectories.csv", "trajectories.png"
-VALUES = {
-    **{f"trace_{name}": f"trace of {attribute_name(name)}" for name in ATTRIBUTES},
-    "lambda_max": "largest eigenvalue",
-    "lambda_min": "smallest eigenvalue",
-}
-INDICES = ("literal", "saddle", "share", "effective_rank")
+VALUES = {f"trace_{name}": f"trace of {attribute_name(name)}" for name in ATTRIBUTES} | ENDS
 
 
 def run_trajectory(options: TrajectoryOptions) -> int:
@@ -68,9 +64,9 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
     """The rows of all runs.  FileNotFoundError or ValueError where a run has none, or is named twice."""
     folders = [run.resolve() for run in runs]
     if not folders:
-        raise ValueError("expected at least one run, got none; name the folders that landscape train wrote")
+        raise InputError("expected at least one run, got none; name the folders that landscape train wrote")
     if len(set(folders)) < len(folders):
-        raise ValueError(f"expected every run once, got {', '.join(str(run) for run in runs)}")
+        raise InputError(f"expected every run once, got {', '.join(str(run) for run in runs)}")
     common = Path(os.path.commonpath(folders))
     tables = []
     for run, folder in zip(runs, folders, strict=True):
@@ -82,20 +78,15 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
                 f"expected {RECORDS} in the run {run}, found none; train with --probe-every, as in "
                 f"landscape train SCENE --out {run} --probe-every 500"
             )
-        try:
-            table = pd.read_csv(path)
-        except ValueError as error:  # pandas names no file
-            raise ValueError(f"expected the records of landscape train --probe-every in {path}, got {error}") from None
-        if not {"step", "state", *VALUES, *INDICES} <= set(table.columns):
-            raise ValueError(f"expected the records of landscape train --probe-every in {path}, got another table")
+        table = read_trajectory(path)
         name = folder.name if folder == common else folder.relative_to(common).as_posix()
         table.insert(0, "run", name)
         tables.append(table)
     together = pd.concat(tables, ignore_index=True)
     if set(together["state"]) == {"skipped"}:
-        note = str(together["note"].iloc[-1])
+        note = str(together["note"].iloc[-1]) if "note" in together else "why is not said"
         remedy = "; train with a larger --probe-share" if note.startswith(NO_TIME) else ""
-        raise ValueError(
+        raise InputError(
             f"expected at least one record that was not skipped, got {len(together)} skipped ({note}){remedy}"
         )
     return together
@@ -122,7 +113,7 @@ def first_and_last(table: pd.DataFrame) -> Table:
         result.add_row("Gaussians", *(f"{end['gaussians']:,}" for end in ends))
         for key, title in VALUES.items():
             result.add_row(title, *(measured(_known(end[key]), _known(end[f"{key}_error"])) for end in ends))
-        for key in INDICES:
+        for key in TRAJECTORY_INDICES:
             result.add_row(key.replace("_", " "), *(_bracketed(end, key) for end in ends))
     return result
 
@@ -130,7 +121,7 @@ def first_and_last(table: pd.DataFrame) -> Table:
 def _bracketed(row: Mapping[str, Any], key: str) -> str:
     value, low, high = (_known(row[name]) for name in (key, f"{key}_low", f"{key}_high"))
     if low is None or high is None:
-        return bracketed({"value": value, "low": low, "high": high, "note": ""}).value
+        return bracketed(Index(value=value, low=low, high=high, note="")).value
     return f"{quantity(value)} ({quantity(low)} to {quantity(high)})"
 
 

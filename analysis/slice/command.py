@@ -6,15 +6,15 @@
     slice           renders where needed, in parallel, interpolated elsewhere (`landscape.slices.refinement`)
     finite steps    along a line: second differences at steps over four decades, beside the infinitesimal curvature
 
-What is found on the way is kept in `.NAME.unfinished` beside the record, from which the same command continues; the
-directory goes when the record is complete.  A line moves all Gaussians, also those in sight at one of its ends only.
+What is found on the way is kept in `.NAME.unfinished` beside the record, from which the same command continues, whatever
+ended this one; the directory goes when the record is complete.  A line moves all Gaussians, also those in sight at one of its
+ends only.
 """
 
 import os
 import shlex
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict
 from functools import partial
 from math import ceil, inf
 from pathlib import Path
@@ -27,16 +27,16 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
-from analysis.console.options import SliceOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.command import scene_objective
 from analysis.probe.measurement import evaluation, slice_notes
-from analysis.probe.record import loss_name
+from analysis.probe.record import loss_name, provenance_of
 from analysis.records.findings import of_slice, resolved
-from analysis.records.provenance import provenance, require_seed
+from analysis.records.provenance import require_seed
 from analysis.records.quantities import measured, quantity
-from analysis.records.records import SLICE, record_folder, require_replaceable
+from analysis.records.records import SliceRecord, record_folder, refusing_damage, require_replaceable
+from analysis.records.schema import FiniteProbe
 from analysis.slice.directions import (
     RISE,
     Direction,
@@ -47,18 +47,20 @@ from analysis.slice.directions import (
     find_directions,
     recorded_eigenvectors,
 )
-from analysis.slice.record import Found, slice_arrays, slice_data
+from analysis.slice.options import SliceOptions
+from analysis.slice.record import Found, slice_arrays, slice_record
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
+from landscape.errors import InputError
 from landscape.probes import split
 from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
 from splat.backend.device import device_named
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
-from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint, load_checkpoint
 
 COARSE = {1: 9, 2: 21}  # points that an adaptive slice begins with, by its dimension
+SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
 
@@ -69,7 +71,7 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     device = device_named(options.device)
     settings = _settings(options, shape, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
-    require_replaceable(out, SLICE)
+    require_replaceable(out, SliceRecord)
     unfinished = out.with_name(f".{out.name}.unfinished")
     console, start = Console(stderr=True), perf_counter()
     stages = Stages(console)
@@ -80,22 +82,19 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         scene = checkpoint.load_scene(options.checkpoint, options.scene)
         objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
     with stages:
-        known = _known(options.checkpoint.parent / "probe", unfinished, checkpoint, objective)
+        notes: list[str] = []
+        known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:
             found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
-        except ValueError:  # it would not end better the next time
-            shutil.rmtree(unfinished, ignore_errors=True)
-            raise
-        except KeyboardInterrupt:
+        except BaseException:
             if unfinished.is_dir():
-                again = shlex.join(command)
-                console.print(f"what was rendered is kept; to continue: {again}", soft_wrap=True, highlight=False)
+                console.print(f"what was rendered is kept; to continue: {shlex.join(command)}", **SAID)
             raise
-        data = slice_data(found, objective, checkpoint.training.config.loss)
-        data["notes"] = slice_notes(found.slice)
-        data["provenance"] = _provenance(options, command, settings, checkpoint, scene)
-        with record_folder(out, SLICE) as folder:
-            write_with_pictures(folder, data, slice_arrays(found), SLICE, stages, start)
+        made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
+        made.other = None if options.other is None else str(options.other)
+        data = slice_record(found, objective, notes + slice_notes(found.slice), made)
+        with record_folder(out, SliceRecord) as folder:
+            write_with_pictures(folder, data, slice_arrays(found), stages, start)
     shutil.rmtree(unfinished, ignore_errors=True)
     _conclude(data, out)
     return 0
@@ -108,11 +107,11 @@ def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> Slic
     holdout = min(SliceSettings.holdout, ceil(options.points**shape.dimension / 8))
     if options.all_points:
         if options.max_renders is not None:
-            raise ValueError("expected --all-points or --max-renders, got both; leave one out")
+            raise InputError("expected --all-points or --max-renders, got both; leave one out")
         return SliceSettings(tolerance=None, workers=workers)
     least = COARSE[shape.dimension] + holdout + 1
     if options.max_renders is not None and options.max_renders < least:
-        raise ValueError(
+        raise InputError(
             f"expected --max-renders of at least {least}, with which a slice of dimension {shape.dimension} can begin and be "
             f"judged, got {options.max_renders}"
         )
@@ -124,7 +123,7 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     """The other checkpoint's parameters, quaternions as unit ones on the near side."""
     here, there = checkpoint.training.gaussians, load_checkpoint(path).training.gaussians
     if (len(here), here.sh_degree) != (len(there), there.sh_degree):
-        raise ValueError(
+        raise InputError(
             f"expected a checkpoint of {len(here):,} Gaussians with SH degree {here.sh_degree} at the other end of the line, "
             f"got {len(there):,} with {there.sh_degree} in {path}; take two of one training after densification has ended"
         )
@@ -135,13 +134,17 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     return there.flat
 
 
-def _known(probe: Path, unfinished: Path, checkpoint: Checkpoint, objective: SceneObjective) -> list[Tensor]:
-    """Eigenvectors of an interrupted run and of the probe."""
-    kept = unfinished / "eigenvectors.npy"
-    found = [torch.from_numpy(np.load(kept, allow_pickle=False))] if kept.is_file() else []
-    center = objective.active.flat
-    name, precision = loss_name(checkpoint.training.config.loss), torch.finfo(center.dtype).eps
-    found += recorded_eigenvectors(probe, name, objective.loss(center), precision)
+def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list[str]) -> list[Tensor]:
+    """Eigenvectors of an interrupted run and of the probe.  notes: is told which of them cannot be read."""
+    kept, found, center = unfinished / "eigenvectors.npy", [], objective.active.flat
+    if kept.is_file():
+        try:
+            with kept.open("rb") as stream, refusing_damage("eigenvectors", kept, "they were computed again"):
+                found.append(torch.from_numpy(np.load(stream, allow_pickle=False)))
+        except InputError as error:
+            notes.append(str(error))
+    name, precision = loss_name(objective.loss_settings), torch.finfo(center.dtype).eps
+    found += recorded_eigenvectors(probe, name, objective.loss(center), precision, notes)
     return [vectors.to(center.device) for vectors in found]
 
 
@@ -210,55 +213,37 @@ def _evaluation(objective: SceneObjective, workers: int) -> Loss:
     def evaluate(flat: Tensor) -> Evaluation:
         try:
             return inner(flat)
-        except ValueError as error:
-            raise ValueError(f"expected steps to where there is an image, got one that is too long ({error})") from None
+        except InputError as error:
+            raise InputError(f"expected steps to where there is an image, got one that is too long ({error})") from None
 
     return evaluate
 
 
-def _provenance(
-    options: SliceOptions, command: Sequence[str], settings: SliceSettings, checkpoint: Checkpoint, scene: Scene
-) -> dict[str, Any]:
-    return provenance(
-        options.seed,
-        checkpoint=str(options.checkpoint),
-        other=None if options.other is None else str(options.other),
-        scene=scene.name,
-        scene_folder=str(scene.root),
-        views=list(checkpoint.scene.train),
-        iteration=checkpoint.training.step,
-        dtype=str(checkpoint.training.gaussians.flat.dtype).removeprefix("torch."),
-        threads=torch.get_num_threads(),
-        command=shlex.join(command),
-        settings=asdict(settings),
-    )
-
-
-def _conclude(data: dict[str, Any], out: Path) -> None:
+def _conclude(data: SliceRecord, out: Path) -> None:
     """The curvatures, how well the slice is known, and the files to open."""
-    say = partial(Console().print, soft_wrap=True, highlight=False)
-    for direction in data["slice"]["directions"]:
-        curvature = measured(direction["curvature"], direction["residual"] or 0.0)
-        text = f"{direction['name']}: curvature {curvature}, slope {quantity(direction['slope'])}"
-        say(f"{text}; one curvature unit is a step of {quantity(direction['unit'])}")
-    if data["finite_probe"]:
-        say(_finite_curvature(data["finite_probe"]))
-    for line in of_slice(data["slice"]):
+    say = partial(Console().print, **SAID)
+    for direction in data.slice.directions:
+        curvature = measured(direction.curvature, direction.residual or 0.0)
+        text = f"{direction.name}: curvature {curvature}, slope {quantity(direction.slope or 0.0)}"
+        say(f"{text}; one curvature unit is a step of {quantity(direction.unit)}")
+    if data.finite_probe:
+        say(_finite_curvature(data.finite_probe))
+    for line in of_slice(data.slice):
         say(line.text)
-    for note in data["notes"]:
+    for note in data.notes:
         say(note, style="yellow")
-    say(f"{data['timing']['total']:.1f} s, {data['counts']['renders']:,} renders of a view")
+    say(f"{data.timing['total']:.1f} s, {data.counts.renders:,} renders of a view")
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))) or "none"
-    say(f"pictures: {pictures}; numbers: {SLICE.file}, in {out}")
+    say(f"pictures: {pictures}; numbers: {data.FILE}, in {out}")
 
 
-def _finite_curvature(probe: dict[str, Any]) -> str:
-    """Between what the curvature lies that the steps see which round-off does not hide."""
-    sure, steps = np.array(resolved(probe)), np.array(probe["steps"])
+def _finite_curvature(probe: FiniteProbe) -> str:
+    """The range of the curvatures at the steps where round-off does not hide them."""
+    sure, steps = np.array(resolved(probe)), np.array(probe.steps)
     if not sure.any():
         return f"at finite steps: round-off hides the curvature at all {len(sure)} steps"
-    values = np.array(probe["curvatures"], float)[sure]
-    crossed = int((sure & np.array(probe["crossed"] or [False] * len(sure))).sum())
+    values = np.array(probe.curvatures, float)[sure]
+    crossed = int((sure & np.array(probe.crossed or [False] * len(sure))).sum())
     across = f", {crossed} of them with another order of splats" if crossed else ""
     return (
         f"at finite steps: curvature from {quantity(values.min())} to {quantity(values.max())}, at the {sure.sum()} of "

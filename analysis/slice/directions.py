@@ -9,21 +9,21 @@
     curvature unit  sqrt(2 rise L / |d.H d|): the step within which the curvature alone changes the loss by rise L
 
 Of two kinds in one plane the second (then e₁⊥, say) is its part at a right angle to the first, drawn out to its old length.
-Eigenvectors that are known already are taken where H itself confirms them: |H v - lambda v| within the tolerance.
+Eigenvectors that are known already are taken where H itself confirms them: |H v - lambda v| within the tolerance, lambda
+falling.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isclose, nan
+from math import isclose
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from analysis.console.options import Along
-from analysis.records.records import read_record
+from analysis.records.records import ProbeRecord, read_record
+from analysis.slice.options import Along
 from landscape import (
     EigenSettings,
     curvature_reach,
@@ -35,6 +35,7 @@ from landscape import (
     random_directions,
     symmetric_axis,
 )
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
 from landscape.results import Progress
 from landscape.slices.grid_evaluations import SAME_LOSS
@@ -62,7 +63,7 @@ class Shape:
     ) -> "Shape":
         """The shape that was asked for; ValueError where the wishes contradict each other."""
         if twice := [kind for kind in dict.fromkeys(along) if along.count(kind) > 1]:
-            raise ValueError(
+            raise InputError(
                 f"expected directions of different kinds, got --along {twice[0]} twice; leave one out, and for a plane of one "
                 "kind, eigenvectors or random, give --dimension 2"
             )
@@ -70,17 +71,17 @@ class Shape:
         named = list(along) or [default]
         kinds: tuple[Along, ...] = tuple(sorted(named, key=lambda kind: kind != "line"))  # a line keeps its ends
         if len(kinds) > 2:
-            raise ValueError(f"expected one or two directions, got {' and '.join(kinds)}; slice again for the others")
+            raise InputError(f"expected one or two directions, got {' and '.join(kinds)}; slice again for the others")
         if ("line" in kinds) != other:
             given = "one more checkpoint; add --along line" if other else "no other checkpoint; name it"
-            raise ValueError(f"expected two checkpoints for a line and one otherwise, got {given}")
+            raise InputError(f"expected two checkpoints for a line and one otherwise, got {given}")
         most = 2 if len(kinds) == 2 or set(kinds) <= PLANES else 1
         wanted = most if dimension is None else dimension
         if wanted > most or (wanted == 1 and len(kinds) == 2):
             advice = "give --along once" if wanted == 1 else "give --along twice"
-            raise ValueError(f"expected directions for dimension {wanted}, got {' and '.join(kinds)}; {advice}")
+            raise InputError(f"expected directions for dimension {wanted}, got {' and '.join(kinds)}; {advice}")
         if len(radii) > wanted or any(not 0 < radius < float("inf") for radius in radii):
-            raise ValueError(f"expected at most {wanted} radii, finite and above 0, got {list(radii)}")
+            raise InputError(f"expected at most {wanted} radii, finite and above 0, got {list(radii)}")
         symmetric_axis(1.0, points)  # says what is wrong with their number
         each = radii if len(radii) == wanted else [*radii, *radii, None, None][:wanted]
         return cls(kinds, wanted, tuple(each))
@@ -183,7 +184,8 @@ def largest_eigenvectors(
         product, exact = operator.apply(vectors).double(), vectors.double()
         values = (exact * product).sum(dim=0)
         residuals = (product - values * exact).norm(dim=0)
-        if (residuals <= RTOL * values.abs()).all() and ((exact.norm(dim=0) - 1).abs() <= RTOL).all():
+        ordered = bool((values.diff() <= RTOL * values.abs().max()).all())  # the steepest first
+        if ordered and (residuals <= RTOL * values.abs()).all() and ((exact.norm(dim=0) - 1).abs() <= RTOL).all():
             report(1, 1, "known already")
             return vectors, residuals.tolist()
         start = vectors
@@ -192,15 +194,23 @@ def largest_eigenvectors(
     return pairs.vectors, pairs.residuals.tolist()
 
 
-def recorded_eigenvectors(folder: Path, loss: str, value: float, precision: float) -> list[Float[Tensor, "n k"]]:
-    """Those of the probe recorded in a folder, if any, where its objective is the Hessian of this loss with this value."""
+def recorded_eigenvectors(
+    folder: Path, loss: str, value: float, precision: float, notes: list[str]
+) -> list[Float[Tensor, "n k"]]:
+    """Those of the probe recorded in a folder, if any, where its objective is the Hessian of this loss with this value.
+
+    notes: is told where there is a record that cannot be read.
+    """
+    if not (folder / ProbeRecord.FILE).is_file():
+        return []
     try:
-        record = read_record(folder)
-    except (FileNotFoundError, ValueError):
+        record = read_record(folder, ProbeRecord)
+    except (FileNotFoundError, InputError) as error:
+        notes.append(f"eigenvectors were not taken from the probe: {error}")
         return []
-    about = record.data.get("objective", {})
-    same = (about.get("loss"), about.get("operator")) == (loss, "hessian")
-    if not same or not isclose(about.get("value", nan), value, rel_tol=SAME_LOSS * precision):
+    about = record.data.objective
+    same = (about.loss, about.operator) == (loss, "hessian") and about.value is not None
+    if not same or not isclose(about.value or 0.0, value, rel_tol=SAME_LOSS * precision):
         return []
-    vectors: np.ndarray | None = record.arrays.get("eigenvectors", {}).get("largest")
+    vectors = record.arrays.get("eigenvectors", {}).get("largest")
     return [] if vectors is None else [torch.from_numpy(vectors)]

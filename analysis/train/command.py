@@ -33,27 +33,31 @@ from rich.text import Text
 from torch import Tensor
 
 from analysis.console.interruption import interruption
-from analysis.console.options import TrainOptions
-from analysis.console.overrides import assignments, leaves, overridden
+from analysis.console.overrides import assignments, overridden
+from analysis.records.json_files import plain
 from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
+from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
+from landscape.errors import InputError
 from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
+from splat.model.typed import leaves
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, split_scene, usual_views
 from splat.scenes.view import View
-from splat.training.checkpoint import SceneReference, load_checkpoint, save_checkpoint, write_atomically
+from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
 from splat.training.densify import DensifySettings
-from splat.training.loop import train
+from splat.training.loop import prepare, train
 from splat.training.methods.methods import METHODS
+from splat.training.scene_reference import SceneReference
 from splat.training.score.evaluate import Evaluation, ViewScore, evaluate, have_masks
 from splat.training.score.perceptual import MissingPerceptual, load_lpips
 from splat.training.start import initial_gaussians
-from splat.training.state import Method, TrainConfig, Training
+from splat.training.state import TrainConfig, Training
 
 HISTORY, RENDERS = "history.csv", "test"
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -75,7 +79,7 @@ SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and 
 def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     """Train, or continue, a run; returns the exit code.  command: as typed, for the message on how to resume."""
     if options.checkpoint_every < 1:
-        raise ValueError(f"expected checkpoint_every of at least 1, got {options.checkpoint_every}")
+        raise InputError(f"expected checkpoint_every of at least 1, got {options.checkpoint_every}")
     along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_share)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
@@ -93,8 +97,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         start = initial_gaussians(scene, views, 0, generator=generator, source=options.start)
         training = Training.start(start, scene.extent(split.train), config)
     training.move(device)
-    # refuses views that lack what the method needs, before there is a folder
-    training.regularizer.begin(training, views)
+    prepare(training, views)  # refuses what cannot be trained before there is a folder
     if not options.resume:
         _create_run(out, training, reference, keep_start=along is not None)
 
@@ -104,8 +107,9 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         f"{scene.name}: {len(views)} views to train on, {len(held_out)} held out, {camera.width} x {camera.height} px, "
         f"{len(training.gaussians)} Gaussians"
     )
-    if later := _beginnings_after(config.iterations, config.method):
-        console.print(later, **WARNING)
+    for words in (_scaled(_asked(options, scene), config), _not_reached(config)):
+        if words:
+            console.print(words, **WARNING)
     trajectory = None if along is None else Trajectory(out, training, views, along)
     if trajectory and (hopeless := trajectory.hopeless):
         console.print(hopeless, **WARNING)
@@ -119,15 +123,29 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     return 0
 
 
-def _beginnings_after(iterations: int, method: Method) -> str:
-    """Which parts of a method a run of so many steps does not reach, in words; none: empty."""
-    starts = {name: value for name, value in asdict(method).items() if name == "warm_up" or name.endswith("_start")}
-    late = [f"{name} = {value}" for name, value in starts.items() if value >= iterations]
+def _scaled(asked: TrainConfig, config: TrainConfig) -> str:
+    """Which settings of a published schedule were scaled to the length of the training, in words; none: empty."""
+    before, after = (leaves(asdict(settings)) for settings in (asked, config))
+    changes = [
+        f"{key.removeprefix('method.')} {before[key]} to {after[key]}" for key in after if before[key] != after[key]
+    ]
+    if not changes:
+        return ""
+    return (
+        f"{config.method.name}: its published schedule is scaled to {config.iterations} steps: {', '.join(changes)}; "
+        "--set KEY=VALUE gives one of them another value"
+    )
+
+
+def _not_reached(config: TrainConfig) -> str:
+    """Which parts of a method a run does not reach, in words; none: empty."""
+    parts = config.method.parts(config)
+    late = [f"{name} = {begins}" for name, begins in parts.items() if begins >= config.iterations]
     if not late:
         return ""
     return (
-        f"{method.name}: what begins after step {' and '.join(late)} is not reached in {iterations} steps; take more "
-        f"--iterations, or --set {late[0].split()[0]}={iterations // 2}"
+        f"{config.method.name}: what begins after step {' and '.join(late)} is not reached in {config.iterations} steps; take "
+        f"more --iterations, or --set {late[0].split()[0]}={config.iterations // 2}"
     )
 
 
@@ -144,9 +162,15 @@ def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig
 
 
 def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
+    """The settings asked for, with the schedule of the method scaled to the length, but for what --set gives."""
+    config = _asked(options, scene)
+    return config.method.scaled(config, [key.removeprefix("method.") for key in assignments(options.set)])
+
+
+def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
     red, green, blue = scene.background.tolist()
     if options.method not in METHODS:
-        raise ValueError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}")
+        raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}")
     config = TrainConfig(
         iterations=options.iterations,
         seed=options.seed,
@@ -161,7 +185,7 @@ def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
     for key, name in OPTIONS.items():
         given = getattr(options, name)
         if key in changes and given != getattr(TrainOptions, name):
-            raise ValueError(
+            raise InputError(
                 f"expected one value for {key}, got --set {key}={changes[key]} beside the option --{name.replace('_', '-')}, "
                 f"which is {given}; leave one out"
             )
@@ -206,7 +230,7 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: 
     }
     for key, value in saved.items():
         if asked[key] != value:
-            raise ValueError(
+            raise InputError(
                 f"expected the settings that the run in {path.parent} was started with, {key} = {value}, got "
                 f"{asked[key]}; {remedy}"
             )
@@ -246,8 +270,8 @@ def _follow(
 
 
 def _write_history(training: Training, path: Path) -> None:
-    if training.regularizer.history:
-        write_atomically(path, pd.DataFrame(training.regularizer.history).to_csv(index=False).encode())
+    if training.method.history:
+        write_atomically(path, pd.DataFrame(training.method.history).to_csv(index=False).encode())
 
 
 class _Rate(ProgressColumn):
@@ -295,7 +319,7 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
         "train": _scores(seen),
         "test": _scores(tested) if tested else None,
         "seconds": asdict(TrainingTime.read(out)),
-        "provenance": provenance(config.seed, checkpoint=str(out / CHECKPOINT)),
+        "provenance": plain(provenance(config.seed, checkpoint=str(out / CHECKPOINT))),
     }
     write_atomically(out / METRICS, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
     console.print(_table(seen, tested))

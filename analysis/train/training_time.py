@@ -30,7 +30,10 @@ class TrainingTime:
     @classmethod
     def read(cls, run: Path) -> "TrainingTime":
         """That of a run folder; none where it has not been saved yet."""
-        return cls(**read_seconds(run)) if (run / SECONDS).is_file() else cls()
+        if not (run / SECONDS).is_file():
+            return cls()
+        found = read_seconds(run)
+        return cls(found.step, found.wall, found.cpu, found.threads)
 
     def write(self, run: Path) -> None:
         write_atomically(run / SECONDS, (json.dumps(asdict(self)) + "\n").encode())

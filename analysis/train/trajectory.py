@@ -43,8 +43,8 @@ import numpy as np
 import pandas as pd
 import torch
 
-from analysis.records.family_table import INDICES
 from analysis.records.run_files import NO_TIME, RECORDS
+from analysis.records.schema import INDICES
 from landscape import (
     CountingOperator,
     EigenSettings,
@@ -55,6 +55,7 @@ from landscape import (
     spectral_density,
 )
 from landscape.eigen.pairs import EigenEnds
+from landscape.errors import InputError
 from landscape.probes import split
 from landscape.spectrum.anisotropy import Anisotropy
 from landscape.spectrum.density import ActiveSpace
@@ -94,9 +95,9 @@ class TrajectorySettings:
 
     def __post_init__(self) -> None:
         if self.every < 1:
-            raise ValueError(f"expected probe_every of at least 1 step, got {self.every}")
+            raise InputError(f"expected probe_every of at least 1 step, got {self.every}")
         if not self.share > 0:
-            raise ValueError(f"expected probe_share above 0 (0.1: a tenth of the time of the steps), got {self.share}")
+            raise InputError(f"expected probe_share above 0 (0.1: a tenth of the time of the steps), got {self.share}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +140,7 @@ class Trajectory:
             start = perf_counter()
             try:
                 row |= self._recorded(allowed)
-            except ValueError as error:  # nothing in sight, say: the training may still find its way
+            except InputError as error:  # such as no Gaussian in sight: the training may still find its way
                 row["note"] = str(error)
             row["seconds"] = perf_counter() - start
         row["time_share"] = (spent + row["seconds"]) / trained
@@ -201,10 +202,7 @@ class Trajectory:
 
 
 def measure(
-    objective: SceneObjective,
-    generator: torch.Generator,
-    settings: TrajectorySettings,
-    seconds: float = inf,
+    objective: SceneObjective, generator: torch.Generator, settings: TrajectorySettings, seconds: float = inf
 ) -> Found:
     """One record, in about so many seconds, counted from the call."""
     began, streams = perf_counter(), [split(generator) for _ in range(3)]
@@ -216,7 +214,7 @@ def measure(
     operator = CountingOperator(hessian)
     traces = exact_traces(objective, streams[0], replace(settings.traces, max_seconds=max(left() / 2, 0.0)))
     fixed = perf_counter() - began
-    leads = BlockEigenvectors(objective, *objective.gaussian_blocks).leads()
+    leads = BlockEigenvectors(objective, *objective.gaussian_blocks).warm_start()
     ends = extreme_eigenpairs(operator, streams[1], replace(settings.eigen, max_seconds=max(left(), 0.0)), leads)
     least = fixed + FEWEST_MATVECS * operator.seconds / operator.matvecs
     short = [f"trace of {name}" for name, trace in traces.items() if trace.reason == "time budget"]

@@ -18,6 +18,7 @@ from torch import Tensor
 from landscape.eigen.krylov import Krylov
 from landscape.eigen.pairs import EigenEnds
 from landscape.eigen.ritz import EigenSettings, Goal
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
 from landscape.results import Progress
 
@@ -46,7 +47,7 @@ def extreme_eigenpairs(
     """
     n = operator.dim
     if settings.wanted > n:
-        raise ValueError(f"expected at most {n} eigenpairs of an operator with {n} rows, got {settings.wanted}")
+        raise InputError(f"expected at most {n} eigenpairs of an operator with {n} rows, got {settings.wanted}")
     space = Krylov(operator, generator, settings, start)
     deadline = monotonic() + settings.max_seconds
     strictness, near, before = 1.0, False, None

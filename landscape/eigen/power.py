@@ -13,6 +13,7 @@ from time import monotonic
 import torch
 
 from landscape.eigen.pairs import EigenEnds, Eigenpairs
+from landscape.errors import InputError
 from landscape.linalg import norm
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.probes import draw_probes
@@ -33,7 +34,7 @@ class PowerSettings:
 
     def __post_init__(self) -> None:
         if not (self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and self.max_matvecs >= 1):
-            raise ValueError(
+            raise InputError(
                 f"expected rtol, atol, max_seconds >= 0 and max_matvecs >= 1, got {self.rtol}, {self.atol}, "
                 f"{self.max_seconds} and {self.max_matvecs}"
             )

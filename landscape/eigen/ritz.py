@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.linalg import norm
 from landscape.operators.operator import SymmetricOperator, product
 
@@ -28,7 +29,7 @@ class EigenSettings:
     rtol, atol: a pair is good enough when its residual |H v - lambda v| is max(rtol |lambda|, atol) or less.
     basis: vectors kept at a time, `block` more in work (the memory budget): at least largest + smallest + 3 block.
     block: vectors per application of the operator; more than one helps with multiple eigenvalues and where the operator is
-        cheaper per vector in blocks (`fastest_block` measures that).
+        cheaper per vector in blocks.
     noise: length of a random vector added to a given start of unit length, so that an end that the start misses is still
         found.  The shorter, the fewer products from a good start, and the likelier to take the neighbour of an end for it,
         where they are about rtol apart: with rtol = 1% and two lowest eigenvalues 1.5% apart in 40% of the runs at 1, in 85%
@@ -49,19 +50,19 @@ class EigenSettings:
 
     def __post_init__(self) -> None:
         if min(self.largest, self.smallest) < 0 or self.wanted < 1 or self.block < 1:
-            raise ValueError(
+            raise InputError(
                 f"expected largest, smallest >= 0 (not both 0) and block >= 1, "
                 f"got {self.largest}, {self.smallest} and {self.block}"
             )
         if not (self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and 0 < self.noise < inf):
-            raise ValueError(
+            raise InputError(
                 f"expected rtol, atol, max_seconds >= 0 and a finite noise > 0, got {self.rtol}, {self.atol}, "
                 f"{self.max_seconds} and {self.noise}"
             )
         if self.basis < self.wanted + 3 * self.block:
-            raise ValueError(f"expected a basis of at least {self.wanted + 3 * self.block} vectors, got {self.basis}")
+            raise InputError(f"expected a basis of at least {self.wanted + 3 * self.block} vectors, got {self.basis}")
         if self.max_matvecs < 2 * self.wanted + self.block + 2:
-            raise ValueError(f"expected max_matvecs >= {2 * self.wanted + self.block + 2}, got {self.max_matvecs}")
+            raise InputError(f"expected max_matvecs >= {2 * self.wanted + self.block + 2}, got {self.max_matvecs}")
 
     @property
     def wanted(self) -> int:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator
 from landscape.probes import draw_probes
 from landscape.results import Number, finite_or_none
@@ -91,7 +92,7 @@ def check_operator(
     True
     """
     if vectors < 2:
-        raise ValueError(f"expected at least 2 vectors to compare, got {vectors}")
+        raise InputError(f"expected at least 2 vectors to compare, got {vectors}")
     tolerance = ROUND_OFFS * torch.finfo(operator.dtype).eps if tolerance is None else tolerance
     Z = draw_probes(operator.dim, vectors, generator, operator.dtype)
     products = operator.apply(torch.cat([Z, SCALE * Z[:, :1]], dim=1))
@@ -168,7 +169,7 @@ def _best_step(
 ) -> DerivativeCheck:
     """The smallest relative discrepancy: large steps see the next derivative, small ones round-off."""
     if not steps or min(steps) <= 0:
-        raise ValueError(f"expected positive steps, got {tuple(steps)}")
+        raise InputError(f"expected positive steps, got {tuple(steps)}")
     here = signature(center) if signature else None
     kept, errors, skipped = [], [], 0
     for step in steps:

@@ -23,6 +23,7 @@ import torch.distributed as dist
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, require_vectors
 
 Item = TypeVar("Item")
@@ -33,7 +34,8 @@ class Ranks:
     """The processes of a group, seen from the one of number `rank` (from 0) out of `size`.
 
     Every method but `share` is collective: all processes have to call it, in the same order.  group: all processes where None.
-    device: where tensors are exchanged; they come back to the device that they were on.
+    device: where tensors are exchanged; they come back to the device that they were on.  A single rank exchanges nothing and
+    needs no group: `ALONE`.
     """
 
     rank: int
@@ -45,7 +47,7 @@ class Ranks:
     def joined(cls, group: dist.ProcessGroup | None = None) -> "Ranks":
         """The group that this process has joined (all processes where None).  ValueError where none is initialised."""
         if not (dist.is_available() and dist.is_initialized()):
-            raise ValueError(
+            raise InputError(
                 "expected an initialised process group, got none; start with torchrun and call "
                 'torch.distributed.init_process_group("gloo") first ("nccl" on GPUs)'
             )
@@ -62,7 +64,7 @@ class Ranks:
         ('ab', 'cde')
         """
         if len(items) < self.size:
-            raise ValueError(
+            raise InputError(
                 f"expected at least one {name} for each of {self.size} ranks, got {len(items)}; start fewer processes"
             )
         return items[self.rank * len(items) // self.size : (self.rank + 1) * len(items) // self.size]
@@ -77,6 +79,8 @@ class Ranks:
 
     def gather(self, x: Shaped[Tensor, "..."]) -> list[Shaped[Tensor, "..."]]:
         """x of every rank, in their order; x has to have the same shape and dtype on all."""
+        if self.size == 1:
+            return [x]
         parts = [torch.empty_like(x, device=self.device) for _ in range(self.size)]
         with _exchange():
             dist.all_gather(parts, x.to(self.device).contiguous(), group=self.group)
@@ -84,16 +88,20 @@ class Ranks:
 
     def require_same(self, name: str, value: object) -> None:
         """Raise ValueError on all ranks unless the value's text is the same on each."""
+        if self.size == 1:
+            return
         digest = int.from_bytes(blake2b(str(value).encode(), digest_size=8).digest(), "little", signed=True)
         if not self._agree(digest):
-            raise ValueError(f"expected the same {name} on every rank, got {value} on rank {self.rank} of {self.size}")
+            raise InputError(f"expected the same {name} on every rank, got {value} on rank {self.rank} of {self.size}")
 
     def require_same_vectors(self, V: Float[Tensor, "n k"]) -> None:
         """Raise ValueError on all ranks unless they have as many vectors, with the same sum of all entries' bit patterns."""
+        if self.size == 1:
+            return
         bits = {2: torch.int16, 4: torch.int32, 8: torch.int64}[V.element_size()]
         fingerprint = int(V.contiguous().view(bits).sum(dtype=torch.int64))  # exact, in whatever order it is added up
         if not self._agree(V.shape[1], fingerprint):
-            raise ValueError(
+            raise InputError(
                 f"expected the same vectors on every rank, got others on some (here {V.shape[1]}); seed the generators "
                 "alike, leave time budgets infinite, and run on machines of one kind"
             )
@@ -105,10 +113,15 @@ class Ranks:
         return torch.equal(least[: len(numbers)], ~least[len(numbers) :])
 
     def _reduced(self, x: Tensor, operation: dist.ReduceOp.RedOpType) -> Tensor:
+        if self.size == 1:
+            return x
         total = x.to(self.device, copy=True).contiguous()
         with _exchange():
             dist.all_reduce(total, operation, group=self.group)
         return total.to(x.device)
+
+
+ALONE = Ranks(0, 1)  # a process that shares nothing
 
 
 @contextmanager

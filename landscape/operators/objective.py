@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.operators.operator import require_blocks, require_vectors
 
 
@@ -35,13 +36,10 @@ class ObjectiveHessian:
     """
 
     def __init__(
-        self,
-        loss: Callable[[Tensor], Tensor],
-        point: Float[Tensor, " n"],
-        blocks: Mapping[str, slice] | None = None,
+        self, loss: Callable[[Tensor], Tensor], point: Float[Tensor, " n"], blocks: Mapping[str, slice] | None = None
     ) -> None:
         if point.ndim != 1 or not point.is_floating_point():
-            raise ValueError(
+            raise InputError(
                 f"expected one flat vector of floats as point, got {point.dtype} of shape {tuple(point.shape)}"
             )
         self.dim, self.dtype = point.numel(), point.dtype
@@ -71,13 +69,13 @@ def _require_loss(value: object) -> None:
     """ValueError unless it is a tensor of one finite number."""
     if not isinstance(value, Tensor):
         kind = type(value).__name__
-        raise ValueError(
+        raise InputError(
             f"expected one scalar tensor as loss, got {kind}; keep to torch, without .item(), float or numpy"
         )
     if value.ndim != 0:
-        raise ValueError(f"expected one scalar tensor as loss, got {value.dtype} of shape {tuple(value.shape)}")
+        raise InputError(f"expected one scalar tensor as loss, got {value.dtype} of shape {tuple(value.shape)}")
     if not torch.isfinite(value):
-        raise ValueError(f"expected a finite scalar loss at the point, got {value.detach()}")
+        raise InputError(f"expected a finite scalar loss at the point, got {value.detach()}")
 
 
 def _traced_gradient(value: Tensor, point: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
@@ -86,7 +84,7 @@ def _traced_gradient(value: Tensor, point: Float[Tensor, " n"]) -> Float[Tensor,
     if value.requires_grad:
         (gradient,) = torch.autograd.grad(value, point, create_graph=True, allow_unused=True)
     if gradient is None:
-        raise ValueError(
+        raise InputError(
             "expected a loss computed from the point, got one that torch does not trace back to it; leave out .detach(), "
             "torch.tensor(...) and torch.no_grad(), or add 0 * point.sum() to a loss that is constant"
         )

@@ -20,6 +20,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
+
 
 @runtime_checkable
 class SymmetricOperator(Protocol):
@@ -58,7 +60,7 @@ def product(operator: SymmetricOperator, V: Float[Tensor, "n k"], finite: bool =
     """
     HV = operator.apply(V)
     if HV.shape != V.shape or HV.dtype != V.dtype:
-        raise ValueError(
+        raise InputError(
             f"expected products H V of the shape {tuple(V.shape)} and dtype {V.dtype} of V, got {tuple(HV.shape)} and "
             f"{HV.dtype} in {', '.join(operator.blocks)}"
         )
@@ -70,7 +72,7 @@ def product(operator: SymmetricOperator, V: Float[Tensor, "n k"], finite: bool =
 def require_finite(operator: SymmetricOperator, finite: bool) -> None:
     """ValueError that says of whose products it is, unless they are finite."""
     if not finite:
-        raise ValueError(
+        raise InputError(
             f"expected finite products H V, got NaN or infinity in {', '.join(operator.blocks)}; check the parameters with "
             "check_operator"
         )
@@ -88,9 +90,9 @@ def require_blocks(blocks: Mapping[str, slice], n: int) -> dict[str, slice]:
     end = 0
     for name, block in sorted(blocks.items(), key=lambda item: (item[1].start or 0, item[1].stop or 0)):
         if block.start is None or block.stop is None or block.step not in (None, 1):
-            raise ValueError(f"expected block {name!r} as slice(start, stop), got {block}")
+            raise InputError(f"expected block {name!r} as slice(start, stop), got {block}")
         if not end <= block.start <= block.stop <= n:
-            raise ValueError(
+            raise InputError(
                 f"expected disjoint blocks within 0..{n}, got {name!r} = {block.start}..{block.stop} after {end}"
             )
         end = block.stop
@@ -111,13 +113,13 @@ class DenseOperator:
 
     def __init__(self, matrix: Float[Tensor, "n n"], blocks: Mapping[str, slice] | None = None) -> None:
         if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-            raise ValueError(f"expected a square matrix, got shape {tuple(matrix.shape)}")
+            raise InputError(f"expected a square matrix, got shape {tuple(matrix.shape)}")
         if not torch.isfinite(matrix).all():
-            raise ValueError("expected a finite matrix, got NaN or infinite entries")
+            raise InputError("expected a finite matrix, got NaN or infinite entries")
         gap = float((matrix - matrix.T).abs().max()) if matrix.numel() else 0.0
         largest = float(matrix.abs().max()) if matrix.numel() else 0.0
         if gap > matrix.shape[0] * torch.finfo(matrix.dtype).eps * largest:
-            raise ValueError(f"expected a symmetric matrix, got |A - A^T| = {gap:.1e}; use (A + A.T) / 2")
+            raise InputError(f"expected a symmetric matrix, got |A - A^T| = {gap:.1e}; use (A + A.T) / 2")
         self.matrix = matrix
         self.dim = matrix.shape[0]
         self.dtype = matrix.dtype

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.linalg import group_sums
 from landscape.operators.operator import require_blocks
 
@@ -62,7 +63,7 @@ def random_directions(
     sizes = _lengths(center.detach().double()[:, None], groups) / _lengths(d, groups)
     d *= sizes[groups]
     if not (torch.isfinite(d).all() and d.any()):
-        raise ValueError("expected parameters that are finite and not all zero, got others; normalise by other sizes")
+        raise InputError("expected parameters that are finite and not all zero, got others; normalise by other sizes")
     return d.to(center.dtype)
 
 
@@ -83,7 +84,7 @@ def gradient_direction(gradient: Float[Tensor, " n"]) -> Float[Tensor, "n 1"]:
     """
     length = torch.linalg.vector_norm(gradient.double())
     if gradient.ndim != 1 or not (torch.isfinite(length) and length > 0):
-        raise ValueError(
+        raise InputError(
             f"expected a flat gradient that is finite and not zero, got shape {tuple(gradient.shape)} and length {length}"
         )
     return (gradient.double() / length).to(gradient.dtype)[:, None]
@@ -96,15 +97,15 @@ def line_between(start: Float[Tensor, " n"], end: Float[Tensor, " n"]) -> Float[
     tensor([[0., 3.]])
     """
     if start.ndim != 1 or start.shape != end.shape:
-        raise ValueError(
+        raise InputError(
             f"expected two checkpoints with the same parameters, got {tuple(start.shape)} and {tuple(end.shape)}; "
             "densification changes their number: compare checkpoints after it has ended"
         )
     difference = end.double() - start.double()
     if not torch.isfinite(difference).all():
-        raise ValueError("expected two checkpoints with finite parameters, got one that has others")
+        raise InputError("expected two checkpoints with finite parameters, got one that has others")
     if not difference.any():
-        raise ValueError("expected two checkpoints that differ, got equal ones; name another second one")
+        raise InputError("expected two checkpoints that differ, got equal ones; name another second one")
     return difference.to(start.dtype)[:, None]
 
 
@@ -119,11 +120,11 @@ def orthonormal(directions: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
     """
     lengths = torch.linalg.vector_norm(directions.double(), dim=0)
     if directions.ndim != 2 or not (torch.isfinite(lengths) & (lengths > 0)).all():
-        raise ValueError(f"expected finite directions (n, d) that are not zero, got lengths {lengths.tolist()}")
+        raise InputError(f"expected finite directions (n, d) that are not zero, got lengths {lengths.tolist()}")
     q, r = torch.linalg.qr(directions.double() / lengths)
     sines = r.diagonal()
     if (sines.abs() < SMALLEST_SINE).any():
-        raise ValueError(
+        raise InputError(
             f"expected directions that are not parallel, got sines {sines.abs().tolist()} of their angles to those before"
         )
     return (q * sines.sign()).to(directions.dtype)

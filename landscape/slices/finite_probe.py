@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.results import Number, Progress, finite_or_none
 from landscape.slices.grid_evaluations import Loss
@@ -100,7 +101,7 @@ def finite_probe(
     at = _Line(loss, origin, v, center.dtype, total, progress)
     middle, here = at(0.0)
     if not isfinite(middle):
-        raise ValueError(f"expected a finite objective at the centre, got {middle}")
+        raise InputError(f"expected a finite objective at the centre, got {middle}")
     # theta_i / v_i, weighted by v_i^4: of the parameters that make up the direction
     rounding = torch.finfo(center.dtype).eps * float((origin * v).norm() / v.square().norm())
     spacing = max(steps[0] / CLOSER, ROUNDINGS * rounding)

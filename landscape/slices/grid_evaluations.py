@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.results import Progress
 
 Evaluation = float | Tensor | tuple[float | Tensor, Hashable]
@@ -61,7 +62,7 @@ class GridEvaluations:
         self._workers, self._store, self._progress = workers, store, progress
         self.center_loss, self._here = evaluated_at(loss, self._center)
         if not isfinite(self.center_loss):
-            raise ValueError(f"expected a finite objective at the centre, got {self.center_loss}")
+            raise InputError(f"expected a finite objective at the centre, got {self.center_loss}")
         self.has_signature = self._here is not None
         count = len(points)
         self.value, self.known, self.crossed = np.full(count, np.nan), np.zeros(count, bool), np.zeros(count, bool)
@@ -133,12 +134,12 @@ class GridEvaluations:
                 has_signature = bool(archive["has_signature"])
                 columns = [archive[name].tolist() for name in ("points", "values", "crossed")]
             stored = {point: (value, crossed) for point, value, crossed in zip(*columns, strict=True)}
-        except (ValueError, OSError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
-            raise ValueError(
+        except (ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
+            raise InputError(
                 f"expected a slice's evaluations in {self._store}, got a damaged file ({error}); {advice}"
             ) from None
         if digest != self._digest:
-            raise ValueError(
+            raise InputError(
                 f"expected evaluations of this slice in {self._store}, got another center, other directions or "
                 f"coordinates; {advice}"
             )
@@ -152,7 +153,7 @@ class GridEvaluations:
     def _require_same(self, where: str, here: float, stored: float, alike: bool, advice: str) -> None:
         room = SAME_LOSS * torch.finfo(self._center.dtype).eps * max(abs(here), abs(self.center_loss))
         if not (alike and abs(here - stored) <= room):
-            raise ValueError(
+            raise InputError(
                 f"expected evaluations of this objective in {self._store}, which is {here} {where}, got one that is {stored}; "
                 f"{advice}"
             )

@@ -17,6 +17,7 @@ from time import monotonic
 import numpy as np
 import torch
 
+from landscape.errors import InputError
 from landscape.results import StopReason
 from landscape.slices.grid_evaluations import GridEvaluations
 from landscape.slices.sparse_grid import SparseGrid
@@ -47,18 +48,18 @@ class SliceSettings:
 
     def __post_init__(self) -> None:
         if self.tolerance is not None and not 0 < self.tolerance < 1:
-            raise ValueError(f"expected a tolerance between 0 and 1, or None for every point, got {self.tolerance}")
+            raise InputError(f"expected a tolerance between 0 and 1, or None for every point, got {self.tolerance}")
         if min(self.holdout, self.batch, self.workers) < 1:
-            raise ValueError(
+            raise InputError(
                 f"expected holdout, batch and workers of at least 1, got {self.holdout}, {self.batch} and {self.workers}"
             )
         if not (self.max_evaluations >= 1 and self.max_seconds > 0):
-            raise ValueError(
+            raise InputError(
                 f"expected positive budgets, one evaluation or more, "
                 f"got {self.max_evaluations} evaluations and {self.max_seconds} seconds"
             )
         if self.tolerance is None and (self.max_evaluations, self.max_seconds) != (inf, inf):
-            raise ValueError("expected no budget for a slice of every point, got one; give a tolerance")
+            raise InputError("expected no budget for a slice of every point, got one; give a tolerance")
 
 
 def evaluate_adaptively(

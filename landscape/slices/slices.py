@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.results import Progress, StopReason
 from landscape.slices.grid_evaluations import GridEvaluations, Loss
@@ -31,9 +32,9 @@ def symmetric_axis(radius: float, points: int = 41) -> Float64[Tensor, " points"
     tensor([-1.0000, -0.5000,  0.0000,  0.5000,  1.0000], dtype=torch.float64)
     """
     if points < 3 or points % 2 == 0:
-        raise ValueError(f"expected an odd number of points, 3 or more, got {points}")
+        raise InputError(f"expected an odd number of points, 3 or more, got {points}")
     if not (radius > 0 and isfinite(radius)):
-        raise ValueError(f"expected a finite radius above 0, got {radius}")
+        raise InputError(f"expected a finite radius above 0, got {radius}")
     half = points // 2
     return torch.arange(-half, half + 1, dtype=torch.float64) * (radius / half)
 
@@ -48,7 +49,7 @@ def curvature_reach(curvature: float, rise: float, multiple: float = 1.0) -> flo
     0.5
     """
     if curvature == 0 or not isfinite(curvature) or rise <= 0 or multiple <= 0:
-        raise ValueError(
+        raise InputError(
             f"expected a curvature that is not zero, rise > 0 and multiple > 0, got {curvature}, {rise} and {multiple};"
             " give the range in parameter units instead"
         )
@@ -145,7 +146,7 @@ def _require_model(
         if given.shape != shape:
             raise ValueError(f"expected {name} of shape {shape} for the quadratic model, got {tuple(given.shape)}")
         if not torch.isfinite(given).all():
-            raise ValueError(f"expected finite {name} for the quadratic model, got NaN or infinity")
+            raise InputError(f"expected finite {name} for the quadratic model, got NaN or infinity")
 
 
 def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Tensor]) -> None:

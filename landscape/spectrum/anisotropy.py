@@ -23,6 +23,7 @@ from math import copysign, inf, isfinite
 import torch
 
 from landscape.eigen.pairs import EigenEnds
+from landscape.errors import InputError
 from landscape.results import Bracket
 from landscape.spectrum.absolute_sum import absolute_sum
 from landscape.spectrum.quantiles import absolute_quantile
@@ -144,7 +145,7 @@ def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float
     out by `ends.beyond`.  Neither end lies beyond what the other one may be.
     """
     if not (len(ends.largest) and len(ends.smallest)):
-        raise ValueError(
+        raise InputError(
             f"expected an eigenpair at each end, got {len(ends.largest)} of the largest and {len(ends.smallest)} of the "
             "smallest; ask for one of each in EigenSettings"
         )

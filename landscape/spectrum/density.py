@@ -40,6 +40,7 @@ from torch import Tensor
 from landscape.eigen.krylov import MARGIN
 from landscape.eigen.lanczos import LanczosFactorization, lanczos
 from landscape.eigen.pairs import EigenEnds
+from landscape.errors import InputError
 from landscape.linalg import gram, norm
 from landscape.operators.operator import ProjectedOperator, SymmetricOperator
 from landscape.results import Progress
@@ -99,7 +100,7 @@ def spectral_density(
     """
     least = FEWEST_STARTS if starts is None else starts
     if least < 2 or matvecs < 2 * least or batch < 1:
-        raise ValueError(
+        raise InputError(
             f"expected starts >= 2, matvecs >= 2 a start vector and batch >= 1, got {least}, {matvecs} and {batch}"
         )
     found = _Runs(operator, generator, active, ends, lambda done, state: progress and progress(done, matvecs, state))

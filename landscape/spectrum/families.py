@@ -15,6 +15,7 @@ from torch import Tensor
 
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds
+from landscape.errors import InputError
 from landscape.operators.operator import RestrictedOperator, SymmetricOperator
 from landscape.probes import split
 from landscape.results import Progress
@@ -90,7 +91,7 @@ def families(
     known = [WHOLE, *(name for name in operator.blocks if name != WHOLE)]
     names = known if parts is None else list(parts)
     if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"expected parts out of {', '.join(known)}, got {unknown[0]!r}")
+        raise InputError(f"expected parts out of {', '.join(known)}, got {unknown[0]!r}")
     results: dict[str, Family] = {}
     for name in names:
         stream = split(generator)

@@ -31,6 +31,7 @@ from scipy.special import betaincinv
 from torch import Tensor
 
 from landscape.eigen.lanczos import lanczos
+from landscape.errors import InputError
 from landscape.operators.operator import DenseOperator
 from landscape.results import Bracket, standard_deviation, t_quantile
 from landscape.spectrum.absolute_sum import integrals_of_rules
@@ -228,4 +229,4 @@ def _first(values: Tensor, otherwise: float) -> Tensor | float:
 
 def _require_share(p: float) -> None:
     if not 0 < p < 1:
-        raise ValueError(f"expected a share p between 0 and 1, got {p}")
+        raise InputError(f"expected a share p between 0 and 1, got {p}")

@@ -88,7 +88,7 @@ class _Choosing(Hutchinson):
 
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
         self.kept.append(super().draw(count))
-        if self.samples.shape[2] > self.most:
+        if self.samples.shape[1] > self.most:
             self.kept = []
         return self.kept[-1] if self.kept else (torch.empty(0), torch.empty(0))
 

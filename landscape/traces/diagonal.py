@@ -7,9 +7,7 @@
 
     a_i = z_i * (H z_i),   diag H ~ mean of a_i,   variance of an entry: the other entries of its row, squared, over k
 
-Where the operator knows the diagonal d of a part K of itself (`control.PartlyKnown`), z * (K z) - d has the mean zero and is
-taken off with the slope that the other probes have in all rows together: unbiased, as no probe has a part in its own slope.
-An operator that knows all of its diagonal is not probed.  A sketch pays where 4 r is below the sum of the entries' variances
+A sketch pays where 4 r is below the sum of the entries' variances
 with one probe, r what the sketch leaves.
 
 The sensitivity of a group of rows (a Gaussian, say) is the sum of |H_rr| over them.  The modulus of an estimate is too large on
@@ -27,12 +25,12 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from landscape.linalg import gram, group_sums
+from landscape.errors import InputError
+from landscape.linalg import group_sums
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.probes import draw_probes
 from landscape.results import Progress
 from landscape.traces.choice import WORSE, sketch_leaves
-from landscape.traces.control import PartlyKnown
 from landscape.traces.sketched import added_directions
 from landscape.traces.sketched_diagonal import sketched_samples
 
@@ -55,9 +53,9 @@ class GroupSums:
 
 @dataclass(frozen=True, eq=False)
 class DiagonalEstimate:
-    """diag H.  samples: one column a test vector, whose mean is `values`; no columns where the diagonal is known exactly.
+    """diag H.  samples: one column a test vector, whose mean is `values`.
 
-    matvecs: products with H that it took.  method: "signs" or "sketch", whichever was used in the end, or "exact".
+    matvecs: products with H that it took.  method: "signs" or "sketch", whichever was used in the end.
     """
 
     values: Float64[Tensor, " n"]
@@ -88,8 +86,6 @@ class DiagonalEstimate:
         groups = groups.to(self.values.device)
         sums = group_sums(self.values.abs(), groups, count)
         probes = self.samples.shape[1]
-        if probes == 0:
-            return GroupSums(sums, torch.zeros_like(sums), torch.zeros_like(sums))
         signed = group_sums(self.values.sign()[:, None] * self.samples, groups, count)
         excess = group_sums(_folded_excess(self.values.abs(), self.standard_errors), groups, count)
         return GroupSums(sums, signed.std(dim=1) / sqrt(probes), excess)
@@ -106,9 +102,8 @@ def estimate_diagonal(
     """diag H with a standard error for every entry, from `probes` (3 or more) matvecs at most.
 
     batch: vectors in one application of the operator.  Keeps n x probes numbers in float64, and squares them: entries within
-    SQUARED, as all of float32 are, have their errors, and ValueError where the largest is not.  Method "auto" is "signs"
-    with fewer than 8 probes, with no more rows than probes, and where a part of the diagonal is known; where all of it is
-    known (`control.PartlyKnown`), nothing is probed.
+    SQUARED, as all of float32 are, have their errors, and InputError where the largest is not.  Method "auto" is "signs" with
+    fewer than 8 probes, and with no more rows than probes.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([1.0, -2.0])))
@@ -116,17 +111,12 @@ def estimate_diagonal(
     tensor([ 1., -2.], dtype=torch.float64)
     """
     if probes < 3:
-        raise ValueError(f"expected at least 3 probes, got {probes}")
+        raise InputError(f"expected at least 3 probes, got {probes}")
     if method not in ("auto", "signs"):
-        raise ValueError(f"expected the method 'auto' or 'signs', got {method!r}")
-    if isinstance(operator, PartlyKnown) and operator.known is operator:
-        exact = operator.known_diagonal().double()
-        return DiagonalEstimate(
-            exact, torch.zeros_like(exact), exact.new_zeros(len(exact), 0), operator.blocks, 0, "exact"
-        )
+        raise InputError(f"expected the method 'auto' or 'signs', got {method!r}")
     half = probes // 2
-    choosing = method == "auto" and half >= FEWEST and operator.dim > probes and not isinstance(operator, PartlyKnown)
-    samples, controls = torch.zeros(2, operator.dim, 0, dtype=torch.float64, device=generator.device)
+    choosing = method == "auto" and half >= FEWEST and operator.dim > probes
+    samples = torch.zeros(operator.dim, 0, dtype=torch.float64, device=generator.device)
     kept: list[tuple[Tensor, Tensor]] = []
     while (done := samples.shape[1]) < probes:
         until = half if choosing and done < half else probes
@@ -134,17 +124,12 @@ def estimate_diagonal(
         Y = product(operator, Z)
         _require_squares(float(Y.abs().max()) if Y.numel() else 0.0)
         samples = torch.cat([samples, Z.double() * Y.double()], dim=1)
-        if isinstance(operator, PartlyKnown):
-            control = (Z * product(operator.known, Z)).double() - operator.known_diagonal().double()[:, None]
-            controls = torch.cat([controls, control], dim=1)
         if progress:
             progress(samples.shape[1], probes, f"diagonal: {samples.shape[1]} probes")
         if choosing and samples.shape[1] <= half:
             kept.append((Z, Y.clone()))  # an operator may give the same buffer again
         if choosing and samples.shape[1] == half and _pays(samples, kept):
             return _sketched(operator, kept, batch, probes, progress)
-    if controls.numel():
-        samples = _controlled(samples, controls)
     return _mean(samples, operator, probes, "signs")
 
 
@@ -168,11 +153,7 @@ def _pays(samples: Float64[Tensor, "n k"], kept: list[tuple[Tensor, Tensor]]) ->
 
 
 def _sketched(
-    operator: SymmetricOperator,
-    kept: list[tuple[Tensor, Tensor]],
-    batch: int,
-    most: int,
-    progress: Progress | None,
+    operator: SymmetricOperator, kept: list[tuple[Tensor, Tensor]], batch: int, most: int, progress: Progress | None
 ) -> DiagonalEstimate:
     """With the products of the sketch's own directions."""
     Z, Y = (torch.cat(parts, dim=1) for parts in zip(*kept, strict=True))
@@ -184,20 +165,6 @@ def _sketched(
         if progress:
             progress(done, most, f"diagonal: a sketch of {Q.shape[1]} directions")
     return _mean(sketched_samples(Z, Y, Q, HQ), operator, done, "sketch")
-
-
-def _controlled(A: Float64[Tensor, "n k"], B: Float64[Tensor, "n k"]) -> Float64[Tensor, "n k"]:
-    """a_i - c_i b_i, c_i the slope of a on b over all rows and all probes but the i-th, a and b less their means there."""
-    k = A.shape[1]
-    cross, spread = gram(A, B), gram(B, B)
-    slopes = _without_own(cross, k) / _without_own(spread, k).clamp_min(1e-300)
-    return A - slopes * B
-
-
-def _without_own(G: Float64[Tensor, "k k"], k: int) -> Float64[Tensor, " k"]:
-    """sum over j of (a_j - a) . (b_j - b), j and the means a and b over all but one, for each one; G_ij = a_i . b_j."""
-    trace, total = G.trace() - G.diagonal(), G.sum() - G.sum(dim=0) - G.sum(dim=1) + G.diagonal()
-    return trace - total / (k - 1)
 
 
 def _folded_excess(size: Tensor, error: Tensor) -> Tensor:

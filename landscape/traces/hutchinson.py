@@ -9,18 +9,18 @@ where the tolerance is as large as the trace of one dominant eigenvalue, and the
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import ceil, inf, sqrt
+from math import ceil, inf
 from time import monotonic
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.linalg import column_dots
 from landscape.operators.operator import SymmetricOperator, product
 from landscape.probes import Distribution, draw_probes
 from landscape.results import Progress, StopReason
-from landscape.traces.control import PartlyKnown, controlled, slope
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.quadratic import FEWEST, PowerSums, mean_interval, power_sums
 
@@ -61,21 +61,21 @@ class TraceSettings:
 
     def __post_init__(self) -> None:
         if self.distribution not in ("rademacher", "gaussian"):
-            raise ValueError(f"expected the distribution 'rademacher' or 'gaussian', got {self.distribution!r}")
+            raise InputError(f"expected the distribution 'rademacher' or 'gaussian', got {self.distribution!r}")
         if self.reading not in ("block", "full"):
-            raise ValueError(f"expected the reading 'block' or 'full', got {self.reading!r}")
+            raise InputError(f"expected the reading 'block' or 'full', got {self.reading!r}")
         if self.method not in ("auto", "hutchinson", "hutch++", "xtrace"):
-            raise ValueError(f"expected the method 'auto', 'hutchinson', 'hutch++' or 'xtrace', got {self.method!r}")
+            raise InputError(f"expected the method 'auto', 'hutchinson', 'hutch++' or 'xtrace', got {self.method!r}")
         if self.method in ("hutch++", "xtrace") and self.reading == "full":
-            raise ValueError(f"expected the reading 'block' with the method {self.method!r}, got 'full'")
+            raise InputError(f"expected the reading 'block' with the method {self.method!r}, got 'full'")
         if not LEAST <= self.min_probes <= self.max_probes or self.max_probes < self.least:
-            raise ValueError(
+            raise InputError(
                 f"expected {LEAST} <= min_probes <= max_probes and max_probes >= {self.least} with the method {self.method!r}, "
                 f"got {self.min_probes} and {self.max_probes}"
             )
         positive = self.rtol >= 0 and self.atol >= 0 and self.max_seconds >= 0 and self.batch >= 1 and self.memory > 0
         if not (positive and 0 < self.confidence < 1):
-            raise ValueError(
+            raise InputError(
                 f"expected rtol, atol >= 0, confidence in (0, 1), max_seconds >= 0, batch >= 1 and memory > 0, "
                 f"got {self.rtol}, {self.atol}, {self.confidence}, {self.max_seconds}, {self.batch} and {self.memory}"
             )
@@ -139,25 +139,21 @@ class Hutchinson:
     ) -> None:
         self.operator, self.rows, self.generator = operator, rows, generator
         self.settings, self.deadline, self.known, self.spent = settings, deadline, known, spent
-        self.part, self.diagonal = None, None
-        if isinstance(operator, PartlyKnown):
-            self.part, self.diagonal = operator.known, operator.known_diagonal().double()
-        forms = 1 if self.part is None else 2  # H, and the part of it that is known
-        self.samples = torch.empty(forms, len(rows), 0, dtype=torch.float64)
+        self.samples = torch.empty(len(rows), 0, dtype=torch.float64)  # z^T H z, a line for each group of rows
         self.groups: dict[str, list[PowerSums]] = {name: [] for name in rows}
-        # Z, H Z and, where there is a known part, K Z of the probes that are in no group yet
-        self.current: list[tuple[Tensor, ...]] = []
+        self.current: list[tuple[Tensor, Tensor]] = []  # Z and H Z of the probes that are in no group yet
 
     def estimate(
         self, done_before: int = 0, most: int = 0, progress: Progress | None = None
     ) -> dict[str, TraceEstimate]:
         """Progress counts matvecs, from done_before to most."""
         settings, probes, looks = self.settings, 0, StoppingRule(self.first_look, self.settings.max_probes)
-        if self.operator.dim == 0 or self.part is self.operator:
-            return self._exact()
+        if self.operator.dim == 0:
+            exact = (self.known, settings.confidence, self.spent)
+            return {name: TraceEstimate.exact(name, 0, *exact) for name in self.rows}
         while True:
             self.draw(min(settings.batch, looks.next - probes, GROUP - probes % GROUP))
-            probes = self.samples.shape[2]
+            probes = self.samples.shape[1]
             if progress:
                 progress(done_before + probes, most, f"trace of {', '.join(self.rows)}: {probes} probes")
             late = monotonic() > self.deadline and probes >= settings.min_probes
@@ -179,39 +175,31 @@ class Hutchinson:
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
         """Probes and their products with H, taken into account."""
         Z = draw_probes(self.operator.dim, count, self.generator, self.operator.dtype, self.settings.distribution)
-        # kept below, and an operator may give the same buffer again
-        forms = [product(form, Z).clone() for form in (self.operator, self.part) if form is not None]
-        sums = torch.stack([torch.stack([column_dots(Z[r], Y[r]) for r in self.rows.values()]) for Y in forms])
-        self.samples = torch.cat([self.samples, sums.cpu()], dim=2)
-        self.current.append((Z, *forms))
-        if self.samples.shape[2] % GROUP == 0:
+        Y = product(self.operator, Z).clone()  # kept below, and an operator may give the same buffer again
+        sums = torch.stack([column_dots(Z[r], Y[r]) for r in self.rows.values()])
+        self.samples = torch.cat([self.samples, sums.cpu()], dim=1)
+        self.current.append((Z, Y))
+        if self.samples.shape[1] % GROUP == 0:
             for name, group in self._open_groups().items():
                 self.groups[name].append(group)
             self.current = []
-        return Z, forms[0]
+        return Z, Y
 
     def _open_groups(self) -> dict[str, PowerSums]:
-        """The power sums of every block from the probes in no group yet; of H less what the known part explains."""
+        """The power sums of every block from the probes in no group yet."""
         if sum(parts[0].shape[1] for parts in self.current) < FEWEST:
             return {}
-        Z, Y, *known = (torch.cat(parts, dim=1) for parts in zip(*self.current, strict=True))
-        groups = {}
-        for i, (name, rows) in enumerate(self.rows.items()):
-            rest = Y[rows] if self.part is None else Y[rows] - slope(*self.samples[:, i]) * known[0][rows]
-            groups[name] = power_sums(Z[rows], rest, self.settings.distribution)
-        return groups
+        Z, Y = (torch.cat(parts, dim=1) for parts in zip(*self.current, strict=True))
+        kind = self.settings.distribution
+        return {name: power_sums(Z[rows], Y[rows], kind) for name, rows in self.rows.items()}
 
     def _estimates(self, reason: StopReason) -> dict[str, TraceEstimate]:
         """The estimates so far; those that have the error asked for say so, the others give the reason."""
         settings, results, opened = self.settings, {}, self._open_groups()
-        probes = self.samples.shape[2]
+        probes = self.samples.shape[1]
         widening = WIDENING if settings.adaptive else 1.0
-        if self.diagonal is not None:
-            widening *= sqrt((probes - 2) / (probes - 3))  # a slope was fitted
         for i, (name, rows) in enumerate(self.rows.items()):
-            samples = self.samples[0, i] + self.known
-            if self.diagonal is not None:
-                samples = controlled(samples, self.samples[1, i], float(self.diagonal[rows].sum()))
+            samples = self.samples[i] + self.known
             groups = self.groups[name] + ([opened[name]] if opened else [])
             value = float(samples.mean())
             error, low, high = mean_interval(value, probes, groups, settings.confidence, widening)
@@ -230,16 +218,3 @@ class Hutchinson:
                 method="hutchinson",
             )
         return results
-
-    def _exact(self) -> dict[str, TraceEstimate]:
-        diagonal = torch.zeros(self.operator.dim) if self.diagonal is None else self.diagonal
-        return {
-            name: TraceEstimate.exact(
-                name,
-                rows.stop - rows.start,
-                self.known + float(diagonal[rows].sum()),
-                self.settings.confidence,
-                self.spent,
-            )
-            for name, rows in self.rows.items()
-        }

@@ -47,6 +47,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.linalg import column_dots, gram, is_roundoff, norm
 from landscape.operators.operator import ProjectedOperator, SymmetricOperator, product
 from landscape.probes import draw_probes
@@ -104,7 +105,7 @@ def xtrace(
     if start is None and n <= settings.max_probes:
         return by_identity(operator, settings, name, generator.device)
     if most < LEAST:
-        raise ValueError(f"expected memory for {VECTORS * LEAST} vectors of {n} numbers, got {settings.memory:g} GiB")
+        raise InputError(f"expected memory for {VECTORS * LEAST} vectors of {n} numbers, got {settings.memory:g} GiB")
     kind = "gaussian" if start is None else settings.distribution
     count = max(settings.min_probes, settings.least) // 2 if start is None else start[0].shape[1]
     empty = torch.empty(n, 0, dtype=operator.dtype, device=generator.device if start is None else start[0].device)

@@ -7,15 +7,13 @@
                          blocks.  Unbiased, because the cross terms vanish in expectation; each other block c adds
                          |H_bc|_F^2 to the variance.
     method "auto"        the default: Hutchinson, unless its first probes tell that XTrace, or every column of the identity,
-                         does better (`choice`); with the reading "full" and where a part of the diagonal is known it
-                         stays Hutchinson
+                         does better (`choice`); with the reading "full" it stays Hutchinson
     method "hutch++"     exact on the range of a sketch H S, Hutchinson on the rest (`sketched`)
     method "xtrace"      every test vector in turn on the rest that the sketch of the others leaves (`sketched`)
 
 The last two pay where a few eigenvalues dominate, with errors that fall like 1 / matvecs and faster; Hutchinson's fall like
 1 / sqrt(matvecs), and are the smaller ones on a flat spectrum.  The default keeps up to max_probes / 2 probes with their
-products and, as XTrace, twice as many vectors more, within `TraceSettings.memory`.  Where the operator knows the diagonal of a
-part of itself (`control.PartlyKnown`), Hutchinson uses it as a control variate, and one that knows all of it is not probed.
+products and, as XTrace, twice as many vectors more, within `TraceSettings.memory`.
 
 `PAPER` is StableGS's estimator, Eq. (6): Gaussian z, one block at a time, ten probes.
 """
@@ -26,11 +24,11 @@ from time import monotonic
 
 import torch
 
-from landscape.operators.operator import SymmetricOperator
+from landscape.errors import InputError
+from landscape.operators.operator import RestrictedOperator, SymmetricOperator
 from landscape.probes import split
 from landscape.results import Progress
 from landscape.traces.choice import chosen
-from landscape.traces.control import PartlyKnown, restrict
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.hutchinson import Hutchinson, TraceSettings
 from landscape.traces.sketched import hutch_plus_plus, xtrace
@@ -69,7 +67,7 @@ def estimate_traces(
     names = list(operator.blocks) if blocks is None else list(blocks)
     unknown = [name for name in names if name not in operator.blocks]
     if unknown:
-        raise ValueError(f"expected blocks out of {', '.join(operator.blocks)}, got {unknown[0]!r}")
+        raise InputError(f"expected blocks out of {', '.join(operator.blocks)}, got {unknown[0]!r}")
     deadline = monotonic() + settings.max_seconds
     if settings.reading == "full":
         rows = {name: operator.blocks[name] for name in names}
@@ -78,10 +76,10 @@ def estimate_traces(
     estimates: dict[str, TraceEstimate] = {}
     most = len(names) * settings.max_probes
     for index, name in enumerate(names):
-        block, own, before = restrict(operator, name), split(generator), index * settings.max_probes
+        block, own, before = RestrictedOperator(operator, name), split(generator), index * settings.max_probes
         # what is left of the time is shared evenly among the blocks to come
         end = monotonic() + max(deadline - monotonic(), 0) / (len(names) - index)
-        if settings.method == "hutchinson" or (settings.method == "auto" and isinstance(block, PartlyKnown)):
+        if settings.method == "hutchinson":
             estimates |= Hutchinson(block, block.blocks, own, settings, end).estimate(before, most, progress)
         else:
             estimates[name] = ESTIMATORS[settings.method](block, own, settings, end, name)

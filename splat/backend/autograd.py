@@ -1,11 +1,7 @@
-"""What torch functions made of kernels share: tensors as the kernels take them, and the end of differentiation."""
-
-from typing import Any
+"""The end of differentiation, for torch functions made of kernels."""
 
 import torch
 from torch import Tensor
-
-from splat.backend.device import by_triton
 
 THIRD = "expected at most two derivatives of the kernels, got a third; render with backend='reference' for more"
 
@@ -26,8 +22,3 @@ class _Last(torch.autograd.Function):
 def last_derivative(values: tuple[Tensor, ...], *sources: Tensor, refusal: str = THIRD) -> tuple[Tensor, ...]:
     """Derivatives by a kernel: on the graph of what they came from, so that the next is refused, not taken for 0."""
     return _Last.apply(refusal, len(values), *values, *sources)  # pyright: ignore[reportReturnType]
-
-
-def to_backend(tensor: Tensor) -> Any:
-    """A tensor as the kernels where it is take it: as an array on the CPU."""
-    return tensor.detach() if by_triton(tensor) else tensor.detach().numpy()

@@ -13,17 +13,19 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from landscape.errors import InputError
+
 
 def device_named(name: Literal["auto", "cpu", "cuda"]) -> torch.device:
     """This process's device; auto: its GPU where it can be used, else the CPU.  ValueError where cuda is asked for and cannot
     be used."""
     if name not in ("auto", "cpu", "cuda"):
-        raise ValueError(f"expected the device 'auto', 'cpu' or 'cuda', got {name!r}")
+        raise InputError(f"expected the device 'auto', 'cpu' or 'cuda', got {name!r}")
     if name == "cpu":
         return torch.device("cpu")
     lack = _lack() or too_few(os.environ, torch.cuda.device_count())
     if name == "cuda" and lack:
-        raise ValueError(f"expected an NVIDIA GPU for the device cuda, got {lack}, or use the device cpu")
+        raise InputError(f"expected an NVIDIA GPU for the device cuda, got {lack}, or use the device cpu")
     return torch.device("cpu") if lack else torch.device("cuda", place(os.environ))
 
 

@@ -1,4 +1,4 @@
-"""The blocks of a Hessian that belong to one Gaussian each: 11 x 11 of its geometry and opacity, and the diagonal of its SH."""
+"""Diagonal blocks of a Hessian, one a Gaussian: 11 x 11 of its geometry and opacity, and the diagonal of its SH."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,7 @@ GEOMETRY_COLUMNS = {
 
 @dataclass(frozen=True, eq=False)
 class PerGaussianBlocks:
-    """The diagonal blocks of a Hessian that belong to one Gaussian each.
-
-    geometry: over the attributes in GEOMETRY_COLUMNS; sh: the diagonal of the SH block.
-    """
+    """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH."""
 
     geometry: Float[Tensor, "n 11 11"]
     sh: Float[Tensor, "n k 3"]
@@ -26,9 +23,9 @@ class PerGaussianBlocks:
         return PerGaussianBlocks(self.geometry + other.geometry, self.sh + other.sh)
 
     def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
-        """Trace of each attribute's block, summed in double precision; without the radial directions of unit quats.
+        """Trace of each attribute's block, summed in double precision.
 
-        scale: D, of D P B P D instead of P B P, where P leaves these directions out.
+        quats: unit quaternions; P projects them out, and the traces are of P B P.  scale: D, of D P B P D instead.
         """
         diagonals = self.diagonals if quats is None else self.diagonals_across(quats)
         if scale is not None:
@@ -43,7 +40,7 @@ class PerGaussianBlocks:
         return {**{name: diagonal[:, columns] for name, columns in GEOMETRY_COLUMNS.items()}, "sh": self.sh.double()}
 
     def diagonals_across(self, quats: Float[Tensor, "n 4"]) -> dict[str, Float64[Tensor, "n ..."]]:
-        """That of P B P, where P leaves out the radial directions of unit quats."""
+        """The diagonal of P B P, where P projects out the unit quats."""
         q, columns, diagonals = quats.double(), GEOMETRY_COLUMNS["quats"], self.diagonals
         along = (self.geometry[:, columns, columns].double() @ q[:, :, None])[:, :, 0]
         turns = diagonals["quats"] - 2 * q * along + q.square() * (q * along).sum(dim=1, keepdim=True)

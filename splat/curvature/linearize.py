@@ -1,4 +1,4 @@
-"""One view held still: the loss, its gradient, and exact derivatives of first and second order as products with blocks.
+"""One view, linearised: the loss, its gradient, and exact derivatives of first and second order as products with blocks.
 
 Everything that depends on the scene alone is done once: projection with its Jacobian and curvature per Gaussian, order,
 tile lists, final transmittances, first-order adjoints, the loss's own derivatives.  Each product is then two passes over
@@ -10,40 +10,40 @@ the pixels for K vectors together.  With y the splats, P the projection, R the c
     H u       P'^T [ R'^T l'' R' P' u + (g . R'')(P' u) ] + (a . P'') u
 
 Vectors are columns of (p, K) blocks laid out like `Gaussians.flat`.  The order of the splats, the alpha_min cut, the stop and
-the clamps are held fixed; they are piecewise constant.
+the clamps are constants of every derivative; they are piecewise constant.
 
-The pieces (raster, projection, loss) are those of where the Gaussians are, arrays on the CPU or tensors on a GPU, and have one
-interface.  On a GPU no product waits for the device.
+Between P and R tangents and adjoints of splats are in the coordinates of `projection/whitening.py`.  The pieces (raster,
+projection, loss) are those of the device of the Gaussians.  On a GPU no product waits for the device.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from splat.backend.autograd import to_backend
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
+from splat.losses.protocols import ViewLoss
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.dispatch import linearize_projection
 from splat.projection.formulas import ProjectionJacobian, lens_of
-from splat.render.forward import rasterize_view
+from splat.raster.dispatch import Adjoint, Tangent
+from splat.render.forward import rasterize_view, touches
 
 
 class LinearizedView:
-    """A view's loss at fixed Gaussians: `.value`, `.image`, `.gradient`, `.jvp(U)`, `.vjp(G)`, `.hvp(U)`, `.ggn(U)`.
+    """A view's loss, linearised at its Gaussians: `.value`, `.image`, `.gradient`, `.jvp(U)`, `.vjp(G)`, `.hvp(U)`, `.ggn(U)`.
 
-    loss: of the view's images, `loss_functions.loss_against`.
+    loss: of the view's images, from `losses.autograd.loss_against`.
     """
 
     def __init__(
         self,
         gaussians: Gaussians,
         camera: Camera,
-        loss: Any,
+        loss: ViewLoss,
         background: Float[Tensor, "3"],
         settings: RenderSettings = RenderSettings(),
     ):
@@ -53,7 +53,7 @@ class LinearizedView:
         self._adjoint = self._raster.backward(self._loss.gradient)
         self._index = self._raster.touched
         self._projection = linearize_projection(
-            gaussians, lens_of(camera, settings), self._raster.splats, self._adjoint.gradient, self._index
+            gaussians, lens_of(camera, settings), self._raster.splats, self._adjoint.moments, self._index
         )
 
     @property
@@ -63,25 +63,25 @@ class LinearizedView:
     @property
     def gradient(self) -> Float[Tensor, " p"]:
         """Of the loss; worked out from its adjoint every time, so that a view that is kept does not hold p numbers more."""
-        return self._pulled([self._adjoint.gradient])[:, 0]
+        return self._pulled([self._adjoint])[:, 0]
 
     @property
     def image(self) -> Float[Tensor, "3 h w"]:
-        return torch.as_tensor(self._raster.crop(self._raster.planes[:3])).clone()
+        return self._raster.crop(self._raster.planes[:3]).clone()
 
     @property
-    def entries(self) -> int:
+    def intersections(self) -> int:
         """How many (splat, tile) pairs a product passes over."""
-        return self._raster.entries_reached
+        return self._raster.intersections_reached
 
     @property
-    def entries_behind(self) -> int:
+    def intersections_behind(self) -> int:
         """How many (splat, tile) pairs are left out because every pixel has stopped in front of them."""
-        return self._raster.entries - self.entries
+        return self._raster.intersections - self.intersections
 
     @property
     def dark_tiles(self) -> int:
-        """How many tiles with entries are left out of products: the loss has neither slope nor curvature there."""
+        """How many tiles with splats are left out of products: the loss has neither slope nor curvature there."""
         return self._raster.dark_tiles(self._adjoint, self._loss.diagonal)
 
     @property
@@ -90,13 +90,15 @@ class LinearizedView:
         return len(self._index)
 
     @property
-    def held(self) -> ProjectionJacobian:
-        """The projection's derivatives, Gaussian by Gaussian."""
-        return self._projection.held
+    def jacobian(self) -> ProjectionJacobian:
+        """The projection's derivatives of the Gaussians that have weight in a pixel; takes a pass over the pixels."""
+        jacobian = self._projection.jacobian
+        seen = touches(self._raster)[jacobian.index]
+        return ProjectionJacobian(*(part[seen] for part in jacobian))
 
     @property
     def bytes(self) -> int:
-        """Memory of what is held for the products; the adjoint's cotangent is the loss's gradient."""
+        """Memory of what is kept for the products; the adjoint's cotangent is the loss's gradient."""
         return self._raster.bytes + self._projection.bytes + self._loss.bytes + self._adjoint.bytes
 
     def workspace(self, vectors: int) -> int:
@@ -108,46 +110,45 @@ class LinearizedView:
 
         On a GPU always True: to look would be to wait for the device.
         """
-        return self._projection.affects(to_backend(U))
+        return self._projection.affects(U)
 
     def jvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "k 4 h w"]:
         """J U: tangents of colour and accumulated alpha."""
-        return torch.as_tensor(self._raster.crop(self._tangent(U).planes)).contiguous()
+        return self._raster.crop(self._tangent(U).planes).contiguous()
 
     def vjp(self, G: Float[Tensor, "k 4 h w"]) -> Float[Tensor, "p k"]:
         """J^T G for cotangents of colour and accumulated alpha."""
-        return self._pulled([self._raster.backward(self._raster.pad(to_backend(g))).gradient for g in G])
+        return self._pulled([self._raster.backward(self._raster.pad(g)) for g in G])
 
     def hvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """H U of the view's loss."""
-        return torch.as_tensor(self._projection.pull(self._curved(U), to_backend(U)))
+        return self._projection.vjp(self._adjoint_tangent(U), U)
 
     def ggn(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         """G U, the Gauss-Newton part of H U."""
         cotangents = self._loss.hvp(self._tangent(U).planes)
-        return self._pulled([self._raster.backward(cotangent).gradient for cotangent in cotangents])
+        return self._pulled([self._raster.backward(cotangent) for cotangent in cotangents])
 
     def block_diagonal(self, *, gauss_newton: bool = False) -> PerGaussianBlocks:
-        """Every Gaussian's own block of the Hessian, or of its Gauss-Newton part, exactly, in one pass over the pixels.
+        """Every Gaussian's diagonal block of the Hessian, or of its Gauss-Newton part, exactly, in one pass over the pixels.
 
         "Exactly" for losses that are sums over pixels; of SSIM's l'' the coupling between pixels is left out.
         """
-        own = self._raster.gaussian_blocks(self._adjoint, self._loss.diagonal, self._index, gauss_newton)
-        return PerGaussianBlocks(*map(torch.as_tensor, self._projection.blocks(own, not gauss_newton)))
+        blocks = self._raster.gaussian_blocks(self._adjoint, self._loss.diagonal, self._index, gauss_newton)
+        return PerGaussianBlocks(*self._projection.blocks(blocks, not gauss_newton))
 
     def loss_curvatures(self, U: Float[Tensor, "p k"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
         """(J u)^T l'' (J u) of every column, and the same with l'' replaced by its pixel-diagonal: no backward pass."""
         return self._loss.curvatures(self._tangent(U).planes)
 
-    def _tangent(self, U: Tensor) -> Any:
-        return self._raster.jvp(self._projection.jvp(to_backend(U)))
+    def _tangent(self, U: Float[Tensor, "p k"]) -> Tangent:
+        return self._raster.jvp(self._projection.jvp(U))
 
-    def _curved(self, U: Tensor) -> Any:
-        """The tangent of the splats' adjoint, (n, K, 9); all else that it takes is free again before the result is made."""
+    def _adjoint_tangent(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "n k 9"]:
+        """The tangent of the splats' adjoint; all else that it takes is free again before the result is made."""
         tangent = self._tangent(U)
-        return tangent.curvature(self._adjoint, self._loss.hvp(tangent.planes, out=tangent.planes))
+        return tangent.backward_tangent(self._adjoint, self._loss.hvp(tangent.planes, out=tangent.planes))
 
-    def _pulled(self, bars: Sequence[Any]) -> Tensor:
-        """P'^T of adjoints of the splats, (n, 9) each."""
-        cotangents = torch.stack([torch.as_tensor(bar) for bar in bars], dim=1)
-        return torch.as_tensor(self._projection.pull(to_backend(cotangents), None))
+    def _pulled(self, adjoints: Sequence[Adjoint]) -> Float[Tensor, "p k"]:
+        """P'^T of adjoints of the splats."""
+        return self._projection.vjp(torch.stack([adjoint.moments for adjoint in adjoints], dim=1))

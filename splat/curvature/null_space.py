@@ -2,15 +2,24 @@
 
 A Gaussian enters a view only through its splat of nine numbers, so over M views Gauss-Newton sees at most
 min(9 M, 10 + 3 min(M, k)) of its 11 + 3 k parameters (k SH coefficients a channel): with SH degree 3 and three views a third of
-the spectrum is zeros that say nothing.  The row space of all its projections' Jacobians, stacked, is what is left.  The
-Hessian sees more: everything but the SH directions that vanish in all view directions together with their slope in the mean,
-and (by choice, see `curvature.py`) the lengths of the quaternions.
+the spectrum is zeros that say nothing.  The row space of all its projections' Jacobians, stacked, is what is left.
+
+The Hessian sees the whole geometry but, by choice (`SceneHessian`), the lengths of the quaternions.  It sees SH coefficients f
+through colours alone.  With d_m the direction from view m to the mean mu, Y the harmonics, a_mc the loss's derivative in the
+colour, and x any parameter,
+
+    colour_mc      = sum_k f_kc Y_k(d_m) + 1/2
+    d2L / df_kc dx = sum_m Y_k(d_m) da_mc/dx + sum_m a_mc dY_k(d_m)/dx
+
+where a_mc = 0 if view m clamps channel c.  So it sees Y(d_m) of every view that draws the Gaussian and does not clamp the
+channel and, over the channels together, three slopes sum_m a_mc dY_k(d_m)/dmu_j.  They couple SH to the mean alone: the block
+of SH by itself is flat along what they have at right angles to the harmonics.
 
 A basis is found per Gaussian by a small singular value decomposition of its rows, each scaled to unit length; directions
-whose singular value is beneath TOLERANCE of the largest are null.
+whose singular value is beneath TOLERANCE of the largest are null.  Slopes are compared with what they are sums of.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,6 +28,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splat.backend.cpu.threads import over_batch
+from splat.model.gaussians import Gaussians
 from splat.projection.formulas import GEOMETRY, ProjectionJacobian
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
@@ -34,28 +44,38 @@ class RowSpace:
     rank: Int[Tensor, " n"]
 
     @cached_property
-    def _partial(self) -> tuple[Int[Tensor, " m"], Float[Tensor, "m r d"]]:
-        """The Gaussians that have null components, and their bases: with low SH degrees few have any."""
-        index = torch.nonzero(self.rank < self.basis.shape[2])[:, 0]
-        return index, self.basis[index]
+    def _partial(self) -> Int[Tensor, " m"]:
+        """The Gaussians that have null components: with low SH degrees or many views few have any."""
+        return torch.nonzero(self.rank < self.basis.shape[2])[:, 0]
+
+    @cached_property
+    def _basis(self) -> Float[Tensor, "m r d"]:
+        """Theirs."""
+        return self.basis if len(self._partial) == len(self.basis) else self.basis[self._partial]
 
     def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         """x without its null components."""
-        index, basis = self._partial
+        basis, index = self._basis, self._partial
+        if basis is self.basis:
+            return basis.mT @ (basis @ x)
         return x.index_copy(0, index, basis.mT @ (basis @ x[index]))
 
     def scaled(self, scale: Float[Tensor, "n d"]) -> "RowSpace":
         """The space of all D x, D = diag(scale) > 0 and x in this space."""
-        rows = (self.basis.double() * scale[:, None].double()).cpu()  # CUDA forms one Q after the other
-        directions = torch.empty_like(rows)
+        return _orthonormal(self.basis * scale[:, None], self.rank)
 
-        def decompose(first: int, last: int) -> None:
-            directions[first:last] = torch.linalg.qr(rows[first:last].mT).Q.mT
 
-        over_batch(len(rows), decompose, rows.device)
-        # the padding is at the end
-        held = torch.arange(self.basis.shape[1], device=self.basis.device) < self.rank[:, None]
-        return RowSpace(torch.where(held[:, :, None], directions.to(self.basis), 0.0), self.rank)
+def _orthonormal(rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSpace:
+    """The space of rows that are independent of each other, followed by padding."""
+    matrices = rows.mT.double().cpu()  # CUDA forms one Q after the other
+    directions = torch.empty_like(matrices.mT, memory_format=torch.contiguous_format)
+
+    def decompose(first: int, last: int) -> None:
+        directions[first:last] = torch.linalg.qr(matrices[first:last]).Q.mT
+
+    over_batch(len(rows), decompose, matrices.device)
+    held = torch.arange(rows.shape[1], device=rows.device) < rank[:, None]
+    return RowSpace(torch.where(held[:, :, None], directions.to(rows), 0.0), rank)
 
 
 Stacked = Callable[[Tensor], Tensor]
@@ -65,27 +85,79 @@ def _alone(rows: Tensor) -> Tensor:
     return rows
 
 
-def seen_harmonics(views: Sequence[ProjectionJacobian], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
-    """The SH directions (k of one channel; the three are alike) in which the Hessian can be non-zero.
+def seen_colours(
+    views: Iterable[ProjectionJacobian],
+    count: int,
+    gaussians: Gaussians,
+    stacked: Stacked = _alone,
+    summed: Stacked = _alone,
+    *,
+    apart: bool = False,
+) -> RowSpace:
+    """The directions of a Gaussian's SH coefficients in which the Hessian can be non-zero; count: of these views.
 
-    stacked: completes the rows of these views to those of all views, where other processes hold some.
+    stacked, summed: complete the rows of these views, and what is summed over them (up to a factor), to those of all views,
+    where other processes hold some.  apart: of the block of SH by itself, without the slopes.
     """
-    rows = _like(views).new_zeros(n, 4 * len(views), bands, dtype=torch.float64)
+    like, (n, bands) = gaussians.flat, gaussians.sh.shape[:2]
+    rows = like.new_zeros(n, count, bands + 3)  # harmonics, and which channels are not clamped
+    slopes, sizes = like.new_zeros(n, 3, 3 * bands), like.new_zeros(n)
     for m, held in enumerate(views):
-        index = torch.as_tensor(held.index)
-        rows[index, 4 * m] = torch.as_tensor(held.harmonic[:, :bands]).double()
-        rows[index, 4 * m + 1 : 4 * m + 4] = torch.as_tensor(held.slope[:, :bands]).double().mT
-    return _row_space(stacked(rows), _like(views).dtype)
+        index, harmonic, slope = (torch.as_tensor(part) for part in (held.index, held.harmonic, held.slope))
+        bar, visible = (torch.as_tensor(part) for part in (held.colour_bar, held.visible))
+        rows[index, m] = torch.cat([harmonic[:, :bands], visible], dim=1)
+        bent = torch.einsum("ekj,ec->ejkc", slope[:, :bands], bar).flatten(2)
+        slopes[index] += bent
+        sizes[index] += bent.flatten(1).norm(dim=1)
+    rows, slopes, sizes = stacked(rows), summed(slopes)[:, : 0 if apart else 3], summed(sizes)
+
+    def part(start: int) -> RowSpace:
+        some = slice(start, start + CHUNK)
+        return _colours_of(rows[some].double(), slopes[some].double(), sizes[some].double(), TOLERANCE[like.dtype])
+
+    return _joined([part(start) for start in range(0, n, CHUNK)], like.dtype)
+
+
+def _colours_of(
+    rows: Float[Tensor, "n m _"], slopes: Float[Tensor, "n s d"], sizes: Float[Tensor, " n"], tolerance: float
+) -> RowSpace:
+    """Of some Gaussians: the harmonics of each channel, and what the slopes add to them."""
+    harmonics, visible = rows[:, :, :-3], rows[:, :, -3:]
+    channels = [_row_space(harmonics * visible[:, :, c, None], tolerance) for c in range(3)]
+    added = _spanned(_across(channels, slopes), sizes, tolerance)
+    for _ in range(2):  # what rounding leaves of the harmonics goes in the second go
+        added = _orthonormal(_across(channels, added.basis), added.rank)
+    bases = [added.basis]
+    for c, space in enumerate(channels):
+        wide = slopes.new_zeros(*space.basis.shape[:2], slopes.shape[2])
+        wide[:, :, c::3] = space.basis
+        bases.append(wide)
+    basis = torch.cat(bases, dim=1)
+    padding = (basis == 0).all(dim=2).int()
+    order, rank = padding.argsort(dim=1, stable=True), basis.shape[1] - padding.sum(dim=1)
+    return RowSpace(basis.gather(1, order[:, : int(rank.max()), None].expand(-1, -1, basis.shape[2])), rank)
+
+
+def _across(channels: Sequence[RowSpace], rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n r d"]:
+    """The part of rows at right angles to the channels' spaces."""
+    kept = [space.project(rows[:, :, c::3].mT).mT for c, space in enumerate(channels)]
+    return rows - torch.stack(kept, dim=3).flatten(2)
 
 
 def seen_parameters(views: Sequence[ProjectionJacobian], n: int, bands: int, stacked: Stacked = _alone) -> RowSpace:
     """The directions of a Gaussian's parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
+    dtype = _like(views).dtype
     parts = [
-        _row_space(stacked(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), _like(views).dtype)
+        _row_space(stacked(_jacobian_rows(views, start, min(start + CHUNK, n), bands)), TOLERANCE[dtype])
         for start in range(0, n, CHUNK)
     ]
+    return _joined(parts, dtype)
+
+
+def _joined(parts: Sequence[RowSpace], dtype: torch.dtype) -> RowSpace:
+    """Those of all Gaussians, given those of some at a time."""
     width = max(part.basis.shape[1] for part in parts)
-    padded = [torch.nn.functional.pad(part.basis, (0, 0, 0, width - part.basis.shape[1])) for part in parts]
+    padded = [torch.nn.functional.pad(part.basis.to(dtype), (0, 0, 0, width - part.basis.shape[1])) for part in parts]
     return RowSpace(torch.cat(padded), torch.cat([part.rank for part in parts]))
 
 
@@ -114,14 +186,17 @@ def _jacobian_rows(views: Sequence[ProjectionJacobian], start: int, stop: int, b
     return rows
 
 
-def _row_space(rows: Float[Tensor, "n r d"], dtype: torch.dtype) -> RowSpace:
-    """An orthonormal basis of each Gaussian's rows: the leading right singular vectors."""
-    rows = rows / rows.norm(dim=2, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny)
+def _row_space(rows: Float[Tensor, "n r d"], tolerance: float) -> RowSpace:
+    """An orthonormal basis of each Gaussian's rows, whatever their lengths."""
+    return _spanned(rows / rows.norm(dim=2, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny), None, tolerance)
+
+
+def _spanned(rows: Float[Tensor, "n r d"], sizes: Float[Tensor, " n"] | None, tolerance: float) -> RowSpace:
+    """The leading right singular vectors: of values above tolerance of sizes, by default of the largest."""
     values, basis = _singular(rows)
-    kept = (values > TOLERANCE[dtype] * values[:, :1]) & (values > 0)
-    basis = torch.where(kept[:, :, None], basis, torch.zeros_like(basis))
+    kept = (values > tolerance * (values[:, :1] if sizes is None else sizes[:, None])) & (values > 0)
     rank = kept.sum(dim=1)
-    return RowSpace(basis[:, : int(rank.max())].to(dtype), rank)
+    return RowSpace(torch.where(kept[:, :, None], basis, 0.0)[:, : int(rank.max())], rank)
 
 
 def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m d"]]:

@@ -1,28 +1,30 @@
-"""The traces of the attributes' Hessian blocks: exact but for the coupling between pixels, which is sampled.
+"""Traces of the attributes' Hessian blocks: exact but for the coupling of pixels by the loss, which is sampled.
 
-With E_b the columns of block b, J the Jacobian of the images, D the pixel-diagonal of l'':
+With E_b the columns of the identity in block b, J the Jacobian of the images, D the diagonal of the loss's l'':
 
-    tr(H_b) = T_b + E[x - y],   T_b exact from `block_diagonal` (D in place of l''),
-    x = |J E_b z|^2 in the metric l'',  y = the same in the metric D,  z random signs;  E[y] = C_b is exact too
+    tr(H_b) = T_b + E[x - y]      T_b: trace with D in place of l'', exact (`SceneObjective.block_diagonal`)
+    x = (J E_b z)^T l'' (J E_b z),  y = (J E_b z)^T D (J E_b z)      z: random signs;  E[y] = C_b is known exactly
 
-so y is a control variate: each sample is x - c (y - C_b), with c fitted to the other samples (so that no sample takes part in
-its own coefficient and the mean stays unbiased).  x and y are sums over views, each with signs of its own: M views then have
-up to M times less variance than with common ones, at no cost (three views of fern: position, rotation and SH 2.6 to 3.6 times
-less, log-scales and opacity 1.2 to 1.9).  A sample costs one J u of as many vectors as there are blocks whose error is
-not yet small enough, and no backward pass.  Where the loss is a sum over pixels, l'' = D and the traces are exact.
+y is a control variate: each sample is x - c (y - C_b), where c is fitted to the other samples so that the mean stays unbiased.
+x and y are sums over views, each with random signs of its own, which lowers the variance up to M times for M views.  A sample
+costs one product J u for each block whose error is not small enough yet, and no backward pass.  Where the loss is a sum over
+pixels, l'' = D and the traces are exact.
 
-`sampled_traces` does the same for other parts of the parameters, such as positions along the rays (`depth.py`).
+`sampled_traces` does the same for other parts of the parameters, such as positions along the rays
+(`analysis/measures/depth.py`).
 """
 
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import sqrt
 from time import monotonic
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.probes import draw_probes
 from landscape.results import Progress, StopReason, t_quantile
 from landscape.traces.control import controlled
@@ -35,9 +37,10 @@ ONE_PERCENT = TraceSettings(rtol=0.01, max_probes=64)
 LEAST_SAMPLES = 4  # a mean, a slope, and a spread of two degrees of freedom
 COLUMNS = 5  # vectors in a pass over the pixels: one for each block
 
+Dimension = Literal["active", "attribute"]
 Draw = Callable[[int, Sequence[torch.Generator], Sequence[str]], Float[Tensor, "p b s"]]
-"""(index of a view that this process holds, generators, names): for each name and each generator a random vector over the
-active parameters, of mean 0 and with the projector onto the named part as its covariance."""
+"""(index of a view of this process, generators, names): for each name and each generator a random vector over the active
+parameters, with mean 0 and, as its covariance, the projector onto the named part."""
 
 
 def exact_traces(
@@ -51,16 +54,22 @@ def exact_traces(
     gauss_newton: bool = False,
     scale: Float[Tensor, " p"] | None = None,
 ) -> dict[str, TraceEstimate]:
-    """The trace of the named attributes' blocks of H, on the complement of the quaternions' radial directions, by name.
+    """Traces of the named attributes' blocks of H, without the quaternions' radial directions, by name.
 
     By default to 1%, from 8 to 64 samples; exact where the loss does not couple pixels (ssim_weight = 0).
-    gauss_newton: of its Gauss-Newton part, whose T_b is C_b.  scale: D > 0, one number a parameter: of D H D instead of H.
-    settings: of them rtol, atol, confidence, min_probes, max_probes (of samples) and max_seconds count; samples are of random
-        signs in any case.
-    samples: exactly so many, at least LEAST_SAMPLES, whatever the settings say: for rough values, as a training needs them.
+    gauss_newton: of the Gauss-Newton part, whose T_b is C_b.  scale: D > 0, one number a parameter; of D H D instead of H.
+    settings: rtol, atol, confidence, min_probes and max_probes (of samples), and max_seconds; the rest is ignored.
+    samples: an exact number, at least LEAST_SAMPLES, for rough values; overrides the settings.
+
+    >>> from splat import SceneObjective, SyntheticSettings, synthetic_scene
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> objective = SceneObjective(made.truth, made.scene.load())
+    >>> traces = exact_traces(objective, torch.Generator().manual_seed(0), samples=4)
+    >>> list(traces), traces["means"].probes
+    (['means', 'log_scales', 'quats', 'opacity_logits', 'sh'], 4)
     """
     if samples is not None and samples < LEAST_SAMPLES:
-        raise ValueError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
+        raise InputError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
     quats, units = objective.active.quats, None if scale is None else objective.active.with_flat(scale)
     whole, coupled = objective.gaussian_blocks
     if gauss_newton:
@@ -76,6 +85,22 @@ def exact_traces(
     return sampled_traces(objective, generator, partial(_signs, objective, scale), traces, progress)
 
 
+def curvature_scale(trace: float, parameters: int, gaussians: int, dimension: Dimension) -> float:
+    """tau of a block, StableGS's curvature scale of an attribute: sqrt(max(trace, 0) / dim), 0 of an empty block.
+
+    parameters: of the block, N d of N active Gaussians, d = 3 for means, log-scales and quaternions (on the unit sphere), 1 for
+    opacities and 3 (l + 1)^2 for SH of degree l.  The paper's H spans all Gaussians, but its d is that of one:
+
+    dimension "active"      dim = N d: the root of the mean curvature of a parameter; what a probe records
+    dimension "attribute"   dim = d: larger by sqrt(N); the paper's letter, and the default of its probes (`ProbeSettings`)
+
+    >>> curvature_scale(12.0, 12, 4, "active"), curvature_scale(12.0, 12, 4, "attribute")
+    (1.0, 2.0)
+    """
+    dim = parameters if dimension == "active" else parameters // max(gaussians, 1)
+    return sqrt(max(trace, 0.0) / dim) if dim else 0.0
+
+
 def sampled_traces(
     objective: SceneObjective,
     generator: torch.Generator,
@@ -83,7 +108,7 @@ def sampled_traces(
     traces: Sequence["SampledTrace"],
     progress: Progress | None = None,
 ) -> dict[str, TraceEstimate]:
-    """Sample traces, side by side, until none is open."""
+    """Sample traces side by side until each is accurate enough or out of samples or time."""
     start = monotonic()
     while still := [trace for trace in traces if trace.open]:
         count, next_look = still[0].count, min(trace.looks.next for trace in still)
@@ -100,9 +125,9 @@ def sampled_traces(
 
 
 class SampledTrace:
-    """The samples of one trace, from first to most, and whether it needs more.
+    """The samples of one trace, at least `first` and at most `most`, and whether it needs more (`open`).
 
-    known: T_b, pixelwise: C_b of the module's docstring; None: the loss does not couple pixels, and T_b is the trace.
+    known: T_b of the module's docstring.  pixelwise: C_b; None where the loss does not couple pixels, so that T_b is the trace.
     """
 
     def __init__(
@@ -111,7 +136,7 @@ class SampledTrace:
         self.name, self.dim, self.settings, self.first, self.most = name, dim, settings, first, most
         self.known, self.pixelwise = known, pixelwise
         self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
-        # a run may end at `first` samples: where the tolerance holds there and held CONFIRMATION earlier
+        # a run ends at `first` samples at the earliest: if the tolerance holds there and held CONFIRMATION samples before
         look = most if first == most else max(first - CONFIRMATION, LEAST_SAMPLES)
         self.looks, self.open, self.late = StoppingRule(look, most), pixelwise is not None, False
 
@@ -134,7 +159,7 @@ class SampledTrace:
         samples = self.known - self.pixelwise + controlled(self.full, self.diagonal, self.pixelwise)
         value = float(samples.mean())
         error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.pixelwise))
-        # the slope of the control variate is one more number that the samples had to give
+        # the fitted coefficient takes one more degree of freedom than the mean
         quantile = t_quantile(self.count - 2, settings.confidence)
         half = quantile * error * (WIDENING if settings.adaptive and self.first < self.most else 1.0)
         reason: StopReason = "time budget" if self.late else "matvec budget"
@@ -147,10 +172,9 @@ class SampledTrace:
 
 
 def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> float:
-    """The standard error of the regression line through (control, samples) at control = mean.
+    """The standard error of the regression line through (control, samples) at control = mean; 0 where control is constant.
 
-    With few samples it is often larger than the spread of the controlled samples, whose slopes have much of it in common.  0
-    where the control does not vary.
+    With few samples it is often larger than the standard error of the controlled samples, which share most of a slope.
     """
     count, centred = len(samples), control - control.mean()
     spread = float(centred.square().sum())
@@ -164,14 +188,14 @@ def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " 
 def coupling_samples(
     objective: SceneObjective, generator: torch.Generator, draw: Draw, names: Sequence[str], count: int
 ) -> tuple[Float64[Tensor, "b s"], Float64[Tensor, "b s"]]:
-    """x and y of the named parts for so many draws, which are the same whatever the names and the count are."""
+    """x and y of the named parts for `count` draws, which depend on neither names nor count."""
     seeds = torch.randint(2**62, (count,), generator=generator, device=generator.device).tolist()
     total = torch.zeros(2, len(names) * count, dtype=torch.float64)
-    for index, held in enumerate(objective.linearized):
+    for index, linearized in enumerate(objective.linearized):
         view = objective.view_numbers[index]
         generators = [torch.Generator(generator.device).manual_seed(seed + view) for seed in seeds]
-        total += torch.stack(held.loss_curvatures(draw(index, generators, names).flatten(1))).cpu()
-    x, y = objective.mean(total)
+        total += torch.stack(linearized.loss_curvatures(draw(index, generators, names).flatten(1))).cpu()
+    x, y = objective.mean_over_views(total)
     return x.view(len(names), count), y.view(len(names), count)
 
 
@@ -182,7 +206,7 @@ def _signs(
     generators: Sequence[torch.Generator],
     names: Sequence[str],
 ) -> Float[Tensor, "p b s"]:
-    """A draw of signs for each generator, in as many vectors as blocks."""
+    """`Draw` of random signs in each named block, times scale."""
     flat = objective.active.flat
     U = flat.new_zeros(flat.numel(), len(names), len(generators))
     for j, generator in enumerate(generators):

@@ -3,28 +3,24 @@
 `loss_against` and `consistency_loss` alone decide which kernels these are: those where the images are.
 """
 
-from typing import Any
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splat.backend.autograd import last_derivative
 from splat.backend.device import by_triton
-from splat.losses.cpu.loss import NUMPY, ImageLoss, ViewLoss
+from splat.losses.cpu.loss import NUMPY, CpuImageLoss, CpuViewLoss
+from splat.losses.protocols import ImageLoss, ViewLoss
 from splat.losses.reference import LossSettings
 
 
-def loss_against(target: Float[Tensor, "3 h w"], settings: LossSettings, like: Tensor) -> Any:
-    """The loss of images against a target, on the device and in the dtype of the tensor `like`.
-
-    A `ViewLoss`, or on a GPU a `CudaViewLoss` with the same interface; `view_loss` takes either.
-    """
+def loss_against(target: Float[Tensor, "3 h w"], settings: LossSettings, like: Tensor) -> ViewLoss:
+    """The loss of images against a target, on the device and in the dtype of the tensor `like`."""
     if by_triton(like):
         from splat.losses.cuda.loss import CudaViewLoss
 
         return CudaViewLoss(target.to(like.device), settings, like.dtype)
-    return ViewLoss.of(target, settings, like.dtype)
+    return CpuViewLoss(target, settings, like.dtype)
 
 
 class _Photometric(torch.autograd.Function):
@@ -56,7 +52,7 @@ class _PhotometricGradient(torch.autograd.Function):
         return *last_derivative(values, image, weight, outputs[0]), None, None
 
 
-def view_loss(image: Float[Tensor, "3 h w"], loss: Any) -> Float[Tensor, ""]:
+def view_loss(image: Float[Tensor, "3 h w"], loss: ViewLoss) -> Float[Tensor, ""]:
     """The loss of an image as a torch scalar, twice differentiable; loss: from `loss_against`."""
     return _Photometric.apply(image, loss)  # pyright: ignore[reportReturnType]
 
@@ -66,7 +62,7 @@ SECOND = "expected one derivative of the consistency of two images, got a second
 
 class _Consistency(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x: Tensor, y: Tensor, loss: Any) -> Tensor:
+    def forward(ctx, x: Tensor, y: Tensor, loss: ImageLoss) -> Tensor:
         value, gradients = loss.consistency(loss.padded(x), loss.padded(y))
         needed = zip(ctx.needs_input_grad, gradients, strict=False)
         ctx.gradients = [loss.cropped(gradient) for need, gradient in needed if need]
@@ -93,4 +89,4 @@ def consistency_loss(x: Float[Tensor, "3 h w"], y: Float[Tensor, "3 h w"], setti
         from splat.losses.cuda.loss import CudaImageLoss
 
         return _Consistency.apply(x, y, CudaImageLoss(x.detach(), settings))  # pyright: ignore[reportReturnType]
-    return _Consistency.apply(x, y, ImageLoss(x.shape, settings, NUMPY[x.dtype]))  # pyright: ignore[reportReturnType]
+    return _Consistency.apply(x, y, CpuImageLoss(x.shape, settings, NUMPY[x.dtype]))  # pyright: ignore[reportReturnType]

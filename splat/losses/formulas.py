@@ -1,70 +1,67 @@
-"""The losses of a pixel: the pixel losses, and SSIM with its first and second derivatives.
+"""The losses at one pixel: the pixel losses, and SSIM with its first and second derivatives, for both compilers.
 
-SSIM of an image x against a target y is taken in the residual r = x - y, because the variances of the usual formula cancel:
-in float32 its curvature is wrong by 3e-5 (in r: 3e-7).  With mu and var the window's mean and variance of y, c = 1/2 (which
-centres pictures), and m, p, q the window's means of r, r^2 and (y - c) r, at a pixel and channel:
+SSIM of an image x and a target y is written in the residual r = x - y, because the variances of the usual formula cancel: in
+float32 its second derivatives lose two digits more.  With mu and var the window's mean and variance of y, c = 1/2 (the middle
+of the range of intensities), and m, p, q the window's means of r, r^2 and (y - c) r at a pixel and channel,
 
     1 - S = 1 - l s       l = 1 - m^2 / B1     B1 = (mu + m)^2 + mu^2 + C1
                           s = 1 - w / B2       w = p - m^2, the variance of r
                                                B2 = 2 (var + q - (mu - c) m) + w + C2
 
-The window's blur is its own adjoint, so with S_m, S_p, S_q the partial derivatives
+The window's blur is its own adjoint.  So with S_m, S_p, S_q the partial derivatives of S,
 
     gradient of sum S      blur(S_m) + 2 r blur(S_p) + (y - c) blur(S_q)
-    its tangent for v      the same of S_m', S_p', S_q', plus 2 v blur(S_p), a dash the second derivative of S applied to
+    its tangent for v      the same of S_m', S_p', S_q', plus 2 v blur(S_p): a dash is the second derivative of S applied to
                            m' = blur(v), p' = 2 blur(r v), q' = blur((y - c) v)
+
+Where both images depend on the parameters, the loss is symmetric and is written in r and a = (x + y) / 2.  With M and V the
+window's mean and variance of a, and D = 1 - S of the same l and s,
+
+    B1 = 2 M^2 + m^2 / 2 + C1         (2 M^2 + m^2 / 2 = mu_x^2 + mu_y^2)
+    B2 = 2 V + w / 2 + C2             (2 V + w / 2 = var_x + var_y)
+
+    gradient of sum D in r      blur(D_m) + 2 r blur(D_p)
+                     in a       blur(D_M - 2 (M - c) D_V) + 2 (a - c) blur(D_V)
+
+The gradient in x is half the one in a plus the one in r; that in y is half the one in a minus the one in r.
 """
 
 from splat.backend.cpu.jit import formula
 from splat.backend.cpu.simd import maximum, select, sqrt
-from splat.losses.reference import C1, C2
-
-
-@formula
-def pair_slopes(m, p, mean, variance):
-    """1 - S, and what is blurred for the gradients in r (2) and in a (2)."""
-    w = p - m * m
-    r1 = 1.0 / (2.0 * mean * mean + 0.5 * m * m + C1)
-    r2 = 1.0 / (2.0 * variance + 0.5 * w + C2)
-    far, apart = m * m * r1, w * r2
-    l, s = 1.0 - far, 1.0 - apart
-    dp, dv = l * (1.0 - 0.5 * apart) * r2, -2.0 * l * apart * r2
-    in_m = m * (s * (2.0 - far) * r1 - 2.0 * dp)
-    in_mean = -4.0 * s * far * mean * r1 - 2.0 * (mean - CENTRE) * dv
-    return far + apart - far * apart, in_m, dp, in_mean, dv
-
+from splat.losses.reference import C1, C2, PixelLoss
 
 L1, CHARBONNIER, L2 = range(3)
+KINDS: dict[PixelLoss, int] = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
 CENTRE = 0.5
 SECONDS = 6  # S_mm, S_mp, S_mq, S_pp, S_pq, S_qq
 
 
 @formula
 def similarity(m, p, q, mu, var):
-    """1 - l and 1 - s, their first derivatives l_m and s_m, s_p, s_q, and what the second ones need."""
+    """1 - l and 1 - s, their first derivatives l_m and s_m, s_p, s_q, and what the second derivatives need."""
     mean = mu + m
     r1 = 1.0 / (mean * mean + mu * mu + C1)
     variance, centred = p - m * m, mean - CENTRE
     r2 = 1.0 / (2.0 * (var + q - (mu - CENTRE) * m) + variance + C2)
-    far, apart = m * m * r1, variance * r2
-    dl = 2.0 * (mean * far - m) * r1
-    sm, sp, sq = 2.0 * (m - centred * apart) * r2, -((1.0 - apart) * r2), 2.0 * apart * r2
-    return far, apart, dl, sm, sp, sq, mean, centred, r1, r2
+    not_l, not_s = m * m * r1, variance * r2
+    dl = 2.0 * (mean * not_l - m) * r1
+    sm, sp, sq = 2.0 * (m - centred * not_s) * r2, -((1.0 - not_s) * r2), 2.0 * not_s * r2
+    return not_l, not_s, dl, sm, sp, sq, mean, centred, r1, r2
 
 
 @formula
-def slopes_of(found):
-    """1 - S, and S_m, S_p, S_q, from `similarity`."""
-    far, apart, dl, sm, sp, sq, _mean, _centred, _r1, _r2 = found
-    l = 1.0 - far
-    return far + apart - far * apart, dl * (1.0 - apart) + l * sm, l * sp, l * sq
+def ssim_slopes(m, p, q, mu, var):
+    """1 - S, and S_m, S_p, S_q."""
+    not_l, not_s, dl, sm, sp, sq, _mean, _centred, _r1, _r2 = similarity(m, p, q, mu, var)
+    l = 1.0 - not_l
+    return not_l + not_s - not_l * not_s, dl * (1.0 - not_s) + l * sm, l * sp, l * sq
 
 
 @formula
-def seconds_of(found):
-    """The SECONDS second derivatives of S, from `similarity`."""
-    far, apart, dl, sm, sp, sq, mean, centred, r1, r2 = found
-    l, s = 1.0 - far, 1.0 - apart
+def ssim_seconds(m, p, q, mu, var):
+    """The SECONDS second derivatives of S."""
+    not_l, not_s, dl, sm, sp, sq, mean, centred, r1, r2 = similarity(m, p, q, mu, var)
+    l, s = 1.0 - not_l, 1.0 - not_s
     ddl = -((2.0 * l + 4.0 * mean * dl) * r1)
     smm, smp = (2.0 * s + 4.0 * centred * sm) * r2, (2.0 * centred * sp - sm) * r2
     smq = 2.0 * (centred * sq - sm) * r2
@@ -87,7 +84,7 @@ def ssim_second_dot(second, dm, dp, dq):
 
 @formula
 def ssim_quadratic_form(second, dm, dp, dq, squared, blurred_sp):
-    """What a pixel has of the second derivative of sum S along v: (m', p', q') . S'' (m', p', q') + 2 v^2 blur(S_p)."""
+    """A pixel's term of v . (second derivative of sum S) v: (m', p', q') . S'' (m', p', q') + 2 v^2 blur(S_p)."""
     sm, sp, sq = ssim_second_dot(second, dm, dp, dq)
     return sm * dm + sp * dp + sq * dq + 2.0 * squared * blurred_sp
 
@@ -107,6 +104,28 @@ def ssim_diag_hessian(second, blurred_sp, residual, aim):
 
 
 @formula
+def pair_slopes(m, p, mean, variance):
+    """1 - S of two images, and the fields that are blurred for the gradients in r (two) and in a (two)."""
+    w = p - m * m
+    r1 = 1.0 / (2.0 * mean * mean + 0.5 * m * m + C1)
+    r2 = 1.0 / (2.0 * variance + 0.5 * w + C2)
+    not_l, not_s = m * m * r1, w * r2
+    l, s = 1.0 - not_l, 1.0 - not_s
+    dp, dv = l * (1.0 - 0.5 * not_s) * r2, -2.0 * l * not_s * r2
+    in_m = m * (s * (2.0 - not_l) * r1 - 2.0 * dp)
+    in_mean = -4.0 * s * not_l * mean * r1 - 2.0 * (mean - CENTRE) * dv
+    return not_l + not_s - not_l * not_s, in_m, dp, in_mean, dv
+
+
+@formula
+def pair_adjoint(x, y, slope, structural, bm, bp, ba, bv):
+    """The gradients in x and y, from the pixel loss's slope in r and the four blurred fields; structural: weight of 1 - S."""
+    apart = slope + structural * (bm + 2.0 * (x - y) * bp)
+    along = structural * (0.5 * ba + (0.5 * (x + y) - CENTRE) * bv)
+    return along + apart, along - apart
+
+
+@formula
 def pixel_slope(residual, kind, eps):
     """The pixel loss of a residual and its derivative."""
     if kind == L1:
@@ -114,7 +133,7 @@ def pixel_slope(residual, kind, eps):
     if kind == L2:
         return residual * residual, 2.0 * residual
     length = sqrt(residual * residual + eps * eps)
-    return length, residual / length
+    return length, residual * (1.0 / length)
 
 
 @formula

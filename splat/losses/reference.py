@@ -18,7 +18,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
+
 WINDOW, SIGMA = 11, 1.5
+REACH = WINDOW // 2
 C1, C2 = 0.01**2, 0.03**2
 PixelLoss = Literal["l1", "charbonnier", "l2"]
 
@@ -28,6 +31,9 @@ class LossSettings:
     """Which loss a view contributes: the pixel loss, and ssim_weight = lambda in [0, 1], of 1 - SSIM.
 
     eps: Charbonnier's, in units of intensity.  literal: the pixel loss has the weight 1 instead of 1 - lambda.
+
+    >>> LossSettings("l2", ssim_weight=0.2).pixel_weight
+    0.8
     """
 
     pixel: PixelLoss = "l1"
@@ -37,9 +43,9 @@ class LossSettings:
 
     def __post_init__(self) -> None:
         if self.pixel not in ("l1", "charbonnier", "l2"):
-            raise ValueError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
+            raise InputError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
         if not (0 <= self.ssim_weight <= 1 and self.eps > 0):
-            raise ValueError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
+            raise InputError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
 
     @property
     def pixel_weight(self) -> float:
@@ -48,7 +54,7 @@ class LossSettings:
 
 def window(dtype: torch.dtype) -> Float[Tensor, "11"]:
     """The normalised 1-D Gaussian; the 2-D window is its outer product."""
-    offset = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    offset = torch.arange(WINDOW, dtype=torch.float64) - REACH
     weight = torch.exp(-(offset**2) / (2 * SIGMA**2))
     return (weight / weight.sum()).to(dtype)
 
@@ -56,8 +62,10 @@ def window(dtype: torch.dtype) -> Float[Tensor, "11"]:
 def blur(fields: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
     """The window's weighted mean round every pixel; zero outside the image.  Its own adjoint."""
     weight, channels = window(fields.dtype), fields.shape[0]
-    rows = F.conv2d(fields[None], weight.view(1, 1, 1, -1).expand(channels, 1, 1, -1), padding=(0, 5), groups=channels)
-    return F.conv2d(rows, weight.view(1, 1, -1, 1).expand(channels, 1, -1, 1), padding=(5, 0), groups=channels)[0]
+    rows = F.conv2d(
+        fields[None], weight.view(1, 1, 1, -1).expand(channels, 1, 1, -1), padding=(0, REACH), groups=channels
+    )
+    return F.conv2d(rows, weight.view(1, 1, -1, 1).expand(channels, 1, -1, 1), padding=(REACH, 0), groups=channels)[0]
 
 
 def ssim_map(image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:

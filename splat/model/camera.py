@@ -12,10 +12,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
+
 
 @dataclass(frozen=True)
 class Camera:
-    """rotation: world to camera, float64; centre: camera centre in world units, float64; the rest in pixels."""
+    """rotation: world to camera, float64; centre: camera centre in world units, float64; the rest in pixels.
+
+    InputError where the rotation is none, or a number is not finite or, but for centre and principal point, not positive.
+
+    >>> Camera(torch.eye(3), torch.zeros(3), fx=50.0, fy=50.0, cx=16.0, cy=12.0, width=32, height=24).resized(16, 12).fx
+    25.0
+    """
 
     rotation: Float[Tensor, "3 3"]
     centre: Float[Tensor, "3"]
@@ -29,16 +37,16 @@ class Camera:
     def __post_init__(self) -> None:
         error = (self.rotation @ self.rotation.T - torch.eye(3, dtype=self.rotation.dtype)).abs().max().item()
         if not error < 1e-4 or torch.linalg.det(self.rotation) < 0:
-            raise ValueError(
+            raise InputError(
                 f"expected a rotation matrix, got one with |R R^T - 1| = {error:.1e}: {self.rotation.tolist()}"
             )
         if not (self.fx > 0 and self.fy > 0 and self.width > 0 and self.height > 0):
-            raise ValueError(
+            raise InputError(
                 f"expected positive focal lengths and image size, got {self.fx}, {self.fy}, {self.width}, {self.height}"
             )
         numbers = (*self.centre.tolist(), self.fx, self.fy, self.cx, self.cy)
         if not all(map(isfinite, numbers)):
-            raise ValueError(f"expected a finite centre, focal lengths and principal point, got {numbers}")
+            raise InputError(f"expected a finite centre, focal lengths and principal point, got {numbers}")
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera with its image resampled to width x height pixels."""
@@ -54,14 +62,14 @@ class Camera:
 
 
 def look_at(centre: Float[Tensor, "3"], target: Float[Tensor, "3"], down: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """World-to-camera rotation at a centre that looks at a target, held level: +x is perpendicular to `down`.
+    """World-to-camera rotation of a level camera at a centre that looks at a target: +x is perpendicular to `down`.
 
-    Raises ValueError where the target is the centre, or straight above or below it.
+    Raises InputError where the target is the centre, or straight above or below it.
     """
     forward = (target - centre) / (target - centre).norm()
     right = torch.linalg.cross(down, forward)
     if not right.norm() > 1e-9 * down.norm():
-        raise ValueError(
+        raise InputError(
             f"expected a target away from the centre, not along {down.tolist()} from it, got {target.tolist()}"
         )
     right = right / right.norm()
@@ -69,14 +77,14 @@ def look_at(centre: Float[Tensor, "3"], target: Float[Tensor, "3"], down: Float[
 
 
 def rotation_about(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The rotation by |vector| radians about it."""
+    """The rotation by |vector| radians about a vector."""
     return torch.from_numpy(scipy.spatial.transform.Rotation.from_rotvec(vector.numpy()).as_matrix()).to(vector.dtype)
 
 
 def slerp(first: Float[Tensor, "3 3"], second: Float[Tensor, "3 3"], t: float) -> Float[Tensor, "3 3"]:
     """first (first^T second)^t: the shorter geodesic on SO(3), first at 0, second at 1, any real t.
 
-    Half a turn apart both ways are equally short; which one is taken is SciPy's choice, always the same.
+    For rotations half a turn apart, both ways are equally short; SciPy always takes the same.
     """
     vector = scipy.spatial.transform.Rotation.from_matrix((first.T @ second).numpy()).as_rotvec()
     return first @ rotation_about(t * torch.from_numpy(vector))

@@ -18,6 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
+
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
 
@@ -39,17 +41,25 @@ def parameters_per_gaussian(sh_degree: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """n Gaussians over one flat vector of n (11 + 3 (sh_degree + 1)^2) stored parameters."""
+    """n Gaussians over one flat vector of n (11 + 3 (sh_degree + 1)^2) stored parameters.
+
+    InputError where sh_degree or the length of the vector cannot be.
+
+    >>> gaussians = Gaussians(torch.zeros(2 * 14), sh_degree=0)
+    >>> gaussians.means[1] = 1.0  # a view: writes to the flat vector
+    >>> len(gaussians), gaussians.flat.sum(), gaussians.blocks["quats"]
+    (2, tensor(3.), slice(12, 20, None))
+    """
 
     flat: Float[Tensor, " p"]
     sh_degree: int
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
+            raise InputError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
         each = parameters_per_gaussian(self.sh_degree)
         if self.flat.ndim != 1 or self.flat.numel() % each:
-            raise ValueError(
+            raise InputError(
                 f"expected a vector of n x {each} parameters at SH degree {self.sh_degree}, got {tuple(self.flat.shape)}"
             )
 
@@ -68,7 +78,7 @@ class Gaussians:
 
     @property
     def blocks(self) -> dict[str, slice]:
-        """Where each attribute lies in the flat vector."""
+        """The rows of each attribute in the flat vector."""
         result, start = {}, 0
         for name, shape in attribute_shapes(len(self), self.sh_degree).items():
             size = int(torch.Size(shape).numel())
@@ -126,11 +136,11 @@ class Gaussians:
         return result
 
     def require_finite(self) -> None:
-        """Raise ValueError that names the attribute and the first Gaussian that has no finite image and derivatives.
+        """Raise InputError, with attribute and number, for the first Gaussian without finite image and derivatives.
 
         Refused are numbers that are not finite, quaternions of length 0, which have no direction, and quaternions and SH whose
-        fourth power (SSIM's curvature has that of a colour, a quaternion's 1 / |q|^2 twice) leaves the range of the dtype.
-        How large log_scales may be depends on the view: `projection_cpu.require_sizes`.
+        fourth power leaves the range of the dtype: SSIM's curvature has the fourth power of a colour, and a quaternion's
+        1 / |q|^2 enters twice.  The limit of log_scales depends on the view: `splat.projection.reference.require_sizes`.
         """
         sizes = {
             name: value.detach().reshape(len(self), -1).abs().amax(dim=1) for name, value in self.attributes.items()
@@ -143,13 +153,13 @@ class Gaussians:
             ((quats >= 1 / largest) & (quats <= largest), "quats", "moderate", range_of_quats),
             (sh <= largest, "sh", "moderate", f" (up to {largest:.1e})"),
         ]
-        if torch.stack([good.all() for good, *_ in conditions]).all():  # one answer, for which a GPU is waited for once
+        if torch.stack([good.all() for good, *_ in conditions]).all():  # waits for a GPU once
             return
         self._refuse(*next(condition for condition in conditions if not condition[0].all()))
 
     def _refuse(self, good: Tensor, name: str, quality: str, meaning: str) -> None:
         first = int((~good).nonzero()[0])
-        raise ValueError(
+        raise InputError(
             f"expected {quality} {name}{meaning}, got {self.attributes[name][first].tolist()} at Gaussian {first} "
             f"({int((~good).sum())} of {len(self)} are not {quality}); remove them from the checkpoint, or lower its rates"
         )

@@ -1,20 +1,23 @@
-"""The thresholds of the renderer, and how a GPU adds up, in one frozen object.
+"""The thresholds of the renderer, and how a GPU accumulates sums, in one frozen object.
 
-Every threshold makes the image a discontinuous or merely piecewise smooth function of the parameters.  The values are
-those of the original 3DGS rasterizer (Kerbl et al. 2023); `SMOOTH` switches off what can be switched off, so that a study
-can measure what the thresholds do to the landscape.
+Every threshold makes the image a discontinuous or merely piecewise smooth function of the parameters.  The default values are
+those of the original 3DGS rasterizer (Kerbl et al. 2023).  `SMOOTH` switches off the thresholds that can be switched off, so
+that a study can measure their effect on the landscape.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
-Sums = Literal["ordered", "atomic"]
+from landscape.errors import InputError
+
+Accumulation = Literal["deterministic", "atomic"]
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """Thresholds of projection and compositing, and the order of a GPU's sums.
+    """Thresholds of projection and compositing, and how a GPU accumulates sums.
 
     blur: variance added to the diagonal of every 2-D covariance, in px^2.
     fov_clamp: the projection's Jacobian is taken at x/z and y/z clamped to this multiple of tan(fov / 2).
@@ -25,7 +28,12 @@ class RenderSettings:
     contour_sigma: an additional cut at this Mahalanobis distance (the original cuts at 3); None keeps alpha_min's contour.
     gradient_through_cap: pass derivatives in ln alpha through the cap, instead of the true 0; the original CUDA code passes
         those in alpha through, which is the same within 1%.
-    sums: how a GPU adds up gradients.  ordered: the same bits every time, as on the CPU; atomic: as they come, which is faster.
+    accumulation: how a GPU adds up gradients.  deterministic: in a fixed order, with the same bits every time, as on the CPU;
+        atomic: in whatever order, which is faster.
+    InputError where a value is out of its range.
+
+    >>> RenderSettings(alpha_min=0.0).near
+    0.2
     """
 
     blur: float = 0.3
@@ -36,25 +44,38 @@ class RenderSettings:
     transmittance_min: float = 1e-4
     contour_sigma: float | None = None
     gradient_through_cap: bool = False
-    sums: Sums = "ordered"
+    accumulation: Accumulation = "deterministic"
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha_max < 1:
-            raise ValueError(
+            raise InputError(
                 f"expected 0 < alpha_max < 1, got {self.alpha_max}: at 1 a Gaussian would hide all behind it exactly, "
                 "and the backward pass divides by 1 - alpha; use e.g. 0.999"
             )
         if not 0 <= self.alpha_min < self.alpha_max:
-            raise ValueError(f"expected 0 <= alpha_min < alpha_max = {self.alpha_max}, got {self.alpha_min}")
+            raise InputError(f"expected 0 <= alpha_min < alpha_max = {self.alpha_max}, got {self.alpha_min}")
         if not 0 <= self.transmittance_min < 1:
-            raise ValueError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
+            raise InputError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
         finite = 0 <= self.blur < inf and 0 < self.near < inf and 0 < self.fov_clamp < inf
         if not finite:  # nan fails every comparison
-            raise ValueError(f"expected blur >= 0, near > 0, fov_clamp > 0, all finite, got {self}")
+            raise InputError(f"expected blur >= 0, near > 0, fov_clamp > 0, all finite, got {self}")
         if self.contour_sigma is not None and not self.contour_sigma > 0:
-            raise ValueError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
-        if self.sums not in get_args(Sums):
-            raise ValueError(f"expected sums 'ordered' or 'atomic', got {self.sums!r}")
+            raise InputError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
+        if self.accumulation not in get_args(Accumulation):
+            raise InputError(f"expected accumulation 'deterministic' or 'atomic', got {self.accumulation!r}")
 
 
 SMOOTH = replace(RenderSettings(), alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)
+
+
+def current_settings(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of `RenderSettings` under their names of today, from those of an older configuration.
+
+    `accumulation` was called `sums` ("ordered" for "deterministic"), and was missing before.
+
+    >>> current_settings({"blur": 0.3, "sums": "ordered"})
+    {'blur': 0.3, 'accumulation': 'deterministic'}
+    """
+    fields = {name: value for name, value in stored.items() if name != "sums"}
+    accumulation = fields.setdefault("accumulation", stored.get("sums", "deterministic"))
+    return {**fields, "accumulation": "deterministic" if accumulation == "ordered" else accumulation}

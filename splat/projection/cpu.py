@@ -1,7 +1,7 @@
 """Projection and SH as kernels: stored parameters of Gaussians -> splats of a view, and the adjoint: training's passes.
 
 Values are computed in double precision, so that needles (condition number to 1e6) keep their conics in float32.  Splats are
-(n, 9): `raster/packing.py`.  The second order is in `projection_linear.py`.
+(n, 9): `whitening.py`.  The second order is in `linear_cpu.py`.
 """
 
 from math import exp
@@ -22,6 +22,7 @@ from splat.projection.formulas import (
     to_camera,
 )
 from splat.projection.reference import require_sizes
+from splat.projection.whitening import converted, put
 
 
 def attribute_arrays(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
@@ -42,6 +43,23 @@ def point(array, i):
 @formula
 def quaternion(array, i):
     return np.float64(array[i, 0]), np.float64(array[i, 1]), np.float64(array[i, 2]), np.float64(array[i, 3])
+
+
+@formula
+def six_of(row):
+    """The first six numbers of a row, in double precision."""
+    return (
+        np.float64(row[0]), np.float64(row[1]), np.float64(row[2]), np.float64(row[3]), np.float64(row[4]), np.float64(row[5])
+    )  # fmt: skip
+
+
+@kernel
+def convert(start, stop, way, splats, numbers, out):
+    """`whitening.converted` of tangents or adjoints of splats, (n, 9); their colours are alike in all coordinates."""
+    for i in range(start, stop):
+        put(out[i], converted(way, splats[i], six_of(numbers[i])))
+        for c in range(6, 9):
+            out[i, c] = numbers[i, c]
 
 
 @kernel
@@ -79,11 +97,7 @@ def project_adjoint(
             moves |= bar[i, j] != 0
         if drawn[i] and moves:
             mean = point(means, i)
-            bars = (
-                np.float64(bar[i, 0]), np.float64(bar[i, 1]), np.float64(bar[i, 2]),
-                np.float64(bar[i, 3]), np.float64(bar[i, 4]),
-            )  # fmt: skip
-            m, s, q = geometry_adjoint(lens, mean, point(log_scales, i), quaternion(quats, i), bars)
+            m, s, q = geometry_adjoint(lens, mean, point(log_scales, i), quaternion(quats, i), six_of(bar[i]))
             harmonic = basis(direction_of(lens, mean)[0])
             weight = np.zeros(16)
             for k in range(bands):

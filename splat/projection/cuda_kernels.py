@@ -1,8 +1,8 @@
 """Projection and SH on the GPU: kernels over blocks of Gaussians.
 
-The formulas are those of `projection_formulas.py` and `raster/whitening.py`, run by `traced.py`.  What is held per Gaussian in
-sight is as in `projection_linear.Held`, with the Gaussians along the last axis, so that neighbouring threads read neighbouring
-numbers.  A block of vectors (p, K) is laid out like the flat vector; `start_of` says where an attribute begins there.
+The formulas are those of `formulas.py` and `whitening.py`, compiled by `triton_formula`.  The arrays of a `ProjectionJacobian`
+have the Gaussians along the last axis here, so that neighbouring threads read neighbouring numbers.  A block of vectors (p, K)
+is laid out like the flat vector; `start_of` says where an attribute begins there.
 
 Values and the tangents of the linearisation are in double precision, products with vectors in that of the parameters.
 """
@@ -13,10 +13,10 @@ Values and the tangents of the linearisation are in double precision, products w
 import triton.language as tl
 
 from splat.backend.gpu.compile import jit, sized
-from splat.backend.gpu.traced import digest, tangent_of, traced, variable
+from splat.backend.gpu.formula import tangent_of, triton_formula, variable
 from splat.projection.formulas import (
+    GEOMETRY,
     Lens,
-    add_symmetric,
     basis,
     colour_adjoint,
     direction_of,
@@ -25,7 +25,7 @@ from splat.projection.formulas import (
     offset_from,
     to_camera,
 )
-from splat.projection.whitening import plain, whitened, whitened_adjoint, whitening
+from splat.projection.whitening import converted, geometry_coefficients, plain_gradient, whitening
 
 LENS = tl.constexpr(20)  # numbers of a lens: rotation 9, centre 3, then the others in order, the near plane last
 
@@ -34,20 +34,20 @@ def lens_from(numbers):
     return Lens(numbers[:9], numbers[9:12], *numbers[12:])
 
 
-@traced
+@triton_formula
 def depth_of(lens, mean):
     camera = lens_from(lens)
     return to_camera(camera, offset_from(camera, mean))[2]
 
 
-@traced
+@triton_formula
 def splat_of(lens, mean, log_scales, quat):
     """Mean x, y and conic, and the sixteen harmonics at the view direction."""
     camera = lens_from(lens)
     return geometry(camera, mean, log_scales, quat), basis(direction_of(camera, mean)[0])
 
 
-@traced
+@triton_formula
 def adjoint_of(lens, mean, log_scales, quat, bar, weight, bands):
     """The adjoints of mean, log-scales and quaternion: of the five numbers in bar, and of weight . harmonics in the mean."""
     camera = lens_from(lens)
@@ -56,19 +56,20 @@ def adjoint_of(lens, mean, log_scales, quat, bar, weight, bands):
     return (m[0] + along[0], m[1] + along[1], m[2] + along[2], *s, *q)
 
 
-@traced
-def linearized_geometry(lens, mean, log_scales, quat, splat, bar, lane):
-    """The whitened Jacobian (5 rows) and the Hessian of bar . geometry (10 rows), one direction at each place of `lane`."""
+@triton_formula
+def linearized_geometry(lens, mean, log_scales, quat, splat, moments, lane):
+    """The Jacobian (5 rows) and the Hessian of adjoint . geometry (10 rows), one direction at each place of `lane`."""
     camera = lens_from(lens)
     numbers = (*mean, *log_scales, *quat)
     variables = [variable(number, lane, i) for i, number in enumerate(numbers)]
     x, s, q = variables[:3], variables[3:6], variables[6:]
-    jacobian = whitened(whitening(splat), [tangent_of(value) for value in geometry(camera, x, s, q)])
-    m, t, r = geometry_adjoint(camera, x, s, q, bar)
+    W = whitening(splat)
+    jacobian = geometry_coefficients(W, [tangent_of(value) for value in geometry(camera, x, s, q)])
+    m, t, r = geometry_adjoint(camera, x, s, q, plain_gradient(W, splat[5], moments))
     return jacobian, [tangent_of(row) for row in (*m, *t, *r)]
 
 
-@traced
+@triton_formula
 def linearized_colour(lens, mean, weight, bands, lane):
     """The harmonics at the view direction, their slopes in the mean, and the Hessian of weight . harmonics (3 rows)."""
     camera = lens_from(lens)
@@ -78,25 +79,22 @@ def linearized_colour(lens, mean, weight, bands, lane):
     return basis(direction_of(camera, mean)[0]), slopes, along
 
 
-@traced
-def plain_tangent(splat, five):
-    return plain(whitening(splat), five)
+@triton_formula
+def in_other_coordinates(way, splat, numbers):
+    return converted(way, splat, numbers)
 
 
-@traced
-def whitened_bar(splat, five):
-    return whitened_adjoint(whitening(splat), five)
-
-
-@traced
+@triton_formula
 def curved(packed, u, h):
-    """h + C u: `add_symmetric`."""
-    total = list(h)
-    add_symmetric(packed, u, total)
+    """h + C u, C symmetric with its lower triangle packed row by row."""
+    total, place = list(h), 0
+    for j in range(GEOMETRY):
+        for k in range(j):
+            total[j] = total[j] + packed[place + k] * u[k]
+            total[k] = total[k] + packed[place + k] * u[j]
+        total[j] = total[j] + packed[place + j] * u[j]
+        place += j + 1
     return total
-
-
-FORMULAS = digest()
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -135,7 +133,7 @@ def row(pointer, i, width: tl.constexpr, count: tl.constexpr, mask):
 
 @jit
 def columns(pointer, e, m, count: tl.constexpr, mask):
-    """What is held at place e of so many arrays of m, one after the other."""
+    """The numbers at place e of so many arrays of m, one after the other."""
     found = ()
     for j in tl.static_range(count):
         found = found + (tl.load(pointer + j * m + e, mask, other=0.0),)
@@ -148,12 +146,24 @@ def sigmoid(x):
     return tl.where(x >= 0, 1.0, smaller) / (1.0 + smaller)
 
 
+@sized("n")
+def convert(splats, numbers, out, n, WAY: tl.constexpr, BLOCK: tl.constexpr):
+    """`whitening.converted` of tangents or adjoints of splats, (n, 9); their colours are alike in all coordinates."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = i < n
+    found = in_other_coordinates(WAY, row(splats, i, 9, 6, here), row(numbers, i, 9, 6, here))
+    for j in tl.static_range(6):
+        tl.store(out + i * 9 + j, found[j], here)
+    for c in tl.static_range(6, 9):
+        tl.store(out + i * 9 + c, tl.load(numbers + i * 9 + c, here, other=0.0), here)
+
+
 # --- values and adjoint -----------------------------------------------------------------------------------------------
 
 
 @sized("n")
 def project_splats(
-    flat, lens, splats, depths, drawn, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+    flat, lens, splats, depths, drawn, n, BANDS: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
     """Splats (n, 9), depths and drawn; a Gaussian behind the near plane gets zeros."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -186,7 +196,7 @@ def colour_bars(bar, splats, i, mask):
     for c in tl.static_range(3):
         lit = tl.where(tl.load(splats + i * 9 + 6 + c, mask, other=0.0) > 0, 1.0, 0.0).to(tl.float64)
         visible = visible + (lit,)
-        found = found + (lit * tl.load(bar + i * 9 + 6 + c, mask, other=0.0),)
+        found = found + (lit * tl.load(bar + i * 9 + 6 + c, mask, other=0.0).to(tl.float64),)
     return found, visible
 
 
@@ -206,7 +216,7 @@ def harmonic_weights(flat, colour_bar, i, n, BANDS: tl.constexpr, mask):
 
 @sized("n")
 def project_adjoint(
-    flat, lens, splats, drawn, bar, gradient, n, BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+    flat, lens, splats, drawn, bar, gradient, n, BANDS: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
     """The gradient in the flat vector, given the adjoint of the splats, bar (n, 9)."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -242,16 +252,21 @@ def project_adjoint(
 
 @sized("n", "m")
 def linearize_geometry(
-    flat, lens, splats, bar, index, jacobian, curvature, n, m, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
+    flat, lens, splats, moments, index, jacobian, curvature, logit_slope, logit_curvature, n, m,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """What is held of the geometry of the Gaussians at index (m,), one direction a lane."""
+    """The derivatives of geometry and opacity of the Gaussians at index (m,), one direction a lane."""
     e, lane = places(BLOCK, 16)
     here = e < m
     i = tl.load(index + e, here, other=0)
     rows, bends = linearized_geometry(
         numbers(lens, LENS), row(flat, i, 3, 3, here), row(flat + start_of(1, n), i, 3, 3, here),
-        row(flat + start_of(2, n), i, 4, 4, here), row(splats, i, 9, 5, here), row(bar, i, 9, 5, here), lane,
+        row(flat + start_of(2, n), i, 4, 4, here), row(splats, i, 9, 6, here), row(moments, i, 9, 6, here), lane,
     )  # fmt: skip
+    slope = 1.0 - tl.load(splats + i * 9 + 5, here, other=0.0)
+    S = tl.load(moments + i * 9, here, other=0.0).to(tl.float64)
+    tl.store(logit_slope + e, slope, here & (lane == 0))
+    tl.store(logit_curvature + e, slope * (2.0 * slope - 1.0) * S, here & (lane == 0))
     for r in tl.static_range(5):
         tl.store(jacobian + (r * 10 + lane) * m + e, rows[r], here & (lane < 10))
     for j in tl.static_range(10):
@@ -260,19 +275,19 @@ def linearize_geometry(
 
 @sized("n", "m")
 def linearize_colour(
-    flat, lens, splats, bar, index, curvature, harmonic, slope, colour_bar, visible, colour_slope, n, m,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    flat, lens, splats, moments, index, curvature, harmonic, slope, colour_bar, visible, colour_slope, n, m,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """What is held of the colours, one direction a lane; what they add to the curvature is added."""
+    """The derivatives of the colours, one direction a lane; what they add to the curvature is added."""
     e, lane = places(BLOCK, 16)
     here = e < m
     i = tl.load(index + e, here, other=0)
-    bars, lit = colour_bars(bar, splats, i, here)
+    bars, lit = colour_bars(moments, splats, i, here)
     weight = harmonic_weights(flat, bars, i, n, BANDS, here)
     values, slopes, along = linearized_colour(numbers(lens, LENS), row(flat, i, 3, 3, here), weight, BANDS, lane)
     for j in tl.static_range(3):
-        at, held = curvature + (j * (j + 1) // 2 + lane) * m + e, here & (lane <= j)
-        tl.store(at, tl.load(at, held, other=0.0) + along[j], held)
+        at, lower = curvature + (j * (j + 1) // 2 + lane) * m + e, here & (lane <= j)
+        tl.store(at, tl.load(at, lower, other=0.0) + along[j], lower)
     for k in tl.static_range(16):
         tl.store(harmonic + k * m + e, values[k], here & (lane == 0))
         tl.store(slope + (k * 3 + lane) * m + e, slopes[k], here & (lane < 3))
@@ -284,21 +299,6 @@ def linearize_colour(
             sh = tl.load(flat + start_of(4, n) + (i * BANDS + b) * 3 + c, here, other=0.0)
             total += sh.to(tl.float64) * slopes[b]
         tl.store(colour_slope + (c * 3 + lane) * m + e, total, here & (lane < 3))
-
-
-@sized("start", "count", "m")
-def plain_jacobian(splats, index, jacobian, out, start, count, m, BLOCK: tl.constexpr, FORMULAS: tl.constexpr):
-    """The geometry's Jacobian in plain coordinates: five rows of out (count, 9, 11), of the Gaussians at places from start."""
-    e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = e < count
-    splat = row(splats, tl.load(index + start + e, here, other=0), 9, 5, here)
-    for j in tl.static_range(10):
-        five = ()
-        for r in tl.static_range(5):
-            five = five + (tl.load(jacobian + (r * 10 + j) * m + start + e, here, other=0.0).to(tl.float64),)
-        tangent = plain_tangent(splat, five)
-        for r in tl.static_range(5):
-            tl.store(out + (e * 9 + r) * 11 + j, tangent[r], here)
 
 
 # --- products with a block of vectors: Gaussians by rows, vectors by columns ------------------------------------------
@@ -319,80 +319,75 @@ def tangents_at(block, i, k, K, n, here):
 
 @sized("n", "m", "K")
 def push_forward(
-    block, splats, index, jacobian, harmonic, visible, colour_slope, out, n, m, K,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr, FORMULAS: tl.constexpr,
+    block, index, jacobian, harmonic, visible, colour_slope, logit_slope, out, n, m, K,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr,
 ):  # fmt: skip
     """P' u: rows of out (n, K, 9)."""
     e, k = places(BLOCK, VECTORS)
     k += tl.program_id(1) * VECTORS
-    held, here = e < m, (e < m) & (k < K)
-    i = tl.load(index + e, held, other=0)
+    kept, here = e < m, (e < m) & (k < K)
+    i = tl.load(index + e, kept, other=0)
     u = tangents_at(block, i, k, K, n, here)
-    whitened_tangent = ()
+    at = out + (i * K + k) * 9
+    logit = tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
+    tl.store(at, tl.load(logit_slope + e, kept, other=0.0) * logit, here)
     for r in tl.static_range(5):
         total = u[0] * 0.0
         for j in tl.static_range(10):
-            total += tl.load(jacobian + (r * 10 + j) * m + e, held, other=0.0) * u[j]
-        whitened_tangent = whitened_tangent + (total.to(tl.float64),)
-    tangent = plain_tangent(row(splats, i, 9, 5, held), whitened_tangent)
-    at = out + (i * K + k) * 9
-    for r in tl.static_range(5):
-        tl.store(at + r, tangent[r], here)
-    opacity = tl.load(splats + i * 9 + 5, held, other=0.0)
-    logit = tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
-    tl.store(at + 5, opacity * (1.0 - opacity) * logit, here)
+            total += tl.load(jacobian + (r * 10 + j) * m + e, kept, other=0.0) * u[j]
+        tl.store(at + 1 + r, total, here)
     for c in tl.static_range(3):
         total = u[0] * 0.0
         for j in tl.static_range(3):
-            total += tl.load(colour_slope + (c * 3 + j) * m + e, held, other=0.0) * u[j]
+            total += tl.load(colour_slope + (c * 3 + j) * m + e, kept, other=0.0) * u[j]
         for b in range(BANDS):
             sh = tl.load(block + (start_of(4, n) + (i * BANDS + b) * 3 + c) * K + k, here, other=0.0)
-            total += tl.load(harmonic + b * m + e, held, other=0.0) * sh
-        tl.store(at + 6 + c, tl.load(visible + c * m + e, held, other=0.0) * total, here)
+            total += tl.load(harmonic + b * m + e, kept, other=0.0) * sh
+        tl.store(at + 6 + c, tl.load(visible + c * m + e, kept, other=0.0) * total, here)
 
 
 @sized("n", "m", "K")
 def pull_back(
-    cotangents, block, splats, opacity_bar, index, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope,
-    out, n, m, K, SECOND_ORDER: tl.constexpr,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr, FORMULAS: tl.constexpr,
+    cotangents, block, index, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope, logit_slope,
+    logit_curvature, out, n, m, K, SECOND_ORDER: tl.constexpr,
+    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr,
 ):  # fmt: skip
     """P'^T of cotangents (n, K, 9), plus (a . P'') u where SECOND_ORDER: rows of out (p, K)."""
     e, k = places(BLOCK, VECTORS)
     k += tl.program_id(1) * VECTORS
-    held, here = e < m, (e < m) & (k < K)
-    i = tl.load(index + e, held, other=0)
-    number = out.dtype.element_ty
-    bars = row(cotangents, i * K + k, 9, 9, here)
-    turned = whitened_bar(row(splats, i, 9, 5, held), bars)
+    kept, here = e < m, (e < m) & (k < K)
+    i = tl.load(index + e, kept, other=0)
+    bars = ()
+    for j in tl.static_range(9):
+        bars = bars + (tl.load(cotangents + (i * K + k) * 9 + j, here, other=0.0),)
+    colour = ()
+    for c in tl.static_range(3):
+        colour = colour + (tl.load(visible + c * m + e, kept, other=0.0) * bars[6 + c],)
     h = ()
     for j in tl.static_range(10):
-        total = tl.load(jacobian + j * m + e, held, other=0.0) * turned[0].to(number)
+        total = tl.load(jacobian + j * m + e, kept, other=0.0) * bars[1]
         for r in tl.static_range(1, 5):
-            total += tl.load(jacobian + (r * 10 + j) * m + e, held, other=0.0) * turned[r].to(number)
+            total += tl.load(jacobian + (r * 10 + j) * m + e, kept, other=0.0) * bars[1 + r]
         for c in tl.static_range(3):
             if j < 3:
-                lit = tl.load(visible + c * m + e, held, other=0.0) * bars[6 + c].to(number)
-                total += tl.load(colour_slope + (c * 3 + j) * m + e, held, other=0.0) * lit
+                total += tl.load(colour_slope + (c * 3 + j) * m + e, kept, other=0.0) * colour[c]
         h = h + (total,)
-    opacity = tl.load(splats + i * 9 + 5, held, other=0.0)
-    logit_bar = opacity * (1.0 - opacity) * bars[5]
+    logit_bar = tl.load(logit_slope + e, kept, other=0.0) * bars[0]
     u = tangents_at(block, i, k, K, n, here)
     if SECOND_ORDER:
-        h = curved(columns(curvature, e, m, 55, held), u, h)
-        bend = opacity * (1.0 - opacity) * (1.0 - 2.0 * opacity) * tl.load(opacity_bar + i * 9, held, other=0.0)
+        h = curved(columns(curvature, e, m, 55, kept), u, h)
+        bend = tl.load(logit_curvature + e, kept, other=0.0)
         logit_bar += bend * tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
     first, second, third = h[0], h[1], h[2]
     for b in range(BANDS):
         at = (start_of(4, n) + (i * BANDS + b) * 3) * K + k
-        s = columns(slope + b * 3 * m, e, m, 3, held)
+        s = columns(slope + b * 3 * m, e, m, 3, kept)
         along = s[0] * u[0] + s[1] * u[1] + s[2] * u[2]
         weight = u[0] * 0.0
         for c in tl.static_range(3):
-            lit = tl.load(visible + c * m + e, held, other=0.0) * bars[6 + c].to(number)
-            value = tl.load(harmonic + b * m + e, held, other=0.0) * lit
+            value = tl.load(harmonic + b * m + e, kept, other=0.0) * colour[c]
             if SECOND_ORDER:
-                coloured = tl.load(colour_bar + c * m + e, held, other=0.0)
+                coloured = tl.load(colour_bar + c * m + e, kept, other=0.0)
                 weight += coloured * tl.load(block + at + c * K, here, other=0.0)
                 value += coloured * along
             tl.store(out + at + c * K, value, here)

@@ -13,7 +13,7 @@ A splat may be larger than the image by many orders of magnitude, and a needle i
   Q (r1; r2) = (beta r1 + r2 x n; beta r2 + n x r1) / det.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,41 +24,33 @@ from splat.model.harmonics import Y00, Y1, Y2A, Y2B, Y2C, Y3A, Y3B, Y3C, Y3D
 from splat.model.settings import RenderSettings
 
 GEOMETRY = 10  # mean 3, log-scales 3, quaternion 4
-
-
 SYMMETRIC = GEOMETRY * (GEOMETRY + 1) // 2
 
 
 class ProjectionJacobian(NamedTuple):
-    """What stands still.  index: (m,) the Gaussians that matter; splats (n, 9); opacity_bar (n,); the rest one row each.
+    """The derivatives of a view's splats, one row for each Gaussian at index (m,); arrays or tensors.
 
-    jacobian (5, 10): mean x, y and conic, whitened (`raster/whitening.py`), in mean, log-scales, quaternion; curvature (55,):
-    lower triangle of the geometry's (10, 10); harmonic (16,) and slope (16, 3) in the mean; colour_bar (3,): adjoint of the
-    colour before its clamp at 0; visible (3,): 1 where that clamp does not hold; colour_slope (3, 3): dcolour/dmean.
+    jacobian (5, 10): QU, QV, QUU, QUV, QVV (`whitening.py`) in mean, log-scales, quaternion; logit_slope: Q0 in the opacity
+    logit.  harmonic (16,) and slope (16, 3), of the harmonics in the mean; visible (3,): 1 where the colour is not clamped
+    at 0; colour_slope (3, 3): of the colour in the mean, without that clamp.
+    Second order, with the adjoint of the splat: curvature (55,), lower triangle of the geometry's (10, 10); logit_curvature;
+    colour_bar (3,): adjoint of the colour before its clamp.
     """
 
-    index: np.ndarray
-    splats: np.ndarray
-    opacity_bar: np.ndarray
-    jacobian: np.ndarray
-    curvature: np.ndarray
-    harmonic: np.ndarray
-    slope: np.ndarray
-    colour_bar: np.ndarray
-    visible: np.ndarray
-    colour_slope: np.ndarray
+    index: Any
+    jacobian: Any
+    curvature: Any
+    harmonic: Any
+    slope: Any
+    colour_bar: Any
+    visible: Any
+    colour_slope: Any
+    logit_slope: Any
+    logit_curvature: Any
 
 
-@formula
-def add_symmetric(packed, u, h):
-    """h += C u, C symmetric with its lower triangle packed row by row."""
-    place = 0
-    for j in range(GEOMETRY):
-        for k in range(j):
-            h[j] += packed[place + k] * u[k]
-            h[k] += packed[place + k] * u[j]
-        h[j] += packed[place + j] * u[j]
-        place += j + 1
+# What a Gaussian's row of each field but index holds.
+ROWS = ((5, GEOMETRY), (SYMMETRIC,), (16,), (16, 3), (3,), (3,), (3, 3), (), ())
 
 
 class Lens(NamedTuple):
@@ -78,18 +70,11 @@ class Lens(NamedTuple):
 
 def lens_of(camera: Camera, settings: RenderSettings) -> Lens:
     """The camera as the kernels read it."""
-    return Lens(
-        camera.rotation.double().reshape(-1).numpy().copy(),
-        camera.centre.double().numpy().copy(),
-        float(camera.fx),
-        float(camera.fy),
-        float(camera.cx),
-        float(camera.cy),
-        settings.fov_clamp * camera.width / (2 * camera.fx),
-        settings.fov_clamp * camera.height / (2 * camera.fy),
-        float(settings.blur),
-        float(settings.near),
-    )
+    rotation, centre = (part.double().reshape(-1).numpy().copy() for part in (camera.rotation, camera.centre))
+    pinhole = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    limit_x = settings.fov_clamp * camera.width / (2 * camera.fx)
+    limit_y = settings.fov_clamp * camera.height / (2 * camera.fy)
+    return Lens(rotation, centre, *pinhole, limit_x, limit_y, float(settings.blur), float(settings.near))
 
 
 @formula

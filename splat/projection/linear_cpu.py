@@ -1,36 +1,38 @@
-"""The projection of one view held still: first and second derivatives as products with blocks of vectors.
+"""The projection of one view, linearised: first and second derivatives as products with blocks of vectors.
 
 Per Gaussian that matters, the Jacobian of the map from its stored parameters to its splat and the curvature `(a . P'')`, a the
 first-order adjoint of its splat.  SH enters the colour linearly: its derivatives are the harmonics at the view direction and
 their slope in the mean, so a Gaussian needs 179 numbers, not a dense 9 x 59 and 59 x 59.
 
 Tangents and adjoints of the stored parameters are (n, parameters of a Gaussian..., K) per attribute: views of a (p, K) block
-that is laid out like the flat vector.  Splats are (n, 9), tangents of splats (n, K, 9): `raster/packing.py`.
+that is laid out like the flat vector.  Tangents and adjoints of splats are (n, K, 9), in the coordinates of `whitening.py`.
 """
 
 from math import prod
 
 import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor
 
 from splat.backend.cpu.dual import DIRECTIONS, tangent_of, variable
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.simd import store
 from splat.backend.cpu.threads import over_range
 from splat.model.gaussians import Gaussians, attribute_shapes
-from splat.projection.cpu import attribute_arrays, point, quaternion
+from splat.projection.cpu import attribute_arrays, point, quaternion, six_of
 from splat.projection.formulas import (
     GEOMETRY,
-    SYMMETRIC,
+    ROWS,
     Lens,
     ProjectionJacobian,
-    add_symmetric,
     basis,
     colour_adjoint,
     direction_of,
     geometry,
     geometry_adjoint,
 )
-from splat.projection.whitening import cancellation, plain, put, whitened, whitened_adjoint, whitening
+from splat.projection.whitening import cancellation, geometry_coefficients, plain_gradient, put, whitening
 
 LEAST_CANCELLATION = 4.0  # from which on tangents take double precision
 
@@ -46,14 +48,14 @@ def variables(like, mean, log_scales, quat):
 
 @kernel
 def linearize_geometry(lens, W, like, mean, log_scales, quat, bar, jacobian, curvature):
-    """One Gaussian's whitened Jacobian (5, 10) and the packed curvature (55,) of its geometry; like: of the tangents' dtype."""
+    """One Gaussian's Jacobian (5, 10) and the packed curvature (55,) of its geometry; like: of the tangents' dtype."""
     x, s, q = variables(like, mean, log_scales, quat)
     tangents = np.empty((5, DIRECTIONS), like.dtype)
     values = geometry(lens, x, s, q)
     for j in range(5):
         store(tangents.reshape(-1), j * DIRECTIONS, tangent_of(values[j]))
     for k in range(GEOMETRY):
-        put(jacobian[:, k], whitened(W, tangents[:, k]))
+        put(jacobian[:, k], geometry_coefficients(W, tangents[:, k]))
     m, t, r = geometry_adjoint(lens, x, s, q, bar)
     rows = (m[0], m[1], m[2], t[0], t[1], t[2], r[0], r[1], r[2], r[3])
     place = 0
@@ -86,14 +88,15 @@ def linearize_colour(lens, mean, x, colour_weight, bands, curvature, harmonic, s
 
 @kernel
 def linearize_gaussian(
-    lens, mean, log_scales, quat, splat, colour_weight, bands, bar, jacobian, curvature, harmonic, slope
+    lens, mean, log_scales, quat, splat, colour_weight, bands, moments, jacobian, curvature, harmonic, slope
 ):
-    """One Gaussian's rows of `Held`; bar: five geometric adjoints.
+    """One Gaussian's rows of a `ProjectionJacobian`; moments: the six of its adjoint.
 
     The geometry of a slanted needle has tangents in double precision: they cancel by a c / (a c - b^2), in whitening as well as
     in `geometry_adjoint`.
     """
     W = whitening(splat)
+    bar = plain_gradient(W, splat[5], moments)
     if cancellation(W) > LEAST_CANCELLATION:
         linearize_geometry(lens, W, np.empty(0), mean, log_scales, quat, bar, jacobian, curvature)
     else:
@@ -103,205 +106,207 @@ def linearize_gaussian(
 
 
 @kernel
-def linearize_all(start, stop, held, lens, means, log_scales, quats, sh, bar):
-    """Fill the arrays of `Projection` for the Gaussians at index; bar (n, 9) is the adjoint of the splats."""
+def linearize_all(start, stop, found, lens, means, log_scales, quats, sh, splats, moments):
+    """Fill the rows of a `ProjectionJacobian`; moments (n, 9): the adjoint of the splats."""
     bands = sh.shape[1]
     for e in range(start, stop):
-        i = held.index[e]
+        i = found.index[e]
         weight = np.zeros(16)
         for c in range(3):
-            held.visible[e, c] = 1.0 if held.splats[i, 6 + c] > 0 else 0.0
-            held.colour_bar[e, c] = held.visible[e, c] * bar[i, 6 + c]
+            found.visible[e, c] = 1.0 if splats[i, 6 + c] > 0 else 0.0
+            found.colour_bar[e, c] = found.visible[e, c] * moments[i, 6 + c]
             for k in range(bands):
-                weight[k] += sh[i, k, c] * held.colour_bar[e, c]
-        bars = (
-            np.float64(bar[i, 0]), np.float64(bar[i, 1]), np.float64(bar[i, 2]),
-            np.float64(bar[i, 3]), np.float64(bar[i, 4]),
-        )  # fmt: skip
+                weight[k] += sh[i, k, c] * found.colour_bar[e, c]
+        opacity = splats[i, 5]
+        found.logit_slope[e] = 1 - opacity
+        found.logit_curvature[e] = (1 - opacity) * (1 - 2 * opacity) * moments[i, 0]
         linearize_gaussian(
-            lens, point(means, i), point(log_scales, i), quaternion(quats, i), held.splats[i], weight, bands, bars,
-            held.jacobian[e], held.curvature[e], held.harmonic[e], held.slope[e],
+            lens, point(means, i), point(log_scales, i), quaternion(quats, i), splats[i], weight, bands, six_of(moments[i]),
+            found.jacobian[e], found.curvature[e], found.harmonic[e], found.slope[e],
         )  # fmt: skip
         for c in range(3):
             for j in range(3):
                 total = 0.0
                 for k in range(bands):
-                    total += sh[i, k, c] * held.slope[e, k, j]
-                held.colour_slope[e, c, j] = total
+                    total += sh[i, k, c] * found.slope[e, k, j]
+                found.colour_slope[e, c, j] = total
+
+
+@formula
+def geometry_tangent(u, i, k, d_means, d_log_scales, d_quats):
+    """Fill u (10,), Gaussian i's part of vector k."""
+    for j in range(3):
+        u[j], u[3 + j] = d_means[i, j, k], d_log_scales[i, j, k]
+    for j in range(4):
+        u[6 + j] = d_quats[i, j, k]
 
 
 @kernel
-def push_forward(start, stop, held, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
+def push_forward(start, stop, at, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
     """P' u: out (n, K, 9), which starts at 0."""
     K, bands = out.shape[1], d_sh.shape[1]
-    y = np.empty(5, d_means.dtype)
+    u = np.empty(GEOMETRY, out.dtype)
     for e in range(start, stop):
-        i = held.index[e]
-        W, opacity = whitening(held.splats[i]), held.splats[i, 5]
+        i = at.index[e]
         for k in range(K):
+            geometry_tangent(u, i, k, d_means, d_log_scales, d_quats)
+            out[i, k, 0] = at.logit_slope[e] * d_logits[i, k]
             for r in range(5):
-                J = held.jacobian[e, r]
-                total = J[6] * d_quats[i, 0, k] + J[9] * d_quats[i, 3, k]
-                total += J[7] * d_quats[i, 1, k] + J[8] * d_quats[i, 2, k]
-                for j in range(3):
-                    total += J[j] * d_means[i, j, k] + J[3 + j] * d_log_scales[i, j, k]
-                y[r] = total
-            put(out[i, k], plain(W, y))
-            out[i, k, 5] = opacity * (1 - opacity) * d_logits[i, k]
+                total = out.dtype.type(0)
+                for j in range(GEOMETRY):
+                    total += at.jacobian[e, r, j] * u[j]
+                out[i, k, 1 + r] = total
             for c in range(3):
-                total = d_means.dtype.type(0)
+                total = out.dtype.type(0)
                 for j in range(3):
-                    total += held.colour_slope[e, c, j] * d_means[i, j, k]
+                    total += at.colour_slope[e, c, j] * u[j]
                 for b in range(bands):
-                    total += held.harmonic[e, b] * d_sh[i, b, c, k]
-                out[i, k, 6 + c] = held.visible[e, c] * total
+                    total += at.harmonic[e, b] * d_sh[i, b, c, k]
+                out[i, k, 6 + c] = at.visible[e, c] * total
 
 
 @kernel
 def pull_back(
-    start, stop, held, second_order, cotangents, d_means, d_log_scales, d_quats, d_logits, d_sh,
+    start, stop, at, second_order, cotangents, d_means, d_log_scales, d_quats, d_logits, d_sh,
     out_means, out_log_scales, out_quats, out_logits, out_sh,
 ):  # fmt: skip
-    """P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order; added to the outputs."""
+    """P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order; outputs start at 0."""
     K, bands = cotangents.shape[1], out_sh.shape[1]
-    y = np.empty(9, out_means.dtype)
+    u, h, bar = np.empty(GEOMETRY, out_means.dtype), np.empty(GEOMETRY, out_means.dtype), np.empty(3, out_means.dtype)
+    curvature = np.empty((GEOMETRY, GEOMETRY), out_means.dtype)
     for e in range(start, stop):
-        i = held.index[e]
-        W, opacity = whitening(held.splats[i]), held.splats[i, 5]
-        slope_of_opacity = opacity * (1 - opacity)
-        u, h = np.empty(GEOMETRY, out_means.dtype), np.empty(GEOMETRY, out_means.dtype)
-        for k in range(K):
-            put(y, whitened_adjoint(W, cotangents[i, k]))
-            for c in range(5, 9):
-                y[c] = cotangents[i, k, c]
+        i = at.index[e]
+        if second_order:
+            place = 0
             for j in range(GEOMETRY):
-                h[j] = 0
-                for r in range(5):
-                    h[j] += held.jacobian[e, r, j] * y[r]
-            logit = slope_of_opacity * y[5]
+                for l in range(j + 1):
+                    curvature[j, l] = curvature[l, j] = at.curvature[e, place + l]
+                place += j + 1
+        for k in range(K):
+            y = cotangents[i, k]
+            geometry_tangent(u, i, k, d_means, d_log_scales, d_quats)
             for c in range(3):
-                bar = held.visible[e, c] * y[6 + c]
+                bar[c] = at.visible[e, c] * y[6 + c]
+            h[:] = 0
+            for r in range(5):
+                for j in range(GEOMETRY):
+                    h[j] += at.jacobian[e, r, j] * y[1 + r]
+            for c in range(3):
                 for j in range(3):
-                    h[j] += held.colour_slope[e, c, j] * bar
-                for b in range(bands):
-                    out_sh[i, b, c, k] += held.harmonic[e, b] * bar
+                    h[j] += at.colour_slope[e, c, j] * bar[c]
+            out_logits[i, k] = at.logit_slope[e] * y[0]
             if second_order:
+                for j in range(GEOMETRY):
+                    for l in range(GEOMETRY):
+                        h[l] += curvature[j, l] * u[j]
+                out_logits[i, k] += at.logit_curvature[e] * d_logits[i, k]
+            for b in range(bands):
+                slope, weight = at.slope[e, b], out_means.dtype.type(0)
+                along = slope[0] * u[0] + slope[1] * u[1] + slope[2] * u[2]
+                for c in range(3):
+                    out_sh[i, b, c, k] = at.harmonic[e, b] * bar[c]
+                    if second_order:
+                        out_sh[i, b, c, k] += at.colour_bar[e, c] * along
+                        weight += at.colour_bar[e, c] * d_sh[i, b, c, k]
                 for j in range(3):
-                    u[j], u[3 + j] = d_means[i, j, k], d_log_scales[i, j, k]
-                for j in range(4):
-                    u[6 + j] = d_quats[i, j, k]
-                add_symmetric(held.curvature[e], u, h)
-                logit += slope_of_opacity * (1 - 2 * opacity) * held.opacity_bar[i] * d_logits[i, k]
-                for b in range(bands):
-                    weight, along = out_means.dtype.type(0), out_means.dtype.type(0)
-                    for c in range(3):
-                        weight += held.colour_bar[e, c] * d_sh[i, b, c, k]
-                    for j in range(3):
-                        h[j] += held.slope[e, b, j] * weight
-                        along += held.slope[e, b, j] * u[j]
-                    for c in range(3):
-                        out_sh[i, b, c, k] += held.colour_bar[e, c] * along
+                    h[j] += slope[j] * weight
             for j in range(3):
-                out_means[i, j, k] += h[j]
-                out_log_scales[i, j, k] += h[3 + j]
+                out_means[i, j, k], out_log_scales[i, j, k] = h[j], h[3 + j]
             for j in range(4):
-                out_quats[i, j, k] += h[6 + j]
-            out_logits[i, k] += logit
+                out_quats[i, j, k] = h[6 + j]
 
 
 @kernel
-def chain_blocks(start, stop, held, own, curved, geometry_out, sh_out):
-    """Own blocks of splats, (m, 9, 9), in stored parameters: P'^T own P', plus (a . P'') where curved.
+def chain_blocks(start, stop, at, blocks, second_order, geometry_out, sh_out):
+    """Diagonal blocks of splats, B (m, 9, 9), in stored parameters: P'^T B P', plus (a . P'') where second_order.
 
     geometry_out: (n, 11, 11) over mean, log-scales, quaternion and opacity logit; sh_out: (n, k, 3), the diagonal of SH's.
-    Both are added to.
     """
     bands = sh_out.shape[1]
     J, product = np.zeros((9, GEOMETRY + 1)), np.zeros(9)
     for e in range(start, stop):
-        i = held.index[e]
-        opacity = np.float64(held.splats[i, 5])
-        slope = opacity * (1 - opacity)
-        J[5, GEOMETRY] = slope
-        W = whitening(held.splats[i])
-        for j in range(GEOMETRY):
-            put(J[:, j], plain(W, held.jacobian[e, :, j]))
+        i = at.index[e]
+        J[0, GEOMETRY] = at.logit_slope[e]
+        J[1:6, :GEOMETRY] = at.jacobian[e]
         for c in range(3):
             for j in range(3):
-                J[6 + c, j] = held.visible[e, c] * held.colour_slope[e, c, j]
+                J[6 + c, j] = at.visible[e, c] * at.colour_slope[e, c, j]
             for b in range(bands):
-                sh_out[i, b, c] += held.visible[e, c] * held.harmonic[e, b] * held.harmonic[e, b] * own[e, 6 + c, 6 + c]
+                sh_out[i, b, c] = at.visible[e, c] * at.harmonic[e, b] * at.harmonic[e, b] * blocks[e, 6 + c, 6 + c]
         for j in range(GEOMETRY + 1):
             for r in range(9):
                 product[r] = 0
                 for s in range(9):
-                    product[r] += own[e, r, s] * J[s, j]
+                    product[r] += blocks[e, r, s] * J[s, j]
             for k in range(j + 1):
                 total = 0.0
                 for r in range(9):
                     total += J[r, k] * product[r]
-                if curved and j < GEOMETRY:
-                    total += held.curvature[e, j * (j + 1) // 2 + k]
-                geometry_out[i, j, k] += total
-                if k < j:
-                    geometry_out[i, k, j] += total
-        if curved:
-            geometry_out[i, GEOMETRY, GEOMETRY] += slope * (1 - 2 * opacity) * held.opacity_bar[i]
+                if second_order and j < GEOMETRY:
+                    total += at.curvature[e, j * (j + 1) // 2 + k]
+                geometry_out[i, j, k] = geometry_out[i, k, j] = total
+        if second_order:
+            geometry_out[i, GEOMETRY, GEOMETRY] += at.logit_curvature[e]
 
 
-class Projection:
-    """The map from stored parameters to the splats of one view, held still at the Gaussians and at an adjoint of the splats.
+class CpuProjection:
+    """The projection of one view, linearised: `projection.dispatch.Projection` by Numba kernels, on NumPy views of tensors."""
 
-    index: the Gaussians that matter (those that touch a pixel); bar: (n, 9), the adjoint of the splats.
-    """
-
-    def __init__(self, gaussians: Gaussians, lens: Lens, splats: np.ndarray, bar: np.ndarray, index: np.ndarray):
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        lens: Lens,
+        splats: Float64[Tensor, "n 9"],
+        moments: Float[Tensor, "n 9"],
+        index: Int[Tensor, " m"],
+    ):
         means, log_scales, quats, _logits, sh = attribute_arrays(gaussians)
         self.n, self.sh_degree, self.parameters = len(gaussians), gaussians.sh_degree, gaussians.flat.numel()
-        m = index.size
+        self._at = ProjectionJacobian(index.numpy(), *(np.empty((len(index), *row), means.dtype) for row in ROWS))
+        arguments = (lens, means, log_scales, quats, sh, splats.numpy(), moments.numpy())
+        over_range(len(index), linearize_all, self._at, *arguments)
 
-        def empty(*shape: int) -> np.ndarray:
-            return np.empty((m, *shape), means.dtype)
-
-        self.held = ProjectionJacobian(
-            index, splats, np.ascontiguousarray(bar[:, 5]), empty(5, GEOMETRY), empty(SYMMETRIC), empty(16), empty(16, 3),
-            empty(3), empty(3), empty(3, 3),
-        )  # fmt: skip
-        over_range(m, linearize_all, self.held, lens, means, log_scales, quats, sh, bar)
+    @property
+    def jacobian(self) -> ProjectionJacobian:
+        return ProjectionJacobian(*map(torch.from_numpy, self._at))
 
     @property
     def bytes(self) -> int:
-        """Memory of what is held per Gaussian in sight."""
-        return sum(array.nbytes for array in self.held[3:])
+        """Memory of what is kept."""
+        return sum(array.nbytes for array in self._at)
 
-    def affects(self, block: np.ndarray) -> bool:
-        """Whether a vector of a block (p, K) moves any of the Gaussians that matter."""
-        return any(part[self.held.index].any() for part in self._split(block))
+    def affects(self, block: Float[Tensor, "p k"]) -> bool:
+        """Whether a vector moves any of the Gaussians at index."""
+        return any(part[self._at.index].any() for part in self._split(block.numpy()))
 
-    def jvp(self, block: np.ndarray) -> np.ndarray:
-        """P' U: (n, K, 9) from a block (p, K) of tangents of the stored parameters."""
-        out = np.zeros((self.n, block.shape[1], 9))
-        over_range(self.held.index.size, push_forward, self.held, *self._split(block), out)
-        return out
+    def jvp(self, block: Float[Tensor, "p k"]) -> Float[Tensor, "n k 9"]:
+        """P' U."""
+        out = np.zeros((self.n, block.shape[1], 9), self._at.jacobian.dtype)
+        over_range(len(self._at.index), push_forward, self._at, *self._split(block.numpy()), out)
+        return torch.from_numpy(out)
 
-    def pull(self, cotangents: np.ndarray, block: np.ndarray | None) -> np.ndarray:
-        """P'^T cotangents (p, K) from (n, K, 9), plus (a . P'') block where a block (p, K) is given."""
-        out = np.zeros((self.parameters, cotangents.shape[1]), self.held.jacobian.dtype)
+    def vjp(
+        self, cotangents: Float[Tensor, "n k 9"], block: Float[Tensor, "p k"] | None = None
+    ) -> Float[Tensor, "p k"]:
+        """P'^T cotangents, plus (a . P'') block where a block is given."""
+        out = np.zeros((self.parameters, cotangents.shape[1]), self._at.jacobian.dtype)
         outputs = self._split(out)
-        tangents = outputs if block is None else self._split(block)
-        over_range(self.held.index.size, pull_back, self.held, block is not None, cotangents, *tangents, *outputs)
-        return out
+        tangents = outputs if block is None else self._split(block.numpy())
+        arguments = (block is not None, cotangents.numpy(), *tangents, *outputs)
+        over_range(len(self._at.index), pull_back, self._at, *arguments)
+        return torch.from_numpy(out)
 
-    def blocks(self, own: np.ndarray, curved: bool) -> tuple[np.ndarray, np.ndarray]:
-        """The blocks of splats, own (m, 9, 9), in stored parameters: `chain_blocks`."""
-        dtype = self.held.jacobian.dtype
-        geometry = np.zeros((self.n, GEOMETRY + 1, GEOMETRY + 1), dtype)
-        sh = np.zeros((self.n, (self.sh_degree + 1) ** 2, 3), dtype)
-        over_range(self.held.index.size, chain_blocks, self.held, own, curved, geometry, sh)
-        return geometry, sh
+    def blocks(
+        self, blocks: Float64[Tensor, "m 9 9"], second_order: bool
+    ) -> tuple[Float[Tensor, "n 11 11"], Float[Tensor, "n b 3"]]:
+        """The blocks of splats in stored parameters: `chain_blocks`."""
+        shapes = ((GEOMETRY + 1, GEOMETRY + 1), ((self.sh_degree + 1) ** 2, 3))
+        geometry, sh = (np.zeros((self.n, *shape), self._at.jacobian.dtype) for shape in shapes)
+        over_range(len(self._at.index), chain_blocks, self._at, blocks.numpy(), second_order, geometry, sh)
+        return torch.from_numpy(geometry), torch.from_numpy(sh)
 
     def _split(self, block: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Views of a (p, K) block laid out like the flat vector: (n, 3, K), (n, 3, K), (n, 4, K), (n, K), (n, k, 3, K)."""
+        """Views of a (p, K) block laid out like the flat vector: (n, 3, K), (n, 3, K), (n, 4, K), (n, K), (n, b, 3, K)."""
         block, views, start = np.ascontiguousarray(block), [], 0
         for shape in attribute_shapes(self.n, self.sh_degree).values():
             size = prod(shape)

@@ -18,13 +18,12 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import harmonics
 from splat.model.settings import RenderSettings
-from splat.projection.formulas import (
-    Lens,
-)
+from splat.projection.formulas import Lens
 
 NEEDLE = 100.0  # the condition number from which on a splat is called a needle
 LARGEST_SPLAT = 2.0**60  # px, and world units: 1 / det of a needle is this squared over blur, which float32 still holds
@@ -123,7 +122,7 @@ def require_sizes(lens: Lens, log_scales: np.ndarray, depths: np.ndarray, drawn:
     bad = drawn & (sizes > limit)
     if bad.any():
         first = int(np.argmax(bad))
-        raise ValueError(
+        raise InputError(
             f"expected log_scales of at most {limit - max(gain[first], 0.0):.1f} at depth {depths[first]:.3g} (a splat of "
             f"{LARGEST_SPLAT:.0e} px), got {log_scales[first].tolist()} at Gaussian {first} ({int(bad.sum())} of {len(bad)} "
             "are larger); remove them from the checkpoint, or lower its rates"

@@ -1,18 +1,23 @@
-"""Coordinates in which a splat is round, so that single precision treats needles and discs alike.
+"""Coordinates of a splat's tangents and adjoints in which needles and discs keep their digits in single precision.
 
-A conic Q = [[a, b], [b, c]] is factored into W^T W = log2(e) / 2 Q,
+A splat is nine numbers: mean x, y (px); conic a, b, c (px^-2); opacity o; colour (3).  Its conic Q = [[a, b], [b, c]] is
+factored into W^T W = log2(e) / 2 Q,
 
     W = [[along, 0], [across shear, across]],  shear = b / c,  across^2 = log2(e) / 2 c,  along^2 = log2(e) / 2 (a - b^2 / c)
 
-and an offset d from the mean has the whitened coordinates (u, v) = W d: log2 alpha = log2 o - u^2 - v^2, and nothing
+and an offset d (px) from the mean has the whitened coordinates (u, v) = W d: log2 alpha = log2 o - u^2 - v^2, where nothing
 cancels.  In plain coordinates a change of a needle's length is a difference of changes of a, b and c that are larger by the
-squared ratio of its axes, and so is an adjoint.  Therefore what is summed over pixels or stored in single precision is
-whitened; splats, tangents and adjoints in plain coordinates, between the stages, are in double precision.
+squared ratio of its axes, and so is an adjoint.  Projection and rasteriser therefore exchange derivatives of q = ln alpha:
 
-The formulas take and give five numbers, of the mean x, y and the conic a, b, c, or whitened; W stands still:
+    tangent   the coefficients of q' = Q0 + QU u + QV v + QUU u^2 + QUV u v + QVV v^2, and the colour's tangent
+    adjoint   the moments S, Su, Sv, Suu, Suv, Svv of dL/dq over pixels, and the colour's adjoint
 
-    tangents    mean' -> W mean';  Q' -> W^-T Q' W^-1      `whitened`, and back `plain`
-    adjoints    by the transposes                          `whitened_adjoint` (of plain ones), and back `plain_adjoint`
+Both are linear in the plain ones at a fixed W.  Splats and plain derivatives are in double precision.
+
+    `whitened`, `plain`                   five numbers, tangents of mean and conic: mean' -> W mean', Q' -> W^-T Q' W^-1; back
+    `whitened_adjoint`, `plain_adjoint`   their adjoints: the transposes of `plain` and `whitened`
+    `coefficients`, `plain_tangent`       six numbers: plain tangent of mean, conic and opacity -> coefficients; back
+    `moments_of`, `plain_gradient`        plain adjoint of mean, conic and opacity -> moments; back
 """
 
 from math import log, sqrt
@@ -23,6 +28,7 @@ from splat.backend.cpu.simd import select
 LOG2_E = 1 / log(2)
 ROUND = 2 / LOG2_E  # the conic in whitened coordinates is this times the identity
 LEAST_RATIO = 2.0**-50  # of a - b^2 / c to a: beneath it, the difference is round-off
+Q0, QU, QV, QUU, QUV, QVV = range(6)
 
 
 @formula
@@ -77,6 +83,60 @@ def plain_adjoint(W, y):
         uv - 2 * shear * a,
         y[4] / (across * across) - shear * (uv - shear * a),
     )
+
+
+@formula
+def ratio(x, opacity):
+    """x / opacity, 0 where nothing is drawn."""
+    return select(opacity > 0, x / opacity, 0.0)
+
+
+@formula
+def geometry_coefficients(W, y):
+    """QU, QV, QUU, QUV, QVV of a plain tangent of mean and conic."""
+    u, v, uu, uv, vv = whitened(W, y)
+    return ROUND * u, ROUND * v, -0.5 * uu, -uv, -0.5 * vv
+
+
+@formula
+def coefficients(W, opacity, y):
+    u, v, uu, uv, vv = geometry_coefficients(W, y)
+    return ratio(y[5], opacity), u, v, uu, uv, vv
+
+
+@formula
+def plain_tangent(W, opacity, q):
+    x, y, a, b, c = plain(W, (q[QU] / ROUND, q[QV] / ROUND, -2.0 * q[QUU], -q[QUV], -2.0 * q[QVV]))
+    return x, y, a, b, c, opacity * q[Q0]
+
+
+@formula
+def moments_of(W, opacity, bar):
+    u, v, uu, uv, vv = whitened_adjoint(W, bar)
+    return opacity * bar[5], u / ROUND, v / ROUND, -2.0 * uu, -uv, -2.0 * vv
+
+
+@formula
+def plain_gradient(W, opacity, moments):
+    S, Su, Sv, Suu, Suv, Svv = moments
+    x, y, a, b, c = plain_adjoint(W, (ROUND * Su, ROUND * Sv, -0.5 * Suu, -Suv, -0.5 * Svv))
+    return x, y, a, b, c, ratio(S, opacity)
+
+
+COEFFICIENTS, PLAIN_TANGENT, MOMENTS, PLAIN_GRADIENT = range(4)
+
+
+@formula
+def converted(way, splat, numbers):
+    """Six numbers of a splat in other coordinates; way: what they become, a constant from above."""
+    W, opacity = whitening(splat), splat[5]
+    if way == COEFFICIENTS:
+        return coefficients(W, opacity, numbers)
+    if way == PLAIN_TANGENT:
+        return plain_tangent(W, opacity, numbers)
+    if way == MOMENTS:
+        return moments_of(W, opacity, numbers)
+    return plain_gradient(W, opacity, numbers)
 
 
 @formula

@@ -1,49 +1,77 @@
-"""What the compositing kernels share: their arrays, and the formulas of one splat in one pixel, at first and second order.
+"""The formulas that the compositing kernels of both compilers share: one splat in one pixel, at first and second order.
 
-A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  Per pixel, splats in order of depth, with the
-pixel's offset from the mean in the splat's whitened coordinates (u, v) (`whitening.py`), opacity o, colour c:
+Per pixel, splats in order of depth, with the pixel's offset from the mean in the splat's whitened coordinates (u, v)
+(`projection/whitening.py`), opacity o, colour c, transmittance T in front of the splat:
 
     l = log2 alpha = log2 o - u^2 - v^2      alpha = min(cap, 2^l)
     active where l >= cut and the pixel has not stopped; elsewhere alpha = 0 and every update below is a no-op
 
-`forward`     w = alpha T;  image += w c;  T <- T - w;  at the end image += T background, alpha plane = 1 - T.
+`forward`           w = alpha T;  image += w c;  T <- T - w;  at the end image += T background, alpha plane = 1 - T.
 
-`backward`    given g = dloss/dimage and, for the alpha plane, g_A.  Back to front, T starts at the final T and R, the
-              sum over the splats behind of w_j (g . c_j) plus the background's part, at T (g . background - g_A):
-              r = 1 / (1 - alpha);  T <- T r;  w = alpha T;  beta = alpha r;  e = g . c
-              s = w e - beta R, the derivative in q = ln alpha, 0 where the cap holds;  R <- R + w e
-              per splat: moments S, Su, Sv, Suu, Suv, Svv of s over the offsets, and G = sum w g.
+`backward`          given v_image = dloss/dimage and, for the alpha plane, v_alpha.  Back to front, T starts at the final T
+                    and R, the sum over the splats behind of w_j (v_image . c_j) plus the background's part, at
+                    T (v_image . background - v_alpha):
+                    r = 1 / (1 - alpha);  T <- T r;  w = alpha T;  beta = alpha r;  e = v_image . c
+                    s = w e - beta R, the derivative in q = ln alpha, 0 where the cap holds;  R <- R + w e
+                    per splat: moments S, Su, Sv, Suu, Suv, Svv of s over the offsets, and G = sum w v_image.
 
-`tangent`     (J u) given tangents of the splats; q' is one quadratic in the offset, 0 where the cap holds:
-              w' = w q' + alpha T';  image' += w' c + w c';  T' <- T' - w';  at the end image' += T' background.
+`tangent`           (J u) given tangents of the splats; q' is one quadratic in the offset, 0 where the cap holds:
+                    w' = w q' + alpha T';  image' += w' c + w c';  T' <- T' - w';  at the end image' += T' background.
 
-`curvature`   (the tangent of `backward`) given q', c' and g' = dg.  With tau = T' / T, r, w, beta, R as above:
-              tau <- tau + beta q';  nu = q' + tau;  h = nu g + g';  z = w (h . c + g . c')
-              s' = z - beta (R' + r R q'), 0 where the cap holds;  R' <- R' + z;  moments of s' and G' = sum w h.
+`backward_tangent`  given q', c' and v_image'.  With tau = T' / T, r, w, beta, R as above:
+                    tau <- tau + beta q';  nu = q' + tau;  h = nu v_image + v_image';  z = w (h . c + v_image . c')
+                    s' = z - beta (R' + r R q'), 0 where the cap holds;  R' <- R' + z;  moments of s' and G' = sum w h.
 
-A dash marks a tangent.  K tangents share the primal quantities of a splat's rows, which stay in L1 between them; for
-K = 1 the two loops are one.  Every entry (a splat in a tile) writes its nine sums to its own slot, splat-major, so that no
-sum depends on the order in which threads finish.
-
-Every kernel (`compositing.py`, `tangents.py`) takes tiles from a counter until none is left (`threads.over_tiles`).  Arrays are
-flat: `params` holds PARAMS floats a splat, `tangents` K x TANGENTS floats a splat, a plane stride x height floats.
+A dash marks a tangent, v_ a cotangent.  K tangents share the primal quantities of a splat.
 """
 
-from math import ceil, floor, inf, log, sqrt
+from math import ceil, floor, inf, log, log2, sqrt
+from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from splat.backend.cpu.jit import formula
 from splat.backend.cpu.simd import exp2, fma, minimum, select
-from splat.projection.whitening import ROUND, plain_adjoint, whitened
+from splat.model.settings import RenderSettings
+from splat.projection.whitening import Q0, QU, QUU, QUV, QV, QVV, ROUND
 
-Q0, QU, QV, QUU, QUV, QVV = range(6)  # q' = Q0 + QU u + QV v + QUU u^2 + QUV u v + QVV v^2
+SPLAT = 9  # numbers of a splat, of its tangent (six coefficients of q', colour'), and of its adjoint (six moments, G)
 WIDEN = 1e-4  # relative widening of an ellipse's level, so that no active pixel is missed
 DEGREE4, DEGREE2 = 15, 6  # how many moments u^j v^k there are up to these degrees
 CROSS = DEGREE4  # after the moments of s + v: those of w g_c + w h_c D_c, and the sums of w^2 h_c
 COLOUR = DEGREE4 + 3 * DEGREE2
 BLOCK_SUMS = COLOUR + 3
-TINY = np.finfo(np.float64).tiny  # an opacity below has no weight, and no inverse
+
+LEAST_TRANSMITTANCE = {torch.float32: 1e-30, torch.float64: 1e-290}  # beneath it T would underflow
+LEAST_LOG2_ALPHA = {torch.float32: -126.0, torch.float64: -1022.0}  # the range of exp2
+
+
+class Thresholds(NamedTuple):
+    """Where a splat is drawn and a pixel stops.
+
+    alpha_min, alpha_max: bounds of alpha; contour: of the distance in standard deviations, or infinite; least: of log2 alpha;
+    free: alpha above which derivatives in ln alpha are 0, or infinite; floor: of the transmittance.
+    """
+
+    alpha_min: float
+    contour: float
+    least: float
+    alpha_max: float
+    free: float
+    floor: float
+
+
+def thresholds_of(settings: RenderSettings, dtype: torch.dtype) -> Thresholds:
+    """The thresholds for pixels of dtype.
+
+    With transmittance_min = 0 a pixel still stops at LEAST_TRANSMITTANCE, an error of the image far beneath round-off.
+    """
+    least = max(log2(settings.alpha_min) if settings.alpha_min else -inf, LEAST_LOG2_ALPHA[dtype])
+    contour = inf if settings.contour_sigma is None else settings.contour_sigma
+    free = inf if settings.gradient_through_cap else settings.alpha_max
+    floor = max(settings.transmittance_min, LEAST_TRANSMITTANCE[dtype])
+    return Thresholds(settings.alpha_min, contour, least, settings.alpha_max, free, floor)
 
 
 # --- one splat in one pixel -------------------------------------------------------------------------------------------
@@ -94,18 +122,18 @@ def plus(x, y, c):
 
 
 @formula
-def behind_all(g, background):
-    """What the final transmittance is multiplied by in the loss: g . background - g_A."""
-    return g[0] * background[0] + g[1] * background[1] + g[2] * background[2] - g[3]
+def behind_all(v_pixel, background):
+    """What the final transmittance is multiplied by in the loss: v_image . background - v_alpha."""
+    return v_pixel[0] * background[0] + v_pixel[1] * background[1] + v_pixel[2] * background[2] - v_pixel[3]
 
 
 @formula
-def step_back(alpha, T, R, g, colour):
+def step_back(alpha, T, R, v_image, colour):
     """A splat undone: T, R in front of it, and its w, beta, r, w e."""
     r = reciprocal(1.0 - alpha)
     T = T * r
     w = alpha * T
-    we = w * dot(g, colour)
+    we = w * dot(v_image, colour)
     return T, R + we, w, alpha * r, r, we
 
 
@@ -117,11 +145,11 @@ def step_tangent(dT, dimage, alpha, w, w_dq, colour, dcolour):
 
 
 @formula
-def step_curvature(tau, dR, dg, w, beta, rR, dq, g, colour, dcolour):
+def step_backward_tangent(tau, dR, dv_image, w, beta, rR, dq, v_image, colour, dcolour):
     """tau and R' after a splat, its s' where the cap does not hold, and h."""
     tau = tau + beta * dq
-    h = plus(dg, dq + tau, g)
-    z = w * dot_plus(h, colour, dot(g, dcolour))
+    h = plus(dv_image, dq + tau, v_image)
+    z = w * dot_plus(h, colour, dot(v_image, dcolour))
     return tau, dR + z, z - beta * (rR * dq + dR), h
 
 
@@ -140,44 +168,25 @@ def column_terms(columns, u):
     return S, Su, Sv, Su * u, Sv * u, Svv, G0, G1, G2
 
 
-# --- between a splat's numbers and its sums (W: `projection/whitening.py`) --------------------------------------------
+# --- a splat's sums ---------------------------------------------------------------------------------------------------
 
 
 @formula
-def exponent_tangent(W, opacity, y):
-    """The coefficients Q0, QU, ... of q' along a splat's tangent y."""
-    u, v, uu, uv, vv = whitened(W, y)
-    return ratio(y[5], opacity), ROUND * u, ROUND * v, -0.5 * uu, -uv, -0.5 * vv
+def second_order(q, moments, total):
+    """The tangent of a splat's six moments along the coefficients q, as the splat itself moves.
 
-
-@formula
-def ratio(x, opacity):
-    """x / opacity, 0 where nothing is drawn."""
-    return select(opacity > 0, x / opacity, 0.0)
-
-
-@formula
-def first_order(W, opacity, total):
-    """The gradient in mean, conic and opacity from a splat's sums."""
-    S, Su, Sv, Suu, Suv, Svv = total[0], total[1], total[2], total[3], total[4], total[5]
-    x, y, a, b, c = plain_adjoint(W, (ROUND * Su, ROUND * Sv, -0.5 * Suu, -Suv, -0.5 * Svv))
-    return x, y, a, b, c, ratio(S, opacity)
-
-
-@formula
-def second_order(W, opacity, y, moments, total):
-    """The gradient's tangent in mean, conic and opacity along a splat's tangent y; moments: S, Su, Sv of the gradient."""
+    moments: those of the gradient, over offsets from the splat; total: of s' over the offsets from where it was.
+    """
     S, Su, Sv = moments[0], moments[1], moments[2]
-    mu, mv, uu, uv, vv = whitened(W, y)
-    white = (
-        ROUND * (total[1] - mu * S) + uu * Su + uv * Sv,
-        ROUND * (total[2] - mv * S) + uv * Su + vv * Sv,
-        -0.5 * (total[3] - 2 * mu * Su),
-        -(total[4] - mu * Sv - mv * Su),
-        -0.5 * (total[5] - 2 * mv * Sv),
+    u, v = q[QU] / ROUND, q[QV] / ROUND
+    return (
+        total[0] - q[Q0] * S,
+        total[1] - u * S - (2 * q[QUU] * Su + q[QUV] * Sv) / ROUND,
+        total[2] - v * S - (q[QUV] * Su + 2 * q[QVV] * Sv) / ROUND,
+        total[3] - 2 * u * Su,
+        total[4] - u * Sv - v * Su,
+        total[5] - 2 * v * Sv,
     )
-    x, y_bar, a, b, c = plain_adjoint(W, white)
-    return x, y_bar, a, b, c, ratio(total[0] - S * ratio(y[5], opacity), opacity)
 
 
 # --- the pixels that a splat reaches ----------------------------------------------------------------------------------
@@ -238,7 +247,7 @@ def box_of(splat, ellipse, width, height):
     return x0, select(level > 0, x1, x0 - 1), y0, y1
 
 
-# --- a splat's own block of the Hessian -------------------------------------------------------------------------------
+# --- a splat's diagonal block of the Hessian --------------------------------------------------------------------------
 
 
 def _moment_index() -> np.ndarray:
@@ -254,6 +263,35 @@ def _moment_index() -> np.ndarray:
 
 MOMENT = _moment_index()
 MOMENT2 = np.array([[0, 3, 5], [1, 4, -1], [2, -1, -1]])  # of the six of degree 2, stored alike: 1, u, u^2, v, u v, v^2
+
+
+def _block_index() -> np.ndarray:
+    """Which of a splat's sums is the entry of its diagonal block, (9, 9) over coefficients and colour; BLOCK_SUMS: none, 0."""
+    powers = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of u and v in q', by Q0, QU, ...
+    index = np.full((9, 9), BLOCK_SUMS, np.int64)
+    for p, (j, k) in enumerate(powers):
+        for r, (j2, k2) in enumerate(powers):
+            index[p, r] = MOMENT[j + j2, k + k2]
+        for c in range(3):
+            index[6 + c, p] = index[p, 6 + c] = CROSS + DEGREE2 * c + MOMENT2[j, k]
+    for c in range(3):
+        index[6 + c, 6 + c] = COLOUR + c
+    return index
+
+
+def _bends() -> np.ndarray:
+    """sum s d2q of a splat, (3, 9, 9) over its coefficients: factors of its moments S, Su, Sv (`second_order`)."""
+    bends = np.zeros((3, 9, 9))
+    terms = (
+        (0, Q0, Q0, -1.0), (0, QU, QU, -1 / ROUND), (0, QV, QV, -1 / ROUND), (1, QU, QUU, -2 / ROUND),
+        (2, QU, QUV, -1 / ROUND), (1, QV, QUV, -1 / ROUND), (2, QV, QVV, -2 / ROUND),
+    )  # fmt: skip
+    for moment, p, r, factor in terms:
+        bends[moment, p, r] = bends[moment, r, p] = factor
+    return bends
+
+
+BLOCK_INDEX, BENDS = _block_index(), _bends()
 
 
 @formula

@@ -7,7 +7,7 @@ order of depth, d = p - mean:
     w     = alpha T,  T <- T - w;  the pixel stops before T would fall below transmittance_min
     colour = sum w colour_i + T background,  alpha of the pixel = 1 - T,  expected depth = sum w z_i
 
-The order, the alpha_min cut and the stop are held fixed under differentiation (they are piecewise constant).
+The order, the alpha_min cut and the stop are constants under differentiation: they are piecewise constant.
 """
 
 import torch
@@ -74,7 +74,7 @@ def _alphas(splats: Splats, index: Tensor, xs: Tensor, ys: Tensor, settings: Ren
     alpha = splats.opacities[index, None, None] * torch.exp(-squared / 2)
     capped = alpha.clamp_max(settings.alpha_max)
     if settings.gradient_through_cap:
-        capped = capped.detach() * (alpha / alpha.detach())
+        capped = capped.detach() * (alpha / torch.where(alpha > 0, alpha, 1).detach())  # alpha may underflow
     active = alpha >= settings.alpha_min
     if settings.contour_sigma is not None:
         active = active & (squared <= settings.contour_sigma**2)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.losses.autograd import view_loss
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.protocols import ViewLoss
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings

@@ -1,16 +1,15 @@
 """Photographs on disk: where they are, whether they fit their cameras, and how they are read.
 
-A `Photo` is what a reader of a scene format knows of an image: its file, its lens (a pycolmap camera, pixel centres at
+A `Photo` holds what a reader of a scene format knows of an image: its file, its lens (a pycolmap camera, pixel centres at
 + 0.5 as everywhere here) and its pose.  `frame` checks the file's header against the lens and fixes the final camera:
 
     stored size    the lens is scaled to the file's size where the aspect ratio is the same within rounding (`images_8`)
-    undistortion   radial and tangential lenses are resampled bilinearly into the largest pinhole image without blank
-                   pixels, with the pinhole camera that pycolmap (as `colmap image_undistorter`) chooses
-    downscale      area averaging: a pixel becomes the mean of the light that fell on its footprint, as on a sensor with
-                   larger pixels; values stay in [0, 1], and at a fractional ratio nothing shifts (a box filter that
-                   takes whole pixels only, as most libraries' does, moves edges by up to a quarter of a pixel)
-    beside it      masks and depth maps (`splat/scenes/layers.py`) are brought to the size of the file, then go the same
-                   way; a pixel is inside its mask where all of its footprint is
+    undistortion   images of radial and tangential lenses are resampled bilinearly into the largest pinhole image without
+                   blank pixels, with the pinhole camera that pycolmap (as `colmap image_undistorter`) chooses
+    downscale      a pixel becomes the mean over its footprint, fractions of pixels included: values stay in [0, 1], and
+                   edges stay in place at any ratio (a box filter of whole pixels moves them by up to a quarter pixel)
+    layers         masks and depth maps (`splat/scenes/layers.py`) are brought to the size of the file, then treated
+                   alike; a pixel is inside its mask where all of its footprint is
 """
 
 import re
@@ -24,21 +23,21 @@ import numpy as np
 import pycolmap
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, UInt8
-from PIL import Image
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
-from splat.scenes.layers import FORMATS, UNREADABLE, read_depth, read_mask
-from splat.scenes.view import Frame, Picture, Subset
+from splat.scenes.layers import opened_image, read_depth, read_mask
+from splat.scenes.view import Frame, Subset, View
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 UNDISTORTED_HERE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-LARGEST_SIDE = 2**31 - 1  # px; COLMAP ends with words of its own where it cannot count them
-SMALLEST = 4  # px a side of a reduced picture; smaller ones are a slip of the factor
+LARGEST_SIDE = 2**31 - 1  # px; COLMAP counts them in 32 bits
+SMALLEST = 4  # px a side of a reduced picture; a smaller one comes from a mistyped factor
 LARGEST_DISPLACEMENT = 2  # of a corner, in half diagonals; the strongest lenses stay below 1
-INSIDE = 1 - 1e-4  # share of a pixel's footprint that must be; below 1 by more than float32 sums can lose
+INSIDE = 1 - 1e-4  # share of a pixel's footprint inside the mask; below 1 by more than float32 sums can lose
 Warp = Callable[[Float[Tensor, "c h w"]], Float[Tensor, "c height width"]]
 
 
@@ -61,34 +60,19 @@ class Photo:
 
 
 def image_folder(root: Path, images: str | None = None) -> Path:
-    """The folder of a scene's photographs: `images` if named, else `images`, else `images_K` with the smallest K."""
-    if images is not None:
-        if not (root / images).is_dir():
-            raise FileNotFoundError(f"expected the image folder {root / images}, which does not exist; {_offers(root)}")
-        return root / images
-    if (root / "images").is_dir():
-        return root / "images"
-    reduced = _reduced_folders(root)
-    if not reduced:
+    """The folder of a scene's photographs: the named one, by default `images`, else `images_K` with the smallest K."""
+    reduced = sorted((int(m[1]), path) for path in root.iterdir() if (m := re.fullmatch(r"images_(\d+)", path.name)))
+    found = [path for path in (root / "images", *(path for _, path in reduced)) if path.is_dir()]
+    if images is not None and not (root / images).is_dir():
+        names = ", ".join(path.name for path in found)
+        offers = f"choose from {names}" if found else "the scene has no folder images or images_K either"
+        raise FileNotFoundError(f"expected the image folder {root / images}, which does not exist; {offers}")
+    if images is None and not found:
         raise FileNotFoundError(
             f"expected a folder images or images_K (K = 2, 4, 8 ...) in {root}, found neither; "
             "name the folder of the photographs with images=..."
         )
-    return reduced[0]
-
-
-def _reduced_folders(root: Path) -> list[Path]:
-    found = [
-        (int(m[1]), path)
-        for path in root.iterdir()
-        if path.is_dir() and (m := re.fullmatch(r"images_(\d+)", path.name))
-    ]
-    return [path for _, path in sorted(found)]
-
-
-def _offers(root: Path) -> str:
-    found = [path.name for path in [root / "images", *_reduced_folders(root)] if path.is_dir()]
-    return f"choose from {', '.join(found)}" if found else "the scene has no folder images or images_K either"
+    return found[0] if images is None else root / images
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -108,33 +92,22 @@ def require_files(paths: Sequence[Path]) -> None:
 
 def image_header(path: Path) -> tuple[tuple[int, int], bool]:
     """((width, height), whether it has an alpha channel), without reading the pixels."""
-    try:
-        with Image.open(path, formats=FORMATS) as file:
-            mode, size, has_alpha = file.mode, file.size, _has_alpha(file)
-    except UNREADABLE as error:
-        raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
-    if mode.startswith(("I", "F")):
-        raise ValueError(f"expected an image of 8 bits a channel, got mode {mode} in {path}; convert it")
-    return size, has_alpha
+    with opened_image(path) as file:
+        if file.mode.startswith(("I", "F")):
+            raise InputError(f"expected an image of 8 bits a channel, got mode {file.mode} in {path}; convert it")
+        return file.size, file.has_transparency_data
 
 
 def image_pixels(path: Path) -> UInt8[np.ndarray, "h w c"]:
     """Red, green, blue, and alpha where the image has it, from 0 to 255."""
-    try:
-        with Image.open(path, formats=FORMATS) as file:
-            return np.array(file.convert("RGBA" if _has_alpha(file) else "RGB"))
-    except UNREADABLE as error:
-        raise ValueError(f"expected an image, cannot read {path}: {error}; replace the file") from error
-
-
-def _has_alpha(file: Image.Image) -> bool:
-    return "A" in file.getbands() or "transparency" in file.info
+    with opened_image(path) as file:
+        return np.array(file.convert("RGBA" if file.has_transparency_data else "RGB"))
 
 
 def checked_lens(model: str, size: tuple[float, float], params: Sequence[float], name: str) -> pycolmap.Camera:
     """The lens of a photograph of this (width, height).  ValueError where it cannot be one."""
     if not (all(map(isfinite, params)) and all(1 <= side <= LARGEST_SIDE for side in size)):
-        raise ValueError(
+        raise InputError(
             f"the camera of image {name!r} cannot be: expected at least 1 px a side and finite numbers, got "
             f"{size[0]:g} x {size[1]:g} px and {[float(value) for value in params]}"
         )
@@ -148,26 +121,18 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
     pinhole = _pinhole(lens, photo)
     width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
     if downscale > 1 and min(width, height) < SMALLEST:
-        raise ValueError(
+        raise InputError(
             f"expected pictures of at least {SMALLEST} px a side, got {width} x {height} px for {photo.name!r} at downscale "
             f"{downscale:g}; reduce less"
         )
     fx, fy, cx, cy = pinhole.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     try:
         full = Camera(photo.rotation, photo.centre, fx, fy, cx, cy, pinhole.width, pinhole.height)
-    except ValueError as error:
-        raise ValueError(f"the camera of image {photo.name!r} cannot be: {error}") from error
+    except InputError as error:
+        raise InputError(f"the camera of image {photo.name!r} cannot be: {error}") from error
     camera = full.resized(width, height)
     warp = partial(_warp, lens, pinhole, (width, height))
-    return Frame(
-        photo.name,
-        camera,
-        partial(_read, photo.path, warp, background),
-        photo.subset,
-        photo.depth_range,
-        partial(_read_mask, photo.mask, size, warp) if photo.mask else None,
-        partial(_read_depth, photo.depth, size, warp) if photo.depth else None,
-    )
+    return Frame(photo.name, camera, partial(_view, photo, camera, warp, background), photo.subset, photo.depth_range)
 
 
 def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> pycolmap.Camera:
@@ -176,7 +141,7 @@ def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> py
     if (lens.width, lens.height) == size:
         return lens
     if not _same_shape((lens.width, lens.height), size):
-        raise ValueError(
+        raise InputError(
             f"expected image {photo.name!r} at the {lens.width} x {lens.height} px of its camera or scaled from it, "
             f"got {width} x {height} px in {photo.path}; it was cropped, rotated or stretched: use the images that the "
             "cameras were computed from, or compute the cameras anew"
@@ -196,12 +161,12 @@ def _same_shape(old: tuple[int, int], new: tuple[int, int]) -> bool:
 
 
 def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
-    """The lens itself where it is a pinhole, else the pinhole camera of its undistorted image."""
+    """The lens of the undistorted image: the lens itself where it is a pinhole."""
     model = lens.model_name
     if model in PINHOLE_MODELS:
         return lens
     if model not in UNDISTORTED_HERE:
-        raise ValueError(
+        raise InputError(
             f"expected a pinhole lens or radial and tangential distortion ({', '.join(UNDISTORTED_HERE)}), got "
             f"{model} for image {photo.name!r}; make pinhole images first: colmap image_undistorter --image_path "
             f"{photo.path.parent} --input_path MODEL --output_path NEW_SCENE, where MODEL is the folder of cameras.bin"
@@ -209,7 +174,7 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
     if lens.is_undistorted():
         return lens
     if not _displacement(lens) <= LARGEST_DISPLACEMENT:
-        raise ValueError(
+        raise InputError(
             f"the camera of image {photo.name!r} cannot be: expected distortion that moves no corner by more than "
             f"{LARGEST_DISPLACEMENT} half diagonals of the picture, got {model} with {lens.params_to_string()}"
         )
@@ -217,7 +182,7 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
 
 
 def _displacement(lens: pycolmap.Camera) -> float:
-    """How far the distortion moves a corner of the picture, at most, in units of the picture's half diagonal."""
+    """The largest distance that the distortion moves a corner of the picture, in units of its half diagonal."""
     size = np.array([lens.width, lens.height])
     corners = size * [[0, 0], [1, 0], [0, 1], [1, 1]]
     (fx, _, cx), (_, fy, cy), _ = lens.calibration_matrix()
@@ -225,33 +190,31 @@ def _displacement(lens: pycolmap.Camera) -> float:
     return float(np.hypot(*(np.asarray(lens.img_from_cam(rays)) - corners).T).max() / np.hypot(*size / 2))
 
 
-def _read(path: Path, warp: Warp, background: Float[Tensor, "3"]) -> Picture:
+def _view(photo: Photo, camera: Camera, warp: Warp, background: Float[Tensor, "3"]) -> View:
     """Composite over the background, undistort, downscale: in this order, no transparent colour bleeds in."""
-    pixels = torch.from_numpy(image_pixels(path))
-    layers = pixels.permute(2, 0, 1).to(torch.float32) / 255
+    layers = torch.from_numpy(image_pixels(photo.path)).permute(2, 0, 1).to(torch.float32) / 255
+    size = (layers.shape[2], layers.shape[1])
     if has_alpha := len(layers) == 4:
         rgb, alpha = layers[:3], layers[3:]
         layers = torch.cat([rgb * alpha + background[:, None, None] * (1 - alpha), alpha])
     layers = warp(layers).clamp(0, 1)
-    return layers[:3], layers[3] if has_alpha else None
-
-
-def _read_mask(path: Path, size: tuple[int, int], warp: Warp) -> Bool[Tensor, "h w"]:
-    inside = warp(_at_size(read_mask(path), size, path))[0] >= INSIDE
-    if not inside.any():
-        raise ValueError(f"expected a mask with whole pixels inside, got none in {path} at this size; reduce less")
-    return inside
-
-
-def _read_depth(path: Path, size: tuple[int, int], warp: Warp) -> Float[Tensor, "h w"]:
-    return warp(_at_size(read_depth(path), size, path))[0]
+    mask = depth = None
+    if photo.mask:
+        mask = warp(_at_size(read_mask(photo.mask), size, photo.mask))[0] >= INSIDE
+        if not mask.any():
+            raise InputError(
+                f"expected a mask with whole pixels inside, got none in {photo.mask} at this size; reduce less"
+            )
+    if photo.depth:
+        depth = warp(_at_size(read_depth(photo.depth), size, photo.depth))[0]
+    return View(photo.name, camera, layers[:3], layers[3] if has_alpha else None, mask, depth)
 
 
 def _at_size(layers: Float[Tensor, "c h w"], size: tuple[int, int], path: Path) -> Tensor:
     """A mask or depth map at the size of its photograph, whose shape it must have."""
     height, width = layers.shape[1:]
     if not _same_shape((width, height), size):
-        raise ValueError(
+        raise InputError(
             f"expected {path} to have the shape of its photograph, {size[0]} x {size[1]} px at any scale, got "
             f"{width} x {height}; make it from that photograph"
         )

@@ -1,16 +1,17 @@
-"""What lies beside a photograph, pixel for pixel: an object mask, a depth map.
+"""Image files, and the files beside a photograph that give a number for each of its pixels: object mask, depth map.
 
-mask    an image file; inside is what has the file's largest value (white; 1 in a mask of 0 and 1) in every channel
+mask    an image file; a pixel is inside if every channel has the file's largest value (white; 1 in a mask of 0 and 1)
 depth   NAME.npy, or NAME.png of 16 bits: relative monocular depth, in any unit.  The numbers are kept as they are; whether
-        larger means farther (depth) or nearer (disparity, what MiDaS and DPT give) is for the method that uses them
+        larger means farther (depth) or nearer (disparity, as MiDaS and DPT give it) is for the method that uses them
 
-A file is found by the photograph's name: NAME.SUFFIX or NAME without its own suffix, in the folder or below it as in the
+A file is found by the photograph's name, with its suffix replaced or followed by another, in the folder or below it as in the
 scene (`train/r_3` in `train/r_3.npy` or `r_3.npy`); the masks of DTU by the number of the view.
 """
 
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -19,25 +20,31 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.scenes.view import View
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".npy", ".png")
 MASK_FOLDERS = ("mask", "masks")
 SIXTEEN_BITS = ("I;16", "I;16B", "I")
-# Pillow goes by what a file holds, whatever its name, and would start Ghostscript for one of PostScript
+# Pillow recognises a file by its content, whatever its name, and would start Ghostscript for PostScript
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-UNREADABLE = (
-    OSError,
-    SyntaxError,
-    EOFError,
-    struct.error,
-    Image.DecompressionBombError,
-)  # what it raises of damaged files
+# raised by Pillow for damaged files
+UNREADABLE = (OSError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError)
+
+
+@contextmanager
+def opened_image(path: Path, kind: str = "an image") -> Iterator[Image.Image]:
+    """An image file, open.  ValueError that says which kind was expected, where it cannot be read."""
+    try:
+        with Image.open(path, formats=FORMATS) as file:
+            yield file
+    except UNREADABLE as error:
+        raise InputError(f"expected {kind}, cannot read {path}: {error}; replace the file") from error
 
 
 def dtu_number(name: str) -> int | None:
-    """The number of a DTU view from 0, by which the protocol and the masks know it; None for any other name.
+    """The number of a DTU view, from 0, in the protocol and the masks; None for any other name.
 
     >>> dtu_number("images/rect_026_3_r5000.png"), dtu_number("IMG_026.png")
     (25, None)
@@ -63,7 +70,7 @@ def require_depths(views: Sequence[View], folder: Path) -> None:
     """ValueError unless every view has a depth map."""
     without = [view.name for view in views if view.depth is None]
     if without:
-        raise ValueError(
+        raise InputError(
             f"expected a depth map for each of the {len(views)} training views in {folder}, got none for {without[0]}; "
             f"save it as {PurePosixPath(without[0]).stem}.npy"
         )
@@ -71,51 +78,49 @@ def require_depths(views: Sequence[View], folder: Path) -> None:
 
 def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
     """1 inside, 0 outside."""
-    try:
-        with Image.open(path, formats=FORMATS) as file:
-            pixels = np.array(file if file.mode in ("1", "L") else file.convert("RGB"))
-    except UNREADABLE as error:
-        raise ValueError(f"expected a mask, cannot read {path}: {error}; replace the file") from error
+    with opened_image(path, "a mask") as file:
+        pixels = np.array(file if file.mode in ("1", "L") else file.convert("RGB"))
     lowest = pixels.reshape(*pixels.shape[:2], -1).min(axis=2)
     if not lowest.any():
-        raise ValueError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
+        raise InputError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
     return torch.from_numpy(lowest == lowest.max()).to(torch.float32)[None]
 
 
 def read_depth(path: Path) -> Float[Tensor, "1 h w"]:
     """The numbers of the file, checked."""
-    try:
-        values = read_array(path) if path.suffix == ".npy" else _read_png(path)
-    except (*UNREADABLE, ValueError) as error:
-        raise ValueError(f"expected a depth map, cannot read {path}: {error}; write it again") from error
+    if path.suffix == ".npy":
+        try:
+            values = read_array(path)
+        except (OSError, ValueError) as error:
+            raise InputError(f"expected a depth map, cannot read {path}: {error}; write it again") from error
+    else:
+        with opened_image(path, "a depth map") as file:
+            if file.mode not in SIXTEEN_BITS:
+                raise InputError(
+                    f"expected depth of 16 bits, got mode {file.mode}, too few levels, in {path}; write it again"
+                )
+            values = np.array(file)
     shape, values = values.shape, values.squeeze()
     if values.ndim != 2 or not values.size:
-        raise ValueError(f"expected a depth map of shape (h, w), got {values.dtype} of shape {shape} in {path}")
+        raise InputError(f"expected a depth map of shape (h, w), got {values.dtype} of shape {shape} in {path}")
     with np.errstate(over="ignore"):  # what becomes infinite is refused
         values = values.astype(np.float32)
     if not np.isfinite(values).all():
-        raise ValueError(
+        raise InputError(
             f"expected finite depths, got {(~np.isfinite(values)).sum()} that are not in {path}; fill them"
         )
     if values.min() == values.max():
-        raise ValueError(f"expected depths that vary, got {values.min()} everywhere in {path}; write it again")
+        raise InputError(f"expected depths that vary, got {values.min()} everywhere in {path}; write it again")
     return torch.from_numpy(values)[None]
 
 
 def read_array(path: Path) -> np.ndarray:
-    """Real numbers that `numpy.save` wrote.  ValueError or OSError where the file holds none."""
+    """Real numbers that `numpy.save` wrote.  ValueError or OSError where the file has others or none."""
     with path.open("rb") as file:
         try:
             values = np.lib.format.read_array(file, allow_pickle=False)
         except Exception as error:  # NumPy has Python read the header, whose errors are of many kinds
-            raise ValueError(f"no array of numbers ({error})") from error
+            raise InputError(f"no array of numbers ({error})") from error
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"an array of {values.dtype}, not of real numbers")
+        raise InputError(f"an array of {values.dtype}, not of real numbers")
     return values
-
-
-def _read_png(path: Path) -> np.ndarray:
-    with Image.open(path, formats=FORMATS) as file:
-        if file.mode not in SIXTEEN_BITS:
-            raise ValueError(f"mode {file.mode} instead of 16 bits, too few levels for depth")
-        return np.array(file)

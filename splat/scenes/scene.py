@@ -6,10 +6,11 @@
     transforms  transforms.json of instant-ngp or nerfstudio                                          `transforms.py`
     DTU         Rectified/scanN beside Calibration                                                    `dtu.py`
 
-in this order: a COLMAP model beside poses_bounds.npy wins, because it has points.  Every image file is looked up and
-its size compared with its camera's here, before any training; the pixels are read when a split asks for them.
+in this order: a COLMAP model beside poses_bounds.npy wins, because it has points.  Every image file is found, and its size
+compared with that of its camera, when the scene is loaded; pixels are read when a view is asked for.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.scenes.formats.colmap import MODEL_FOLDERS, find_model, read_colmap
 from splat.scenes.formats.dtu import is_dtu, mask_folder, read_dtu
@@ -27,8 +29,6 @@ from splat.scenes.formats.transforms import BLENDER_FILES, SINGLE_FILE, read_ble
 from splat.scenes.images import Photo, frame, image_header, require_files
 from splat.scenes.layers import DEPTH_SUFFIXES, MASK_FOLDERS, MASK_SUFFIXES, find_layer
 from splat.scenes.view import Frame, Points, View
-
-__all__ = ["Frame", "Points", "Scene", "View", "camera_extent", "load_scene"]
 
 Kind = Literal["colmap", "llff", "blender", "transforms", "dtu", "synthetic"]
 
@@ -53,7 +53,7 @@ class Scene:
         by_name = {frame.name: frame for frame in self.frames}
         unknown = [name for name in names if name not in by_name]
         if unknown:
-            raise ValueError(
+            raise InputError(
                 f"expected names of images of {self.root}, got {unknown[0]!r} ({len(unknown)} unknown); the scene has "
                 f"{len(self.frames)} images from {self.names[0]!r} to {self.names[-1]!r}"
             )
@@ -69,14 +69,14 @@ class Scene:
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 x the largest distance of a camera from the mean of all, world units: 3DGS's unit of position steps.
+    """1.1 x the largest distance of a camera from the mean of all, world units.
 
-    3DGS takes it over the training cameras.
+    Taken over the training cameras, it is 3DGS's unit for steps of positions.  InputError where all cameras are at one place.
     """
     centres = torch.stack([camera.centre for camera in cameras])
     extent = 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
     if not extent > 0:
-        raise ValueError(
+        raise InputError(
             f"expected cameras at different places, got {len(cameras)} at the same one: the scene has no scale; "
             "choose at least two views from different places"
         )
@@ -98,11 +98,22 @@ def load_scene(
     downscale: both sides of every picture are divided by this and rounded.
     background: RGB in [0, 1] that transparent pictures are composited over and renders are drawn on; by default white
         where the pictures have an alpha channel (as 3DGS does for Blender scenes), else black.
-    masks, depths: folders of `splat/scenes/layers.py`; an image that has no file there goes without.  Masks by default:
-        those that the scene's files name, else a folder mask or masks in the scene, else DTU's own.
-    points: whether a COLMAP model's are wanted, which take longest to read; without them the scene may have none.
+    masks, depths: folders of `splat/scenes/layers.py`, which need not have a file for every image.  Masks by default:
+        those that the scene's files name, else a folder mask or masks in the scene, else those that DTU provides.
+    points: whether to read a COLMAP model's points, which take longest.
 
-    Raises FileNotFoundError for what is missing and ValueError for what cannot be used, in one sentence.
+    Raises FileNotFoundError for a missing file and InputError for one that cannot be used, in one sentence.
+
+    >>> from splat.scenes.write import write_transforms_scene
+    >>> from splat import SyntheticSettings, synthetic_scene
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> folder = getfixture("tmp_path") / "scene"
+    >>> write_transforms_scene(made.scene, folder)
+    >>> scene = load_scene(folder)
+    >>> scene.kind, scene.names
+    ('transforms', ('images/view_000.png', 'images/view_001.png'))
+    >>> scene.load()[0].image.shape
+    torch.Size([3, 12, 16])
     """
     root = Path(path)
     if not root.is_dir():
@@ -110,7 +121,7 @@ def load_scene(
             f"expected a scene folder, {root} {'is not a folder' if root.exists() else 'does not exist'}"
         )
     if not 1 <= downscale < float("inf"):
-        raise ValueError(f"expected downscale of at least 1, got {downscale}")
+        raise InputError(f"expected downscale of at least 1, got {downscale}")
     kind, photos, found, own_background = _read(root, images, points)
     photos = _with_layers(root, photos, masks, depths)
     require_files([photo.path for photo in photos] + [photo.mask for photo in photos if photo.mask])
@@ -127,7 +138,7 @@ def load_scene(
 def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
     three = isinstance(values, list | tuple) and len(values) == 3
     if not (three and all(isinstance(v, (int, float)) and 0 <= v <= 1 for v in values)):
-        raise ValueError(f"expected a background of three numbers in [0, 1], got {values!r}")
+        raise InputError(f"expected a background of three numbers in [0, 1], got {values!r}")
     return torch.tensor(values, dtype=torch.float32)
 
 
@@ -139,7 +150,7 @@ def _read(root: Path, images: str | None, points: bool) -> tuple[Kind, list[Phot
         return "llff", read_llff(root, images), None, None
     if all((root / name).is_file() for _, name in BLENDER_FILES):
         if images is not None:
-            raise ValueError(f"expected no image folder for {root}, whose transforms files name theirs, got {images!r}")
+            raise InputError(f"expected no image folder for {root}, whose transforms files name theirs, got {images!r}")
         return "blender", read_blender(root), None, None
     for name in (SINGLE_FILE, BLENDER_FILES[0][1]):
         if (root / name).is_file():
@@ -179,7 +190,6 @@ def _with_layers(root: Path, photos: list[Photo], masks: Path | None, depths: Pa
 
 
 def _require_distinct(photos: Sequence[Photo], root: Path) -> None:
-    names = [photo.name for photo in photos]
-    twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    twice = sorted(name for name, count in Counter(photo.name for photo in photos).items() if count > 1)
     if twice:
-        raise ValueError(f"expected every image of {root} once, got {twice[0]!r} more than once ({len(twice)} such)")
+        raise InputError(f"expected every image of {root} once, got {twice[0]!r} more than once ({len(twice)} such)")

@@ -1,10 +1,10 @@
-"""Which views train and which test: the sparse-view protocols of the field.
+"""Training and test views of a scene, by the sparse-view protocols of the field.
 
 LLFF       3, 6 or 9 views.  Names sorted; every 8th, from the first, is a test view; n training views at the rounded,
            evenly spaced places of the rest, np.linspace(0, m - 1, n): RegNeRF, FreeNeRF, FSGS and their followers.
            Images of images_8, 504 x 378
-Mip-NeRF   360: 12 or 24 views by the same rule, images of images_8 (FSGS, CoR-GS, DropGaussian).  So is every scene
-           without a protocol of its own
+Mip-NeRF   360: 12 or 24 views by the same rule, images of images_8 (FSGS, CoR-GS, DropGaussian).  The same rule holds for
+           every scene that no other protocol is for
 DTU        3, 6 or 9 views, the first of 25, 22, 28, 40, 44, 48, 0, 8, 13 (views counted from 0); the 25 test views are the
            other ones of the first 49 but 3-7, 16-21 and 36-39, which are badly exposed: pixelNeRF, RegNeRF (`dtu_split_type`
            pixelnerf), DNGaussian, CoR-GS.  Images reduced by 4; metrics inside the objects' masks.  A scene is DTU's by the
@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from landscape.errors import InputError
 from splat.scenes.layers import dtu_number
 from splat.scenes.scene import Scene
 from splat.scenes.view import Frame
@@ -42,7 +43,7 @@ class Split:
 
 
 def usual_views(scene: Scene) -> int:
-    """How many training views the scene has where nobody says: all 8 of Blender's protocol, else the fewest of the field."""
+    """The default number of training views: all 8 of Blender's protocol, else the fewest of the field."""
     return len(BLENDER_TRAINING) if scene.kind == "blender" else FEWEST
 
 
@@ -52,15 +53,23 @@ def split_scene(
     train: Sequence[str | int] | None = None,
     test: Sequence[str | int] | None = None,
 ) -> Split:
-    """The protocol of the scene's kind with that many training views (all by default), or the explicit lists."""
+    """The protocol of the scene's kind with that many training views (all by default), or the explicit lists.
+
+    InputError where the scene lacks views.
+
+    >>> from splat import SyntheticSettings, synthetic_scene
+    >>> scene = synthetic_scene(SyntheticSettings(gaussians=50, views=10, width=16, height=12)).scene
+    >>> split_scene(scene, 2).train
+    ('images/view_001.png', 'images/view_009.png')
+    """
     if train is not None:
         if views is not None:
-            raise ValueError(
+            raise InputError(
                 f"expected a number of views or a list of training views, got both: {views} and {list(train)}"
             )
         return explicit_split(scene.names, train, test)
     if test is not None:
-        raise ValueError("expected a list of training views beside the list of test views, got none; give both")
+        raise InputError("expected a list of training views beside the list of test views, got none; give both")
     if scene.kind == "blender":
         return blender_split(scene.frames, views)
     if all(dtu_number(name) is not None for name in scene.names):
@@ -73,9 +82,9 @@ def evenly_spaced(names: Sequence[str], n: int | None) -> tuple[str, ...]:
     if n is None:
         return tuple(names)
     if n < 1:
-        raise ValueError(f"expected at least 1 training view, got {n}")
+        raise InputError(f"expected at least 1 training view, got {n}")
     if n > len(names):
-        raise ValueError(f"expected at most {len(names)} training views, which the scene has, got {n}; ask for fewer")
+        raise InputError(f"expected at most {len(names)} training views, which the scene has, got {n}; ask for fewer")
     return tuple(names[int(place)] for place in np.rint(np.linspace(0, len(names) - 1, n)))
 
 
@@ -84,7 +93,7 @@ def llff_split(names: Sequence[str], n: int | None = None) -> Split:
     names = sorted(names)
     others = [name for i, name in enumerate(names) if i % HOLD_OUT]
     if not others:
-        raise ValueError(f"expected at least 2 images, one to train and one to test, got {len(names)}")
+        raise InputError(f"expected at least 2 images, one to train and one to test, got {len(names)}")
     return Split(evenly_spaced(others, n), tuple(names[::HOLD_OUT]), "llff")
 
 
@@ -103,11 +112,11 @@ def dtu_split(names: Sequence[str], n: int | None = None) -> Split:
     """The first n of the 9 training views (all by default), and the 25 test views, or those that the scene has."""
     by_number = {dtu_number(name): name for name in names}
     if n is not None and not 1 <= n <= len(DTU_TRAINING):
-        raise ValueError(f"expected 1 to {len(DTU_TRAINING)} training views, as DTU's protocol has, got {n}")
+        raise InputError(f"expected 1 to {len(DTU_TRAINING)} training views, as DTU's protocol has, got {n}")
     wanted = DTU_TRAINING[:n]
     missing = [number for number in wanted if number not in by_number]
     if missing:
-        raise ValueError(
+        raise InputError(
             f"expected the training views {', '.join(map(str, wanted))} of DTU's protocol, got a scene without view "
             f"{missing[0]} (rect_{missing[0] + 1:03d}); restore its image"
         )
@@ -131,20 +140,20 @@ def explicit_split(names: Sequence[str], train: Sequence[str | int], test: Seque
     """These views train; `test`, or else all others, test.  A view is a name, its last part, or a number."""
     chosen = tuple(_resolve(names, key) for key in train)
     if not chosen or len(set(chosen)) < len(chosen):
-        raise ValueError(f"expected training views, each once, got {list(train)}")
+        raise InputError(f"expected training views, each once, got {list(train)}")
     held_out = (
         tuple(name for name in names if name not in chosen) if test is None else tuple(_resolve(names, k) for k in test)
     )
     both = sorted(set(chosen) & set(held_out))
     if both:
-        raise ValueError(f"expected test views that do not train, got {both[0]!r} in both lists")
+        raise InputError(f"expected test views that do not train, got {both[0]!r} in both lists")
     return Split(chosen, held_out, "explicit")
 
 
 def _resolve(names: Sequence[str], key: str | int) -> str:
     if isinstance(key, int):
         if not 0 <= key < len(names):
-            raise ValueError(f"expected the number of a view from 0 to {len(names) - 1}, got {key}")
+            raise InputError(f"expected the number of a view from 0 to {len(names) - 1}, got {key}")
         return names[key]
     if key in names:
         return key
@@ -153,7 +162,7 @@ def _resolve(names: Sequence[str], key: str | int) -> str:
     ]
     if len(matches) != 1:
         problem = f"{len(matches)} views have it: {', '.join(matches[:3])}" if matches else "no view has it"
-        raise ValueError(
+        raise InputError(
             f"expected the name of one view, got {key!r}: {problem}; the names go from {names[0]!r} to {names[-1]!r}"
         )
     return matches[0]

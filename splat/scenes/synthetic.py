@@ -15,12 +15,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera, look_at
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.render.render import Rendering, render
 from splat.scenes.scene import Scene
-from splat.scenes.view import Frame, Picture, Points, inside_image, pixel_coordinates
+from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
 
 GOLDEN = (1 + sqrt(5)) / 2
 FLOOR, WALL = 1.0, 3.0
@@ -32,7 +33,10 @@ class SyntheticSettings:
     """gaussians: about how many (each surface rounds its share).  arc: degrees that the cameras span.
 
     point_share: share of the Gaussians seen by two views that become points; point_noise: their error, in units of the
-    Gaussian's largest scale.
+    Gaussian's largest scale.  InputError where a value is out of its range.
+
+    >>> SyntheticSettings(views=3).width
+    120
     """
 
     gaussians: int = 1600
@@ -47,9 +51,9 @@ class SyntheticSettings:
 
     def __post_init__(self) -> None:
         if self.gaussians < 50 or self.views < 2 or min(self.width, self.height) < 8:
-            raise ValueError(f"expected at least 50 Gaussians, 2 views and 8 x 8 pixels, got {self}")
+            raise InputError(f"expected at least 50 Gaussians, 2 views and 8 x 8 pixels, got {self}")
         if not (0 < self.arc < 150 and 0 < self.point_share <= 1 and self.point_noise >= 0):
-            raise ValueError(f"expected 0 < arc < 150, 0 < point_share <= 1 and point_noise >= 0, got {self}")
+            raise InputError(f"expected 0 < arc < 150, 0 < point_share <= 1 and point_noise >= 0, got {self}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,23 +75,24 @@ class Surface:
 
 
 def synthetic_scene(settings: SyntheticSettings = SyntheticSettings()) -> SyntheticScene:
-    """Build the Gaussians and render every view.  The same settings give the same scene."""
+    """Build the Gaussians and render every view.  The same settings give the same scene.
+
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> made.scene.names, 45 < len(made.truth) < 55
+    (('images/view_000.png', 'images/view_001.png'), True)
+    """
     generator = torch.Generator().manual_seed(settings.seed)
     truth = _gaussians(_still_life(settings.gaussians, generator), settings.sh_degree, generator)
     cameras = _arc_of_cameras(settings)
     with torch.no_grad():
         renderings = [render(truth, camera, depth=True) for camera in cameras]
-    frames = tuple(
-        Frame(f"images/view_{i:03d}.png", camera, partial(_picture, rendering.image.clamp(0, 1)))
-        for i, (camera, rendering) in enumerate(zip(cameras, renderings))
-    )
+    frames = []
+    for i, (camera, rendering) in enumerate(zip(cameras, renderings)):
+        name = f"images/view_{i:03d}.png"
+        frames.append(Frame(name, camera, partial(View, name, camera, rendering.image.clamp(0, 1))))
     points = _points(truth, frames, renderings, settings, generator)
-    scene = Scene("synthetic", Path("synthetic"), "synthetic", frames, points, torch.zeros(3))
+    scene = Scene("synthetic", Path("synthetic"), "synthetic", tuple(frames), points, torch.zeros(3))
     return SyntheticScene(scene, truth)
-
-
-def _picture(image: Float[Tensor, "3 h w"]) -> Picture:
-    return image, None
 
 
 def _still_life(n: int, generator: torch.Generator) -> list[Surface]:
@@ -213,7 +218,7 @@ def _arc_of_cameras(settings: SyntheticSettings) -> list[Camera]:
 
 def _points(
     truth: Gaussians,
-    frames: tuple[Frame, ...],
+    frames: list[Frame],
     renderings: list[Rendering],
     settings: SyntheticSettings,
     generator: torch.Generator,

@@ -1,8 +1,8 @@
-"""What a scene is made of: views, frames that have not been read yet, and points.
+"""The parts of a scene: views, frames whose pictures are not read yet, and points.
 
     View    a camera with its picture, as training and evaluation use it
-    Frame   the same, whose picture is read from disk when `view()` is called; its camera and size are already final
-    Points  coloured points of the scene, from structure from motion or a scanner, and which images see each of them
+    Frame   a camera whose picture is read from disk by `view()`; camera and size are already final
+    Points  coloured points of the scene, from structure from motion or a scanner, and the images that see each of them
 
 Pictures are (3, h, w) float32 in [0, 1], in the encoding of the file (no linearisation), composited over the scene's
 background where the file has an alpha channel.  World units and axes are those of the scene's files.
@@ -16,18 +16,22 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 
 Subset = Literal["train", "test"]
-Picture = tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"] | None]
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera and its picture.
+    """A camera and its picture.  ValueError where their sizes differ.
 
     alpha: coverage in [0, 1] where the file has an alpha channel.  mask: the pixels that metrics count, where the scene
     has masks.  depth: relative depth or disparity, in any unit, where a folder of depth maps was given.
+
+    >>> level = Camera(torch.eye(3), torch.zeros(3), fx=20.0, fy=20.0, cx=4.0, cy=3.0, width=8, height=6)
+    >>> View("grey", level, torch.full((3, 6, 8), 0.5)).image.shape
+    torch.Size([3, 6, 8])
     """
 
     name: str
@@ -49,26 +53,17 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A posed picture that is read on demand.
+    """A posed picture that `view()` reads.
 
-    subset: the part that the scene's own files assign it to; depth_range: nearest and farthest depth of the scene
-    content, world units; read_mask, read_depth: of what `View` calls mask and depth.  None where there is no file.
+    subset: the part that the scene's own files assign it to.  depth_range: nearest and farthest depth of the scene
+    content, world units.  None where the files do not say.
     """
 
     name: str
     camera: Camera
-    read: Callable[[], Picture]
+    view: Callable[[], View]
     subset: Subset | None = None
     depth_range: tuple[float, float] | None = None
-    read_mask: Callable[[], Bool[Tensor, "h w"]] | None = None
-    read_depth: Callable[[], Float[Tensor, "h w"]] | None = None
-
-    def view(self) -> View:
-        """Read the picture, and what lies beside it."""
-        image, alpha = self.read()
-        mask = self.read_mask() if self.read_mask else None
-        depth = self.read_depth() if self.read_depth else None
-        return View(self.name, self.camera, image, alpha, mask, depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +85,11 @@ class Points:
                 f"expected xyz and rgb of shape (n, 3), got {tuple(self.xyz.shape)} and {tuple(self.rgb.shape)}"
             )
         if not bool(torch.isfinite(self.xyz).all()):
-            raise ValueError("expected finite points, got some that are not; remove them from the scene's point file")
+            raise InputError("expected finite points, got some that are not; remove them from the scene's point file")
         if self.observations is not None and self.observations.numel():
             point, image = self.observations.amax(dim=0).tolist()
             if point >= len(self.xyz) or image >= len(self.names) or int(self.observations.min()) < 0:
-                raise ValueError(
+                raise InputError(
                     f"expected observations of {len(self.xyz)} points in {len(self.names)} images, "
                     f"got point {point} in image {image}"
                 )
@@ -103,7 +98,7 @@ class Points:
         return len(self.xyz)
 
     def sightings(self, views: Sequence[View | Frame]) -> Int[Tensor, " n"]:
-        """In how many of these views each point is seen: by its track, or, where there are none, inside the image."""
+        """The number of these views that see each point: by its track or, without tracks, because it lies in the image."""
         if self.observations is None:
             inside = [inside_image(view.camera, self.xyz) for view in views]
             return torch.stack(inside).sum(dim=0) if inside else torch.zeros(len(self), dtype=torch.int64)
@@ -113,7 +108,7 @@ class Points:
 
 
 def pixel_coordinates(camera: Camera, xyz: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
-    """Where points fall in the image (px) and their depth z (world units); meaningless where z <= 0."""
+    """Positions of points in the image (px) and depths z (world units); meaningless where z <= 0."""
     x, y, z = ((xyz - camera.centre.to(xyz)) @ camera.rotation.to(xyz).T).unbind(-1)
     return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1), z
 
@@ -121,7 +116,7 @@ def pixel_coordinates(camera: Camera, xyz: Float[Tensor, "n 3"]) -> tuple[Float[
 def inside_image(
     camera: Camera, xyz: Float[Tensor, "n 3"], depth_range: tuple[float, float] | None = None
 ) -> Bool[Tensor, " n"]:
-    """Which points lie in front of the camera (within the depth range) and fall inside its image."""
+    """Which points lie in front of the camera, within the depth range (z), and inside its image."""
     pixel, z = pixel_coordinates(camera, xyz)
     near, far = depth_range or (0.0, float("inf"))
     u, v = pixel.unbind(-1)

@@ -4,7 +4,10 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,24 +23,29 @@ POINTS_FILE = "points.ply"
 COLOURS = ("red", "green", "blue")
 
 
+@contextmanager
+def finished_folder(folder: Path) -> Iterator[Path]:
+    """A new folder that becomes `folder` when the block ends, and is removed if it fails.  FileExistsError if there is one."""
+    if folder.exists():
+        raise FileExistsError(f"expected a folder that does not exist yet, got {folder}; remove it or choose another")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        yield building
+        building.chmod(0o755)  # temporary folders are private
+        os.replace(building, folder)
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+
+
 def write_transforms_scene(scene: Scene, folder: Path) -> None:
     """Write a scene so that `load_scene` finds it again, in a folder that appears when it is complete.
 
     Pictures are rounded to 8 bits and keep their background; an alpha channel is not written.  Cameras keep every
     digit.  FileExistsError if the folder exists already.
     """
-    folder = Path(folder)
-    if folder.exists():
-        raise FileExistsError(f"expected a folder that does not exist yet, got {folder}; remove it or choose another")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
+    with finished_folder(Path(folder)) as building:
         _write_into(scene, building)
-        building.chmod(0o755)  # mkdtemp's own is private
-        os.replace(building, folder)
-    except BaseException:
-        shutil.rmtree(building, ignore_errors=True)
-        raise
 
 
 def _write_into(scene: Scene, folder: Path) -> None:
@@ -51,33 +59,27 @@ def _write_into(scene: Scene, folder: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         pixels = (frame.view().image * 255).round().to(torch.uint8)
         Image.fromarray(pixels.permute(1, 2, 0).numpy()).save(path)
-    entries = [
-        {"file_path": file, **_intrinsics(f.camera), "transform_matrix": _pose(f.camera)} for file, f in files.items()
-    ]
+    entries = [{"file_path": file, **_camera(frame.camera)} for file, frame in files.items()]
     (folder / SINGLE_FILE).write_text(json.dumps({**content, "frames": entries}, indent=1), encoding="utf-8")
 
 
 def _file(frame: Frame) -> str:
-    """images/NAME.png"""
+    """The path of a frame's picture: images/NAME.png."""
     name = frame.name.removeprefix("images/")
     return f"images/{name}" if name.lower().endswith(".png") else f"images/{name}.png"
 
 
-def _intrinsics(camera: Camera) -> dict[str, float]:
-    pixels = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    return {**pixels, "w": camera.width, "h": camera.height}
-
-
-def _pose(camera: Camera) -> list[list[float]]:
-    """Camera to world, OpenGL axes."""
+def _camera(camera: Camera) -> dict[str, Any]:
+    """Intrinsics (px), and the pose: camera to world, with the axes right, up, backwards (OpenGL)."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = camera.rotation.T * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     pose[:3, 3] = camera.centre
-    return pose.tolist()
+    pixels = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return {**pixels, "w": camera.width, "h": camera.height, "transform_matrix": pose.tolist()}
 
 
 def _write_points(points: Points, names: tuple[str, ...], path: Path) -> None:
-    """x y z, red green blue, and, where tracks are known, the list `views` of the frames that see the point."""
+    """Write x y z, red green blue and, where tracks are known, the list `views` of the frames that see the point."""
     kinds = [(axis, "f8") for axis in "xyz"] + [(colour, "u1") for colour in COLOURS]
     if points.observations is not None:
         kinds.append(("views", "O"))

@@ -1,103 +1,38 @@
-"""Checkpoints: a training under way and where its scene lies, in one file.
+"""Checkpoints: a training under way and a reference to its scene, in one file.
 
 The file is a `torch.save` of tensors and plain types, loaded with `weights_only=True` (nothing in it can run code), and
 written whole or not at all.  Its checksums are compared, which torch leaves out.  The same training gives the same bytes.
-Keys (p parameters, n Gaussians):
-
-    format, version     "splat-landscape checkpoint", 2; version 1 knew no methods: it is 3DGS, and has no regularizer
-    torch               version of torch that wrote it
-    step, extent        steps made; radius of the scene's cameras, world units
-    sh_degree, flat     the Gaussians: bands in use, (p,) stored parameters
-    adam                {"first": (p,), "second": (p,), "updates": int}
-    screen_gradients    {"total": (n,), "renders": (n,)}
-    generator, order    state of the random generator, uint8; views still to come in this epoch
-    regularizer         state of the method's regularizer, see `splat/training/state.py`; of a training in it, the
-                        keys from `step` to `config`
-    config              `TrainConfig` as nested plain types
-    scene               `SceneReference` as plain types
+Its keys are the fields of `_File` and of `_Training`, side by side.
 """
 
+import errno
 import io
 import os
 import sys
 import warnings
 import zipfile
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, replace
+from math import inf
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
 
+from landscape.errors import InputError, lacks_memory
 from splat.model.gaussians import Gaussians
-from splat.scenes.scene import Scene, load_scene
-from splat.scenes.splits import Split
+from splat.model.settings import current_settings
+from splat.model.typed import Count, leaves, typed
+from splat.scenes.scene import Scene
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
 from splat.training.optim.adam import Adam
-from splat.training.plain_types import fits, short
-from splat.training.start import Source
-from splat.training.state import Method, Regularizer, ThreeDGS, TrainConfig, Training
+from splat.training.scene_reference import SceneReference
+from splat.training.state import Method, ThreeDGS, TrainConfig, Training
 
 FORMAT, VERSION = "splat-landscape checkpoint", 2
-
-
-@dataclass(frozen=True)
-class SceneReference:
-    """Which scene a training belongs to, and how to load it as it was.
-
-    absolute, relative: the scene's folder, and the same from the checkpoint's folder.  images: the folder of images in
-    it, where one was named; downscale: the factor by which its images were reduced further.  train, test: names of the views;
-    sizes: (width, height) of the training views, px.  start: what the Gaussians started from (`splat/training/start.py`);
-    depths:
-    the folder of depth maps, where one was named.  Older files have neither; they are read as "scene" and None.
-    """
-
-    absolute: str
-    relative: str
-    images: str | None
-    downscale: float
-    train: list[str]
-    test: list[str]
-    sizes: list[list[int]]
-    start: Source = "scene"
-    depths: str | None = None
-
-    @classmethod
-    def to(
-        cls,
-        scene: Scene,
-        checkpoint: Path,
-        split: Split,
-        images: str | None,
-        downscale: float,
-        start: Source = "scene",
-        depths: Path | None = None,
-    ) -> "SceneReference":
-        """The scene, loaded with these images, downscale and depths, as seen from where the checkpoint will lie."""
-        return cls(
-            absolute=str(scene.root),
-            relative=os.path.relpath(scene.root, checkpoint.parent.resolve()),
-            images=images,
-            downscale=float(downscale),
-            train=list(split.train),
-            test=list(split.test),
-            sizes=[[frame.camera.width, frame.camera.height] for frame in scene.select(split.train)],
-            start=start,
-            depths=None if depths is None else str(depths.resolve()),
-        )
-
-    def find(self, checkpoint: Path) -> Path:
-        """The scene's folder: seen from the checkpoint, else where it lay.  FileNotFoundError if in neither."""
-        candidates = [(checkpoint.parent / self.relative).resolve(), Path(self.absolute)]
-        for folder in candidates:
-            if folder.is_dir():
-                return folder
-        raise FileNotFoundError(
-            f"expected the scene of {checkpoint} at {' or '.join(str(c) for c in dict.fromkeys(candidates))}, "
-            "found no such folder; pass where it is now with --scene"
-        )
+KIND = "expected a checkpoint written by landscape train"
+REMEDY = "take another copy of the file, or train anew"
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,56 +44,76 @@ class Checkpoint:
     torch_version: str
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
-        """The scene that this checkpoint, read from path, belongs to; scene: its folder, where it has moved.
+        """The scene that this checkpoint, read from path, belongs to, see `SceneReference.load`."""
+        return self.scene.load(path, self.training.config.background, scene)
 
-        `scene.load(checkpoint.scene.train)` then gives the training views.  A COLMAP model's points, from which the Gaussians
-        started, are not read again.  FileNotFoundError where there is no such folder; ValueError where the scene lacks a view
-        or has one of another size.
-        """
-        reference = self.scene
-        folder = reference.find(path) if scene is None else scene
-        try:
-            found = load_scene(
-                folder, reference.images, reference.downscale, self.training.config.background, points=False
-            )
-            found.select([*reference.train, *reference.test])
-        except (ValueError, FileNotFoundError) as error:
-            if scene is None or not folder.is_dir():
-                raise
-            name = Path(reference.absolute).name
-            raise ValueError(
-                f"expected the training's scene {name} in {folder}, got another or a part: {error}"
-            ) from None
-        for frame, size in zip(found.select(reference.train), reference.sizes, strict=True):
-            if [frame.camera.width, frame.camera.height] != size:
-                raise ValueError(
-                    f"expected view {frame.name!r} of {folder} at {size[0]} x {size[1]} px, as in the training, got "
-                    f"{frame.camera.width} x {frame.camera.height}; its images have changed, restore them or train anew"
-                )
-        return found
+
+@dataclass(frozen=True)
+class _Moments:
+    """Adam's, (p,) each, and the number of updates."""
+
+    first: Tensor
+    second: Tensor
+    updates: Count
+
+
+@dataclass(frozen=True)
+class _ScreenGradients:
+    """(n,) each, see `ScreenGradients`."""
+
+    total: Tensor
+    renders: Tensor
+
+
+@dataclass(frozen=True)
+class _Training:
+    """A training of n Gaussians with p stored parameters, as `training_state` writes it.
+
+    step: steps made; extent: radius of the scene's cameras, world units.  sh_degree, flat: the Gaussians, bands in use and (p,)
+    stored parameters.  generator: state of the random generator, uint8; order: views still to come in this epoch.
+    regularizer: `Method.state`, a training in it (a second field) in this same form.  config: `TrainConfig` as plain types.
+    """
+
+    step: Count
+    extent: float
+    sh_degree: int
+    flat: Tensor
+    adam: _Moments
+    screen_gradients: _ScreenGradients
+    generator: Tensor
+    order: list[Count]
+    regularizer: dict[str, Any]
+    config: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _File:
+    """The keys beside those of the training.  version: 1 knew no methods, so that there is no `regularizer`: it is 3DGS.
+
+    torch: the version that wrote the file; scene: `SceneReference` as plain types.
+    """
+
+    format: str
+    version: int
+    torch: str
+    scene: SceneReference
 
 
 def training_state(training: Training) -> dict[str, Any]:
-    """All that a training depends on, as tensors and plain types: the keys from `step` to `config`."""
+    """All that a training depends on, as tensors and plain types: the fields of `_Training`."""
+    adam, screen = training.adam, training.screen_gradients
     return {
         "step": training.step,
         "extent": training.extent,
         "sh_degree": training.gaussians.sh_degree,
         "flat": training.gaussians.flat,
-        "adam": {
-            "first": training.adam.first.flat,
-            "second": training.adam.second.flat,
-            "updates": training.adam.updates,
-        },
-        "screen_gradients": {
-            "total": training.screen_gradients.total,
-            "renders": training.screen_gradients.renders,
-        },
+        "adam": {"first": adam.first.flat, "second": adam.second.flat, "updates": adam.updates},
+        "screen_gradients": {"total": screen.total, "renders": screen.renders},
         "generator": training.generator.get_state(),
         "order": training.order,
         "regularizer": {
             key: training_state(value) if isinstance(value, Training) else value
-            for key, value in training.regularizer.state().items()
+            for key, value in training.method.state().items()
         },
         "config": asdict(training.config),
     }
@@ -173,7 +128,7 @@ def save_checkpoint(path: Path, training: Training, scene: SceneReference) -> No
         **training_state(training),
         "scene": asdict(scene),
     }
-    buffer = io.BytesIO()  # a file's own name would be among the bytes
+    buffer = io.BytesIO()  # torch writes the name of a file into it
     torch.save(_interned(content), buffer)
     write_atomically(path, buffer.getvalue())
 
@@ -206,168 +161,132 @@ def write_atomically(path: Path, content: bytes) -> None:
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint, its tensors on the CPU.
 
-    OSError where there is none or it may not be read; ValueError, which says what is wrong with it, where it is damaged or of
-    another kind.
+    OSError where there is none or the system does not give it, MemoryError or torch's where memory is short; InputError, which
+    says what is wrong with it, where it is damaged or of another kind.
+
+    >>> load_checkpoint(Path("nowhere/checkpoint.pt"))
+    Traceback (most recent call last):
+        ...
+    FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file
     """
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
-        raise FileNotFoundError(f"expected a checkpoint written by landscape train at {path}, found {found}")
-    damaged = ValueError(
-        f"expected a checkpoint written by landscape train, got {path}, which is not one or is damaged"
-        f"{' (Gaussians from a PLY file cannot be read)' if path.suffix.lower() == '.ply' else ''}"
-    )
+        raise FileNotFoundError(f"{KIND} at {path}, found {found}")
     with path.open("rb") as file:  # one file throughout: a training may replace it meanwhile
-        try:
-            with zipfile.ZipFile(file) as archive:
-                whole = archive.testzip() is None
-            file.seek(0)
-            with warnings.catch_warnings(
-                action="ignore"
-            ):  # torch warns of pickles of another kind before it refuses them
-                content = torch.load(file, map_location="cpu", weights_only=True)
-        except Exception:  # what torch stumbles over in a file of another kind is of many kinds too
-            raise damaged from None
-    if not whole:
-        raise damaged
+        content = _read(file, path)
     try:
         return _checkpoint(content)
-    except ValueError as error:
-        raise ValueError(f"expected a checkpoint written by landscape train, got {path}: {error}") from None
+    except InputError as error:
+        raise InputError(f"{KIND}, got {path}: {error}; {REMEDY}") from error
+
+
+def _read(file: BinaryIO, path: Path) -> Any:
+    """The content that torch saved, after its checksums were found to be right."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if wrong := archive.testzip():
+                raise zipfile.BadZipFile(f"the checksum of {wrong} is wrong")
+        file.seek(0)
+        with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
+            return torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # a file of another kind fails in torch in as many ways
+        bad_seek = isinstance(error, OSError) and error.errno == errno.EINVAL  # to where a damaged index points
+        if lacks_memory(error) or (isinstance(error, OSError) and not bad_seek):
+            raise
+        ply = " (Gaussians from a PLY file cannot be read)" if path.suffix.lower() == ".ply" else ""
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise InputError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {reason}; {REMEDY}") from error
 
 
 def _checkpoint(content: Any) -> Checkpoint:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"it does not hold the format {FORMAT!r}")
-    version = _get(content, "version", int)
-    if version not in (1, VERSION):
-        raise ValueError(f"its format version is {version!r}, this program reads up to {VERSION}")
-    if version == 1:
-        config = {**_get(content, "config", dict), "method": asdict(ThreeDGS())}
-        content = {**content, "config": config, "regularizer": Regularizer(0).state()}
-    training = restored_training(content)
-    scene = _dataclass(SceneReference, {"start": "scene", "depths": None, **_get(content, "scene", dict)}, "scene")
+        raise InputError(f"it does not hold the format {FORMAT!r}")
+    file = typed(_File, content)
+    if file.version not in (1, VERSION):
+        raise InputError(f"its format version is {file.version}, this program reads up to {VERSION}")
+    if file.version == 1:
+        plain, config = ThreeDGS(), typed(dict[str, Any], content.get("config"), "config")
+        content = {**content, "config": {**config, "method": asdict(plain)}, "regularizer": plain.create(0).state()}
+    training, scene = restored_training(content), file.scene
     if len(scene.sizes) != len(scene.train):
-        raise ValueError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
-    if not all(type(index) is int and 0 <= index < len(scene.train) for index in training.order):
-        raise ValueError(f"its order does not index its {len(scene.train)} training views")
-    return Checkpoint(training, scene, _get(content, "torch", str))
+        raise InputError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
+    if not all(index < len(scene.train) for index in training.order):
+        raise InputError(f"its order does not index its {len(scene.train)} training views")
+    return Checkpoint(training, scene, file.torch)
 
 
 def restored_training(content: dict[str, Any]) -> Training:
-    """The training of a state.  ValueError that says what is wrong with it."""
-    flat = _get(content, "flat", Tensor)
-    gaussians = Gaussians(_tensor(content, "flat", (flat.numel(),), flat.dtype), _get(content, "sh_degree", int))
-    if not len(gaussians):
-        raise ValueError("it holds no Gaussian")
+    """The training of a state.  InputError that says what is wrong with it."""
+    saved = typed(_Training, content)
+    adam, screen, p, dtype = saved.adam, saved.screen_gradients, saved.flat.numel(), saved.flat.dtype
+    gaussians = Gaussians(_numbers("flat", saved.flat, p, dtype), saved.sh_degree)
+    n = len(gaussians)
+    if not n:
+        raise InputError("it holds no Gaussian")
     gaussians.require_finite()
-    config = _get(content, "config", dict)
-    if isinstance(thresholds := config.get("render"), dict):
-        config = {**config, "render": {"sums": "ordered", **thresholds}}  # a choice that older checkpoints did not have
-    config = _dataclass(TrainConfig, config, "config")
-    regularizer = config.method.regularizer(config.seed)
-    _restore(regularizer, _get(content, "regularizer", dict))
-    adam, screen = _get(content, "adam", dict), _get(content, "screen_gradients", dict)
-    training = Training(
+    config = _config(saved.config)
+    if saved.step > config.iterations:
+        raise InputError(f"its step {saved.step} is not among its {config.iterations} iterations")
+    if not 0 < saved.extent < inf:
+        raise InputError(f"its extent is {saved.extent}")
+    if adam.updates > saved.step:
+        raise InputError(f"its optimiser has made {adam.updates} updates in {saved.step} steps")
+    first, second = _numbers("first", adam.first, p, dtype, -inf), _numbers("second", adam.second, p, dtype, 0.0)
+    sums = _numbers("total", screen.total, n, dtype, 0.0), _numbers("renders", screen.renders, n, dtype, 0.0)
+    return Training(
         config=config,
-        extent=_get(content, "extent", float),
+        extent=saved.extent,
         gaussians=gaussians,
-        adam=Adam(
-            gaussians.with_flat(_finite(adam, "first", flat.shape, flat.dtype, signed=True)),
-            gaussians.with_flat(_finite(adam, "second", flat.shape, flat.dtype)),
-            _get(adam, "updates", int),
-        ),
-        screen_gradients=ScreenGradients(
-            _finite(screen, "total", (len(gaussians),), flat.dtype),
-            _finite(screen, "renders", (len(gaussians),), flat.dtype),
-        ),
-        generator=_generator(_get(content, "generator", Tensor)),
-        regularizer=regularizer,
-        order=_get(content, "order", list),
-        step=_get(content, "step", int),
+        adam=Adam(gaussians.with_flat(first), gaussians.with_flat(second), adam.updates),
+        screen_gradients=ScreenGradients(*sums),
+        generator=_generator(saved.generator),
+        method=_method(config, saved.regularizer),
+        order=saved.order,
+        step=saved.step,
     )
-    if not 0 <= training.step <= config.iterations:
-        raise ValueError(f"its step {training.step} is not among its {config.iterations} iterations")
-    if not 0 < training.extent < float("inf"):
-        raise ValueError(f"its extent is {training.extent}")
-    if not 0 <= training.adam.updates <= training.step:
-        raise ValueError(f"its optimiser has made {short(training.adam.updates)} updates in {training.step} steps")
-    return training
 
 
-T = TypeVar("T")
+def _config(content: dict[str, Any]) -> TrainConfig:
+    """The settings: every one of today's has to be there, but for those that older files did not know."""
+    method, render = (typed(dict[str, Any], content.get(key), f"config.{key}") for key in ("method", "render"))
+    name = typed(str, method.get("name"), "config.method.name")
+    if name not in METHODS:
+        raise InputError(f"'config.method' has the unknown name {name[:80]!r}, expected one of {', '.join(METHODS)}")
+    method, render = {**METHODS[name].BEFORE, **method}, current_settings(render)
+    content = {**content, "render": render, "method": {}}
+    config = replace(typed(TrainConfig, content, "config"), method=typed(METHODS[name], method, "config.method"))
+    if different := leaves({**content, "method": method}).keys() ^ leaves(asdict(config)).keys():
+        raise InputError(f"'config' has missing or unknown keys: {', '.join(sorted(map(str, different)))}")
+    return config
 
 
-def _get(content: dict, key: str, kind: type[T]) -> T:
-    if key not in content:
-        raise ValueError(f"{key!r} is missing")
-    value = content[key]
-    if not isinstance(value, kind):
-        raise ValueError(f"{key!r} is {type(value).__name__}, expected {kind.__name__}")
-    return value
-
-
-def _tensor(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    value = _get(content, key, Tensor)
-    kind = f"{value.dtype} of shape {tuple(value.shape)}"
-    if tuple(value.shape) != tuple(shape) or value.dtype != dtype or dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"{key!r} is {kind}, expected {dtype} {tuple(shape)}")
-    if value.device.type != "cpu" or not value.is_contiguous():
-        raise ValueError(f"{key!r} is {kind} that does not hold its numbers one by one")
-    return value
-
-
-def _finite(content: dict, key: str, shape: Sequence[int], dtype: torch.dtype, signed: bool = False) -> Tensor:
-    value = _tensor(content, key, shape, dtype)
-    if not (value.isfinite() & (signed | (value >= 0))).all():
-        raise ValueError(f"{key!r} holds a number that is not finite{'' if signed else ', or a negative one'}")
-    return value
-
-
-def _is_training(value: Any) -> bool:
-    return isinstance(value, dict) and "regularizer" in value
-
-
-def _restore(regularizer: Regularizer, state: dict) -> None:
+def _method(config: TrainConfig, state: dict[str, Any]) -> Method:
+    """The method with its state, in which what has a method is a training."""
+    method = config.method.create(config.seed)
+    inner = {key: value for key, value in state.items() if isinstance(value, dict) and "regularizer" in value}
     try:
-        regularizer.restore(
-            {key: restored_training(value) if _is_training(value) else value for key, value in state.items()}
-        )
+        method.restore(state | {key: restored_training(value) for key, value in inner.items()})
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"'regularizer' is not the state of its method ({error}); take another copy of the file, or train anew"
-        ) from None
+        if lacks_memory(error):
+            raise
+        raise InputError(f"'regularizer' is not the state of the method {config.method.name} ({error})") from error
+    return method
 
 
 def _generator(state: Tensor) -> torch.Generator:
-    generator = torch.Generator()
     try:
-        return generator.set_state(state)
+        return torch.Generator().set_state(state)
     except (RuntimeError, TypeError) as error:
-        raise ValueError(f"'generator' is not the state of a random generator ({error})") from None
+        raise InputError(f"'generator' is not the state of a random generator ({error})") from error
 
 
-def _dataclass(kind: type[T], content: dict, where: str) -> T:
-    """A dataclass, and those in it, from what `asdict` made of it; its own checks apply."""
-    hints = get_type_hints(kind)
-    if set(content) != set(hints):
-        different = sorted(map(str, set(content) ^ set(hints)))
-        raise ValueError(f"{where!r} has missing or unknown keys: {', '.join(different)}")
-    values = {}
-    for key, hint in hints.items():
-        value = content[key]
-        if inner := _nested(hint, value, f"{where}.{key}"):
-            value = _dataclass(inner, _get(content, key, dict), f"{where}.{key}")
-        elif not fits(value, hint):
-            raise ValueError(f"'{where}.{key}' is {short(value)}, expected {getattr(hint, '__name__', hint)}")
-        values[key] = value
-    return kind(**values)
-
-
-def _nested(hint: Any, value: Any, where: str) -> type | None:
-    """The dataclass that a value is of, a method's by its name; None where no dataclass is expected."""
-    if hint is not Method:
-        return hint if isinstance(hint, type) and is_dataclass(hint) else None
-    name = value.get("name") if isinstance(value, dict) else value
-    if isinstance(name, str) and name in METHODS:
-        return METHODS[name]
-    raise ValueError(f"'{where}' has the unknown name {short(name)}")
+def _numbers(key: str, value: Tensor, count: int, dtype: torch.dtype, least: float | None = None) -> Tensor:
+    """The tensor, if it holds so many numbers of this type in memory, one by one; least: also finite, and not below this."""
+    kind = f"{value.dtype} of shape {tuple(value.shape)}"
+    if tuple(value.shape) != (count,) or value.dtype != dtype or dtype not in (torch.float32, torch.float64):
+        raise InputError(f"'{key}' is {kind}, expected {dtype} {(count,)}")
+    if value.device.type != "cpu" or not value.is_contiguous():
+        raise InputError(f"'{key}' is {kind} that does not hold its numbers one by one")
+    if least is not None and not ((value >= least) & value.isfinite()).all():
+        raise InputError(f"'{key}' holds a number that is not finite{', or a negative one' if least == 0 else ''}")
+    return value

@@ -17,13 +17,17 @@ so that gradient is (w/2 dL/dx, h/2 dL/dy).  extent: radius of the cameras' boun
 
 from dataclasses import dataclass
 from math import floor, log
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
+from msgspec import Meta
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
+from splat.model.typed import Count, Length, Positive, Settings, Share
 from splat.projection.reference import Splats, on_screen, rotation_matrices
 
 SPLIT_INTO = 2
@@ -31,7 +35,7 @@ SPLIT_SHRINK = 0.8 * SPLIT_INTO
 
 
 @dataclass(frozen=True)
-class DensifySettings:
+class DensifySettings(Settings):
     """When and what to densify, in a run of T steps: after min(start, start_share T), before min(stop, stop_share T).
 
     The interval is `every`, but at most every_share T.  3DGS trains for 30,000 steps, where the shares change nothing;
@@ -42,32 +46,24 @@ class DensifySettings:
     """
 
     enabled: bool = True
-    start: int = 500
-    stop: int = 15000
-    start_share: float = 0.25
-    stop_share: float = 0.5
-    every: int = 100
-    every_share: float = 0.05
-    gradient_threshold: float = 2e-4
-    clone_scale: float = 0.01
-    prune_scale: float = 0.1
-    min_opacity: float = 0.005
-    reset_every: int = 3000
-    reset_opacity: float = 0.01
+    start: Count = 500
+    stop: Count = 15000
+    start_share: Share = 0.25
+    stop_share: Share = 0.5
+    every: Length = 100
+    every_share: Share = 0.05
+    gradient_threshold: Positive = 2e-4
+    clone_scale: Positive = 0.01
+    prune_scale: Positive = 0.1
+    min_opacity: Share = 0.005
+    reset_every: Length = 3000
+    reset_opacity: Annotated[float, Meta(gt=0, lt=1)] = 0.01
 
     def __post_init__(self) -> None:
-        if self.every < 1 or self.reset_every < 1:
-            raise ValueError(f"expected every and reset_every of at least 1, got {self.every} and {self.reset_every}")
-        if min(self.start, self.stop) < 0:
-            raise ValueError(f"expected start and stop of at least 0, got {self.start} and {self.stop}")
-        shares = self.start_share, self.stop_share, self.every_share
-        if not all(0 <= share <= 1 for share in shares):
-            raise ValueError(f"expected start_share, stop_share and every_share in [0, 1], got {shares}")
-        if not (self.gradient_threshold > 0 and self.clone_scale > 0 and self.prune_scale > 0):
-            raise ValueError(f"expected gradient_threshold, clone_scale and prune_scale above 0, got {self}")
-        if not 0 <= self.min_opacity < self.reset_opacity < 1:
-            raise ValueError(
-                "expected 0 <= min_opacity < reset_opacity < 1 (else a reset would remove every Gaussian), "
+        super().__post_init__()
+        if self.min_opacity >= self.reset_opacity:
+            raise InputError(
+                "expected min_opacity < reset_opacity (else a reset would remove every Gaussian), "
                 f"got {self.min_opacity} and {self.reset_opacity}"
             )
 

@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.capture import common_target
 from splat.model.gaussians import Gaussians
@@ -50,9 +51,15 @@ def initial_gaussians(
     random_points: int = 10_000,
     source: Source = "scene",
 ) -> Gaussians:
-    """From the points of the source.  Same generator state, same Gaussians."""
+    """Gaussians from the points of the source.  The same state of the generator gives the same Gaussians.
+
+    >>> from splat import SyntheticSettings, synthetic_scene
+    >>> scene = synthetic_scene(SyntheticSettings(gaussians=50, views=3, width=16, height=12)).scene
+    >>> initial_gaussians(scene, scene.load(), sh_degree=1, generator=torch.Generator().manual_seed(0)).sh_degree
+    1
+    """
     if source == "points" and scene.points is None:
-        raise ValueError(f"expected a scene with points, {scene.root} has none; start from triangulated or random ones")
+        raise InputError(f"expected a scene with points, {scene.root} has none; start from triangulated or random ones")
     if source == "triangulated":
         return gaussians_from_points(triangulated_points(views), views, sh_degree)
     if source != "random" and scene.points is not None:
@@ -68,7 +75,7 @@ def gaussians_from_points(points: Points, views: Sequence[View | Frame], sh_degr
     seen = points.sightings(views) >= needed
     kept, n = points.xyz[seen], int(seen.sum())
     if n <= NEIGHBOURS:
-        raise ValueError(
+        raise InputError(
             f"expected more than {NEIGHBOURS} points seen by at least {needed} of the {len(views)} training views, "
             f"got {n} of {len(points)}; choose views that overlap more, or more of them"
         )
@@ -91,7 +98,7 @@ def _neighbour_distances(xyz: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     scales = torch.from_numpy(np.sqrt(np.square(distances[:, 1:]).mean(axis=1)))
     median = float(scales.median())
     if not median > 0:
-        raise ValueError(f"expected distinct points, got {len(xyz)} of which most coincide with {NEIGHBOURS} others")
+        raise InputError(f"expected distinct points, got {len(xyz)} of which most coincide with {NEIGHBOURS} others")
     return scales.clamp_min(SMALLEST_SCALE * median)
 
 
@@ -106,13 +113,13 @@ def points_in_common_volume(
     depth_ranges: (near, far) of each view, world units; None derives it from where the cameras look.
     """
     if n < 1:
-        raise ValueError(f"expected at least 1 random point, got {n}")
+        raise InputError(f"expected at least 1 random point, got {n}")
     given = depth_ranges or [None] * len(views)
     ranges = [own or _range_around_target(views, view.camera) for view, own in zip(views, given, strict=True)]
     needed, kept, draws = min(SEEN_BY, len(views)), [], 0
     while (found := sum(len(xyz) for xyz, _ in kept)) < n:
         if draws >= MAX_DRAWS * n:
-            raise ValueError(
+            raise InputError(
                 f"expected {needed} of {len(views)} views to see the same places, got {found} such places in {draws} "
                 "random draws; choose views that overlap more"
             )
@@ -156,7 +163,7 @@ def _random_batch(
 def _range_around_target(views: Sequence[View], camera: Camera) -> tuple[float, float]:
     """Depths round the point that is nearest to all optical axes."""
     if len(views) == 1:
-        raise ValueError(
+        raise InputError(
             "expected at least 2 training views for random points, got 1: one alone does not say how far away the scene is; "
             "take more views, or start from points (COLMAP), or give depth ranges (poses_bounds.npy)"
         )
@@ -164,7 +171,7 @@ def _range_around_target(views: Sequence[View], camera: Camera) -> tuple[float, 
     if target is not None:
         depth = float((target - camera.centre) @ camera.forward)
         return NEAR * depth, FAR * depth
-    raise ValueError(
+    raise InputError(
         f"expected {len(views)} cameras that look at a common place, got parallel or diverging ones: the scene's depth "
         "is unknown; give the scene points (COLMAP), or depth ranges (poses_bounds.npy)"
     )

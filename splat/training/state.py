@@ -1,45 +1,43 @@
-"""What a method of training adds to plain 3DGS: the interface between the loop (`splat/training/loop.py`) and its regularizers.
+"""Settings and state of a training of 3D Gaussian Splatting, and the interface of the methods that add to it.
 
-The loop asks, in this order, `begin` before the first step and after a resume, and at every step:
+TrainConfig, MethodSettings    plain values: all that the result depends on beside the start and the views
+Training, Method               the state that changes from step to step; `Method` holds the method's part
+Step                           one step: its number, its view, its loss
 
-    opacity_scale    how the opacities are changed in this step's render (dropout), or None
-    gradient        what Adam descends, given the photometric gradient of the sampled view
-    follow          ... after density control, or any other change of the Gaussians: which old one each new one comes from
-    after           anything else, once the step is whole (unpooling, a second field's own density control)
-
-A regularizer draws from its own generator, so that the same seed shows every method the same views in the same order and
-splits the same Gaussians alike.  `state` and `restore` carry it through a checkpoint to the same bits.
+The loop (`splat/training/loop.py`) makes the steps; a checkpoint (`splat/training/checkpoint.py`) holds all of it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from math import inf
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
+from landscape.errors import InputError
+from landscape.operators.distributed import ALONE, Ranks
 from splat.curvature.objective import SceneObjective
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.protocols import ViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
+from splat.model.typed import Count, Length, NonNegative, Positive, Settings, Share, typed
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.scenes.view import View
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.training.optim.adam import Adam
-from splat.training.plain_types import fits, short
 
-Row = dict[str, Any]
+Row = dict[str, Count | float | bool | str]  # of a history
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
     """One step of a training.  number: from 1; chosen: index in `views` of the sampled view.
 
-    gaussians: before the update.  background, loss: this step's colour, and the loss against the sampled view's image on it.
+    gaussians: before the update.  background: RGB; loss: against the sampled view's image on that background.
     """
 
     number: int
@@ -60,141 +58,135 @@ class Step:
         return self.views[self.chosen].camera
 
 
-class Regularizer:
-    """Plain 3DGS: nothing is added.  The base of the methods' own regularizers, which hold what they need between steps.
+@dataclass(frozen=True)
+class MethodSettings(Settings):
+    """Settings of a method; `create` makes a `Method` from them.  name: its key in `methods.METHODS`.
 
-    generator: of whatever the method draws.  history: rows of what is worth a look afterwards, each with its "step";
-    `landscape train` writes them to history.csv.  Both are part of the state.
+    BEFORE: values for settings that older checkpoints lack, with which the method does the same as it did then.
     """
 
-    def __init__(self, seed: int):
-        self.generator = torch.Generator().manual_seed(seed)
-        self.history: list[Row] = []
+    name: str = ""
+    BEFORE: ClassVar[dict[str, Any]] = {}
 
-    def begin(self, training: "Training", views: Sequence[View]) -> None:
-        """Steps are about to be made on these views; a second call changes nothing.  ValueError where the views lack what the
-        method needs."""
+    def create(self, seed: int) -> "Method":
+        """The method before its first step."""
+        return Method(self, seed)
+
+    def parts(self, config: "TrainConfig") -> dict[str, int]:
+        """Steps before each part of the method begins, by the name of the setting; parts that are switched off are left out."""
+        return {self.name: 0}
+
+    def density_control(self, config: "TrainConfig") -> DensifySettings:
+        """When and how Gaussians are cloned, split and removed."""
+        return config.densify
+
+    def scaled(self, config: "TrainConfig", keep: Collection[str] = ()) -> "TrainConfig":
+        """The training with the method's published schedule scaled to its length.  keep: dotted names that stay as they are."""
+        return config
+
+
+S = TypeVar("S", bound=MethodSettings)
+
+
+class Method(Generic[S]):
+    """Additions of a method to 3DGS, and its state between steps.  This base adds nothing: it is 3DGS.
+
+    hook            runs                                      arguments          result
+    on_start        before the first step, after a resume     training, views    InputError where views lack what it needs
+    opacity_scale   before the sampled view is rendered       step               (n,) factors on the opacities, or None
+    gradient        after its backward pass, before Adam      step, base         loss and gradient to go on with
+    on_densify      after each change of the Gaussians        change             which old one each new one comes from
+    after_step      after Adam and density control            step
+
+    The hook `gradient` returns a loss with two gradients: Adam descends its `gradient`, density control counts its
+    `screen_gradient`.
+
+    generator: for everything that the method draws.  It is not the training's, so that with the same seed every method sees
+    the same views in the same order and splits the same Gaussians alike.  history: rows to look at afterwards, each with its
+    "step"; `landscape train` writes them to history.csv.  Both are in `state`; `restore` continues from it to the same bits.
+    """
+
+    def __init__(self, settings: S, seed: int):
+        self.settings = settings
+        self.generator = torch.Generator().manual_seed(seed)
+        self.history: list[dict[str, Any]] = []
+
+    def on_start(self, training: "Training", views: Sequence[View]) -> None:
+        """A second call changes nothing."""
 
     def opacity_scale(self, step: Step) -> Float[Tensor, " n"] | None:
-        """Factors on the opacities of this step's render, None for 1."""
         return None
 
-    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
-        """What the optimiser descends.  base: the sampled view's loss and gradient, in the parameters of step.gaussians."""
-        return base.gradient
+    def gradient(self, step: Step, base: LossAndGradient) -> LossAndGradient:
+        """base: the sampled view's, in the parameters of step.gaussians."""
+        return base
 
-    def follow(self, change: Densified) -> None:
-        """The Gaussians were replaced."""
+    def on_densify(self, change: Densified) -> None: ...
 
-    def after(self, step: Step) -> None:
-        """The step is whole: update and density control are done."""
+    def after_step(self, step: Step) -> None: ...
 
     def state(self) -> dict[str, Any]:
-        """Tensors, plain types and trainings: `restore` makes a new one of the same settings go on from it to the same bits."""
+        """Tensors, plain values and trainings."""
         return {"generator": self.generator.get_state(), "history": self.history}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take over a state.  ValueError, KeyError or RuntimeError where it does not fit."""
+        """Go on from a state.  ValueError, KeyError, TypeError or RuntimeError where it is not one of this method."""
         self.generator.set_state(state["generator"])
-        if type(state["history"]) is not list:
-            raise ValueError(f"expected the history as a list of rows, found {short(state['history'])}")
-        for row in state["history"]:
-            _require_row(row)
-        self.history = list(state["history"])
-
-
-def _require_row(row: Any) -> None:
-    """ValueError unless a row of a history holds plain values, its step and its counts whole numbers of at least 0."""
-    plain = fits(row, dict[str, int | float | bool | str]) and "step" in row
-    if (
-        not plain
-        or any(type(row.get(name, 0)) is not int for name in ("step", "count"))
-        or any(type(value) is int and value < 0 for value in row.values())
-    ):
-        raise ValueError(
-            "expected a row of the history with plain values, its step and its counts whole numbers of at least 0, "
-            f"found {short(row)}"
-        )
+        self.history = typed(list[Row], state["history"], "history")
+        if not all(type(row.get("step")) is int and type(row.get("count", 0)) is int for row in self.history):
+            raise InputError("'history': expected a step, and counts, that are whole numbers in every row")
 
 
 @dataclass(frozen=True)
-class Method:
-    """Settings of a method, from which `regularizer(seed)` makes a new regularizer.  name: its key in `methods.METHODS`."""
-
-    name: str = ""
-
-    def regularizer(self, seed: int) -> Regularizer:
-        return Regularizer(seed)
-
-
-@dataclass(frozen=True)
-class ThreeDGS(Method):
+class ThreeDGS(MethodSettings):
     """3D Gaussian Splatting as it is (Kerbl et al. 2023)."""
 
     name: Literal["3dgs"] = "3dgs"
 
 
 @dataclass(frozen=True)
-class LearningRates:
+class LearningRates(Settings):
     """Adam's rates of 3DGS, about what a step changes a stored parameter by.
 
     position, position_final: per unit of the scene's extent, at the first step and at the last.  sh_constant, sh_higher: of the
     SH band of degree 0 and of those above.
     """
 
-    position: float = 1.6e-4
-    position_final: float = 1.6e-6
-    log_scales: float = 5e-3
-    quats: float = 1e-3
-    opacity_logits: float = 0.05
-    sh_constant: float = 2.5e-3
-    sh_higher: float = 2.5e-3 / 20
-
-    def __post_init__(self) -> None:
-        if not (0 < self.position < inf and 0 < self.position_final < inf):
-            raise ValueError(
-                "expected finite position rates above 0 (decay is exponential), got "
-                f"{self.position}, {self.position_final}"
-            )
-        others = self.log_scales, self.quats, self.opacity_logits, self.sh_constant, self.sh_higher
-        if not all(0 <= rate < inf for rate in others):
-            raise ValueError(f"expected finite learning rates of at least 0, got {self}")
+    position: Positive = 1.6e-4
+    position_final: Positive = 1.6e-6
+    log_scales: NonNegative = 5e-3
+    quats: NonNegative = 1e-3
+    opacity_logits: NonNegative = 0.05
+    sh_constant: NonNegative = 2.5e-3
+    sh_higher: NonNegative = 2.5e-3 / 20
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Settings):
     """Everything that a training's result depends on beside its start and its views.
 
     sh_degree: the highest SH degree, 0 to 3; one is added every sh_degree_every steps, from 0.
     background: the colour that the views were composited over, RGB in [0, 1], drawn behind the Gaussians.
     random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
     method: what is added to 3DGS, with its settings (`splat/training/methods/methods.py`).
-    ValueError where a setting is out of its range.
+    InputError where a setting is out of its range.
+
+    >>> from splat import METHODS
+    >>> TrainConfig(iterations=300, method=METHODS["stablegs"](warm_up=100)).method.name
+    'stablegs'
     """
 
-    iterations: int = 2000
-    seed: int = 0
-    sh_degree: int = 3
-    sh_degree_every: int = 1000
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    iterations: Length = 2000
+    seed: Count = 0
+    sh_degree: Annotated[int, Meta(ge=0, le=3)] = 3
+    sh_degree_every: Length = 1000
+    background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
     random_background: bool = False
     loss: LossSettings = field(default_factory=LossSettings)
     rates: LearningRates = field(default_factory=LearningRates)
     densify: DensifySettings = field(default_factory=DensifySettings)
     render: RenderSettings = field(default_factory=RenderSettings)
-    method: Method = field(default_factory=ThreeDGS)
-
-    def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError(f"expected at least 1 iteration, got {self.iterations}")
-        if not 0 <= self.seed < 2**63:
-            raise ValueError(f"expected a seed in [0, 2^63), got {self.seed}")
-        if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
-        if self.sh_degree_every < 1:
-            raise ValueError(f"expected sh_degree_every of at least 1, got {self.sh_degree_every}")
-        if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
-            raise ValueError(f"expected a background of three numbers in [0, 1], got {self.background}")
+    method: MethodSettings = field(default_factory=ThreeDGS)
 
     @property
     def is_white(self) -> bool:
@@ -204,10 +196,14 @@ class TrainConfig:
     def background_colour(self, dtype: torch.dtype) -> Float[Tensor, "3"]:
         return torch.tensor(self.background, dtype=dtype)
 
-    def objective(self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False) -> SceneObjective:
+    def objective(
+        self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False, ranks: Ranks = ALONE
+    ) -> SceneObjective:
         """This loss, on this background, averaged over views: the objective whose Hessian is studied.  See `SceneObjective`."""
         background = self.background_colour(gaussians.flat.dtype)
-        return SceneObjective(gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen)
+        return SceneObjective(
+            gaussians, views, self.loss, background, self.render, keep_unseen=keep_unseen, ranks=ranks
+        )
 
 
 @dataclass(eq=False)
@@ -216,6 +212,10 @@ class Training:
 
     extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.
     order: indices of the epoch's views still to come, last first.
+
+    >>> from splat import Gaussians
+    >>> Training.start(Gaussians(torch.ones(14), sh_degree=0), extent=1.0, config=TrainConfig()).step
+    0
     """
 
     config: TrainConfig
@@ -224,7 +224,7 @@ class Training:
     adam: Adam
     screen_gradients: ScreenGradients
     generator: torch.Generator
-    regularizer: Regularizer
+    method: Method
     order: list[int] = field(default_factory=list)
     step: int = 0
 
@@ -232,17 +232,17 @@ class Training:
     def start(cls, gaussians: Gaussians, extent: float, config: TrainConfig) -> "Training":
         """A training before its first step.  The Gaussians are copied; extent: world units, as of `Scene.extent`.
 
-        ValueError where there are no Gaussians, one is not finite, or their SH degree is above the training's.
+        InputError where there are no Gaussians, one is not finite, or their SH degree is above the training's.
         """
         if len(gaussians) == 0:
-            raise ValueError("expected at least one Gaussian to start from, got none; use a random start")
+            raise InputError("expected at least one Gaussian to start from, got none; use a random start")
         if gaussians.sh_degree > config.sh_degree:
-            raise ValueError(
+            raise InputError(
                 f"expected a start of at most the training's SH degree {config.sh_degree}, got {gaussians.sh_degree}; "
                 "drop bands with Gaussians.select or raise sh_degree"
             )
         if not 0 < extent < float("inf"):
-            raise ValueError(f"expected a finite extent above 0, got {extent}")
+            raise InputError(f"expected a finite extent above 0, got {extent}")
         gaussians.require_finite()
         flat = gaussians.flat.detach().clone()
         return cls(
@@ -252,7 +252,7 @@ class Training:
             adam=Adam.zero(gaussians),
             screen_gradients=ScreenGradients.zero(len(gaussians), flat.dtype, flat.device),
             generator=torch.Generator().manual_seed(config.seed),
-            regularizer=config.method.regularizer(config.seed),
+            method=config.method.create(config.seed),
         )
 
     def move(self, device: torch.device) -> None:
@@ -281,25 +281,27 @@ class Training:
 
     def control_density(self, step: int, camera: Camera, base: LossAndGradient) -> None:
         """Collect the screen-space gradient of a render; clone, split, prune and reset opacities in the steps that do so."""
-        schedule, iterations = self.config.densify, self.config.iterations
+        schedule, iterations = self.config.method.density_control(self.config), self.config.iterations
         if schedule.collects(step, iterations):
             self.screen_gradients.add(base.screen_gradient, base.splats, camera)
         if schedule.densifies(step, iterations):
             gradients, large = self.screen_gradients.mean, schedule.prunes_large(step)
-            self.follow(densify(self.gaussians, gradients, self.extent, schedule, self.generator, prune_large=large))
+            self.replace_gaussians(
+                densify(self.gaussians, gradients, self.extent, schedule, self.generator, prune_large=large)
+            )
         if schedule.resets_opacity(step, iterations, white=self.config.is_white):
             reset_opacities(self.gaussians, schedule.reset_opacity)
             self.adam.forget("opacity_logits")
 
-    def follow(self, change: Densified) -> None:
-        """Replace the Gaussians: Adam's moments follow each one that is kept and are 0 for new ones."""
+    def replace_gaussians(self, change: Densified) -> None:
+        """Go on with other Gaussians: Adam's moments follow each one that is kept and are 0 for new ones."""
         if not len(change.gaussians):
-            raise ValueError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
+            raise InputError(f"every Gaussian became transparent or too large by step {self.step + 1}; lower the rates")
         self.gaussians = change.gaussians
         self.adam.select(change.parents, change.fresh)
         flat = change.gaussians.flat
         self.screen_gradients = ScreenGradients.zero(len(change.gaussians), flat.dtype, flat.device)
-        self.regularizer.follow(change)
+        self.method.on_densify(change)
 
     def raise_sh_degree(self, degree: int) -> None:
         """Add bands of zeros up to this degree."""

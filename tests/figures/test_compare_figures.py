@@ -6,15 +6,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from analysis.records.records import Record
+from analysis.records.records import ProbeRecord, Record
 from figures.compare import ALONE, beyond, draw_comparison, draw_densities, draw_sections, draw_slices, draw_traces
 from figures.style import RUNS, style
 from tests.figures.test_figures import POINT, laid_out
-from tests.recorded import synthetic
+from tests.recorded import probe_of, synthetic
 
 
-def records(tmp_path, *scales: float) -> dict[str, Record]:
-    return {f"run {scale:g} $x_1$": Record(tmp_path, *synthetic(scale)) for scale in scales}
+def records(tmp_path, *scales: float) -> dict[str, Record[ProbeRecord]]:
+    made = {scale: synthetic(scale) for scale in scales}
+    return {f"run {scale:g} $x_1$": Record(tmp_path, probe_of(data), arrays) for scale, (data, arrays) in made.items()}
 
 
 def test_slices_share_the_smallest_window_and_the_levels(tmp_path):
@@ -43,15 +44,16 @@ def test_steps_of_both_directions_look_equally_long_or_the_axes_say_that_they_di
 
 def test_a_trace_shows_its_sign_and_whether_its_interval_decides_it(tmp_path):
     (record,) = records(tmp_path, 1.0).values()
-    record.data["traces"]["sh"] |= {"value": 12.0, "low": -1.0, "high": 25.0, "sign": "undetermined"}
-    record.data["traces"]["means"] |= {"value": None}
+    sh = record.data.traces["sh"]
+    sh.value, sh.low, sh.high, sh.sign = 12.0, -1.0, 25.0, "undetermined"
+    record.data.traces["means"].value = None
     marked = [line for line in draw_traces({"one": record}).axes[0].lines if line.get_marker() not in ("None", None)]
     looks = [(float(line.get_xdata()[0]), line.get_marker(), line.get_markerfacecolor()) for line in marked]  # pyright: ignore[reportIndexIssue, reportArgumentType]
     by_value = {round(value): (marker, face) for value, marker, face in looks}
-    traces = record.data["traces"]
+    traces = record.data.traces
     assert len(looks) == 4 and by_value[12] == ("X", RUNS[0])
-    assert by_value[round(-traces["opacity_logits"]["value"])] == ("o", "white")
-    assert by_value[round(traces["quats"]["value"])] == ("o", RUNS[0])
+    assert by_value[round(-(traces["opacity_logits"].value or 0.0))] == ("o", "white")
+    assert by_value[round(traces["quats"].value or 0.0)] == ("o", RUNS[0])
 
 
 def test_a_density_is_shared_out_among_the_directions_on_both_sides_of_zero(tmp_path):
@@ -81,8 +83,7 @@ def test_a_side_of_which_only_ends_are_known_says_so_and_the_legend_names_them(t
     said = [[text.get_text() for text in axes.texts] for axes in figure.axes]
     assert said == [["the density found none;\nthe ends alone are known"], []]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "end of the spectrum"]
-    for end in record.data["eigenvalues"].values():
-        end["value"] = None
+    record.data.eigenvalues.max.value = record.data.eigenvalues.min.value = None
     figure = draw_densities({"one": record})
     assert [text.get_text() for text in figure.axes[0].texts] == ["none found"] and len(
         figure.legends[0].get_texts()
@@ -107,7 +108,7 @@ def test_a_run_without_slice_or_density_is_left_out_of_those_pictures_alone(tmp_
     both = records(tmp_path, 1.0, 2.0)
     poor = list(both.values())[1]
     del poor.arrays["slice"], poor.arrays["spectrum"]
-    poor.data["slice"] = None
+    poor.data.slice = None
     assert len([axes for axes in draw_slices(both).axes if axes.get_title(loc="left")]) == 1
     for draw in (draw_sections, draw_densities, draw_traces):
         figure = draw(both)
@@ -122,7 +123,7 @@ def test_what_no_run_has_is_not_drawn(tmp_path, monkeypatch):
     poor = records(tmp_path, 1.0, 2.0)
     for record in poor.values():
         record.arrays.clear()
-        record.data["slice"] = None
+        record.data.slice = None
     (tmp_path / "compare.json").write_text(json.dumps({"runs": {label: label for label in poor}}))
-    monkeypatch.setattr("figures.compare.read_record", lambda folder: poor[folder])
+    monkeypatch.setattr("figures.compare.read_record", lambda folder, kind: poor[folder])
     assert [path.name for path in draw_comparison(tmp_path)] == ["compare_traces.png"]

@@ -12,24 +12,17 @@ from matplotlib.text import Text
 from PIL import Image
 
 from analysis.console.drawing import module_environment
-from analysis.records.records import Record, read_record, record_folder, write_record
 from figures import make_all, slice2d, spectrum, surface, traces
 from figures.plane import plane
 from figures.render_surface import Box
 from figures.style import BLACK, COLUMN, SKY, exponent_of, save, style
-from tests.recorded import synthetic
+from tests.recorded import synthetic, written
 
 POINT = 1 / 72  # inches
 
 
-def recorded(folder, data, arrays) -> Record:
-    with record_folder(folder) as partial:
-        write_record(partial, data, arrays)
-    return read_record(folder)
-
-
 def test_a_png_is_what_matplotlib_saves_and_takes_one_drawing(tmp_path, monkeypatch):
-    record = recorded(tmp_path / "probe", *synthetic())
+    record = written(tmp_path / "probe", *synthetic())
     with style():
         traces.draw(record).savefig(tmp_path / "saved.png")
     figure, drawings = traces.draw(record), []
@@ -111,21 +104,21 @@ def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, m
     monkeypatch.setattr(surface, "_rendered", nothing_drawn)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", surface.RendererMissing)
-        figure = module.draw(recorded(tmp_path / "probe", *difficult(case)))
+        figure = module.draw(written(tmp_path / "probe", *difficult(case)))
     require_layout(figure)
 
 
 def test_the_drawn_traces_are_the_recorded_ones(tmp_path):
-    record = recorded(tmp_path / "probe", *synthetic())
+    record = written(tmp_path / "probe", *synthetic())
     axes = traces.draw(record).axes[0]
     markers = [line for line in axes.lines if line.get_marker() in {"o", "s"}]
     drawn = [float(np.asarray(line.get_xdata())[0]) for line in markers]
-    assert drawn == [abs(entry["value"]) for entry in record.data["traces"].values()]
+    assert drawn == [abs(trace.value) for trace in record.data.traces.values()]
     assert [line.get_marker() for line in markers] == ["o", "o", "o", "s", "o"]  # only opacity is negative
 
 
 def test_an_undetermined_sign_reaches_the_left_edge(tmp_path):
-    axes = traces.draw(recorded(tmp_path / "probe", *difficult("extremes"))).axes[0]
+    axes = traces.draw(written(tmp_path / "probe", *difficult("extremes"))).axes[0]
     left = axes.get_xlim()[0]
     bars = [line for line in axes.lines if line.get_marker() == "None" and len(np.asarray(line.get_xdata())) == 2]
     assert [float(np.asarray(bar.get_xdata())[0]) == left for bar in bars] == [False, False, False, True, False]
@@ -134,7 +127,7 @@ def test_an_undetermined_sign_reaches_the_left_edge(tmp_path):
 def test_a_density_shows_who_has_the_curvature(tmp_path):
     data, arrays = synthetic()
     arrays["spectrum"] |= {"nodes": np.array([[0.1, 61.0, -20.0]]), "weights": np.array([[0.9, 0.05, 0.05]])}
-    axes = spectrum.draw(recorded(tmp_path / "probe", data, arrays)).axes[1]
+    axes = spectrum.draw(written(tmp_path / "probe", data, arrays)).axes[1]
     directions, curvature = (np.asarray(line.get_ydata(), float) for line in axes.lines[:2])
     x = np.asarray(axes.lines[0].get_xdata(), float)
     np.testing.assert_array_equal(x[1:-1], [-20.0, 0.1, 61.0])
@@ -144,10 +137,10 @@ def test_a_density_shows_who_has_the_curvature(tmp_path):
 
 
 def test_cross_sections_are_the_rows_and_columns_through_the_centre(tmp_path):
-    record = recorded(tmp_path / "probe", *synthetic())
+    record = written(tmp_path / "probe", *synthetic())
     figure, arrays = slice2d.draw(record), record.arrays["slice"]
     field = plane(record)
-    center = record.data["slice"]["center_loss"]
+    center = record.data.slice.center_loss
     sections = {axes.get_xlabel(): axes.lines[0] for axes in figure.axes if "step along" in axes.get_xlabel()}
     first = np.asarray(sections[field.x.short_label].get_ydata(), dtype=float) * 10.0**field.exponent
     second = np.asarray(sections[field.y.short_label].get_ydata(), dtype=float) * 10.0**field.exponent
@@ -162,7 +155,7 @@ def test_the_numbers_along_the_steps_stay_apart(tmp_path, reach):
     for name, about, far in zip("xy", data["slice"]["directions"], reach):
         arrays["slice"][name] *= far / arrays["slice"][name].max()
         about["unit"] = far / 3
-    figure = slice2d.draw(recorded(tmp_path / "probe", data, arrays))
+    figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     renderer = laid_out(figure, dpi=300)
     for axes in (axes for axes in figure.axes if "step along" in axes.get_xlabel()):
         uppers = [upper for upper in axes.child_axes if isinstance(upper, SecondaryAxis)]
@@ -179,7 +172,7 @@ def test_the_first_direction_runs_to_the_right(tmp_path):
     data, arrays = synthetic()
     arrays["slice"]["loss"] = data["slice"]["center_loss"] + np.add.outer(np.arange(21.0), np.zeros(17))
     arrays["slice"]["crossed"] = np.arange(21)[:, None] * np.ones(17) > 15
-    axes = slice2d.draw(recorded(tmp_path / "probe", data, arrays)).axes[0]
+    axes = slice2d.draw(written(tmp_path / "probe", data, arrays)).axes[0]
     (dots,) = [line for line in axes.lines if len(np.asarray(line.get_xdata())) == 5 * 17]
     assert np.min(np.asarray(dots.get_xdata())) > 0.4 * axes.get_xlim()[1]
 
@@ -190,7 +183,7 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     evaluated[::5, ::4] = True
     arrays["slice"]["evaluated"], arrays["slice"]["crossed"] = evaluated, evaluated & (np.arange(21) > 10)[:, None]
     data["slice"]["interpolation_error"] = 0.004
-    record = recorded(tmp_path / "probe", data, arrays)
+    record = written(tmp_path / "probe", data, arrays)
     figure = slice2d.draw(record)
     dots = {
         line.get_color(): len(np.asarray(line.get_xdata())) for line in figure.axes[0].lines if line.get_marker() == "."
@@ -208,7 +201,7 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
 def test_a_missing_slice_is_said_and_the_other_figures_are_drawn(tmp_path):
     data, arrays = synthetic()
     del arrays["slice"]
-    record = recorded(tmp_path / "probe", data | {"slice": None}, arrays)
+    record = written(tmp_path / "probe", data | {"slice": None}, arrays)
     for module in (slice2d, surface):
         with pytest.raises(ValueError, match="expected a recorded slice"):
             module.draw(record)
@@ -219,11 +212,11 @@ def test_a_slice_without_a_finite_point_is_refused(tmp_path):
     data, arrays = synthetic()
     arrays["slice"]["loss"][:] = math.nan
     with pytest.raises(ValueError, match="expected finite losses"):
-        slice2d.draw(recorded(tmp_path / "probe", data, arrays))
+        slice2d.draw(written(tmp_path / "probe", data, arrays))
 
 
 def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypatch):
-    record = recorded(tmp_path / "probe", *synthetic())
+    record = written(tmp_path / "probe", *synthetic())
     monkeypatch.setattr(surface, "RENDERER", [sys.executable, "-c", "import sys; sys.exit('no OpenGL here')"])
     with pytest.warns(surface.RendererMissing, match="no OpenGL here"):
         figure = surface.draw(record)
@@ -231,7 +224,7 @@ def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypat
 
 
 def test_the_command_draws_the_folder_named_on_its_standard_input_and_nothing_without_a_name(tmp_path):
-    folder = recorded(tmp_path / "probe", *synthetic()).folder
+    folder = written(tmp_path / "probe", *synthetic()).folder
     command = [sys.executable, "-m", "figures.make_all", "--without", "surface", "--without", "slice2d", "-"]
     for said, names in (("", []), (f"{folder}\n", ["spectrum.png", "traces.png"])):
         done = subprocess.run(command, input=said, capture_output=True, text=True, env=module_environment(), check=True)
@@ -268,7 +261,7 @@ def test_pyvista_renders_the_field_where_the_labels_are_put(tmp_path):
 
 
 def test_a_figure_from_the_command_line_and_its_refusal(tmp_path):
-    folder = recorded(tmp_path / "probe", *synthetic()).folder
+    folder = written(tmp_path / "probe", *synthetic()).folder
     good, bad = (
         subprocess.run(
             [sys.executable, "-m", "figures.traces", str(place)], capture_output=True, text=True, check=False

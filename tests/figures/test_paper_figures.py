@@ -10,13 +10,13 @@ import pytest
 from matplotlib.colors import to_hex
 from PIL import Image
 
-from analysis.records.records import SLICE, read_record, record_folder, write_record
+from analysis.records.records import SliceRecord, read_record, record_folder, write_record
 from figures import fig1, fig7
 from figures.manifold import Scale, landscape_of, start_of
 from figures.style import RUNS
 from tests.figures.test_figures import POINT, laid_out
 from tests.figures.test_trajectory_figure import rows
-from tests.recorded import synthetic
+from tests.recorded import slice_of, synthetic
 
 
 def slice_at(run: Path, scale: float) -> None:
@@ -24,8 +24,8 @@ def slice_at(run: Path, scale: float) -> None:
     run.mkdir(parents=True, exist_ok=True)
     (run / "checkpoint.pt").touch()
     data, arrays = synthetic(scale)
-    with record_folder(run / "slice-eigenvectors-2d", SLICE) as folder:
-        write_record(folder, data, {"slice": arrays["slice"]}, SLICE)
+    with record_folder(run / "slice-eigenvectors-2d", SliceRecord) as folder:
+        write_record(folder, slice_of(data), {"slice": arrays["slice"]})
 
 
 @pytest.fixture
@@ -54,8 +54,8 @@ def test_contours_have_the_few_ticks_of_sections_whose_room_the_layout_knows(run
         record = read_record(run / "slice-eigenvectors-2d")
         for axis in "xy":
             record.arrays["slice"][axis] *= reach / record.arrays["slice"][axis].max()
-        with record_folder(run / "slice-eigenvectors-2d", SLICE) as anew:
-            write_record(anew, {k: v for k, v in record.data.items() if k != "arrays"}, record.arrays, SLICE)
+        with record_folder(run / "slice-eigenvectors-2d", SliceRecord) as anew:
+            write_record(anew, record.data, record.arrays)
     figure = fig1.draw(runs)
     laid_out(figure)
     first, second = figure.axes[:2]
@@ -87,9 +87,9 @@ def test_a_start_that_slopes_down_is_not_cut_off_at_the_ends_own_limits(runs):
     folder = runs[0] / "start" / "slice-eigenvectors-2d"
     record = read_record(folder)
     x = record.arrays["slice"]["x"]
-    record.arrays["slice"]["loss"][:] = record.data["slice"]["center_loss"] - 2e-2 * (x / x.max())[:, None]
-    with record_folder(folder, SLICE) as anew:
-        write_record(anew, {k: v for k, v in record.data.items() if k != "arrays"}, record.arrays, SLICE)
+    record.arrays["slice"]["loss"][:] = record.data.slice.center_loss - 2e-2 * (x / x.max())[:, None]
+    with record_folder(folder, SliceRecord) as anew:
+        write_record(anew, record.data, record.arrays)
     along_e1 = fig7.draw(runs).axes[-2]
     start, *_ = (np.asarray(line.get_ydata(), float) for line in along_e1.lines)
     assert along_e1.get_ylim()[0] <= np.nanmin(start) < 0
@@ -156,9 +156,9 @@ def test_landscapes_of_different_functions_are_not_drawn_beside_each_other(
     def recorded(run: Path, value: object) -> None:
         folder = run / "slice-eigenvectors-2d"
         record = read_record(folder)
-        record.data[section][key] = value
-        with record_folder(folder, SLICE) as anew:
-            write_record(anew, {k: v for k, v in record.data.items() if k != "arrays"}, record.arrays, SLICE)
+        setattr(getattr(record.data, section), key, value)
+        with record_folder(folder, SliceRecord) as anew:
+            write_record(anew, record.data, record.arrays)
 
     recorded(runs[0], first)
     recorded(runs[1], None)

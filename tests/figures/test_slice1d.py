@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from analysis.records.records import SLICE, Record, read_record, record_folder, write_record
 from figures import make_all, slice1d, slice2d
 from figures.style import BLACK, BLUE, SKY, VERMILION
 from tests.figures.test_figures import require_layout
-from tests.recorded import synthetic_line
-
-
-def recorded(folder, data, arrays) -> Record:
-    with record_folder(folder, SLICE) as partial:
-        write_record(partial, data, arrays, SLICE)
-    return read_record(folder)
+from tests.recorded import synthetic, synthetic_line, written
 
 
 def difficult(case):
@@ -39,27 +32,27 @@ def difficult(case):
 
 @pytest.mark.parametrize("case", ["plain", "1e-12", "1e9", "no numbers", "flat", "least"])
 def test_labels_stay_inside_the_column_and_apart_whatever_the_record(tmp_path, case):
-    figure = slice1d.draw(recorded(tmp_path / "slice", *difficult(case)))
+    figure = slice1d.draw(written(tmp_path / "slice", *difficult(case)))
     require_layout(figure)
 
 
 def test_dots_are_renders_and_the_blue_ones_are_crossed(tmp_path):
-    record = recorded(tmp_path / "slice", *synthetic_line())
+    record = written(tmp_path / "slice", *synthetic_line())
     above, arrays = slice1d.draw(record).axes[0], record.arrays["slice"]
     dots = {line.get_color(): np.asarray(line.get_xdata()) for line in above.lines if line.get_marker() == "."}
     assert dots[SKY] == pytest.approx(arrays["x"][arrays["crossed"]] * 1e3)
     assert dots[BLACK] == pytest.approx(arrays["x"][arrays["evaluated"] & ~arrays["crossed"]] * 1e3)
     (model,) = [line for line in above.lines if line.get_color() == VERMILION]
-    change = arrays["model"] - record.data["slice"]["center_loss"]
+    change = arrays["model"] - record.data.slice.center_loss
     assert np.asarray(model.get_ydata()) == pytest.approx(change * 1e6, abs=1e-9)
 
 
 def test_curvatures_that_round_off_hides_set_no_limits_and_have_no_dot(tmp_path):
-    record = recorded(tmp_path / "slice", *synthetic_line())
-    below, probe = slice1d.draw(record).axes[1], record.data["finite_probe"]
+    record = written(tmp_path / "slice", *synthetic_line())
+    below, probe = slice1d.draw(record).axes[1], record.data.finite_probe
     dots = {to_hex(line.get_markerfacecolor()): line for line in below.lines if line.get_marker() == "o"}
-    assert list(np.asarray(dots[BLUE.lower()].get_xdata())) == probe["steps"][1:2]
-    assert list(np.asarray(dots["#ffffff"].get_ydata())) == probe["curvatures"][2:]
+    assert list(np.asarray(dots[BLUE.lower()].get_xdata())) == probe.steps[1:2]
+    assert list(np.asarray(dots["#ffffff"].get_ydata())) == probe.curvatures[2:]
     low, high = below.get_ylim()
     assert 20 < low < 37 and 70 < high < 90
     labels = below.get_legend_handles_labels()[1]
@@ -70,7 +63,7 @@ def test_a_value_that_is_hardly_known_does_not_flatten_the_others_and_shows_wher
     data, arrays = synthetic_line()
     probe = data["finite_probe"]
     probe["curvatures"][0], probe["round_off"][0] = -9000.0, 3000.0
-    below = slice1d.draw(recorded(tmp_path / "slice", data, arrays)).axes[1]
+    below = slice1d.draw(written(tmp_path / "slice", data, arrays)).axes[1]
     low, high = below.get_ylim()
     assert 20 < low < 37 and 70 < high < 90
     (beyond,) = [line for line in below.lines if line.get_marker() == "v"]
@@ -79,7 +72,7 @@ def test_a_value_that_is_hardly_known_does_not_flatten_the_others_and_shows_wher
 
 
 def test_a_line_has_one_figure_and_a_plane_is_asked_for_elsewhere(tmp_path):
-    record = recorded(tmp_path / "slice", *synthetic_line())
+    record = written(tmp_path / "slice", *synthetic_line())
     assert [path.name for path in make_all.draw_probe(record.folder)] == ["slice1d.png"]
     with pytest.raises(ValueError, match="got one along a line"):
         slice2d.draw(record)
@@ -89,7 +82,6 @@ def test_without_a_line_or_a_finite_loss_it_says_so(tmp_path):
     data, arrays = synthetic_line()
     arrays["slice"]["loss"][:] = math.nan
     with pytest.raises(ValueError, match="expected finite losses"):
-        slice1d.draw(recorded(tmp_path / "slice", data, arrays))
-    data["slice"]["directions"] *= 2
+        slice1d.draw(written(tmp_path / "slice", data, arrays))
     with pytest.raises(ValueError, match="expected a slice along a line"):
-        slice1d.draw(recorded(tmp_path / "plane", data, arrays))
+        slice1d.draw(written(tmp_path / "plane", *synthetic()))

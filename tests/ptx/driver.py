@@ -1,5 +1,7 @@
-"""Stands in for a GPU's driver: Triton compiles for sm_90 and launches as ever, and the machine runs what it launches."""
+"""A stand-in for a GPU's driver: Triton compiles for sm_90 and launches as usual, and `machine.py` runs what it launches."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,16 +10,14 @@ from torch import Tensor
 
 
 def target() -> Any:
-    """An H100 or H200, as Triton knows it."""
+    """An H100 or H200, as Triton describes it."""
     from triton.backends.compiler import GPUTarget
 
     return GPUTarget("cuda", 90, 32)
 
 
 def stand_in() -> None:
-    """A driver for this process, which has not launched anything: all of it that Triton needs to compile and to choose
-    kernels.
-    """
+    """Give this process a driver with all that Triton needs to compile and to choose kernels."""
     from triton.runtime import driver
 
     driver.set_active(
@@ -30,29 +30,40 @@ def stand_in() -> None:
     )
 
 
-def install() -> None:
-    """The driver, and the machine for what is launched."""
+@contextmanager
+def emulator() -> Iterator[None]:
+    """Within the context kernels are launched by the stand-in and run by the machine."""
     from triton.compiler.compiler import CompiledKernel
+    from triton.runtime import driver
 
+    before, handles = vars(driver).copy(), CompiledKernel._init_handles
+    stand_in()
+    CompiledKernel._init_handles = _run_by_the_machine  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        vars(driver).update(before)
+        CompiledKernel._init_handles = handles
+
+
+def _run_by_the_machine(kernel: Any) -> None:
+    """In place of loading a compiled kernel: what Triton calls to launch it."""
     from tests.ptx import machine
 
-    def handles(kernel: Any) -> None:
-        def run(
-            x: int, y: int, z: int, _stream: Any, _function: Any, _packed: Any, _launch: Any, *hooks_and_all: Any
-        ) -> None:
-            arguments = [a for a, constant in zip(hooks_and_all[2:], constants, strict=True) if not constant]
-            about = kernel.metadata
-            machine.launch(kernel.asm["ptx"], (x, y, z), about.num_warps, about.shared, arguments)
+    constants = [(i,) in kernel.src.constants for i in range(len(kernel.src.fn.arg_names))]
 
-        constants = [(i,) in kernel.src.constants for i in range(len(kernel.src.fn.arg_names))]
-        kernel.module = kernel._run = run
+    def run(
+        x: int, y: int, z: int, _stream: Any, _function: Any, _packed: Any, _launch: Any, *hooks_and_all: Any
+    ) -> None:
+        arguments = [a for a, constant in zip(hooks_and_all[2:], constants, strict=True) if not constant]
+        about = kernel.metadata
+        machine.launch(kernel.asm["ptx"], (x, y, z), about.num_warps, about.shared, arguments)
 
-    stand_in()
-    CompiledKernel._init_handles = handles  # pyright: ignore[reportAttributeAccessIssue]
+    kernel.module = kernel._run = run
 
 
 def unwritten(make: Any) -> Any:
-    """Of a function that leaves memory as it is: what nobody wrote is not a number, the least one, or true."""
+    """A function that makes uninitialised tensors, which then hold NaN, the least integer or True."""
 
     def made(*arguments: Any, **named: Any) -> Tensor:
         tensor: Tensor = make(*arguments, **named)

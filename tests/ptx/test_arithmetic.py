@@ -29,7 +29,7 @@ def test_a_fused_product_is_rounded_once():
         assert fma(np.array([1e308]), np.array([10.0]), np.array([1.0])).tolist() == [np.inf]
 
 
-def test_what_the_hardware_approximates_is_off_by_two_units_at_most_and_always_alike():
+def test_an_approximate_instruction_is_off_by_two_units_and_repeatable():
     x = np.linspace(-20, 0, 10_000, dtype=np.float32)
     got = np.array(of("ex2.approx.ftz.f32", x))
     off = got / np.exp2(x.astype(np.float64)) - 1

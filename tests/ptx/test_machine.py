@@ -63,7 +63,7 @@ $AGAIN:
     assert run(body, ints(32)) == [33 - max(3, -(-i // 3) * 3) for i in range(32)]
 
 
-def test_blocks_have_shared_memory_of_their_own_and_wait_for_all_of_their_warps():
+def test_a_block_has_its_own_shared_memory_and_waits_for_its_warps():
     body = """
     shl.b32 %r4, %r1, 2;
     mov.b32 %r5, global_smem;
@@ -109,7 +109,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("what", FAULTS)
-def test_what_a_gpu_would_stop_at_or_not_notice_is_named_with_its_instruction(what):
+def test_a_fault_is_named_with_its_instruction(what):
     with pytest.raises(Fault, match=f"^k: .*{re.escape(what)}"):
         run(re.sub(r"^\s+\$", "$", FAULTS[what], flags=re.MULTILINE), ints(64), blocks=2)
     run("st.global.b32 [ %rd2 + 0 ], { %r1 };", ints(64), blocks=2)  # in another launch it is allowed

@@ -97,6 +97,12 @@ class Case:
         """What the products' rounding may do to an estimate, as a share of its scale: independent roundings of every row."""
         return self.operator.dim**0.5 * torch.finfo(self.operator.dtype).eps
 
+    @property
+    def scene(self) -> SceneObjective:
+        """The objective, of a case that is a scene."""
+        assert self.objective is not None
+        return self.objective
+
     @cached_property
     def ends(self) -> EigenEnds:
         """Both ends, by the library's defaults."""

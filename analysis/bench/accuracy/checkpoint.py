@@ -17,7 +17,6 @@ from pathlib import Path
 import torch
 
 from analysis.bench.accuracy.cases import Case, Truth
-from analysis.bench.accuracy.methods import Method
 from analysis.bench.workloads import workload_of
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.spectrum.absolute_sum import absolute_sum
@@ -29,18 +28,7 @@ from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
 from splat.training.checkpoint import write_atomically
 
-# a scene's products cost too much for more, and for what the matrices have shown to be the same as another, or no rival
-BUDGETS = (12, 36)  # matvecs a block
-LEFT_OUT = (
-    "Hutchinson, Gaussian",
-    "Hutchinson, adaptive",
-    "chosen by",
-    "PyHessian",
-    "lobpcg",
-    "power iteration",
-    "in blocks",
-)
-SAMPLES, FINE, MOST = 128, 1e-6, 250
+SAMPLES, FINE, MOST = 128, 1e-6, 250  # MOST: products of the search for the ends
 STARTS, STEPS = 6, 24
 TRUTH = "truth.json"
 
@@ -64,11 +52,6 @@ def checkpoint_case(path: Path, out: Path, downscale: float = 1.0) -> Case:
         write_atomically(stored, json.dumps(kept, indent=1).encode())
     active = ActiveSpace(hessian.project, hessian.rank)
     return Case(workload.name, "checkpoint", hessian, Truth(**kept["truth"]), None, objective, active)
-
-
-def affordable(method: Method) -> bool:
-    """Whether a method is run on a checkpoint."""
-    return method.quantity != "diagonal" and not any(name in method.name for name in LEFT_OUT)
 
 
 def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:

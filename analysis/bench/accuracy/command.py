@@ -18,37 +18,6 @@ there who did not know the truth.  An estimator that several packages have alike
 less than it does.  The interval of the ratio is a bootstrap over seeds.  An end of the polygon gives a bound.  What is asked
 holds ("yes") where the whole interval is below it, "no" where all of it is above, and is "open" otherwise.  Peers without a
 stopping rule are given the right budget, as an oracle would.
-
-**Which defaults the figures support** (products, seeds as below).
-
-    traces       method "auto": a sketch on the power law (26 products for 1.5%, Hutchinson's 100 for 6%; 1.01 of the best
-                 peer's, 0.97 to 1.07 over 500 seeds) and at rank 5 (13, exact; 1.08), Hutchinson on the others.  There three
-                 packages run the same estimator, whose mean square error, 2 p_2 / m, is known: over 10,000 seeds the default
-                 needs 1.00 (0.97 to 1.03; clustered) and 1.03 (1.00 to 1.06; indefinite) of its m, and over 2,000 0.96 (0.89 to
-                 1.00) of theirs on the flat one.  A ratio from tens of seeds is off by a factor of 1.5 either way.  On splats
-                 `exact_traces`, a third of the best peer's work at equal error, and no error at all without SSIM
-    both ends    one Lanczos run to 1e-3 with a basis of 64: looser saves two to four products, other bases and blocks
-                 nothing.  It needs the steps that no Krylov method does without, 0.93 to 0.99 of those of a peer that is told
-                 how many (0.11 on the power law), as it reads the noise of products from their asymmetry.  On scenes the
-                 Gaussians' own blocks lead, and their pass is paid: over 24 small scenes (`--scenes 8`, 15 seeds) 0.64 of
-                 SciPy's products, which stops by itself, and 0.84 (0.84 to 0.88) of those of the best peer when it is told how
-                 many steps do, 0.71 to 1.06 one by one; fern after 2,000 steps, from one direction of either end, 2 seeds: 0.52
-                 (0.49 to 0.54) of SciPy's, the best there, and 0.39 of its seconds
-    diagonal     method "auto": 0.76 of XDiag's products on the power law, 0.88 and exact at rank 5 (21), random signs elsewhere
-    quadrature   192 products, divided as they go: start vectors are many on flat, clustered and indefinite spectra, four of up
-                 to 48 steps elsewhere.  At equal error 0.5 of the best peer's products or less in sum |lambda| and effective
-                 rank, mass quantiles 0.5 to 0.8, over 48 seeds (300 on the indefinite one); eigenvalues that start vectors find
-                 in common are counted.  With trace and ends known, as a probe has them, sum |lambda| of a power law and of a
-                 flat spectrum is exact, near a fit its error 1.2% instead of 2.5%
-    precision    float32 products: rounding adds some 1e-8 of |z| |H z|, six digits below what chance adds.  Sums in float64
-                 make no difference at these sizes; they are kept as they cost nothing, and float32's grow with the rows
-
-**Which they do not.**  Mass quantiles of scenes lie where the rules of so few steps have a node or two: their middles are off
-by 15 to 150%, and only their brackets tell.  On eight of the 24 scenes the ends take more than 0.85 of the products of a peer
-that is told how many: 10 to 15 steps do there from random vectors, too, and a good start saves no more than its pass costs.
-(With a peer's steps in doublings, 10, 20, 40, the same runs seemed to take 0.65: its error falls to round-off between two.)
-A search that begins with one direction of either end takes 7% less, and misses ends (`splat.curvature.block_eigenvectors`).
-In seconds the 24 take 1.13 of the told peer: with so small a scene a product takes a millisecond, the rest as long.
 """
 
 from collections.abc import Iterator, Sequence
@@ -59,25 +28,24 @@ from typing import get_args
 
 import pandas as pd
 import torch
-from rich import box
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 from torch import Tensor
 
 from analysis.bench.accuracy.cases import Case, MeteredOperator, matrix_cases, splat_cases
-from analysis.bench.accuracy.checkpoint import BUDGETS as FEW_BUDGETS
-from analysis.bench.accuracy.checkpoint import affordable, checkpoint_case
-from analysis.bench.accuracy.methods import BUDGETS, Answer, Method, own_methods
+from analysis.bench.accuracy.checkpoint import checkpoint_case
+from analysis.bench.accuracy.methods import BUDGETS, FEW_BUDGETS, Answer, Method, affordable, own_methods
 from analysis.bench.accuracy.peers import peer_methods
 from analysis.bench.accuracy.ratios import points, ratio_table, ratios
+from analysis.bench.options import BenchOptions, Quantity
+from analysis.bench.tables import rich_table, write_table
 from analysis.console.drawing import draw
-from analysis.console.options import BenchOptions, Quantity
+from landscape.errors import InputError
 from landscape.operators.operator import DenseOperator, SymmetricOperator
 from landscape.probes import draw_probes
-from splat.training.checkpoint import write_atomically
 
 SEED = 0
+TITLES = {"peer": "the defaults at equal true error: over the best peer", "own": "over our own best other setting"}
 # of the repetitions: a scene has five blocks' traces to each seed; other quantities vary less, or take longer
 SEEDS_OF_FAMILY = {"matrices": 1.0, "splats": 0.2, "checkpoint": 0.14}
 SEEDS_OF_QUANTITY = {"traces": 3.0, "ends": 0.5, "sums": 0.5, "diagonal": 1.0}
@@ -191,21 +159,11 @@ def quadratic_forms(operator: SymmetricOperator, Z: Tensor, sums: torch.dtype) -
     return (Z.to(sums) * operator.apply(Z).to(sums)).sum(dim=0)
 
 
-def precision_table(means: pd.DataFrame) -> Table:
-    """For the terminal: the root mean squares over seeds."""
-    found = means[means["quantity"] == "precision"].pivot(index="case", columns="method", values="true_error")
-    title = "what rounding adds to z.Hz, over |z| |Hz|"
-    table = Table("case", *PRECISIONS, title=title, title_justify="left", box=box.SIMPLE_HEAD)
-    for case, errors in found.iterrows():
-        table.add_row(str(case), *(f"{errors[name]:.1e}" for name in PRECISIONS))
-    return table
-
-
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
 def run_accuracy(options: BenchOptions) -> int:
-    """Run every method on every case; print, write and draw what came of it; 0."""
+    """Run every method on every case; print, write and draw what came of it; returns the exit code 0."""
     console, errors = Console(), Console(stderr=True)
     options.out.mkdir(parents=True, exist_ok=True)
     runs: list[Run] = []
@@ -239,15 +197,15 @@ def run_accuracy(options: BenchOptions) -> int:
 
 def _cases(options: BenchOptions) -> list[Case]:
     if options.scenes < 1:
-        raise ValueError(f"expected at least 1 scene of each kind, got --scenes {options.scenes}")
+        raise InputError(f"expected at least 1 scene of each kind, got --scenes {options.scenes}")
     if options.checkpoint is not None:
         if options.case or options.scenes > 1:
-            raise ValueError("expected neither --case nor --scenes beside a checkpoint, which is the only case")
+            raise InputError("expected neither --case nor --scenes beside a checkpoint, which is the only case")
         return [checkpoint_case(options.checkpoint, options.out, options.downscale)]
     matrices, scenes = {case.name: case for case in matrix_cases(SEED)}, splat_cases(SEED, options.scenes)
     if strange := set(options.case) - {*matrices, *scenes}:
         names = ", ".join(map(repr, (*scenes, *matrices)))
-        raise ValueError(f"expected --case to be one of {names}, got {', '.join(map(repr, sorted(strange)))}")
+        raise InputError(f"expected --case to be one of {names}, got {', '.join(map(repr, sorted(strange)))}")
     chosen = options.case or (*scenes, *matrices)
     return [scenes[name]() if name in scenes else matrices[name] for name in chosen]
 
@@ -263,19 +221,14 @@ def _report(table: pd.DataFrame, options: BenchOptions, cases: Sequence[Case], c
     floors = {case.name: case.round_off for case in cases}
     means = points(table, floors)
     found = ratios(table, floors)
-    for against in ("peer", "own"):
-        part = pd.DataFrame(found[found["against"] == against])
-        title = {
-            "peer": "the defaults at equal true error: over the best peer",
-            "own": "over our own best other setting",
-        }
-        console.print(ratio_table(part, title[against]))
-    if "precision" in set(means["quantity"]):
-        console.print(precision_table(means))
+    for against, title in TITLES.items():
+        console.print(rich_table(ratio_table(pd.DataFrame(found[found["against"] == against])), title))
+    rounding = means[means["quantity"] == "precision"].pivot(index="case", columns="method", values="true_error")
+    if len(rounding):
+        shown = rounding.reset_index().filter(["case", *PRECISIONS])
+        console.print(rich_table(shown, "what rounding adds to z.Hz, over |z| |Hz|"))
     for name, data in {"accuracy": table, "accuracy_points": means, "accuracy_ratios": found}.items():
-        path = options.out / f"{name}.csv"
-        write_atomically(path, data.to_csv(index=False).encode())
-        console.print(path, soft_wrap=True, highlight=False)
+        write_table(data, options.out / f"{name}.csv", console)
     draw("accuracy", options.out / "accuracy_points.csv")
     console.print(f"{options.out}/accuracy_*.png", soft_wrap=True, highlight=False)
     verdicts = [row["holds"] for row in found.to_dict("records") if row["against"] == "peer" and row["holds"]]

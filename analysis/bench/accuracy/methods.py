@@ -7,13 +7,13 @@ A method is run on an operator that counts, with a seed, and returns an `Answer`
     sum of |lambda|, effective rank, mass quantile     one part, from one spectral density ("sums")
     diagonal          one part, a vector
 
-Work that is not products H v is charged in products: a pass over the pixels for all own blocks, and to find their ends, PASS
-(the most that was measured on fern: 1.05 to 1.2 with vectors of 512 bits, 0.65 to 1.1 with 256, and 0.15); a product with the
-images' Jacobian JACOBIAN (its share of a product's arithmetic; there is no backward pass).
+Work that is not products H v is charged in products: PASS for a pass over the pixels for every Gaussian's block, with the
+ends of the blocks; JACOBIAN for a product with the images' Jacobian.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from math import inf, nan
 from typing import Literal
@@ -28,24 +28,39 @@ from analysis.bench.speed.scene import OPERATIONS
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds
 from landscape.eigen.power import PowerSettings, power_ends
-from landscape.results import Bracket
 from landscape.spectrum.absolute_sum import absolute_sum
 from landscape.spectrum.anisotropy import effective_rank, mass_quantile
 from landscape.spectrum.density import spectral_density
 from landscape.traces.diagonal import Method as DiagonalMethod
 from landscape.traces.diagonal import estimate_diagonal
+from landscape.traces.estimate import TraceEstimate
+from landscape.traces.hutchinson import Method as TraceMethod
 from landscape.traces.trace import PAPER, TraceSettings, estimate_traces
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.traces import ONE_PERCENT, exact_traces
 
 Origin = Literal["default", "own", "peer"]
-PASS = 1.35
+PASS = 1.35  # the most that fern after 2,000 steps took, of vectors of 256 and 512 bits: 1.2 for the pass, 0.15 for the ends
+# its share of a product's arithmetic: there is no backward pass
 JACOBIAN = OPERATIONS["J u 1"] / (OPERATIONS["J u 1"] + OPERATIONS["tangent of backward 1"])
 BUDGETS = (12, 24, 48, 96)  # matvecs a block
+# on a trained scene, whose products cost too much for more, and for what matrices have shown to be as good as another
+# method, or no rival
+FEW_BUDGETS = (12, 36)
+LEFT_OUT = (
+    "Hutchinson, Gaussian",
+    "Hutchinson, adaptive",
+    "chosen by",
+    "PyHessian",
+    "lobpcg",
+    "power iteration",
+    "in blocks",
+)
 TOLERANCES = (1e-1, 1e-2)  # of residuals; 1e-3 is the default
 DENSITIES = ((2, 12), (4, 24), (8, 48))  # start vectors and steps; by default 192 products are divided as they go
 PROBES = (8, 16, 64)  # of a diagonal; 32 is the default
 CONFIDENCE = 0.95
+SKETCHES: dict[TraceMethod, str] = {"hutch++": "Hutch++", "xtrace": "XTrace"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +77,26 @@ class Answer:
     high: float | Float64[Tensor, " n"] = nan
 
 
+Run = Callable[[Case, MeteredOperator, int], list[Answer]]
+"""A method's run on a case, by an operator that counts, with a seed: the answers, one a part."""
+Applies = Callable[[Case], bool]
+
+
+def always(_: Case) -> bool:
+    return True
+
+
+def is_scene(case: Case) -> bool:
+    return case.objective is not None
+
+
+def is_matrix(case: Case) -> bool:
+    return case.objective is None
+
+
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One estimator at one setting.  run(case, operator, seed): the answers, one a part.
+    """One estimator at one setting.
 
     estimator: the name of what several packages have alike, "" where this method stands alone.
     """
@@ -72,9 +104,9 @@ class Method:
     quantity: str
     name: str
     settings: str
-    run: Callable[[Case, MeteredOperator, int], list[Answer]]
+    run: Run
     origin: Origin = "own"
-    applies: Callable[[Case], bool] = lambda case: True
+    applies: Applies = always
     estimator: str = ""
 
 
@@ -82,12 +114,9 @@ def generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def _is_scene(case: Case) -> bool:
-    return case.objective is not None
-
-
-def _is_matrix(case: Case) -> bool:
-    return case.objective is None
+def affordable(method: Method) -> bool:
+    """Whether a method is run on a checkpoint, whose diagonal nothing but a product for every row gives."""
+    return method.quantity != "diagonal" and not any(name in method.name for name in LEFT_OUT)
 
 
 def own_methods(budgets: tuple[int, ...] = BUDGETS) -> Iterator[Method]:
@@ -102,7 +131,7 @@ def own_methods(budgets: tuple[int, ...] = BUDGETS) -> Iterator[Method]:
 
 
 def trace_methods(budgets: tuple[int, ...]) -> Iterator[Method]:
-    yield _traces("chosen by its probes", "rtol 0.05", TraceSettings(), "default", _is_matrix)
+    yield _traces("chosen by its probes", "rtol 0.05", TraceSettings(), "default", is_matrix)
     for rtol in (0.2, 0.1):
         yield _traces("chosen by its probes", f"rtol {rtol:g}", TraceSettings(rtol=rtol))
     for rtol in (0.2, 0.1, 0.05):
@@ -113,85 +142,70 @@ def trace_methods(budgets: tuple[int, ...]) -> Iterator[Method]:
         yield _traces("Hutchinson, Rademacher", f"{budget} probes", fixed)
         yield _traces("Hutchinson, Gaussian", f"{budget} probes", replace(fixed, distribution="gaussian"))
         yield _traces("Hutchinson, one probe for all", f"{budget} probes", replace(fixed, reading="full"))
-        for method in ("hutch++", "xtrace"):
+        for method, name in SKETCHES.items():
             if budget >= TraceSettings(max_probes=100, method=method).least:
-                name = {"hutch++": "Hutch++", "xtrace": "XTrace"}[method]
                 yield _traces(name, f"{budget} matvecs", replace(fixed, method=method))
     yield _exact("rtol 0.01", ONE_PERCENT, "default")
     for samples in (8, 64):
         yield _exact(f"{samples} samples", TraceSettings.fixed(samples))
 
 
-def _traces(
-    name: str,
-    text: str,
-    settings: TraceSettings,
-    origin: Origin = "own",
-    applies: Callable[[Case], bool] = lambda case: True,
-) -> Method:
+def _traces(name: str, text: str, settings: TraceSettings, origin: Origin = "own", applies: Applies = always) -> Method:
     def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
-        found = estimate_traces(operator, generator(seed), settings)
-        return [Answer(part, x.value, x.standard_error, x.low, x.high) for part, x in found.items()]
+        return _trace_answers(estimate_traces(operator, generator(seed), settings))
 
     return Method("traces", name, text, run, origin, applies)
 
 
 def _exact(text: str, settings: TraceSettings, origin: Origin = "own") -> Method:
     def run(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
-        assert case.objective is not None
-        found = exact_traces(case.objective, generator(seed), settings)
-        passes = 2 if case.objective.couples_pixels else 1
+        found = exact_traces(case.scene, generator(seed), settings)
+        passes = 2 if case.scene.couples_pixels else 1
         operator.charge(passes * PASS + JACOBIAN * sum(x.matvecs for x in found.values()))
-        return [Answer(part, x.value, x.standard_error, x.low, x.high) for part, x in found.items()]
+        return _trace_answers(found)
 
-    return Method("traces", "exact pass, sampled coupling", text, run, origin, _is_scene)
+    return Method("traces", "exact pass, sampled coupling", text, run, origin, is_scene)
+
+
+def _trace_answers(found: Mapping[str, TraceEstimate]) -> list[Answer]:
+    return [Answer(part, x.value, x.standard_error, x.low, x.high) for part, x in found.items()]
 
 
 # --- both ends --------------------------------------------------------------------------------------------------------
 
 
 def end_methods() -> Iterator[Method]:
-    yield _lanczos("rtol 0.001", EigenSettings(), "default", _is_matrix)
-    yield _lanczos("rtol 0.001", EigenSettings(), applies=_is_scene)
-    yield Method("ends", "led by own blocks", "rtol 0.001", _from_own_blocks, "default", _is_scene)
+    yield _lanczos("rtol 0.001", EigenSettings(), "default", is_matrix)
+    yield _lanczos("rtol 0.001", EigenSettings(), applies=is_scene)
+    yield Method("ends", "led by own blocks", "rtol 0.001", _from_blocks, "default", is_scene)
     for rtol in TOLERANCES:
         yield _lanczos(f"rtol {rtol:g}", EigenSettings(rtol=rtol))
     yield _lanczos("basis 20", EigenSettings(basis=20))
     yield _lanczos("block 2", EigenSettings(block=2))
     for rtol in (1e-1, 1e-2, 1e-3):
-        power = PowerSettings(rtol, max_matvecs=300)
-        yield Method("ends", "power iteration, shifted", f"rtol {rtol:g}", _power(power))
+        yield Method("ends", "power iteration, shifted", f"rtol {rtol:g}", partial(_power, rtol=rtol))
 
 
-def _lanczos(
-    text: str,
-    settings: EigenSettings,
-    origin: Origin = "own",
-    applies: Callable[[Case], bool] = lambda case: True,
-) -> Method:
+def _lanczos(text: str, settings: EigenSettings, origin: Origin = "own", applies: Applies = always) -> Method:
     def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
-        return end_answers(extreme_eigenpairs(operator, generator(seed), settings))
+        return _end_answers(extreme_eigenpairs(operator, generator(seed), settings))
 
     name = "Lanczos, both ends"
     return Method("ends", name if settings.block == 1 else f"{name}, in blocks", text, run, origin, applies)
 
 
-def _from_own_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
+def _from_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
     """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
-    assert case.objective is not None
-    start = BlockEigenvectors(case.objective, case.objective.block_diagonal()).leads()
+    start = BlockEigenvectors(case.scene, case.scene.block_diagonal()).warm_start()
     operator.charge(PASS)
-    return end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
+    return _end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
 
 
-def _power(settings: PowerSettings) -> Callable[[Case, MeteredOperator, int], list[Answer]]:
-    def run(_: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
-        return end_answers(power_ends(operator, generator(seed), settings))
-
-    return run
+def _power(_: Case, operator: MeteredOperator, seed: int, rtol: float) -> list[Answer]:
+    return _end_answers(power_ends(operator, generator(seed), PowerSettings(rtol, max_matvecs=300)))
 
 
-def end_answers(ends: EigenEnds) -> list[Answer]:
+def _end_answers(ends: EigenEnds) -> list[Answer]:
     """Eigenvalues with their residuals."""
     pairs = {"largest": ends.largest, "smallest": ends.smallest}
     return [
@@ -221,14 +235,12 @@ def _density(text: str, origin: Origin, known: bool = False, **division: int) ->
             "effective rank": effective_rank(case.ends, density),
             "mass quantile": mass_quantile(case.ends, density),
         }
-        return [_bracketed(part, bracket) for part, bracket in found.items()]
+        return [
+            Answer(part, nan if x.value is None else x.value, (x.high - x.low) / 2, x.low, x.high)
+            for part, x in found.items()
+        ]
 
     return Method("sums", "Lanczos quadrature", text, run, origin)
-
-
-def _bracketed(part: str, bracket: Bracket) -> Answer:
-    value = nan if bracket.value is None else bracket.value
-    return Answer(part, value, (bracket.high - bracket.low) / 2, bracket.low, bracket.high)
 
 
 # --- the diagonal -----------------------------------------------------------------------------------------------------
@@ -237,33 +249,24 @@ def _bracketed(part: str, bracket: Bracket) -> Answer:
 def diagonal_methods() -> Iterator[Method]:
     names: dict[DiagonalMethod, str] = {"auto": "chosen by its probes", "signs": "random signs"}
     for probes, (method, name) in product((32, *PROBES), names.items()):
-
-        def run(
-            _: Case, operator: MeteredOperator, seed: int, probes: int = probes, method: DiagonalMethod = method
-        ) -> list[Answer]:
-            found = estimate_diagonal(operator, generator(seed), probes, method=method)
-            freedom = found.samples.shape[1] - 1
-            half = float(student.ppf((1 + CONFIDENCE) / 2, freedom)) * found.standard_errors
-            return [Answer("all", found.values, found.standard_errors, found.values - half, found.values + half)]
-
         origin: Origin = "default" if (probes, method) == (32, "auto") else "own"
+        run = partial(_diagonal, probes=probes, method=method)
         yield Method("diagonal", name, f"{probes} probes", run, origin)
-
-    def gaussian_blocks(case: Case, operator: MeteredOperator, _: int) -> list[Answer]:
-        assert case.objective is not None
-        values = block_diagonal(case)
-        operator.charge(PASS)
-        known = torch.zeros_like(values) if not case.objective.couples_pixels else torch.full_like(values, inf)
-        return [Answer("all", values, known, values - known, values + known)]
-
-    yield Method("diagonal", "own blocks, no coupling", "one pass", gaussian_blocks, applies=_is_scene)
+    yield Method("diagonal", "own blocks, no coupling", "one pass", _diagonal_of_blocks, applies=is_scene)
 
 
-def block_diagonal(case: Case) -> Float64[Tensor, " n"]:
-    """The diagonal of the own blocks, less the radial directions of the quaternions."""
-    assert case.objective is not None
-    parts = case.objective.block_diagonal().diagonals_across(case.objective.active.quats)
-    result = torch.empty(case.operator.dim, dtype=torch.float64)
+def _diagonal(_: Case, operator: MeteredOperator, seed: int, probes: int, method: DiagonalMethod) -> list[Answer]:
+    found = estimate_diagonal(operator, generator(seed), probes, method=method)
+    half = float(student.ppf((1 + CONFIDENCE) / 2, found.samples.shape[1] - 1)) * found.standard_errors
+    return [Answer("all", found.values, found.standard_errors, found.values - half, found.values + half)]
+
+
+def _diagonal_of_blocks(case: Case, operator: MeteredOperator, _: int) -> list[Answer]:
+    """The diagonal of every Gaussian's block, less the radial directions of the quaternions; exact without SSIM."""
+    parts = case.scene.block_diagonal().diagonals_across(case.scene.active.quats)
+    values = torch.empty(case.operator.dim, dtype=torch.float64)
     for name, rows in case.operator.blocks.items():
-        result[rows] = parts[name].reshape(-1)
-    return result
+        values[rows] = parts[name].reshape(-1)
+    operator.charge(PASS)
+    error = torch.full_like(values, inf if case.scene.couples_pixels else 0.0)
+    return [Answer("all", values, error, values - error, values + error)]

@@ -8,16 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from rich import box
-from rich.table import Table
 
-ASKED = {
-    ("splats", "traces"): 0.5,
-    ("splats", "ends"): 0.85,
-    ("checkpoint", "traces"): 0.5,
-    ("checkpoint", "ends"): 0.85,
-}
-MATRICES = 1.1  # of any quantity
+SCENES = {"traces": 0.5, "ends": 0.85}  # what the project promises of scenes and checkpoints, by quantity
+MATRICES = 1.1  # and of matrices, any quantity
 DRAWS = 200  # of the bootstrap
 LIMITS = (0.025, 0.975)  # of a 95% interval
 MEANS = ("error", "needs", "rival_needs", "ratio", "seconds_ratio")  # of scenes together
@@ -27,20 +20,16 @@ SETTING = ["case", "family", "quantity", "origin", "method", "settings"]
 
 def points(table: pd.DataFrame, floors: Mapping[str, float]) -> pd.DataFrame:
     """A line a setting: means over seeds and parts, root mean squares of errors."""
-    table = table.assign(
-        true_error=_squares(table, "true_error", floors), reported_error=table["reported_error"].pow(2)
-    )
+    table = table.assign(true_error=_squares(table, floors), reported_error=table["reported_error"].pow(2))
     columns = ["matvecs", "seconds", "true_error", "reported_error", "covered"]
     means = pd.DataFrame(table.groupby(SETTING, sort=False)[columns].mean()).reset_index()
     return means.assign(true_error=means["true_error"].pow(0.5), reported_error=means["reported_error"].pow(0.5))
 
 
-def _squares(table: pd.DataFrame, column: str, floors: Mapping[str, float]) -> np.ndarray:
-    """Squared errors, none below its case's round-off; what failed has an infinite one."""
-    floor = [
-        0.0 if quantity == "precision" else floors[case] for case, quantity in zip(table["case"], table["quantity"])
-    ]
-    return np.maximum(table[column].fillna(np.inf).to_numpy(float), floor) ** 2
+def _squares(table: pd.DataFrame, floors: Mapping[str, float]) -> np.ndarray:
+    """Squared true errors, none below its case's round-off; what failed has an infinite one."""
+    floor = table["case"].map(lambda case: floors[case]).where(table["quantity"] != "precision", 0.0)
+    return np.maximum(table["true_error"].fillna(np.inf).to_numpy(float), floor.to_numpy(float)) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +84,7 @@ def ratios(table: pd.DataFrame, floors: Mapping[str, float]) -> pd.DataFrame:
 
     Where there are several scenes, a line more for each quantity that they are asked for (`_together`).
     """
-    table = table.assign(square=_squares(table, "true_error", floors))
+    table = table.assign(square=_squares(table, floors))
     rng, lines, drawn = np.random.default_rng(0), [], {}
     places = table[["case", "family", "quantity"]].drop_duplicates().itertuples(index=False, name=None)
     for case, family, quantity in places:
@@ -136,7 +125,7 @@ def _together(found: Sequence[tuple[Mapping, np.ndarray]]) -> dict:
 
 def _asked(family: str, quantity: str) -> float:
     """What the ratio may be at most; nan: nothing is asked for."""
-    return MATRICES if family == "matrices" else ASKED.get((family, quantity), np.nan)
+    return MATRICES if family == "matrices" else SCENES.get(quantity, np.nan)
 
 
 def _compared(
@@ -177,18 +166,23 @@ def verdict(line: Mapping[str, object], asked: float) -> str:
     return "no" if low > asked and bound in ("", "≥") else "open"
 
 
-def ratio_table(found: pd.DataFrame, title: str) -> Table:
-    """For the terminal."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for heading in ("case", "quantity", "error", "H v", "best rival", "H v", "ratio", "asked", "holds"):
-        table.add_column(heading, justify="left" if heading in ("case", "quantity", "best rival", "holds") else "right")
-    styles = {"yes": "green", "no": "bold red", "open": "yellow", "": ""}
-    for row in found.to_dict("records"):
-        ratio = f"{row['bound']}{row['ratio']:.2f} ({row['low']:.2f}-{row['high']:.2f})"
-        asked = "" if np.isnan(row["asked"]) else f"{row['asked']:g}"
-        held = f"[{styles[row['holds']]}]{row['holds']}[/]" if row["holds"] else ""
-        needs, rival = f"{row['needs']:.0f}", f"{row['rival_needs']:.0f}"
-        table.add_row(
-            row["case"], row["quantity"], f"{row['error']:.1e}", needs, row["rival"], rival, ratio, asked, held
-        )
-    return table
+def ratio_table(found: pd.DataFrame) -> pd.DataFrame:
+    """The lines of `ratios` for the terminal."""
+    styles = {"yes": "green", "no": "bold red", "open": "yellow"}
+
+    def line(row: Mapping) -> dict:
+        return {
+            "case": row["case"],
+            "quantity": row["quantity"],
+            "error": row["error"],
+            "H v": round(row["needs"]),
+            "best rival": row["rival"],
+            "its H v": round(row["rival_needs"]),
+            "ratio": f"{row['bound']}{row['ratio']:.2f}",
+            "from": row["low"],
+            "to": row["high"],
+            "asked": row["asked"],
+            "holds": f"[{styles[row['holds']]}]{row['holds']}[/]" if row["holds"] else "",
+        }
+
+    return pd.DataFrame(map(line, found.to_dict("records")))

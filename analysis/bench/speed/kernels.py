@@ -1,223 +1,150 @@
-"""The compositing kernels by themselves, on random splats, beside a prototype of them where one is given.
+"""`landscape bench kernels`: the stages of compositing on the CPU (`passes`) by themselves, on random splats.
 
-A row is one stage as a view pays for it; arrays are allocated beforehand, and images are in each side's own layout:
-
-    binning               sort by depth, tile lists, order of the tiles
-    packing               parameters of the splats as the kernels read them
-    forward
-    slots                 numbering of the entries that are reached
-    backward + reduce     and the sum over each splat's entries
-    tangents K            packing of K tangents
-    J u K
-    tangent of backward K
-    reduce K              the sum over each splat's entries
-
-The last four are per tangent.  A gradient is the first five rows; H u is the last four.
+OUT/kernels.csv         a line a stage and size: milliseconds, per tangent; and sums of stages, `gradient` and `H u K`, each
+                        also without what is not compositing
+OUT/kernel_bounds.csv   products over gradients, from the same times
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
+from rich.console import Console
+from rich.progress import Progress
 
-from analysis.bench.speed.prototype import Prototype
-from analysis.bench.workloads import BACKGROUND, TANGENTS, Problem, Size, random_splats, splat_problem
+from analysis.bench.speed.passes import Calls, compositing_kernels, compositing_stages, tangent_stages
+from analysis.bench.tables import rich_table, write_table
+from analysis.bench.workloads import Size
 from analysis.console.timing import Timing, interleaved
-from splat.backend.cpu.planes import aligned
-from splat.backend.cpu.threads import over_range, over_tiles, thread_count
+from splat.backend.cpu.threads import thread_count
 from splat.model.settings import RenderSettings
-from splat.raster.cpu import binning, compositing, packing, tangents, tile
-from splat.raster.cpu.raster import Adjoint, Raster
+from splat.projection.dispatch import plain_gradient
+from splat.raster.cpu.raster import CpuRaster
 
-BOUNDS = (1.6, 1.1)  # of H u over a gradient, for each of TANGENTS
-LISTS = ("binning", "packing", "slots")
+BACKGROUND = (0.1, 0.2, 0.3)
+BOUNDS = {1: 1.6, 4: 1.1}  # at most of H u K per tangent over a gradient, by K: what the project promises
+NAMES = {"bin": "binning", "pack": "packing"}  # of stages, in the tables
 COMPOSITING = ("forward", "backward + reduce")
+Times = Mapping[str, Timing]
 
 
 @dataclass(frozen=True, eq=False)
-class Stages:
-    """What is timed, by row, and what the compositing rows leave, for a check that both sides compute the same."""
-
-    calls: dict[str, Callable[[], object]]
-    results: Callable[[], dict[str, np.ndarray]]
-    raster: Raster
-
-
-def own_stages(p: Problem) -> Stages:
-    """The stages of the project's kernels."""
-    settings, drawn = RenderSettings(), np.ones(len(p.splats), np.bool_)
-    size = p.size
-    raster = Raster(p.splats, p.depths, drawn, np.array(BACKGROUND), size.width, size.height, settings)
-    by_entries = raster.lists
-    planes = raster.pad(np.concatenate([p.cotangents, np.zeros_like(p.cotangents[:, :1])], axis=1))
-    adjoint = raster.backward(planes[0])
-    slot_start, splats = raster.slot_start, raster.splats
-    n = len(splats)
-    entries, scalars = int(slot_start[-1]), (raster.params, raster.lists, raster.frame, raster.pixels)
-    sums = aligned((entries * tile.SUMS,), p.splats.dtype)
-    cut = np.log2(settings.alpha_min)
-
-    def slots():
-        raster.lists, raster._slot_start = by_entries, None
-        return raster.slot_start
-
-    def backward():
-        over_tiles(compositing.backward, *scalars, adjoint.cotangent, sums)
-        over_range(n, packing.reduce_gradient, splats, slot_start, sums, adjoint.moments, adjoint.gradient)
-
-    calls: dict[str, Callable[[], object]] = {
-        "binning": lambda: binning.bin_splats(splats, p.depths, drawn, size.width, size.height, settings),
-        "packing": lambda: over_range(n, packing.pack_splats, splats, cut, np.inf, raster.params),
-        "forward": lambda: over_tiles(compositing.forward, raster.params, by_entries, raster.frame, raster.pixels),
-        "slots": slots,
-        "backward + reduce": backward,
-    }
-    results: dict[str, np.ndarray] = {}
-    for K in TANGENTS:
-        calls |= _own_tangent_stages(p, raster, adjoint, planes[1 : 1 + K], K, results)
-
-    def finished() -> dict[str, np.ndarray]:
-        return {"forward": raster.crop(raster.planes[:3]), "backward + reduce": adjoint.gradient, **results}
-
-    return Stages(calls, finished, raster)
-
-
-def _own_tangent_stages(
-    p: Problem, raster: Raster, adjoint: Adjoint, cotangents: np.ndarray, K: int, results: dict[str, np.ndarray]
-) -> dict[str, Callable[[], object]]:
-    splats, dtype, size, slot_start = raster.splats, raster.dtype, raster.frame.size, raster.slot_start
-    n, directions = len(splats), np.ascontiguousarray(p.directions[:, :K], np.float64)
-    packed = aligned((n * K * tile.TANGENTS,), dtype)
-    planes, transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
-    sums = aligned((int(slot_start[-1]) * K * tile.SUMS,), dtype)
-    primal, cotangents = (raster.lists, raster.frame, raster.pixels), np.ascontiguousarray(cotangents).reshape(-1)
-    product = np.empty_like(directions)
-    results[f"J u {K}"] = raster.crop(planes.reshape(K, 4, *raster.plane)[:, :3])
-    results[f"reduce {K}"] = product
-    return {
-        f"tangents {K}": lambda: over_range(n, packing.pack_tangents, splats, directions, packed),
-        f"J u {K}": lambda: over_tiles(
-            tangents.tangent, raster.params, packed, *primal, planes, transmittances
-        ),
-        f"tangent of backward {K}": lambda: over_tiles(
-            tangents.curvature, raster.params, packed, *primal, adjoint.cotangent, transmittances, cotangents, sums
-        ),
-        f"reduce {K}": lambda: over_range(
-            n, packing.reduce_curvature, splats, directions, slot_start, sums, adjoint.moments, product
-        ),
-    }  # fmt: skip
-
-
-# --- comparison -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Row:
-    """A stage at a size: own and prototype's times (None without one), per tangent, and how far the results are apart."""
+class Problem:
+    """Random splats (n, 9) with their depths, cotangents (1 + K, 3, h, w) and directions (n, K, 9), K the most tangents."""
 
     size: Size
-    stage: str
-    own: Timing
-    prototype: Timing | None
-    difference: float | None
+    splats: np.ndarray
+    depths: np.ndarray
+    cotangents: np.ndarray
+    directions: np.ndarray
 
 
-def measure(size: Size, prototype: Prototype | None, repetitions: int, on_round: Callable[[], None]) -> list[Row]:
-    """Time every stage at a size, own and prototype's in turns."""
-    rng = np.random.default_rng(0)
-    splats, depths = prototype.splats(*_numbers(size)) if prototype else random_splats(size, rng)
-    p = splat_problem(size, splats, depths, rng)
-    own = own_stages(p)
-    calls, theirs = {("own", stage): call for stage, call in own.calls.items()}, None
-    if prototype:
-        their_calls, theirs = prototype.stages(p)
-        calls |= {("prototype", stage): call for stage, call in their_calls.items()}
-    ordered = {key: calls[key] for stage in own.calls for key in (("own", stage), ("prototype", stage)) if key in calls}
-    times = interleaved(ordered, repetitions, on_round)
-    apart = _differences(own.results(), theirs()) if theirs else {}
-    rows = []
-    for stage in own.calls:
-        K = _tangents_of(stage)
-        other = times[("prototype", stage)] / K if prototype else None
-        rows.append(Row(size, stage, times[("own", stage)] / K, other, apart.get(stage)))
-    return rows
+def random_splats(size: Size, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Splats (n, 9) and depths: spread evenly, the smaller standard deviation about 2.5 px, three in a hundred large."""
+    n = size.count
+    means = rng.uniform(-5, [size.width + 5, size.height + 5], (n, 2))
+    large = rng.random(n) < 0.03
+    minor = np.where(large, rng.uniform(15, 30, n), rng.lognormal(np.log(2.5), 0.5, n))
+    major = np.clip(minor * rng.lognormal(0, 0.5, n), np.where(large, 8, 0.3), np.where(large, 35, 40))
+    minor, angle = np.clip(minor, 0.3, 40), rng.uniform(0, np.pi, n)
+    cos, sin = np.cos(angle), np.sin(angle)
+    xx, yy = cos**2 * minor**2 + sin**2 * major**2 + 0.3, sin**2 * minor**2 + cos**2 * major**2 + 0.3
+    xy = cos * sin * (minor**2 - major**2)
+    conics = np.stack([yy, -xy, xx], axis=1) / (xx * yy - xy**2)[:, None]
+    rest = [rng.uniform(0.05, 0.95, (n, 1)), rng.random((n, 3))]
+    return np.concatenate([means, conics, *rest], axis=1).astype(np.float32), rng.uniform(1, 10, n).astype(np.float32)
 
 
-def _numbers(size: Size) -> tuple[int, int, int]:
-    return size.count, size.width, size.height
+def splat_problem(size: Size, rng: np.random.Generator) -> Problem:
+    """Random splats, cotangents and directions; a direction's parts have the scale of what they move."""
+    splats, depths = random_splats(size, rng)
+    K = max(BOUNDS)
+    cotangents = rng.standard_normal((1 + K, 3, size.height, size.width), np.float32)
+    scales = np.array([1, 1, 0.01, 0.01, 0.01, 0.1, 0.3, 0.3, 0.3], np.float32)
+    return Problem(size, splats, depths, cotangents, scales * rng.standard_normal((len(splats), K, 9), np.float32))
 
 
-def _tangents_of(stage: str) -> int:
+def stages_of(p: Problem) -> tuple[Calls, Callable[[], dict[str, np.ndarray]], CpuRaster]:
+    """Every stage by its name, what they leave in plain coordinates, and the raster that they work on."""
+    settings, size = RenderSettings(), (p.size.width, p.size.height)
+    splats, depths, drawn = (
+        torch.from_numpy(p.splats),
+        torch.from_numpy(p.depths),
+        torch.ones(len(p.splats), dtype=torch.bool),
+    )
+    raster = CpuRaster(splats, depths, drawn, torch.tensor(BACKGROUND), *size, settings)
+    cotangents = torch.from_numpy(p.cotangents)
+    planes = raster.pad(torch.cat([cotangents, torch.zeros_like(cotangents[:, :1])], dim=1))
+    adjoint = raster.backward(planes[0])
+    first = compositing_stages((splats, depths, drawn), raster, adjoint)
+    calls = {NAMES.get(name, name): call for name, call in first.items()}
+    calls["backward + reduce"] = backward = compositing_kernels(raster, adjoint)
+    left = {}
+    for K in BOUNDS:
+        more, left[K] = tangent_stages(raster, adjoint, torch.from_numpy(p.directions[:, :K]), planes[1 : 1 + K])
+        calls |= more
+
+    def results() -> dict[str, np.ndarray]:
+        found = {"backward + reduce": plain_gradient(raster.splats, torch.from_numpy(backward())).numpy()}
+        for K, arrays in left.items():
+            found[f"J u {K}"], found[f"reduce {K}"] = arrays()
+        return found
+
+    return calls, results, raster
+
+
+def measure(size: Size, repetitions: int, on_round: Callable[[], None]) -> dict[str, Timing]:
+    """The times of every stage at a size, per tangent, and those of a gradient and of products, summed from them."""
+    calls, _, _ = stages_of(splat_problem(size, np.random.default_rng(0)))
+    times = {stage: time / _tangents(stage) for stage, time in interleaved(calls, repetitions, on_round).items()}
+    sums = {"gradient": ("binning", "packing", "slots", *COMPOSITING), "gradient, compositing": COMPOSITING}
+    for K in BOUNDS:
+        kernels = (f"J u {K}", f"tangent of backward {K}")
+        sums |= {f"H u {K}": (*kernels, f"reduce {K}"), f"H u {K}, compositing": kernels}
+    return times | {name: reduce(add, (times[stage] for stage in stages)) for name, stages in sums.items()}
+
+
+def _tangents(stage: str) -> int:
     last = stage.rsplit(" ", 1)[-1]
     return int(last) if last.isdigit() else 1
 
 
-def _differences(own: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, float]:
-    """|own - theirs| / |theirs|, root mean square."""
-    return {name: float(np.linalg.norm(own[name] - x) / np.linalg.norm(x)) for name, x in theirs.items()}
+def run_kernels(sizes: Sequence[Size], repetitions: int, out: Path, console: Console) -> None:
+    """Time the stages at every size; print and write the tables."""
+    lines, ratios = [], []
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        for size in sizes:
+            bar = progress.add_task(f"{size} (first compiling)", total=repetitions)
+            times = measure(size, repetitions, lambda bar=bar: progress.advance(bar))
+            about = {"gaussians": size.count, "width": size.width, "height": size.height, "threads": thread_count()}
+            lines += [
+                {**about, "stage": stage, "minimum_ms": 1e3 * time.minimum, "median_ms": 1e3 * time.median}
+                for stage, time in times.items()
+            ]
+            ratios += [{"size": str(size), **line} for line in products_over_gradients(times)]
+            progress.remove_task(bar)
+    table, bounds = pd.DataFrame(lines), pd.DataFrame(ratios)
+    for size in sizes:
+        shown = table.query("gaussians == @size.count and width == @size.width and height == @size.height")
+        console.print(rich_table(shown.filter(["stage", "minimum_ms", "median_ms"]), f"{size}: ms, per tangent"))
+    console.print(rich_table(bounds, "products over gradients"))
+    write_table(table, out / "kernels.csv", console)
+    write_table(bounds, out / "kernel_bounds.csv", console)
 
 
-def with_totals(rows: list[Row]) -> list[Row]:
-    """The rows of a size and their sums: a gradient with and without the lists, H u with and without the stages around it."""
-    of = {row.stage: row for row in rows}
-    sums = {"gradient": (*LISTS, *COMPOSITING), "gradient, compositing": COMPOSITING}
-    for K in TANGENTS:
-        kernels = (f"J u {K}", f"tangent of backward {K}")
-        sums |= {f"H u {K}": (f"tangents {K}", *kernels, f"reduce {K}"), f"H u {K}, compositing": kernels}
-    return [*rows, *(_total(name, [of[stage] for stage in stages]) for name, stages in sums.items())]
-
-
-def _total(name: str, rows: list[Row]) -> Row:
-    own, theirs = rows[0].own, rows[0].prototype
-    for row in rows[1:]:
-        own = own + row.own
-        theirs = theirs + row.prototype if theirs and row.prototype else None
-    return Row(rows[0].size, name, own, theirs, None)
-
-
-def table(rows: list[Row]) -> pd.DataFrame:
-    """One line a row: milliseconds (minimum, median) of both sides, and own over prototype."""
-    lines = []
-    for row in rows:
-        line = {
-            "gaussians": row.size.count,
-            "width": row.size.width,
-            "height": row.size.height,
-            "threads": thread_count(),
-            "stage": row.stage,
-            "minimum_ms": 1e3 * row.own.minimum,
-            "median_ms": 1e3 * row.own.median,
-        }
-        if row.prototype:
-            line |= {
-                "prototype_minimum_ms": 1e3 * row.prototype.minimum,
-                "prototype_median_ms": 1e3 * row.prototype.median,
-                "ratio_of_minima": row.own.minimum / row.prototype.minimum,
-                "ratio_of_medians": row.own.median / row.prototype.median,
-                "difference": row.difference,
-            }
-        lines.append(line)
-    return pd.DataFrame(lines)
-
-
-def products_over_gradients(rows: list[Row]) -> pd.DataFrame:
+def products_over_gradients(times: Times) -> list[dict]:
     """H u per tangent over a gradient, each as a whole and by its compositing alone, with what is asked of it."""
     lines = []
-    for size in dict.fromkeys(row.size for row in rows):
-        of = {row.stage: row.own for row in rows if row.size == size}
-        for K, bound in zip(TANGENTS, BOUNDS, strict=True):
-            for what in ("", ", compositing"):
-                product, gradient = of[f"H u {K}{what}"], of[f"gradient{what}"]
-                ratio = product.minimum / gradient.minimum
-                lines.append(
-                    {
-                        "size": str(size),
-                        "ratio": f"H u {K}{what} / gradient{what}",
-                        "of_minima": ratio,
-                        "of_medians": product.median / gradient.median,
-                        "at_most": bound,
-                        "holds": ratio <= bound,
-                    }
-                )
-    return pd.DataFrame(lines)
+    for K, bound in BOUNDS.items():
+        for part in ("", ", compositing"):
+            product, gradient = times[f"H u {K}{part}"], times[f"gradient{part}"]
+            ratio = product.minimum / gradient.minimum
+            medians = {"of_minima": ratio, "of_medians": product.median / gradient.median}
+            name = f"H u {K}{part} / gradient{part}"
+            lines.append({"ratio": name, **medians, "at_most": bound, "holds": ratio <= bound})
+    return lines

@@ -1,77 +1,107 @@
-"""The stages of compositing that a bench times one by one, in the kernels' own parts, on the CPU and on a GPU.
+"""The stages of compositing that a bench times one by one, on the CPU and on a GPU.
 
-    bin, pack, forward, slots, backward + reduce
+    bin                   sort by depth, tile lists, order of the tiles
+    pack                  parameters of the splats as the kernels read them
+    forward
+    slots                 numbering of the (splat, tile) intersections that some pixel reaches
+    backward + reduce     and the sum over each splat's intersections
+    J u K                 the image's change along K tangents
+    tangent of backward K
+    reduce K              the sum over each splat's intersections
 
-pairs: the (pixel, Gaussian) pairs that a pass evaluates: on the CPU every lane of every row of every entry that is reached, on
-a GPU every pixel of its tile.
+A gradient is the first five, a product with the Hessian the last three.  Arrays are allocated beforehand.
+
+pairs: the (pixel, Gaussian) pairs that a pass evaluates: on the CPU every lane of every row of every intersection that is
+reached, on a GPU every pixel of its tile.
 """
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from analysis.bench.workloads import Workload
 from splat.backend.cpu.planes import aligned
 from splat.backend.cpu.threads import over_range, over_tiles
-from splat.backend.device import by_triton
-from splat.model.camera import Camera
-from splat.raster.cpu import binning, compositing, packing, tile
-from splat.raster.cpu.raster import Raster
+from splat.projection.dispatch import coefficients_of, plain_gradient
+from splat.raster.cpu import compositing, packing, tangents
+from splat.raster.cpu.raster import CpuAdjoint, CpuRaster
+from splat.raster.formulas import SPLAT
 
 Calls = dict[str, Callable[[], object]]
 
 
-def compositing_stages(
-    workload: Workload, camera: Camera, projected: tuple[Any, ...], raster: Any, adjoint: Any
-) -> Calls:
-    """The stages of a view by name.  projected: splats, depths and which are drawn; they leave `raster` as it was."""
-    make = _on_gpu if by_triton(workload.gaussians.flat) else _on_cpu
-    return make(workload, camera, projected, raster, adjoint)
+def compositing_stages(projected: tuple[Any, ...], raster: Any, adjoint: Any) -> Calls:
+    """The first five stages of a view by name.  projected: splats, depths, which are drawn; `raster` stays as it was."""
+    return {
+        "bin": lambda: raster.bin(*projected[1:]),
+        "pack": raster.pack,
+        "forward": raster.forward,
+        "slots": raster.number_accumulators,
+        "backward + reduce": lambda: raster.backward(adjoint.cotangent),
+    }
+
+
+def compositing_kernels(raster: CpuRaster, adjoint: CpuAdjoint) -> Callable[[], np.ndarray]:
+    """ "backward + reduce" of a CPU into arrays that are there already: a call that leaves and returns the moments (n, 9)."""
+    lists, splat_start = raster.reached
+    sums, moments = (
+        aligned((int(splat_start[-1]) * SPLAT,), raster.dtype),
+        np.empty((len(raster.splats), SPLAT), raster.dtype),
+    )
+    arguments = (raster.params, lists, raster.frame, raster.pixels, raster.flat(adjoint.cotangent), sums)
+
+    def backward() -> np.ndarray:
+        over_tiles(compositing.backward, *arguments)
+        over_range(len(moments), packing.reduce_sums, splat_start, sums, moments)
+        return moments
+
+    return backward
+
+
+def tangent_stages(
+    raster: CpuRaster, adjoint: CpuAdjoint, directions: Float[Tensor, "n k 9"], cotangents: Float[Tensor, "k 4 H W"]
+) -> tuple[Calls, Callable[[], tuple[np.ndarray, np.ndarray]]]:
+    """The last three stages on a CPU, and what they leave, in plain coordinates: the images' changes (k, 3, h, w) and the
+    products (n, k, 9).
+
+    directions: plain tangents of the splats; cotangents: tangents of the adjoint's cotangent.
+    """
+    dtype, size, (lists, splat_start), K = raster.dtype, raster.frame.size, raster.reached, directions.shape[1]
+    packed = torch.stack(
+        [coefficients_of(raster.splats, each.contiguous()) for each in directions.double().unbind(1)], dim=1
+    )
+    packed = np.ascontiguousarray(packed.numpy(), dtype)
+    planes, transmittances = aligned((K * 4 * size,), dtype), aligned((K * size,), dtype)
+    sums, product = aligned((int(splat_start[-1]) * K * SPLAT,), dtype), np.empty_like(packed)
+    primal, moments = (raster.params, packed.reshape(-1), lists, raster.frame, raster.pixels), adjoint.moments.numpy()
+    v_planes, dv_planes = raster.flat(adjoint.cotangent), raster.flat(cotangents)
+    calls: Calls = {
+        f"J u {K}": lambda: over_tiles(tangents.tangent, *primal, planes, transmittances),
+        f"tangent of backward {K}": lambda: over_tiles(
+            tangents.backward_tangent, *primal, v_planes, transmittances, dv_planes, sums
+        ),
+        f"reduce {K}": lambda: over_range(
+            len(packed), packing.reduce_tangents, packed, splat_start, sums, moments, product
+        ),
+    }
+
+    def left() -> tuple[np.ndarray, np.ndarray]:
+        plain = [plain_gradient(raster.splats, each.contiguous()) for each in torch.from_numpy(product).unbind(1)]
+        images = raster.crop(torch.from_numpy(planes).view(K, 4, *raster.plane)[:, :3])
+        return images.numpy(), torch.stack(plain, dim=1).numpy()
+
+    return calls, left
 
 
 def pairs_of(raster: Any) -> int:
-    if not isinstance(raster, Raster):
+    """(pixel, Gaussian) pairs that a pass evaluates."""
+    if not isinstance(raster, CpuRaster):
         from splat.raster.cuda.binning import HEIGHT, WIDTH
 
-        return raster.entries_reached * WIDTH * HEIGHT
-    _ = raster.slot_start  # drops the entries that are not reached
-    rows = ((raster.lists.rows >> 8) & 255) - (raster.lists.rows & 255) + 1
+        return raster.intersections_reached * WIDTH * HEIGHT
+    packed = raster.reached[0].rows
+    rows = ((packed >> 8) & 255) - (packed & 255) + 1
     return int(rows.sum()) * raster.plane[1] // raster.frame.columns
-
-
-def _on_cpu(workload: Workload, camera: Camera, projected: tuple[Any, ...], raster: Raster, adjoint: Any) -> Calls:
-    splats, depths, drawn = (tensor.numpy() for tensor in projected)
-    where, n = (camera.width, camera.height, workload.settings), len(splats)
-    lists = binning.bin_splats(splats, depths, drawn, *where)  # also the entries that `slots` drops
-    sums = aligned((int(raster.slot_start[-1]) * tile.SUMS,), raster.dtype)
-    drawing = (raster.params, raster.lists, raster.frame, raster.pixels)
-
-    def slots() -> np.ndarray:
-        raster.lists, raster._slot_start = lists, None
-        return raster.slot_start
-
-    def backward() -> None:
-        over_tiles(compositing.backward, *drawing, adjoint.cotangent, sums)
-        over_range(n, packing.reduce_gradient, splats, raster.slot_start, sums, adjoint.moments, adjoint.gradient)
-
-    return {
-        "bin": lambda: binning.bin_splats(splats, depths, drawn, *where),
-        "pack": lambda: over_range(n, packing.pack_splats, splats, -8.0, np.inf, np.empty_like(raster.params)),
-        "forward": lambda: over_tiles(compositing.forward, raster.params, lists, raster.frame, raster.pixels),
-        "slots": slots,
-        "backward + reduce": backward,
-    }
-
-
-def _on_gpu(workload: Workload, camera: Camera, projected: tuple[Any, ...], raster: Any, adjoint: Any) -> Calls:
-    from splat.raster.cuda.binning import bin_splats
-
-    splats, depths, drawn = projected
-    return {
-        "bin": lambda: bin_splats(splats, depths, drawn, camera.width, camera.height, raster.frame),
-        "pack": raster.pack,
-        "forward": raster.forward,
-        "slots": raster.number_slots,
-        "backward + reduce": lambda: raster.backward(adjoint.cotangent),
-    }

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 import triton.language as tl
 
-from splat.backend.gpu.compile import fma, jit, launch
+from splat.backend.gpu.compile import jit, launch
 
 BLOCK, WARPS = 1024, 4  # numbers a program: eight a thread
 UNROLLED = 32  # steps between two looks at the loop's counter
@@ -23,7 +23,7 @@ def multiply_add(values, a, b, steps, BLOCK: tl.constexpr, UNROLLED: tl.constexp
     x = tl.load(at)
     for _turn in range(0, steps // UNROLLED):
         for _step in tl.static_range(UNROLLED):  # a name of its own: older versions of Triton take it for the outer one
-            x = fma(x, a, b)
+            x = tl.fma(x, a, b)
     tl.store(at, x)
 
 

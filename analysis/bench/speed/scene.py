@@ -36,8 +36,8 @@ from splat.backend.device import by_triton
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import LinearizedView
 from splat.losses.autograd import loss_against, view_loss
-from splat.model.settings import Sums
-from splat.projection.dispatch import projected, pulled
+from splat.model.settings import Accumulation
+from splat.projection.dispatch import plain_gradient, projected, projected_vjp
 from splat.projection.formulas import lens_of
 from splat.raster.dispatch import rasterize
 from splat.render.render import render
@@ -95,12 +95,12 @@ class ViewBench:
         return self._to_parameters(splats, drawn, adjoint)
 
     def _to_parameters(self, splats: torch.Tensor, drawn: torch.Tensor, adjoint: Any) -> torch.Tensor:
-        bar = torch.as_tensor(adjoint.gradient)
-        return pulled(self.workload.gaussians, self.lens, splats, drawn, bar)
+        bar = plain_gradient(splats, adjoint.moments)
+        return projected_vjp(self.workload.gaussians, self.lens, splats, drawn, bar)
 
-    def gradient_by_autograd(self, sums: Sums = "ordered") -> torch.Tensor:
+    def gradient_by_autograd(self, accumulation: Accumulation = "deterministic") -> torch.Tensor:
         """The same, as a step of a training makes it."""
-        w, settings = self.workload, replace(self.workload.settings, sums=sums)
+        w, settings = self.workload, replace(self.workload.settings, accumulation=accumulation)
         flat = self.like.clone().requires_grad_()
         image = render(w.gaussians.with_flat(flat), self.view.camera, self.background, settings).image
         return torch.autograd.grad(view_loss(image, self.loss), flat)[0]
@@ -108,9 +108,9 @@ class ViewBench:
     def stages(self) -> Calls:
         """The parts of a gradient and of a product with one vector, and compositing alone."""
         w, raster, adjoint = self.workload, self.raster, self.adjoint
-        passes = compositing_stages(w, self.view.camera, self.projected, raster, adjoint)
+        passes = compositing_stages(self.projected, raster, adjoint)
         held, (splats, _, drawn) = self.linearized, self.projected
-        directions = held._projection.jvp(self.vectors[1] if by_triton(self.like) else self.vectors[1].numpy())
+        directions = held._projection.jvp(self.vectors[1])
         tangent = raster.jvp(directions)
         curved = held._loss.hvp(tangent.planes)
         return {
@@ -121,7 +121,7 @@ class ViewBench:
             "compositing": lambda: (passes["forward"](), passes["backward + reduce"]()),
             "J u 1": lambda: raster.jvp(directions),
             "loss H v 1": lambda: held._loss.hvp(tangent.planes),
-            "tangent of backward 1": lambda: tangent.curvature(adjoint, curved),
+            "tangent of backward 1": lambda: tangent.backward_tangent(adjoint, curved),
         }
 
     def wholes(self) -> Calls:
@@ -159,7 +159,7 @@ class ViewBench:
     def bytes_of(self, name: str) -> int:
         """What a pass reads and writes."""
         an_entry, a_pixel = BYTES[name]
-        return an_entry * self.linearized.entries + a_pixel * self.workload.pixels
+        return an_entry * self.linearized.intersections + a_pixel * self.workload.pixels
 
     def workspace(self, K: int, meter: Meter) -> int:
         """Bytes that a product with K vectors allocates at most at a time, its result included."""
@@ -175,9 +175,7 @@ def _buffers(item: Any, found: dict[int, int], depth: int = 0) -> dict[int, int]
     """Address and bytes of every array that an object holds, in attributes, tuples, lists or dictionaries."""
     if isinstance(item, torch.Tensor):
         found[item.untyped_storage().data_ptr()] = item.untyped_storage().nbytes()
-    elif isinstance(item, np.ndarray):
-        while isinstance(item.base, np.ndarray):
-            item = item.base
+    elif isinstance(item, np.ndarray):  # a tensor over the same memory begins where the array does
         found[item.ctypes.data] = max(item.nbytes, found.get(item.ctypes.data, 0))
     elif depth < 6:
         inner = item.values() if isinstance(item, dict) else item if isinstance(item, tuple | list) else None

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import ATTRIBUTES, Gaussians
 from splat.model.settings import RenderSettings
@@ -124,7 +125,7 @@ def _case(
         if steady(gaussians, camera, settings):
             break
     else:
-        raise ValueError(f"expected a scene without a pixel at a threshold for {name!r}, got none in {ATTEMPTS} seeds")
+        raise InputError(f"expected a scene without a pixel at a threshold for {name!r}, got none in {ATTEMPTS} seeds")
     size = (3, camera.height, camera.width)
     picture = torch.rand(size, generator=generator) if target is None else torch.full(size, target)
     return Case(name, gaussians, camera, settings, picture, dense=n < 100 and camera.width * camera.height < 1000)

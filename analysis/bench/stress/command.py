@@ -24,20 +24,19 @@ is compared with the float64 kernels.
 """
 
 from dataclasses import dataclass
-from math import isnan, nan, sqrt
+from math import nan, sqrt
 
 import pandas as pd
 import torch
 from jaxtyping import Float64
-from rich import box
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch import Tensor
 
+from analysis.bench.options import BenchOptions
 from analysis.bench.stress.cases import BACKGROUND, Case, Refusal, cases, refusals
 from analysis.bench.stress.condition import Condition, cancellation, specified
-from analysis.console.options import BenchOptions
+from analysis.bench.tables import rich_table, write_table
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from splat.backend.cpu.simd import EXP2_ERROR
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS
@@ -46,12 +45,12 @@ from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
 from splat.losses.reference import LossSettings
 from splat.scenes.view import View
-from splat.training.checkpoint import write_atomically
 
 # L2: in autograd's derivative of the others terms of 1 / eps^2 cancel, and the specification would lose their digits
 WITH_SSIM, PIXELS_ALONE = LossSettings("l2"), LossSettings("l2", ssim_weight=0.0)
 SEED = 0
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
+GOOD = ("inside", "refused")  # verdicts
 
 
 @dataclass(frozen=True)
@@ -70,12 +69,7 @@ class Finding:
 
     @property
     def holds(self) -> bool:
-        return self.verdict in ("inside", "refused")
-
-    @property
-    def share(self) -> float:
-        """How much of the bound is used."""
-        return self.error / self.bound if self.bound > 0 else 0.0
+        return self.verdict in GOOD
 
 
 # --- the kernels ------------------------------------------------------------------------------------------------------
@@ -128,14 +122,11 @@ class Study:
         self.point, self.blocks = exact.active, exact.blocks
         generator = torch.Generator().manual_seed(seed)
         signs = torch.randint(0, 2, (self.point.flat.numel(), 1), generator=generator).double() * 2 - 1
-        masked = [torch.zeros_like(signs).index_copy(0, rows, signs[rows]) for rows in self._rows().values()]
-        self.U = torch.cat([signs, *masked], dim=1)
-        self.measured_at = self.point
-        if case.stand_in is not None:
-            self.measured_at = case.stand_in.select(exact.mask)
-
-    def _rows(self) -> dict[str, Tensor]:
-        return {name: torch.arange(rows.start, rows.stop) for name, rows in self.blocks.items()}
+        masked = torch.zeros(len(signs), len(self.blocks), dtype=torch.float64)
+        for column, rows in enumerate(self.blocks.values()):
+            masked[rows, column] = signs[rows, 0]
+        self.U = torch.cat([signs, masked], dim=1)
+        self.measured_at = self.point if case.stand_in is None else case.stand_in.select(exact.mask)
 
     @property
     def compared(self) -> list[str]:
@@ -265,30 +256,17 @@ def run_stress(options: BenchOptions) -> int:
     findings += [refused(refusal) for refusal in refusals(SEED)]
     table = pd.DataFrame(vars(finding) for finding in findings)
     options.out.mkdir(parents=True, exist_ok=True)
-    path = options.out / "stress.csv"
-    write_atomically(path, table.to_csv(index=False).encode())
-    console.print(worst_table(findings))
+    console.print(rich_table(worst(table), "nearest to its bound"))
     missed = [finding for finding in findings if not finding.holds]
-    console.print(
-        f"{len(findings)} comparisons, {len(missed)} outside their bounds; {path}", soft_wrap=True, highlight=False
-    )
+    console.print(f"{len(findings)} comparisons, {len(missed)} outside their bounds", soft_wrap=True, highlight=False)
+    write_table(table, options.out / "stress.csv", console)
     return 1 if missed else 0
 
 
-def worst_table(findings: list[Finding]) -> Table:
+def worst(table: pd.DataFrame) -> pd.DataFrame:
     """A line a case and precision: the quantity nearest to its bound; and every one that missed it."""
-    table = Table(title="nearest to its bound", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for heading in ("case", "quantity", "precision", "error", "bound", "truth", "verdict"):
-        table.add_column(heading, justify="right" if heading in ("error", "bound", "truth") else "left")
-    worst: dict[tuple[str, str], Finding] = {}
-    for finding in findings:
-        key = finding.case, finding.precision
-        if key not in worst or finding.share > worst[key].share:
-            worst[key] = finding
-    for finding in findings:
-        if finding is worst[finding.case, finding.precision] or not finding.holds:
-            numbers = ("" if isnan(x) else f"{x:.1e}" for x in (finding.error, finding.bound, finding.size))
-            what = f"{finding.quantity} {finding.attribute}".strip()
-            verdict = finding.verdict if finding.holds else f"[bold red]{finding.verdict}[/]"
-            table.add_row(finding.case, what, finding.precision, *numbers, verdict)
-    return table
+    share = (table["error"] / table["bound"]).fillna(0.0)
+    nearest = share.groupby([table["case"], table["precision"]]).transform("idxmax") == table.index
+    what = (table["quantity"] + " " + table["attribute"]).str.strip()
+    shown = pd.DataFrame(table.assign(quantity=what, truth=table["size"])[nearest | ~table["verdict"].isin(GOOD)])
+    return shown.filter(["case", "quantity", "precision", "error", "bound", "truth", "verdict"])

@@ -28,14 +28,15 @@ from rich.console import Console
 
 from analysis.console.drawing import module_environment
 from analysis.console.interruption import interruption
-from analysis.console.options import SweepOptions
 from analysis.records.provenance import usable_cores
-from analysis.records.records import FILE, read_record
+from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS
+from analysis.runs.options import SweepOptions
 from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import PROBE, of_other_threads, summarize, tables, unfinished, write_results
 from analysis.train.command import planned, resumed
+from landscape.errors import InputError
 
 CELL_FAILED = 1
 LOCK = ".lock"
@@ -46,7 +47,7 @@ POLL = 0.5  # seconds
 def run_sweep(options: SweepOptions) -> int:
     """Run what is missing; returns the exit code."""
     if options.jobs < 1:
-        raise ValueError(f"expected at least 1 job, got {options.jobs}")
+        raise InputError(f"expected at least 1 job, got {options.jobs}")
     sweep = read_sweep(options.file, options.out, options.probe)
     to_do = {cell.name: missing(cell, sweep) for cell in sweep.cells}
     sweep.out.mkdir(parents=True, exist_ok=True)
@@ -65,7 +66,7 @@ def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
             return wanted
         remedy = f"remove {cell.out}, or choose another out"
         training = resumed(cell.out / CHECKPOINT, config, reference, remedy)
-    except (ValueError, FileNotFoundError) as error:
+    except (InputError, FileNotFoundError) as error:
         raise type(error)(f"{sweep.file}, {cell.name}: {error}") from None
     if training.step < config.iterations or not (cell.out / METRICS).is_file():
         return wanted
@@ -73,12 +74,11 @@ def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
 
 
 def _probed(cell: Cell, sweep: Sweep) -> bool:
-    if not (cell.out / PROBE / FILE).is_file():
+    if not (cell.out / PROBE / ProbeRecord.FILE).is_file():
         return False
-    data = read_record(cell.out / PROBE).data
-    return data["provenance"].get("iteration") == cell.training.iterations and (
-        "split_control" in data or not sweep.split_control
-    )
+    data = read_record(cell.out / PROBE, ProbeRecord).data
+    whole = bool(data.split_control) or not sweep.split_control
+    return data.provenance.iteration == cell.training.iterations and whole
 
 
 @contextmanager
@@ -88,7 +88,7 @@ def locked(out: Path) -> Iterator[int]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(
+            raise InputError(
                 f"expected no other sweep at work in {out}, got one, or a command that it left behind; wait until it ends"
             ) from None
         yield file.fileno()

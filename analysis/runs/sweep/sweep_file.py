@@ -30,8 +30,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from analysis.console.options import ProbeOptions, TrainOptions
 from analysis.console.overrides import leaves, read_value
+from analysis.probe.options import ProbeOptions
+from analysis.train.options import TrainOptions
+from landscape.errors import InputError
 
 FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
@@ -93,11 +95,11 @@ def read_sweep(file: Path, out: Path | None = None, probe: bool = False) -> Swee
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"expected a sweep in TOML in {file}, got a file that is none: {error}") from None
+        raise InputError(f"expected a sweep in TOML in {file}, got a file that is none: {error}") from None
     try:
         return _sweep(content, file, out, probe)
     except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
+        raise InputError(f"{file}: {error}") from None
 
 
 def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -> Sweep:
@@ -105,9 +107,9 @@ def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -
     top = _values(content, TOP | TRAINING, "", file.parent)
     seeds = top.pop("seeds", (0,))
     if not seeds or len(set(seeds)) < len(seeds):
-        raise ValueError(f"expected different seeds, at least one, got seeds = {list(seeds)}")
+        raise InputError(f"expected different seeds, at least one, got seeds = {list(seeds)}")
     if (folder := out or top.pop("out", None)) is None:
-        raise ValueError(
+        raise InputError(
             'expected the folder of the results, as in out = "sweeps/fern", got no out; add it or give --out'
         )
     own = {name: top.pop(name) for name in TOP if name in top and name not in ("out", "seeds")}
@@ -136,12 +138,12 @@ def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -
 def _tables(found: Any, name: str) -> dict[str, dict[str, Any]]:
     """The tables [name.X], at least one, each X fit for a folder."""
     if not isinstance(found, dict) or not found:
-        raise ValueError(f"expected at least one table [{name}.NAME], got {'none' if not found else repr(found)}")
+        raise InputError(f"expected at least one table [{name}.NAME], got {'none' if not found else repr(found)}")
     for key, table in found.items():
         if not isinstance(table, dict):
-            raise ValueError(f"expected a table [{name}.{key}], got {key} = {table!r}")
+            raise InputError(f"expected a table [{name}.{key}], got {key} = {table!r}")
         if not FOLDER_NAME.fullmatch(key):
-            raise ValueError(
+            raise InputError(
                 f"expected a name of letters, digits, - _ + . or blanks, as it names a folder, got {key!r}"
             )
     return found
@@ -150,7 +152,7 @@ def _tables(found: Any, name: str) -> dict[str, dict[str, Any]]:
 def _scene(table: Mapping[str, Any], name: str, file: Path) -> dict[str, Any]:
     values = _values(table, SCENE | TRAINING, f"scenes.{name}.", file.parent)
     if "path" not in values:
-        raise ValueError(f"expected the folder of the scene as scenes.{name}.path, got none")
+        raise InputError(f"expected the folder of the scene as scenes.{name}.path, got none")
     return {"scene": values.pop("path"), **values}
 
 
@@ -158,7 +160,7 @@ def _method(table: Mapping[str, Any], name: str, file: Path) -> dict[str, Any]:
     where = f"methods.{name}."
     changes = table.get("set", {})
     if not isinstance(changes, dict):
-        raise ValueError(f"expected a table {where}set of settings, as in set = {{ gamma = 0.5 }}, got {changes!r}")
+        raise InputError(f"expected a table {where}set of settings, as in set = {{ gamma = 0.5 }}, got {changes!r}")
     rest = {key: value for key, value in table.items() if key != "set"}
     values = _values(rest, METHOD | TRAINING, where, file.parent)
     texts = tuple(f"{key}={_text(value)}" for key, value in leaves(changes).items())
@@ -170,7 +172,7 @@ def _values(table: Mapping[str, Any], hints: Mapping[str, Any], where: str, fold
     values = {}
     for key, value in table.items():
         if key not in hints:
-            raise ValueError(f"expected a key among {', '.join(hints)}, got {where}{key}")
+            raise InputError(f"expected a key among {', '.join(hints)}, got {where}{key}")
         read = read_value(value, hints[key], where + key)
         values[key] = folder / read if isinstance(read, Path) else read
     return values

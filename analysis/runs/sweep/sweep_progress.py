@@ -17,8 +17,8 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Column
 
 from analysis.probe.measurement import ProbeSettings
-from analysis.train.training_time import TrainingTime
 from analysis.runs.sweep.sweep_file import Cell, Sweep
+from analysis.train.training_time import TrainingTime
 
 Stage = Literal["train", "probe"]
 

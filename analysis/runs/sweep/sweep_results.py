@@ -17,15 +17,16 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from msgspec import structs
 from rich import box
 from rich.table import Table
 
-from analysis.records.family_table import INDICES
-from analysis.records.quantities import PLACES, SCORES, quantity
-from analysis.records.records import read_record
-from analysis.records.run_files import read_scores
-from analysis.runs.sweep.sweep_file import Cell, Sweep
 from analysis.records.findings import attribute_name, of_budgets
+from analysis.records.quantities import PLACES, SCORES, quantity
+from analysis.records.records import ProbeRecord, read_record
+from analysis.records.run_files import Clock, ViewScores, read_scores
+from analysis.records.schema import INDICES, Effect, Index
+from analysis.runs.sweep.sweep_file import Cell, Sweep
 from splat.training.checkpoint import write_atomically
 
 RESULTS, SUMMARY, PROBE = "results.csv", "summary.csv", "probe"
@@ -90,57 +91,52 @@ def summarize(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _metrics(run: Path) -> dict[str, float]:
-    metrics = read_scores(run)
-    scores = {
-        f"{prefix}{key}": _scores(metrics.get(part))[key]
-        for part, prefix in (("test", ""), ("train", "train_"))
-        for key in ("psnr", "ssim", "lpips")
+    found = read_scores(run)
+    row: dict[str, float] = {}
+    for part, prefix in ((found.test, ""), (found.train, "train_")):
+        row |= {f"{prefix}{key}": _number(value) for key, value in structs.asdict(part or ViewScores()).items()}
+    clock = found.seconds or Clock()
+    seconds = {
+        "wall_seconds": _number(clock.wall),
+        "cpu_seconds": _number(clock.cpu),
+        "threads": clock.threads or math.nan,
     }
-    seconds = metrics.get("seconds") or {}
-    return {
-        **scores,
-        "gaussians": metrics["gaussians"],
-        **{f"{clock}_seconds": seconds.get(clock, math.nan) for clock in ("wall", "cpu")},
-        "threads": seconds.get("threads") or math.nan,
-    }
+    return row | {"gaussians": found.gaussians} | seconds
 
 
-def _scores(part: Mapping[str, Any] | None) -> dict[str, float]:
-    """Of the held-out views, where there are any."""
-    part = part or {}
-    return {key: math.nan if part.get(key) is None else float(part[key]) for key in ("psnr", "ssim", "lpips")}
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def _probe(run: Path) -> dict[str, float | str | None]:
     """Traces, ends and indices of the run's record; nothing without one."""
     if not (run / PROBE).is_dir():
         return {}
-    data = read_record(run / PROBE).data
+    data = read_record(run / PROBE, ProbeRecord).data
     row: dict[str, float | str | None] = {}
-    for name, trace in data["traces"].items():
-        row |= {f"trace_{name}": trace["value"], f"trace_{name}_error": trace["standard_error"]}
-    for end in ("max", "min"):
-        pair = data["eigenvalues"][end]
-        row |= {f"lambda_{end}": pair["value"], f"lambda_{end}_error": pair["residual"]}
-    row |= {name: data["eigenvalues"][end].get("reason") or "" for name, end in REASONS.items()}
-    for name, index in data["anisotropy"].items():
-        row |= {name: _bounded(index), f"{name}_low": index["low"], f"{name}_high": index["high"]}
-    whole = [
-        e for e in data.get("split_control", {}).get("effects", []) if (e["operator"], e["block"]) == ("hessian", "all")
-    ]
-    return row | {f"{SPLIT}{effect['index']}": _bounded(effect) for effect in whole}
+    for name, trace in data.traces.items():
+        row |= {f"trace_{name}": trace.value, f"trace_{name}_error": trace.standard_error}
+    ends = {"max": data.eigenvalues.max, "min": data.eigenvalues.min}
+    for name, end in ends.items():
+        row |= {f"lambda_{name}": end.value, f"lambda_{name}_error": end.residual}
+    row |= {name: ends[end].reason or "" for name, end in REASONS.items()}
+    for name, index in data.anisotropy.items():
+        row |= {name: _bounded(index), f"{name}_low": index.low, f"{name}_high": index.high}
+    effects = data.split_control.effects if data.split_control else ()
+    whole = [effect for effect in effects if (effect.operator, effect.block) == ("hessian", "all")]
+    return row | {f"{SPLIT}{effect.index}": _bounded(effect) for effect in whole}
 
 
-def _bounded(index: Mapping[str, Any]) -> float | None:
+def _bounded(index: Index | Effect) -> float | None:
     """The value that a mean may be taken of: none where the number may be without bound."""
-    return None if index["low"] is None or index["high"] is None else index["value"]
+    return None if index.low is None or index.high is None else index.value
 
 
 def unfinished(rows: pd.DataFrame) -> list[str]:
     """Which ends of the spectrum may lie farther out than the means have them, with the cells."""
     cells: dict[str, list[str]] = {}
     for row in rows.reindex(columns=["scene", "method", "seed", *REASONS]).dropna().to_dict("records"):
-        for line in of_budgets({end: {"reason": row[name]} for name, end in REASONS.items()}):
+        for line in of_budgets({end: row[name] for name, end in REASONS.items()}):
             cells.setdefault(line.text, []).append(f"{row['scene']}/{row['method']}/{row['seed']}")
     return [f"{', '.join(names)}: {text}" for text, names in cells.items()]
 

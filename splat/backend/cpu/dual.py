@@ -9,7 +9,7 @@ duals, its Jacobian; applied to the adjoint of a function, its Hessian.  Branche
     dual(x, dx)         value_of(x)         tangent_of(x)        value_of takes floats too
     variable(a, x, i)   x, whose derivative is 1 in direction i and 0 in the others; a: an array of the tangents' dtype
     sqrt(x), exp(x)     of floats and duals
-    select(c, x, y)     x where c holds, else y, of floats and duals: for formulas that other compilers take, too (`traced.py`)
+    select(c, x, y)     x where c holds, else y, of floats and duals: for formulas that Triton compiles, too
 """
 
 # pyright: reportOptionalCall=false

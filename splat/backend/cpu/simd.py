@@ -34,6 +34,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import lower_builtin, lower_cast, models, register_model
 
+from landscape.errors import InputError
 from splat.backend.cpu.kernel_cache import keep_kernels
 
 
@@ -46,7 +47,7 @@ def _register_bits() -> int:
     """Width of the machine's vector registers; LANDSCAPE_VECTOR_BITS overrides it (for tests of other widths)."""
     if chosen := os.environ.get("LANDSCAPE_VECTOR_BITS"):
         if chosen not in ("128", "256", "512"):
-            raise ValueError(f"expected LANDSCAPE_VECTOR_BITS to be 128, 256 or 512, got {chosen!r}")
+            raise InputError(f"expected LANDSCAPE_VECTOR_BITS to be 128, 256 or 512, got {chosen!r}")
         return int(chosen)
     features = llvmlite.binding.get_host_cpu_features()
     if features.get("avx512f") and features.get("avx512dq"):

@@ -1,11 +1,12 @@
-"""Products recorded on a GPU: what they launch, sent off again in one go by a CUDA graph.
+"""Products as CUDA graphs: the kernel launches of a product, recorded once and sent to the GPU again as one.
 
-A product launches some fourteen kernels a view, each of which takes the host longer than the device where a scene is small.
-A recording repeats them on other vectors: the same kernels in the same order and memory, so the same result to the last bit.
-What is recorded must not wait for the device or take numbers from the host, and whatever it reads has to stay where it is.
+A product launches some fourteen kernels a view, and where a scene is small each launch takes the host longer than the device.
+A graph repeats them on other vectors: the same kernels in the same order and memory, so the same result to the last bit.
+While it is recorded a function must not wait for the device or take numbers from the host, and what it reads must stay where
+it is.
 
-The recordings of one function share their memory, which is that of the one that takes most: what a replay leaves is copied out
-at once, and none reads what another has written.
+The graphs of one function share the memory of the largest: the result of a replay is copied out at once, and none reads what
+another has written.
 """
 
 import warnings
@@ -17,14 +18,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-CALLS = 3  # with as many vectors, before they are recorded: making a recording takes about as long as two
+CALLS = 3  # with the same number of vectors before they are recorded: to record takes about as long as two calls
 Product = Callable[[Tensor], Tensor]
 Capture = Callable[[Callable[[], Tensor]], tuple[Tensor, Callable[[], None]]]
 
 
 @dataclass(frozen=True, eq=False)
 class _Recording:
-    """argument, result: where replay() reads and writes."""
+    """A recorded call; replay() reads argument and writes result."""
 
     argument: Tensor
     result: Tensor
@@ -37,9 +38,9 @@ class _Recording:
 
 
 class CudaGraphCache:
-    """The recordings of one function of blocks of vectors (p, k): one for every k, made at the third call with that k.
+    """The graphs of one function of blocks of vectors (p, k): one for every k, made at call number CALLS with that k.
 
-    capture: runs a call without arguments and gives its result and a function that repeats its launches.  Where that fails, a
+    capture: runs a call without arguments, and returns its result and a function that repeats its launches.  Where it fails, a
     warning says so, and the function itself is called from then on.
     """
 
@@ -49,7 +50,7 @@ class CudaGraphCache:
         self._failed = False
 
     def __call__(self, function: Product, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-        """function(V).  It is the same at every call; not kept, lest it keeps its owner alive, whose memory is the GPU's."""
+        """function(V); the same function at every call.  It is not stored, which would keep its owner and GPU memory alive."""
         vectors = V.shape[1]
         self._calls[vectors] += 1
         if self._calls[vectors] >= CALLS and vectors not in self._made and not self._failed:
@@ -58,7 +59,7 @@ class CudaGraphCache:
 
     def _record(self, function: Product, V: Tensor) -> None:
         argument = V.clone(memory_format=torch.contiguous_format)
-        function(argument)  # compiles what is still to be compiled, which may not happen during a capture
+        function(argument)  # compiles its kernels, which must not happen during a capture
         try:
             result, replay = self._capture(lambda: function(argument))
         except RuntimeError as error:
@@ -69,7 +70,7 @@ class CudaGraphCache:
 
 
 class CudaGraphs:
-    """The `Capture` of a GPU."""
+    """A `Capture` by a GPU."""
 
     def __init__(self, device: torch.device):
         self._device = device
@@ -79,7 +80,7 @@ class CudaGraphs:
     def __call__(self, call: Callable[[], Tensor]) -> tuple[Tensor, Callable[[], None]]:
         graph = torch.cuda.CUDAGraph()
         pool = self._graphs[0].pool() if self._graphs else None
-        # other threads may go on allocating; and this stream is left also where the capture cannot be ended
+        # other threads may go on allocating; and this stream is left also where ending the capture fails
         recording = torch.cuda.graph(graph, pool, self._stream, capture_error_mode="thread_local")
         with torch.cuda.device(self._device), torch.cuda.stream(self._stream), recording:
             result = call()

@@ -1,14 +1,20 @@
-"""The sweeps of the losses: value, gradient, Hessian-vector product, quadratic form and diagonal, each in one pass down the
-rows.
+"""The sweeps of the losses: value, gradient, Hessian-vector product, quadratic form and diagonal.
 
-A sweep (`window_kernels.py`) has up to three stages, each REACH rows behind the one before: products blurred along the row;
-partial derivatives at a row (`losses_formulas.py`), blurred along it; the result at a row.  So nothing of the size of an image
-is written but the result, and what is held for tangents is blur(S_p) and the two images: m, p and q are blurred again beside
-it, where six plane sets of S's second derivatives would be held, once for all vectors of a sweep.
+A sweep is one pass down the rows with up to three stages, each REACH rows behind the one before:
 
-A quadratic form has no third stage, as the window is its own adjoint: for five vectors it takes two fifths of the time of as
-many products one by one, and products together two thirds (504 x 378, vectors of 256 bits).
+    feed            products of v, r and y at a row, blurred along it (`window.py`)
+    differentiate   those blurred down, and from them partial derivatives at a row (`formulas.py`), blurred along it
+    finish          those blurred down, and the result at a row
+
+So the only arrays of the size of the image that a sweep writes are its results.  Products need blur(S_p), which the gradient's
+sweep leaves, and the two images; S's second derivatives are worked out again, once for all vectors of a sweep.  A quadratic
+form has no third stage, as the window is its own adjoint.  Two images that both depend on the parameters (a pair) take four
+blurs in and four out, where a loss against each as the other's target takes sixteen.
+
+The kernels' arguments: x, y image and target, or a pair; target: mu and var of y (2 plane sets); loss: see `Loss`.
 """
+
+from typing import NamedTuple
 
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.simd import broadcast, lanes, load, store
@@ -17,359 +23,326 @@ from splat.losses.cpu.window import (
     REACH,
     blur_along,
     blur_down,
-    channel_part,
+    blur_down_three,
+    bordered_rows,
     clear,
+    moments_along,
+    moments_down,
+    part_of,
+    put,
     ring_buffer,
-    ring_row,
-    row_buffer,
     row_sum,
 )
 from splat.losses.formulas import (
     CENTRE,
     SECONDS,
+    pair_adjoint,
+    pair_slopes,
     pixel_curvature,
     pixel_slope,
-    seconds_of,
-    similarity,
-    slopes_of,
     ssim_adjoint,
     ssim_diag_hessian,
     ssim_quadratic_form,
     ssim_second_dot,
+    ssim_seconds,
+    ssim_slopes,
 )
 
-PRODUCT_FIELDS = 6  # of rows that a sweep of products keeps for a vector
+PRODUCT_FIELDS = 6  # rings of rows that a sweep of products keeps for a vector
+PAIR_FIELDS = 4  # m, p, M, V; after differentiation what is blurred for the gradients in r (2) and in a (2)
+
+
+class Loss(NamedTuple):
+    """The pixel loss and its eps, and the weights of it and of 1 - S over the number of values; no SSIM if structural is 0."""
+
+    kind: int
+    eps: float
+    pixel: float
+    structural: float
 
 
 @formula
-def blur_three(b0, b1, b2, width, stride, taps, ring, field, row):
-    blur_along(b0, width, stride, taps, ring, ring_row(field, row, stride))
-    blur_along(b1, width, stride, taps, ring, ring_row(field + 1, row, stride))
-    blur_along(b2, width, stride, taps, ring, ring_row(field + 2, row, stride))
+def feed(v, x, y, top, row, frame, rows, ring, field):
+    """Stage one: row `row` of v, r v and (y - c) v, blurred along itself, to three fields of the ring.
 
-
-@formula
-def clear_three(ring, field, row, stride):
-    clear(ring, field, row, stride)
-    clear(ring, field + 1, row, stride)
-    clear(ring, field + 2, row, stride)
-
-
-@formula
-def down_three(ring, field, row, i, stride, taps):
-    one, two = blur_down(ring, field, row, i, stride, taps), blur_down(ring, field + 1, row, i, stride, taps)
-    return one, two, blur_down(ring, field + 2, row, i, stride, taps)
-
-
-@formula
-def feed(V, vector, x, y, top, row, shape, taps, b0, b1, b2, ring, field):
-    """Stage one: row `row` of v, r v and (y - c) v of the channel that begins at `top`, blurred along itself, to three fields
-    of the ring.  vector: where v begins in V."""
-    height, width, _plane_rows, stride = shape
-    if row < 0 or row >= height:
-        clear_three(ring, field, row, stride)
-        return
-    at = top + row * stride
-    for i in range(0, stride, lanes(V)):
-        value, aim = load(V, vector + at + i), load(y, at + i)
-        store(b0, BORDER + i, value)
-        store(b1, BORDER + i, value * (load(x, at + i) - aim))
-        store(b2, BORDER + i, value * (aim - CENTRE))
-    blur_three(b0, b1, b2, width, stride, taps, ring, field, row)
-
-
-@formula
-def feed_residual(x, y, top, row, shape, taps, b0, b1, b2, ring):
-    """Stage one for v = r."""
-    height, width, _plane_rows, stride = shape
-    if row < 0 or row >= height:
-        clear_three(ring, 0, row, stride)
-        return
-    at = top + row * stride
-    for i in range(0, stride, lanes(x)):
-        aim = load(y, at + i)
-        residual = load(x, at + i) - aim
-        store(b0, BORDER + i, residual)
-        store(b1, BORDER + i, residual * residual)
-        store(b2, BORDER + i, residual * (aim - CENTRE))
-    blur_three(b0, b1, b2, width, stride, taps, ring, 0, row)
-
-
-@formula
-def feed_all(V, K, x, y, top, row, shape, taps, b0, b1, b2, own, ring):
-    """Stage one for the residual and for all K vectors of V."""
-    feed_residual(x, y, top, row, shape, taps, b0, b1, b2, own)
-    for k in range(K):
-        feed(V, k * (V.size // K), x, y, top, row, shape, taps, b0, b1, b2, ring, 3 * k)
-
-
-@formula
-def similarity_at(ring, row, i, at, size, stride, taps, target):
-    """`similarity` at a row and column, from the ring of the residual's stage one."""
-    m, p, q = down_three(ring, 0, row, i, stride, taps)
-    return similarity(m, p, q, load(target, at), load(target, size + at))
-
-
-@kernel
-def value_rows(start, stop, shape, taps, x, y, target, kind, eps, structural, pixels, distances):
-    """Sums over each row of the pixel loss and, unless structural = 0, of 1 - S.  target: mu and var (2 plane sets)."""
-    height, width, plane_rows, stride = shape
-    L, size = lanes(x), 3 * plane_rows * stride
-    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
-    ring, values = ring_buffer(x, 3, stride), row_buffer(x, stride)
-    for channel in range(3):
-        first, last = channel_part(start, stop, channel, height)
-        if first >= last:
-            continue
-        top = channel * plane_rows * stride
-        for row in range(first, last):
-            at = top + row * stride
-            for i in range(0, stride, L):
-                store(values, BORDER + i, pixel_slope(load(x, at + i) - load(y, at + i), kind, eps)[0])
-            pixels[channel * height + row] = row_sum(values, width)
-        if structural == 0:
-            continue
-        for ahead in range(first - REACH, last + REACH):
-            feed_residual(x, y, top, ahead, shape, taps, b0, b1, b2, ring)
-            row = ahead - REACH
-            if row < first:
-                continue
-            at = top + row * stride
-            for i in range(0, stride, L):
-                found = similarity_at(ring, row, i, at + i, size, stride, taps, target)
-                store(values, BORDER + i, slopes_of(found)[0])
-            distances[channel * height + row] = row_sum(values, width)
-
-
-@formula
-def differentiate_row(ring, row, at, size, shape, taps, target, b0, b1, b2, values, slopes):
-    """Stage two of the gradient: S_m, S_p, S_q of a row, blurred along it; the sum of 1 - S."""
-    _height, width, _plane_rows, stride = shape
-    for i in range(0, stride, lanes(ring)):
-        distance, sm, sp, sq = slopes_of(similarity_at(ring, row, i, at + i, size, stride, taps, target))
-        store(values, BORDER + i, distance)
-        store(b0, BORDER + i, sm)
-        store(b1, BORDER + i, sp)
-        store(b2, BORDER + i, sq)
-    blur_three(b0, b1, b2, width, stride, taps, slopes, 0, row)
-    return row_sum(values, width)
-
-
-@kernel
-def gradient_rows(
-    start, stop, shape, taps, x, y, target, kind, eps, pixel, structural, gradient, blurred_sp, pixels, distances
-):  # fmt: skip
-    """The gradient of the loss; sums over each row of the pixel loss and of 1 - S (unless structural = 0).
-
-    pixel, structural: weights of the two losses over the number of values.  target: mu and var (2 plane sets).  blurred_sp:
-    where blur(S_p) goes, or empty.
+    v: a flat plane set, r if None.  top: where the channel begins.
     """
-    height, width, plane_rows, stride = shape
-    L, size = lanes(x), 3 * plane_rows * stride
-    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
-    ring, slopes, values = ring_buffer(x, 3, stride), ring_buffer(x, 3, stride), row_buffer(x, stride)
-    for channel in range(3):
-        first, last = channel_part(start, stop, channel, height)
-        if first >= last:
-            continue
-        top = channel * plane_rows * stride
-        lead = 2 * REACH if structural != 0 else 0
-        for ahead in range(first - lead, last + lead):
-            if structural != 0:
-                feed_residual(x, y, top, ahead, shape, taps, b0, b1, b2, ring)
-                row = ahead - REACH
-                if first - REACH <= row < last + REACH:
-                    if 0 <= row < height:
-                        at = top + row * stride
-                        total = differentiate_row(ring, row, at, size, shape, taps, target, b0, b1, b2, values, slopes)
-                        if first <= row < last:
-                            distances[channel * height + row] = total
-                    else:
-                        clear_three(slopes, 0, row, stride)
-            row = ahead - lead
-            if row < first:
-                continue
-            at = top + row * stride
-            for i in range(0, stride, L):
-                residual = load(x, at + i) - load(y, at + i)
-                value, slope = pixel_slope(residual, kind, eps)
-                slope = slope * pixel
-                store(values, BORDER + i, value)
-                if structural != 0:
-                    bm, bp, bq = down_three(slopes, 0, row, i, stride, taps)
-                    slope -= structural * ssim_adjoint(residual, load(y, at + i) - CENTRE, bm, bp, bq)
-                    if blurred_sp.size > 0:
-                        store(blurred_sp, at + i, bp)
-                store(gradient, at + i, slope)
-            pixels[channel * height + row] = row_sum(values, width)
-            for i in range(width, stride):
-                gradient[at + i] = 0
+    if row < 0 or row >= frame.height:
+        clear(ring, field, 3, row, frame)
+        return
+    at = top + row * frame.stride
+    for i in range(0, frame.stride, lanes(x)):
+        target = load(y, at + i)
+        residual = load(x, at + i) - target
+        if v is None:
+            value = residual
+        else:
+            value = load(v, at + i)
+        put(rows, i, frame, (value, value * residual, value * (target - CENTRE)))
+    blur_along(rows, 3, frame, ring, field, row)
 
 
 @formula
-def seconds_row(own, row, at, size, stride, taps, target, buffers):
-    """The SECONDS second derivatives of a row, to as many buffers."""
-    for i in range(0, stride, lanes(own)):
-        found = similarity_at(own, row, i, at + i, size, stride, taps, target)
-        mm, mp, mq, pp, pq, qq = seconds_of(found)
-        store(buffers[0], BORDER + i, mm)
-        store(buffers[1], BORDER + i, mp)
-        store(buffers[2], BORDER + i, mq)
-        store(buffers[3], BORDER + i, pp)
-        store(buffers[4], BORDER + i, pq)
-        store(buffers[5], BORDER + i, qq)
+def window_at(own, row, i, at, frame, target):
+    """m, p, q, mu and var at the lanes at i of a row; own: the ring of the residual's stage one."""
+    m, p, q = blur_down_three(own, 0, row, i, frame)
+    return m, p, q, load(target, at + i), load(target, 3 * frame.plane_rows * frame.stride + at + i)
 
 
 @formula
-def six_buffers(x, stride):
-    one, two, three = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
-    return one, two, three, row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
+def differentiate(own, row, top, frame, target, rows, values, slopes, gradient):
+    """Stage two of the gradient, if any: S_m, S_p, S_q of a row, blurred along it, to `slopes`; the sum of 1 - S."""
+    if row < 0 or row >= frame.height:
+        clear(slopes, 0, 3, row, frame)
+        return 0.0
+    for i in range(0, frame.stride, lanes(own)):
+        m, p, q, mu, var = window_at(own, row, i, top + row * frame.stride, frame, target)
+        distance, sm, sp, sq = ssim_slopes(m, p, q, mu, var)
+        store(values, BORDER + i, distance)
+        if gradient is not None:
+            put(rows, i, frame, (sm, sp, sq))
+    if gradient is not None:
+        blur_along(rows, 3, frame, slopes, 0, row)
+    return row_sum(values, frame.width)
 
 
 @formula
-def load_six(buffers, at):
-    one, two, three = load(buffers[0], at), load(buffers[1], at), load(buffers[2], at)
-    return one, two, three, load(buffers[3], at), load(buffers[4], at), load(buffers[5], at)
+def finish_gradient(x, y, at, row, frame, slopes, loss, gradient, blurred_sp, values):
+    """Stage three of the gradient, if any; the sum of the pixel loss over the row at `at`."""
+    for i in range(0, frame.stride, lanes(x)):
+        target = load(y, at + i)
+        residual = load(x, at + i) - target
+        value, slope = pixel_slope(residual, loss.kind, loss.eps)
+        store(values, BORDER + i, value)
+        if gradient is not None:
+            slope = slope * loss.pixel
+            if loss.structural != 0:
+                bm, bp, bq = blur_down_three(slopes, 0, row, i, frame)
+                slope -= loss.structural * ssim_adjoint(residual, target - CENTRE, bm, bp, bq)
+                if blurred_sp.size > 0:
+                    store(blurred_sp, at + i, bp)
+            store(gradient, at + i, slope)
+    if gradient is not None:
+        for i in range(frame.width, frame.stride):
+            gradient[at + i] = 0
+    return row_sum(values, frame.width)
 
 
 @formula
-def curve_row(second, ring, field, row, shape, taps, b0, b1, b2, slopes):
-    """Stage two of the product: S_m', S_p', S_q' of a row, blurred along it, to three fields of slopes.  second: buffers."""
-    _height, width, _plane_rows, stride = shape
-    for i in range(0, stride, lanes(ring)):
-        dm, dp, dq = down_three(ring, field, row, i, stride, taps)
-        sm, sp, sq = ssim_second_dot(load_six(second, BORDER + i), dm, 2.0 * dp, dq)
-        store(b0, BORDER + i, sm)
-        store(b1, BORDER + i, sp)
-        store(b2, BORDER + i, sq)
-    blur_three(b0, b1, b2, width, stride, taps, slopes, field, row)
+def feed_pair(x, y, top, row, frame, rows, ring):
+    """Stage one of a pair: r, r^2 and the moments of a."""
+    if row < 0 or row >= frame.height:
+        clear(ring, 0, PAIR_FIELDS, row, frame)
+        return
+    at = top + row * frame.stride
+    for i in range(0, frame.stride, lanes(x)):
+        one, other = load(x, at + i), load(y, at + i)
+        r = one - other
+        put(rows, i, frame, (r, r * r, 0.5 * (one + other)))
+    blur_along(rows, 2, frame, ring, 0, row)
+    moments_along(rows, 2, frame, ring, 2, row)
+
+
+@formula
+def differentiate_pair(ring, row, frame, rows, values, slopes):
+    """Stage two of a pair: the fields of `pair_slopes`, blurred along the row; the sum of 1 - S."""
+    if row < 0 or row >= frame.height:
+        clear(slopes, 0, PAIR_FIELDS, row, frame)
+        return 0.0
+    for i in range(0, frame.stride, lanes(ring)):
+        m, p = blur_down(ring, 0, row, i, frame), blur_down(ring, 1, row, i, frame)
+        mean, variance = moments_down(ring, 2, row, i, frame)
+        distance, in_m, in_p, in_mean, in_variance = pair_slopes(m, p, mean, variance)
+        store(values, BORDER + i, distance)
+        put(rows, i, frame, (in_m, in_p, in_mean, in_variance))
+    blur_along(rows, PAIR_FIELDS, frame, slopes, 0, row)
+    return row_sum(values, frame.width)
+
+
+@formula
+def finish_pair(x, y, at, row, frame, slopes, loss, in_x, in_y, values):
+    """Stage three of a pair, if any; the sum of the pixel loss over the row at `at`."""
+    for i in range(0, frame.stride, lanes(x)):
+        one, other = load(x, at + i), load(y, at + i)
+        value, slope = pixel_slope(one - other, loss.kind, loss.eps)
+        store(values, BORDER + i, value)
+        if in_x is not None:
+            slope = slope * loss.pixel
+            one_bar, other_bar = slope, -slope
+            if loss.structural != 0:
+                bm, bp, ba = blur_down_three(slopes, 0, row, i, frame)
+                bv = blur_down(slopes, 3, row, i, frame)
+                one_bar, other_bar = pair_adjoint(one, other, slope, loss.structural, bm, bp, ba, bv)
+            store(in_x, at + i, one_bar)
+            store(in_y, at + i, other_bar)
+    return row_sum(values, frame.width)
 
 
 @kernel
-def product_rows(start, stop, shape, taps, V, x, y, target, blurred_sp, kind, eps, pixel, structural, products):
-    """The Hessian of the loss times every v in V.  products must not be V: another range may still read it."""
-    height, width, plane_rows, stride = shape
-    L, size, K = lanes(x), 3 * plane_rows * stride, len(products)
-    each, second = V.size // K, six_buffers(x, stride)
-    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
-    own, ring, slopes = ring_buffer(x, 3, stride), ring_buffer(x, 3 * K, stride), ring_buffer(x, 3 * K, stride)
+def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, pixels, distances):
+    """The gradient in x, unless None, of a loss against a target; or, where target is None, the gradients in both of a pair.
+
+    other: where the gradient in y goes or, against a target, blur(S_p), unless empty.  pixels, distances: sums over each row
+    of the pixel loss and of 1 - S.
+    """
+    rows, values = bordered_rows(x, PAIR_FIELDS, frame), bordered_rows(x, 1, frame)
+    ring, slopes = ring_buffer(x, PAIR_FIELDS, frame), ring_buffer(x, PAIR_FIELDS, frame)
+    reach = 0 if gradient is None else REACH  # rows beyond the range that are differentiated
+    lead = reach + REACH if loss.structural != 0 else 0
     for channel in range(3):
-        first, last = channel_part(start, stop, channel, height)
-        if first >= last:
-            continue
-        top = channel * plane_rows * stride
-        lead = 2 * REACH if structural != 0 else 0
-        for ahead in range(first - lead, last + lead):
-            if structural != 0:
-                feed_all(V, K, x, y, top, ahead, shape, taps, b0, b1, b2, own, ring)
+        top, first, last, rows_ahead = part_of(start, stop, channel, lead, frame)
+        for ahead in rows_ahead:
+            if loss.structural != 0:
+                if target is None:
+                    feed_pair(x, y, top, ahead, frame, rows, ring)
+                else:
+                    feed(None, x, y, top, ahead, frame, rows, ring, 0)
                 row = ahead - REACH
-                if first - REACH <= row < last + REACH:
-                    if 0 <= row < height:
-                        seconds_row(own, row, top + row * stride, size, stride, taps, target, second)
-                        for k in range(K):
-                            curve_row(second, ring, 3 * k, row, shape, taps, b0, b1, b2, slopes)
+                if first - reach <= row < last + reach:
+                    if target is None:
+                        distance = differentiate_pair(ring, row, frame, rows, values, slopes)
                     else:
-                        for k in range(K):
-                            clear_three(slopes, 3 * k, row, stride)
+                        distance = differentiate(ring, row, top, frame, target, rows, values, slopes, gradient)
+                    if first <= row < last:
+                        distances[channel * frame.height + row] = distance
             row = ahead - lead
             if row < first:
                 continue
-            at = top + row * stride
+            at = top + row * frame.stride
+            if target is None:
+                total = finish_pair(x, y, at, row, frame, slopes, loss, gradient, other, values)
+            else:
+                total = finish_gradient(x, y, at, row, frame, slopes, loss, gradient, other, values)
+            pixels[channel * frame.height + row] = total
+
+
+@formula
+def seconds_row(own, row, top, frame, target, second):
+    """S's second derivatives at a row of the image, to SECONDS bordered rows."""
+    for i in range(0, frame.stride, lanes(own)):
+        m, p, q, mu, var = window_at(own, row, i, top + row * frame.stride, frame, target)
+        put(second, i, frame, ssim_seconds(m, p, q, mu, var))
+
+
+@formula
+def seconds_at(second, i, frame):
+    """The second derivatives at the lanes at i."""
+    at, pitch = BORDER + i, frame.stride + 2 * BORDER
+    mm, mp, mq = load(second, at), load(second, at + pitch), load(second, at + 2 * pitch)
+    return mm, mp, mq, load(second, at + 3 * pitch), load(second, at + 4 * pitch), load(second, at + 5 * pitch)
+
+
+@formula
+def curve(second, ring, field, row, frame, rows, slopes):
+    """Stage two of a vector's product: S_m', S_p', S_q' at a row of the image, blurred along it, to three of `slopes`."""
+    for i in range(0, frame.stride, lanes(ring)):
+        dm, dp, dq = blur_down_three(ring, field, row, i, frame)
+        put(rows, i, frame, ssim_second_dot(seconds_at(second, i, frame), dm, 2.0 * dp, dq))
+    blur_along(rows, 3, frame, slopes, field, row)
+
+
+@formula
+def finish_product(v, x, y, at, row, field, frame, slopes, loss, blurred_sp, product):
+    """Stage three of a vector's product."""
+    for i in range(0, frame.stride, lanes(x)):
+        aim, tangent = load(y, at + i), load(v, at + i)
+        residual = load(x, at + i) - aim
+        total = pixel_curvature(residual, loss.kind, loss.eps, broadcast(x, loss.pixel)) * tangent
+        if loss.structural != 0:
+            bm, bp, bq = blur_down_three(slopes, field, row, i, frame)
+            turned = 2.0 * tangent * load(blurred_sp, at + i)
+            total -= loss.structural * (ssim_adjoint(residual, aim - CENTRE, bm, bp, bq) + turned)
+        store(product, at + i, total)
+    for i in range(frame.width, frame.stride):
+        product[at + i] = 0
+
+
+@formula
+def finish_forms(v, x, y, at, row, field, frame, ring, second, loss, blurred_sp, diagonal, values, rows):
+    """A row's sums of v . l'' v and v . D v."""
+    for i in range(0, frame.stride, lanes(x)):
+        squared = load(v, at + i) * load(v, at + i)
+        residual = load(x, at + i) - load(y, at + i)
+        total = pixel_curvature(residual, loss.kind, loss.eps, broadcast(x, loss.pixel)) * squared
+        if loss.structural != 0:
+            dm, dp, dq = blur_down_three(ring, field, row, i, frame)
+            bends, bp = seconds_at(second, i, frame), load(blurred_sp, at + i)
+            total -= loss.structural * ssim_quadratic_form(bends, dm, 2.0 * dp, dq, squared, bp)
+        store(values, BORDER + i, total)
+        store(rows, BORDER + i, load(diagonal, at + i) * squared)
+    return row_sum(values, frame.width), row_sum(rows, frame.width)
+
+
+@kernel
+def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, products, diagonal, forms):
+    """Of every v in V (k, plane sets), unless None: the Hessian of the loss times v, to products (k, plane sets); the sums
+    over each row of v . l'' v and v . D v, D the diagonal of l'', to forms (2, k, 3 height).
+
+    products must not be V: another range may still read it.
+    """
+    K, rows, second = len(V), bordered_rows(x, 3, frame), bordered_rows(x, SECONDS, frame)
+    own, ring, slopes = ring_buffer(x, 3, frame), ring_buffer(x, 3 * K, frame), ring_buffer(x, 3 * K, frame)
+    values = bordered_rows(x, 1, frame)
+    reach = 0 if products is None else REACH  # rows beyond the range that are differentiated
+    lead = reach + REACH if loss.structural != 0 else 0
+    for channel in range(3):
+        top, first, last, rows_ahead = part_of(start, stop, channel, lead, frame)
+        for ahead in rows_ahead:
+            row = ahead - REACH
+            if loss.structural != 0:
+                feed(None, x, y, top, ahead, frame, rows, own, 0)
+                inside = first - reach <= row < last + reach and 0 <= row < frame.height
+                if inside:
+                    seconds_row(own, row, top, frame, target, second)
+                for k in range(K):
+                    feed(V[k], x, y, top, ahead, frame, rows, ring, 3 * k)
+                    if products is not None and inside:
+                        curve(second, ring, 3 * k, row, frame, rows, slopes)
+                    elif products is not None:
+                        clear(slopes, 3 * k, 3, row, frame)
+            row = ahead - lead
+            if row < first:
+                continue
+            at = top + row * frame.stride
             for k in range(K):
-                product = products[k]
-                for i in range(0, stride, L):
-                    aim, tangent = load(y, at + i), load(V, k * each + at + i)
-                    residual = load(x, at + i) - aim
-                    total = pixel_curvature(residual, kind, eps, broadcast(x, pixel)) * tangent
-                    if structural != 0:
-                        bm, bp, bq = down_three(slopes, 3 * k, row, i, stride, taps)
-                        turned = 2.0 * tangent * load(blurred_sp, at + i)
-                        total -= structural * (ssim_adjoint(residual, aim - CENTRE, bm, bp, bq) + turned)
-                    store(product, at + i, total)
-                for i in range(width, stride):
-                    product[at + i] = 0
+                if products is not None:
+                    finish_product(V[k], x, y, at, row, 3 * k, frame, slopes, loss, blurred_sp, products[k])
+                if forms is not None:
+                    place = channel * frame.height + row
+                    forms[0, k, place], forms[1, k, place] = finish_forms(
+                        V[k], x, y, at, row, 3 * k, frame, ring, second, loss, blurred_sp, diagonal, values, rows
+                    )
 
 
 @kernel
-def form_rows(
-    start, stop, shape, taps, V, x, y, target, blurred_sp, kind, eps, pixel, structural, diagonal, full, pixelwise
-):  # fmt: skip
-    """v . l'' v and v . D v of every v in V, D the diagonal of l'', summed over each row: (k, 3 height) each."""
-    height, width, plane_rows, stride = shape
-    L, size, K = lanes(x), 3 * plane_rows * stride, len(full)
-    each, second = V.size // K, six_buffers(x, stride)
-    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
-    own, ring = ring_buffer(x, 3, stride), ring_buffer(x, 3 * K, stride)
+def diagonal_rows(start, stop, frame, loss, x, y, target, blurred_sp, squared, diagonal):
+    """The diagonal of the loss's Hessian.  squared: the frame with the window's weights squared."""
+    rows, second = bordered_rows(x, 3, frame), bordered_rows(x, SECONDS, frame)
+    own, bends = ring_buffer(x, 3, frame), ring_buffer(x, SECONDS, frame)
+    lead = 2 * REACH if loss.structural != 0 else 0
     for channel in range(3):
-        first, last = channel_part(start, stop, channel, height)
-        if first >= last:
-            continue
-        top = channel * plane_rows * stride
-        lead = REACH if structural != 0 else 0
-        for ahead in range(first - lead, last + lead):
-            if structural != 0:
-                feed_all(V, K, x, y, top, ahead, shape, taps, b0, b1, b2, own, ring)
-            row = ahead - lead
-            if row < first:
-                continue
-            at = top + row * stride
-            if structural != 0:
-                seconds_row(own, row, at, size, stride, taps, target, second)
-            for k in range(K):
-                for i in range(0, stride, L):
-                    squared = load(V, k * each + at + i) * load(V, k * each + at + i)
-                    residual = load(x, at + i) - load(y, at + i)
-                    total = pixel_curvature(residual, kind, eps, broadcast(x, pixel)) * squared
-                    if structural != 0:
-                        dm, dp, dq = down_three(ring, 3 * k, row, i, stride, taps)
-                        bends = load_six(second, BORDER + i)
-                        total -= structural * ssim_quadratic_form(
-                            bends, dm, 2.0 * dp, dq, squared, load(blurred_sp, at + i)
-                        )
-                    store(b0, BORDER + i, total)
-                    store(b1, BORDER + i, load(diagonal, at + i) * squared)
-                full[k, channel * height + row] = row_sum(b0, width)
-                pixelwise[k, channel * height + row] = row_sum(b1, width)
-
-
-@kernel
-def diagonal_rows(start, stop, shape, taps, squares, x, y, target, blurred_sp, kind, eps, pixel, structural, diagonal):
-    """The diagonal of the loss's Hessian.  squares: the window squared."""
-    height, width, plane_rows, stride = shape
-    L, size = lanes(x), 3 * plane_rows * stride
-    b0, b1, b2 = row_buffer(x, stride), row_buffer(x, stride), row_buffer(x, stride)
-    buffers, own, bends = six_buffers(x, stride), ring_buffer(x, 3, stride), ring_buffer(x, SECONDS, stride)
-    for channel in range(3):
-        first, last = channel_part(start, stop, channel, height)
-        if first >= last:
-            continue
-        top = channel * plane_rows * stride
-        lead = 2 * REACH if structural != 0 else 0
-        for ahead in range(first - lead, last + lead):
-            if structural != 0:
-                feed_residual(x, y, top, ahead, shape, taps, b0, b1, b2, own)
+        top, first, _last, rows_ahead = part_of(start, stop, channel, lead, frame)
+        for ahead in rows_ahead:
+            if loss.structural != 0:
+                feed(None, x, y, top, ahead, frame, rows, own, 0)
                 row = ahead - REACH
-                if first - REACH <= row < last + REACH:
-                    if 0 <= row < height:
-                        seconds_row(own, row, top + row * stride, size, stride, taps, target, buffers)
-                        for f in range(SECONDS):
-                            blur_along(buffers[f], width, stride, squares, bends, ring_row(f, row, stride))
-                    else:
-                        for f in range(SECONDS):
-                            clear(bends, f, row, stride)
+                if 0 <= row < frame.height and row >= first - REACH:
+                    seconds_row(own, row, top, frame, target, second)
+                    blur_along(second, SECONDS, squared, bends, 0, row)
+                else:
+                    clear(bends, 0, SECONDS, row, frame)
             row = ahead - lead
             if row < first:
                 continue
-            at = top + row * stride
-            for i in range(0, stride, L):
+            at = top + row * frame.stride
+            for i in range(0, frame.stride, lanes(x)):
                 residual, aim = load(x, at + i) - load(y, at + i), load(y, at + i) - CENTRE
-                total = pixel_curvature(residual, kind, eps, broadcast(x, pixel))
-                if structural != 0:
-                    mm, mp = blur_down(bends, 0, row, i, stride, squares), blur_down(bends, 1, row, i, stride, squares)
-                    mq, pp = blur_down(bends, 2, row, i, stride, squares), blur_down(bends, 3, row, i, stride, squares)
-                    pq, qq = blur_down(bends, 4, row, i, stride, squares), blur_down(bends, 5, row, i, stride, squares)
-                    second = mm, mp, mq, pp, pq, qq
-                    total -= structural * ssim_diag_hessian(second, load(blurred_sp, at + i), residual, aim)
+                total = pixel_curvature(residual, loss.kind, loss.eps, broadcast(x, loss.pixel))
+                if loss.structural != 0:
+                    mm, mp, mq = blur_down_three(bends, 0, row, i, squared)
+                    pp, pq, qq = blur_down_three(bends, 3, row, i, squared)
+                    own_second = (mm, mp, mq, pp, pq, qq)
+                    total -= loss.structural * ssim_diag_hessian(own_second, load(blurred_sp, at + i), residual, aim)
                 store(diagonal, at + i, total)
-            for i in range(width, stride):
+            for i in range(frame.width, frame.stride):
                 diagonal[at + i] = 0

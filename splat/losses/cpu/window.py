@@ -1,86 +1,119 @@
-"""The window of SSIM on the CPU: blurs in one sweep down the rows, and the window's mean and variance round every pixel.
+"""The window of SSIM on the CPU: blurs in one pass down the rows, and the window's mean and variance around every pixel.
 
-A blur is separable: along each row at once, down the columns out of a `ring` of the last RING rows.  Outside the image
-everything is 0.
+A blur is separable.  Along a row it is computed at once, from a bordered row: `stride` numbers with BORDER zeros at either
+side.  Down the columns it is computed from a ring: the last RING rows of each field, blurred along themselves.  Outside the
+image every field is 0.
 
 The variance blur(y^2) - blur(y)^2 cancels.  That of the separable window is, by the law of total variance,
 
     var = blur_down(var_along) + var_down(mean_along)       var_1d = sum w_k d_k^2 - (sum w_k d_k)^2,  d_k = y_k - y_0
 
-whose relative error is round-off times mean / std, that of rounding y itself, not the square of it: the square taken away
-is at most 1 / w_0 = 3.8 times what is left, w_0 the middle weight.
+whose relative error is round-off times mean / std, as that of rounding y itself, not the square of it: the square that is
+subtracted is at most 1 / w_0 = 3.8 times the difference, w_0 the middle weight.
 
-Kernels take a range of `rows`, those of the three channels one after the other; fields are flat plane sets (3, plane_rows,
-stride) of `shape` = (height, width, plane_rows, stride).  What a range needs beyond its ends it works out for itself.
+Kernels take a range of rows, those of the three channels one after the other, and work out for themselves what they need
+beyond its ends.  Fields are flat plane sets (3, plane_rows, stride), of which (3, height, width) is the image.
 """
+
+from typing import NamedTuple
+
+import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.planes import scratch
 from splat.backend.cpu.simd import lanes, load, store
-from splat.losses.reference import WINDOW
+from splat.losses.reference import REACH
 
-BORDER = 16  # floats before a row in scratch, so that the window may look past its ends
-REACH = WINDOW // 2
-RING = 16  # rows; a power of two, at least WINDOW
-
-
-@formula
-def row_buffer(like, stride):
-    return scratch(like, stride + 2 * BORDER + 16)
+BORDER = 16  # numbers, at least REACH; whole cache lines
+RING = 16  # rows, at least WINDOW; a power of two
 
 
-@formula
-def ring_buffer(like, fields, stride):
-    return scratch(like, fields * RING * stride)
+class Frame(NamedTuple):
+    """The sizes of plane sets, and the weights of a window."""
 
-
-@formula
-def ring_row(field, y, stride):
-    """Where row y of a field lies in a ring."""
-    return (field * RING + (y & (RING - 1))) * stride
+    height: int
+    width: int
+    plane_rows: int
+    stride: int
+    taps: np.ndarray
 
 
 @formula
-def clear(ring, field, y, stride):
-    """Rows outside the image are 0."""
-    at = ring_row(field, y, stride)
-    for i in range(stride):
-        ring[at + i] = 0
+def bordered_rows(like, fields, frame):
+    """Uninitialised bordered rows, side by side."""
+    return scratch(like, fields * (frame.stride + 2 * BORDER))
 
 
 @formula
-def clear_borders(buffer, width):
-    """A bordered row is 0 beyond its `width` numbers."""
+def ring_buffer(like, fields, frame):
+    return scratch(like, fields * RING * frame.stride)
+
+
+@formula
+def ring_row(field, y, frame):
+    """The place of row y of a field in a ring."""
+    return (field * RING + (y & (RING - 1))) * frame.stride
+
+
+@formula
+def clear(ring, first, fields, y, frame):
+    """Row y of the fields of a ring from `first` on is 0, as a row outside of the image."""
+    for field in range(first, first + fields):
+        at = ring_row(field, y, frame)
+        for i in range(frame.stride):
+            ring[at + i] = 0
+
+
+@formula
+def put(rows, i, frame, numbers):
+    """Numbers at column i of as many bordered rows."""
+    for field in range(len(numbers)):
+        store(rows, field * (frame.stride + 2 * BORDER) + BORDER + i, numbers[field])
+
+
+@formula
+def begin_of(rows, field, frame):
+    """Where a bordered row has its first number; what follows its `width` numbers, and what precedes them, is set to 0."""
+    at = field * (frame.stride + 2 * BORDER)
     for i in range(BORDER):
-        buffer[i] = 0
-    for i in range(BORDER + width, buffer.size):
-        buffer[i] = 0
+        rows[at + i] = 0
+    for i in range(BORDER + frame.width, frame.stride + 2 * BORDER):
+        rows[at + i] = 0
+    return at + BORDER
 
 
 @formula
-def blur_along(buffer, width, stride, taps, ring, at):
-    """The window along a bordered row of `width` numbers, to ring[at:]."""
-    clear_borders(buffer, width)
-    for i in range(0, stride, lanes(buffer)):
-        total = load(buffer, BORDER + i) * taps[REACH]
-        for k in range(1, REACH + 1):
-            total += (load(buffer, BORDER + i - k) + load(buffer, BORDER + i + k)) * taps[REACH + k]
-        store(ring, at + i, total)
+def blur_along(rows, fields, frame, ring, first, y):
+    """The window along bordered rows, to row y of the fields of a ring from `first` on."""
+    for field in range(fields):
+        begin, at = begin_of(rows, field, frame), ring_row(first + field, y, frame)
+        for i in range(0, frame.stride, lanes(rows)):
+            total = load(rows, begin + i) * frame.taps[REACH]
+            for k in range(1, REACH + 1):
+                total += (load(rows, begin + i - k) + load(rows, begin + i + k)) * frame.taps[REACH + k]
+            store(ring, at + i, total)
 
 
 @formula
-def blur_down(ring, field, y, i, stride, taps):
-    """The window over the rows round y of a ring, at the lanes at i."""
-    total = load(ring, ring_row(field, y, stride) + i) * taps[REACH]
+def blur_down(ring, field, y, i, frame):
+    """The window over the rows around y of a field, at the lanes at i."""
+    total = load(ring, ring_row(field, y, frame) + i) * frame.taps[REACH]
     for k in range(1, REACH + 1):
-        above, below = ring_row(field, y - k, stride) + i, ring_row(field, y + k, stride) + i
-        total += (load(ring, above) + load(ring, below)) * taps[REACH + k]
+        above, below = ring_row(field, y - k, frame) + i, ring_row(field, y + k, frame) + i
+        total += (load(ring, above) + load(ring, below)) * frame.taps[REACH + k]
     return total
 
 
 @formula
+def blur_down_three(ring, field, y, i, frame):
+    """`blur_down` of three fields from one on."""
+    one, two = blur_down(ring, field, y, i, frame), blur_down(ring, field + 1, y, i, frame)
+    return one, two, blur_down(ring, field + 2, y, i, frame)
+
+
+@formula
 def row_sum(values, width):
-    """In float64; four chains of additions, because one would wait for itself."""
+    """The sum of a bordered row in float64; four chains of additions, because one would wait for itself."""
     a = b = c = d = 0.0
     whole = width & ~3
     for i in range(BORDER, BORDER + whole, 4):
@@ -91,66 +124,63 @@ def row_sum(values, width):
 
 
 @formula
-def moments_along(buffer, width, stride, taps, ring, mean, variance, y):
-    """The window's mean and variance along a bordered row, to row y of two fields of the ring."""
-    clear_borders(buffer, width)
-    for i in range(0, stride, lanes(buffer)):
-        middle = load(buffer, BORDER + i)
+def moments_along(rows, field, frame, ring, first, y):
+    """The window's mean and variance along one of the bordered rows, to row y of two fields of the ring."""
+    begin = begin_of(rows, field, frame)
+    for i in range(0, frame.stride, lanes(rows)):
+        middle = load(rows, begin + i)
         shift = square = middle * 0.0
         for k in range(1, REACH + 1):
-            before, after = load(buffer, BORDER + i - k) - middle, load(buffer, BORDER + i + k) - middle
-            shift += (before + after) * taps[REACH + k]
-            square += (before * before + after * after) * taps[REACH + k]
-        store(ring, ring_row(mean, y, stride) + i, middle + shift)
-        store(ring, ring_row(variance, y, stride) + i, square - shift * shift)
+            before, after = load(rows, begin + i - k) - middle, load(rows, begin + i + k) - middle
+            shift += (before + after) * frame.taps[REACH + k]
+            square += (before * before + after * after) * frame.taps[REACH + k]
+        store(ring, ring_row(first, y, frame) + i, middle + shift)
+        store(ring, ring_row(first + 1, y, frame) + i, square - shift * shift)
 
 
 @formula
-def moments_down(ring, mean, variance, y, i, stride, taps):
+def moments_down(ring, first, y, i, frame):
     """The window's mean and variance at row y, at the lanes at i, from two fields of the ring."""
-    middle = load(ring, ring_row(mean, y, stride) + i)
-    within = load(ring, ring_row(variance, y, stride) + i) * taps[REACH]
+    middle = load(ring, ring_row(first, y, frame) + i)
     shift = square = middle * 0.0
     for k in range(1, REACH + 1):
-        above, below = ring_row(mean, y - k, stride) + i, ring_row(mean, y + k, stride) + i
+        above, below = ring_row(first, y - k, frame) + i, ring_row(first, y + k, frame) + i
         before, after = load(ring, above) - middle, load(ring, below) - middle
-        shift += (before + after) * taps[REACH + k]
-        square += (before * before + after * after) * taps[REACH + k]
-        above, below = ring_row(variance, y - k, stride) + i, ring_row(variance, y + k, stride) + i
-        within += (load(ring, above) + load(ring, below)) * taps[REACH + k]
-    return middle + shift, within + (square - shift * shift)
+        shift += (before + after) * frame.taps[REACH + k]
+        square += (before * before + after * after) * frame.taps[REACH + k]
+    return middle + shift, blur_down(ring, first + 1, y, i, frame) + (square - shift * shift)
 
 
 @formula
-def channel_part(start, stop, channel, height):
-    """The rows of a channel that a range of rows covers; none where the first is not beneath the second."""
-    return max(start - channel * height, 0), min(stop - channel * height, height)
+def part_of(start, stop, channel, lead, frame):
+    """A range's part of a channel: where the channel begins, the part's first row and the one after its last; rows to feed.
+
+    The latter begin `lead` rows before the part and end as many behind it; none where the part has no rows.
+    """
+    first, last = max(start - channel * frame.height, 0), min(stop - channel * frame.height, frame.height)
+    ahead = range(first - lead, last + lead) if first < last else range(0)
+    return channel * frame.plane_rows * frame.stride, first, last, ahead
 
 
 @kernel
-def moments_rows(start, stop, shape, taps, y, moments):
+def moments_rows(start, stop, frame, y, moments):
     """mu and var (2 plane sets): the window's mean and variance of y."""
-    height, width, plane_rows, stride = shape
-    L, size = lanes(y), 3 * plane_rows * stride
-    buffer, ring = row_buffer(y, stride), ring_buffer(y, 2, stride)
+    size = 3 * frame.plane_rows * frame.stride
+    rows, ring = bordered_rows(y, 1, frame), ring_buffer(y, 2, frame)
     for channel in range(3):
-        first, last = channel_part(start, stop, channel, height)
-        if first >= last:
-            continue
-        top = channel * plane_rows * stride
-        for ahead in range(first - REACH, last + REACH):
-            if 0 <= ahead < height:
-                for i in range(0, stride, L):
-                    store(buffer, BORDER + i, load(y, top + ahead * stride + i))
-                moments_along(buffer, width, stride, taps, ring, 0, 1, ahead)
+        top, first, _last, rows_ahead = part_of(start, stop, channel, REACH, frame)
+        for ahead in rows_ahead:
+            if 0 <= ahead < frame.height:
+                for i in range(0, frame.stride, lanes(y)):
+                    store(rows, BORDER + i, load(y, top + ahead * frame.stride + i))
+                moments_along(rows, 0, frame, ring, 0, ahead)
             else:
-                clear(ring, 0, ahead, stride)
-                clear(ring, 1, ahead, stride)
+                clear(ring, 0, 2, ahead, frame)
             row = ahead - REACH
             if row < first:
                 continue
-            at = top + row * stride
-            for i in range(0, stride, L):
-                mean, variance = moments_down(ring, 0, 1, row, i, stride, taps)
+            at = top + row * frame.stride
+            for i in range(0, frame.stride, lanes(y)):
+                mean, variance = moments_down(ring, 0, row, i, frame)
                 store(moments, at + i, mean)
                 store(moments, size + at + i, variance)

@@ -1,8 +1,9 @@
 """The losses on the GPU: kernels over the values of an image, each thread one pixel of one channel.
 
-The formulas of a pixel are those of `losses_formulas.py` and `consistency_kernels.py`, run by `traced.py`.  A sweep of the CPU
-is here up to four kernels, with the fields between them in memory: products blurred along the rows; blurred down the columns
-and differentiated; that blurred along the rows; down the columns, and the result.  Sums over the window have the CPU's order.
+The formulas of a pixel are those of `splat/losses/formulas.py`.  A sweep of the CPU is here up to four kernels, with the fields
+between them in memory: `feed`, products blurred along the rows; `differentiate`, those blurred down the columns, and partial
+derivatives; `blur_along`, these blurred along the rows; `finish_...`, those blurred down the columns, and the result.  Sums
+over the window have the CPU's order.
 
 Fields are planes (3, h, w) one after the other; `constants` are the window's WINDOW weights, eps, and the weights of the pixel
 loss and of the structural one over the number of values, in the image's precision.  Kernels with vectors take one for each
@@ -15,37 +16,19 @@ place along the grid's second axis.
 import triton.language as tl
 
 from splat.backend.gpu.compile import jit
-from splat.backend.gpu.traced import digest, traced
-from splat.losses import formulas as losses_formulas
-from splat.losses.formulas import seconds_of, similarity, slopes_of
-from splat.losses.reference import WINDOW
+from splat.backend.gpu.formula import triton_formula
+from splat.losses import formulas, reference
 
-EPS, PIXEL, STRUCTURAL = tl.constexpr(WINDOW), tl.constexpr(WINDOW + 1), tl.constexpr(WINDOW + 2)
-REACH = tl.constexpr(WINDOW // 2)
-CENTRE = tl.constexpr(losses_formulas.CENTRE)
-SECONDS = tl.constexpr(losses_formulas.SECONDS)
+EPS, PIXEL, STRUCTURAL = (tl.constexpr(reference.WINDOW + i) for i in range(3))
+REACH, CENTRE = tl.constexpr(reference.REACH), tl.constexpr(formulas.CENTRE)
+SECONDS = tl.constexpr(formulas.SECONDS)
 
-pixel_slope = traced(losses_formulas.pixel_slope)
-pixel_curvature = traced(losses_formulas.pixel_curvature)
-ssim_adjoint = traced(losses_formulas.ssim_adjoint)
-ssim_second_dot = traced(losses_formulas.ssim_second_dot)
-ssim_quadratic_form = traced(losses_formulas.ssim_quadratic_form)
-ssim_diag_hessian = traced(losses_formulas.ssim_diag_hessian)
-pair_slopes = traced(losses_formulas.pair_slopes)
-
-
-@traced
-def slopes(m, p, q, mu, var):
-    """1 - S, and S_m, S_p, S_q."""
-    return slopes_of(similarity(m, p, q, mu, var))
-
-
-@traced
-def seconds(m, p, q, mu, var):
-    return seconds_of(similarity(m, p, q, mu, var))
-
-
-FORMULAS = digest()
+ssim_slopes, ssim_seconds = triton_formula(formulas.ssim_slopes), triton_formula(formulas.ssim_seconds)
+ssim_adjoint, ssim_second_dot = triton_formula(formulas.ssim_adjoint), triton_formula(formulas.ssim_second_dot)
+ssim_quadratic_form = triton_formula(formulas.ssim_quadratic_form)
+ssim_diag_hessian = triton_formula(formulas.ssim_diag_hessian)
+pixel_slope, pixel_curvature = triton_formula(formulas.pixel_slope), triton_formula(formulas.pixel_curvature)
+pair_slopes, pair_adjoint = triton_formula(formulas.pair_slopes), triton_formula(formulas.pair_adjoint)
 
 
 # --- the window -------------------------------------------------------------------------------------------------------
@@ -53,9 +36,9 @@ FORMULAS = digest()
 
 @jit
 def pixels(height, width, BLOCK: tl.constexpr):
-    """A program's values, their columns and rows, and which of them exist."""
+    """A program's values: their places in a field, columns, rows, and which of them exist; the size of a field."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    return at, at % width, (at // width) % height, at < 3 * height * width
+    return at, at % width, (at // width) % height, at < 3 * height * width, 3 * height * width
 
 
 @jit
@@ -77,9 +60,49 @@ def windowed(pointer, at, place, step, limit, constants, here):
 
 
 @jit
-def product(value, residual, aim, FIELD: tl.constexpr):
-    """v, r v or (y - c) v."""
-    return value if FIELD == 0 else value * residual if FIELD == 1 else value * aim
+def windowed_down(fields, at, y, height, width, constants, here, COUNT: tl.constexpr):
+    """The window down the columns, of so many fields."""
+    found = ()
+    for j in tl.static_range(COUNT):
+        field = fields if j == 0 else fields + j * (3 * height * width)  # an offset of 0 would cost registers
+        found = found + (windowed(field, at, y, width, height, constants, here),)
+    return found
+
+
+@jit
+def moments(pointer, at, place, step, limit, constants, here):
+    """The window's mean and variance along an axis."""
+    middle = tl.load(pointer + at, here, other=0.0)
+    shift, square = middle * 0.0, middle * 0.0
+    for k in tl.static_range(1, REACH + 1):
+        before = near(pointer, at, place, -k, step, limit, here) - middle
+        after = near(pointer, at, place, k, step, limit, here) - middle
+        shift += (before + after) * tl.load(constants + REACH + k)
+        square += (before * before + after * after) * tl.load(constants + REACH + k)
+    return middle + shift, square - shift * shift
+
+
+@jit
+def windowed_moments(along, at, y, height, width, constants, here):
+    """The window's mean and variance, from those along the rows: by the law of total variance (`losses/cpu/window.py`)."""
+    within = windowed(along + 3 * height * width, at, y, width, height, constants, here)
+    mean, variance = moments(along, at, y, width, height, constants, here)
+    return mean, within + variance
+
+
+@jit
+def load_all(fields, at, size, here, COUNT: tl.constexpr):
+    """The values of so many fields."""
+    found = ()
+    for j in tl.static_range(COUNT):
+        found = found + (tl.load(fields + j * size + at, here, other=0.0),)
+    return found
+
+
+@jit
+def store_all(fields, at, size, values, here, COUNT: tl.constexpr):
+    for j in tl.static_range(COUNT):
+        tl.store(fields + j * size + at, values[j], here)
 
 
 @jit
@@ -91,19 +114,25 @@ def partial_sum(values, here, out):
 @jit
 def blur_along(fields, out, constants, height, width, BLOCK: tl.constexpr):
     """Every field blurred along its rows."""
-    at, x, _y, here = pixels(height, width, BLOCK)
-    first = tl.program_id(1).to(tl.int64) * 3 * height * width
+    at, x, _y, here, size = pixels(height, width, BLOCK)
+    first = tl.program_id(1).to(tl.int64) * size
     tl.store(out + first + at, windowed(fields + first, at, x, 1, width, constants, here), here)
 
 
 @jit
-def feed(v, v_stride, residual, target, out, constants, height, width, BLOCK: tl.constexpr):
-    """v, r v and (y - c) v blurred along the rows: three fields a vector."""
-    at, x, _y, here = pixels(height, width, BLOCK)
-    size, vector = 3 * height * width, tl.program_id(1).to(tl.int64)
+def product(value, residual, aim, FIELD: tl.constexpr):
+    """v, r v or (y - c) v."""
+    return value if FIELD == 0 else value * residual if FIELD == 1 else value * aim
+
+
+@jit
+def feed(v, v_stride, residual, target, out, constants, height, width, FIELDS: tl.constexpr, BLOCK: tl.constexpr):
+    """The first so many of v, r v and (y - c) v, blurred along the rows, of every vector."""
+    at, x, _y, here, size = pixels(height, width, BLOCK)
+    vector = tl.program_id(1).to(tl.int64)
     v += vector * v_stride
-    out += vector * 3 * size
-    for field in tl.static_range(3):
+    out += vector * FIELDS * size
+    for field in tl.static_range(FIELDS):
         total = tl.load(constants) * 0.0
         for k in tl.static_range(REACH + 1):
             pair = total * 0.0
@@ -116,87 +145,47 @@ def feed(v, v_stride, residual, target, out, constants, height, width, BLOCK: tl
         tl.store(out + field * size + at, total, here)
 
 
-# --- one image against a target ---------------------------------------------------------------------------------------
-
-
 @jit
-def moments_of(middle, shift, square):
-    return middle + shift, square - shift * shift
-
-
-@jit
-def moments_along(x, y, out, constants, height, width, BLOCK: tl.constexpr):
-    """The window's mean and variance of (x + y) / 2 along the rows: two fields."""
-    at, column, _row, here = pixels(height, width, BLOCK)
-    middle = 0.5 * (tl.load(x + at, here, other=0.0) + tl.load(y + at, here, other=0.0))
-    shift, square = middle * 0.0, middle * 0.0
-    for k in tl.static_range(1, REACH + 1):
-        before = 0.5 * (near(x, at, column, -k, 1, width, here) + near(y, at, column, -k, 1, width, here)) - middle
-        after = 0.5 * (near(x, at, column, k, 1, width, here) + near(y, at, column, k, 1, width, here)) - middle
-        shift += (before + after) * tl.load(constants + REACH + k)
-        square += (before * before + after * after) * tl.load(constants + REACH + k)
-    mean, variance = moments_of(middle, shift, square)
-    tl.store(out + at, mean, here)
-    tl.store(out + 3 * height * width + at, variance, here)
-
-
-@jit
-def moments(along, at, y, height, width, constants, here):
-    """The window's mean and variance, from those along the rows."""
-    size = 3 * height * width
-    middle = tl.load(along + at, here, other=0.0)
-    within = windowed(along + size, at, y, width, height, constants, here)
-    shift, square = middle * 0.0, middle * 0.0
-    for k in tl.static_range(1, REACH + 1):
-        before = near(along, at, y, -k, width, height, here) - middle
-        after = near(along, at, y, k, width, height, here) - middle
-        shift += (before + after) * tl.load(constants + REACH + k)
-        square += (before * before + after * after) * tl.load(constants + REACH + k)
-    mean, variance = moments_of(middle, shift, square)
-    return mean, within + variance
+def moments_along(image, out, constants, height, width, BLOCK: tl.constexpr):
+    """The window's mean and variance along the rows: two fields."""
+    at, x, _y, here, size = pixels(height, width, BLOCK)
+    store_all(out, at, size, moments(image, at, x, 1, width, constants, here), here, 2)
 
 
 @jit
 def moments_down(along, out, constants, height, width, BLOCK: tl.constexpr):
-    """mu and var: two fields."""
-    at, _x, y, here = pixels(height, width, BLOCK)
-    mean, variance = moments(along, at, y, height, width, constants, here)
-    tl.store(out + at, mean, here)
-    tl.store(out + 3 * height * width + at, variance, here)
+    """The window's mean and variance, from those along the rows: two fields."""
+    at, _x, y, here, size = pixels(height, width, BLOCK)
+    store_all(out, at, size, windowed_moments(along, at, y, height, width, constants, here), here, 2)
+
+
+# --- one image against a target ---------------------------------------------------------------------------------------
 
 
 @jit
 def differentiate(
     fed, target_moments, out, second, distances, constants, height, width,
-    SLOPES: tl.constexpr, SECOND: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    SLOPES: tl.constexpr, SECOND: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums of 1 - S; with SLOPES also S_m, S_p, S_q, with SECOND the second derivatives of S."""
-    at, _x, y, here = pixels(height, width, BLOCK)
-    size = 3 * height * width
-    m = windowed(fed, at, y, width, height, constants, here)
-    p = windowed(fed + size, at, y, width, height, constants, here)
-    q = windowed(fed + 2 * size, at, y, width, height, constants, here)
-    mu = tl.load(target_moments + at, here, other=0.0)
-    var = tl.load(target_moments + size + at, here, other=0.0)
-    found = slopes(m, p, q, mu, var)
-    partial_sum(found[0], here, distances)
+    at, _x, y, here, size = pixels(height, width, BLOCK)
+    m, p, q = windowed_down(fed, at, y, height, width, constants, here, 3)
+    mu, var = load_all(target_moments, at, size, here, 2)
+    distance, sm, sp, sq = ssim_slopes(m, p, q, mu, var)
+    partial_sum(distance, here, distances)
     if SLOPES:
-        for j in tl.static_range(3):
-            tl.store(out + j * size + at, found[1 + j], here)
+        store_all(out, at, size, (sm, sp, sq), here, 3)
     if SECOND:
-        bends = seconds(m, p, q, mu, var)
-        for j in tl.static_range(SECONDS):
-            tl.store(second + j * size + at, bends[j], here)
+        store_all(second, at, size, ssim_seconds(m, p, q, mu, var), here, SECONDS)
 
 
 @jit
 def finish_gradient(
     blurred, residual, target, gradient, blurred_sp, losses, constants, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums of the pixel loss; with SLOPES the gradient, and blur(S_p)."""
-    at, _x, y, here = pixels(height, width, BLOCK)
-    size = 3 * height * width
+    at, _x, y, here, _size = pixels(height, width, BLOCK)
     r = tl.load(residual + at, here, other=0.0)
     value, slope = pixel_slope(r, KIND, tl.load(constants + EPS))
     partial_sum(value, here, losses)
@@ -204,59 +193,35 @@ def finish_gradient(
         total = slope * tl.load(constants + PIXEL)
         if SSIM:
             aim = tl.load(target + at, here, other=0.0) - CENTRE
-            bm = windowed(blurred, at, y, width, height, constants, here)
-            bp = windowed(blurred + size, at, y, width, height, constants, here)
-            bq = windowed(blurred + 2 * size, at, y, width, height, constants, here)
+            bm, bp, bq = windowed_down(blurred, at, y, height, width, constants, here, 3)
             total -= tl.load(constants + STRUCTURAL) * ssim_adjoint(r, aim, bm, bp, bq)
             tl.store(blurred_sp + at, bp, here)
         tl.store(gradient + at, total, here)
 
 
 @jit
-def changes(fed, at, y, height, width, constants, here):
-    """m', p' and q' of a vector."""
-    size = 3 * height * width
-    dm = windowed(fed, at, y, width, height, constants, here)
-    dp = windowed(fed + size, at, y, width, height, constants, here)
-    return dm, 2.0 * dp, windowed(fed + 2 * size, at, y, width, height, constants, here)
-
-
-@jit
-def second_derivatives(second, at, size, here):
-    bends = ()
-    for j in tl.static_range(SECONDS):
-        bends = bends + (tl.load(second + j * size + at, here, other=0.0),)
-    return bends
-
-
-@jit
-def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr, FORMULAS: tl.constexpr):
+def curve(fed, second, out, constants, height, width, BLOCK: tl.constexpr):
     """S_m', S_p', S_q' of every vector."""
-    at, _x, y, here = pixels(height, width, BLOCK)
-    size = 3 * height * width
+    at, _x, y, here, size = pixels(height, width, BLOCK)
     first = tl.program_id(1).to(tl.int64) * 3 * size
-    dm, dp, dq = changes(fed + first, at, y, height, width, constants, here)
-    found = ssim_second_dot(second_derivatives(second, at, size, here), dm, dp, dq)
-    for j in tl.static_range(3):
-        tl.store(out + first + j * size + at, found[j], here)
+    dm, dp, dq = windowed_down(fed + first, at, y, height, width, constants, here, 3)
+    found = ssim_second_dot(load_all(second, at, size, here, SECONDS), dm, 2.0 * dp, dq)
+    store_all(out + first, at, size, found, here, 3)
 
 
 @jit
 def finish_product(
     v, v_stride, blurred, residual, target, blurred_sp, out, out_stride, constants, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The Hessian of the loss times every vector; out may be v."""
-    at, _x, y, here = pixels(height, width, BLOCK)
-    size, vector = 3 * height * width, tl.program_id(1).to(tl.int64)
+    at, _x, y, here, size = pixels(height, width, BLOCK)
+    vector = tl.program_id(1).to(tl.int64)
     r, tangent = tl.load(residual + at, here, other=0.0), tl.load(v + vector * v_stride + at, here, other=0.0)
     total = pixel_curvature(r, KIND, tl.load(constants + EPS), tl.load(constants + PIXEL)) * tangent
     if SSIM:
         aim = tl.load(target + at, here, other=0.0) - CENTRE
-        blurred += vector * 3 * size
-        bm = windowed(blurred, at, y, width, height, constants, here)
-        bp = windowed(blurred + size, at, y, width, height, constants, here)
-        bq = windowed(blurred + 2 * size, at, y, width, height, constants, here)
+        bm, bp, bq = windowed_down(blurred + vector * 3 * size, at, y, height, width, constants, here, 3)
         turned = 2.0 * tangent * tl.load(blurred_sp + at, here, other=0.0)
         total -= tl.load(constants + STRUCTURAL) * (ssim_adjoint(r, aim, bm, bp, bq) + turned)
     tl.store(out + vector * out_stride + at, total, here)
@@ -265,18 +230,18 @@ def finish_product(
 @jit
 def forms(
     v, v_stride, fed, second, residual, blurred_sp, diagonal, full, pixelwise, constants, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums of v . l'' v and of v . D v, D the diagonal of l'', of every vector: one a program."""
-    at, _x, y, here = pixels(height, width, BLOCK)
-    size, vector = 3 * height * width, tl.program_id(1).to(tl.int64)
+    at, _x, y, here, size = pixels(height, width, BLOCK)
+    vector = tl.program_id(1).to(tl.int64)
     r, tangent = tl.load(residual + at, here, other=0.0), tl.load(v + vector * v_stride + at, here, other=0.0)
     squared = tangent * tangent
     total = pixel_curvature(r, KIND, tl.load(constants + EPS), tl.load(constants + PIXEL)) * squared
     if SSIM:
-        dm, dp, dq = changes(fed + vector * 3 * size, at, y, height, width, constants, here)
-        bends, blurred = second_derivatives(second, at, size, here), tl.load(blurred_sp + at, here, other=0.0)
-        total -= tl.load(constants + STRUCTURAL) * ssim_quadratic_form(bends, dm, dp, dq, squared, blurred)
+        dm, dp, dq = windowed_down(fed + vector * 3 * size, at, y, height, width, constants, here, 3)
+        bends, bp = load_all(second, at, size, here, SECONDS), tl.load(blurred_sp + at, here, other=0.0)
+        total -= tl.load(constants + STRUCTURAL) * ssim_quadratic_form(bends, dm, 2.0 * dp, dq, squared, bp)
     partial_sum(total, here, full + vector * tl.num_programs(0))
     partial_sum(tl.load(diagonal + at, here, other=0.0) * squared, here, pixelwise + vector * tl.num_programs(0))
 
@@ -284,17 +249,14 @@ def forms(
 @jit
 def finish_diagonal(
     along, residual, target, blurred_sp, out, constants, squared, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The diagonal of the loss's Hessian.  along: the second derivatives blurred along the rows by the window squared."""
-    at, _x, y, here = pixels(height, width, BLOCK)
-    size = 3 * height * width
+    at, _x, y, here, _size = pixels(height, width, BLOCK)
     r = tl.load(residual + at, here, other=0.0)
     total = r * 0.0 + pixel_curvature(r, KIND, tl.load(constants + EPS), tl.load(constants + PIXEL))
     if SSIM:
-        bends = ()
-        for j in tl.static_range(SECONDS):
-            bends = bends + (windowed(along + j * size, at, y, width, height, squared, here),)
+        bends = windowed_down(along, at, y, height, width, squared, here, SECONDS)
         aim = tl.load(target + at, here, other=0.0) - CENTRE
         own = ssim_diag_hessian(bends, tl.load(blurred_sp + at, here, other=0.0), r, aim)
         total -= tl.load(constants + STRUCTURAL) * own
@@ -305,57 +267,30 @@ def finish_diagonal(
 
 
 @jit
-def feed_pair(x, y, out, constants, height, width, BLOCK: tl.constexpr):
-    """r and r^2 blurred along the rows, r = x - y: two fields."""
-    at, column, _row, here = pixels(height, width, BLOCK)
-    for field in tl.static_range(2):
-        total = tl.load(constants) * 0.0
-        for k in tl.static_range(REACH + 1):
-            pair = total * 0.0
-            for side in tl.static_range(2 if k > 0 else 1):
-                distance = k if side == 1 else -k
-                r = near(x, at, column, distance, 1, width, here) - near(y, at, column, distance, 1, width, here)
-                pair += r if field == 0 else r * r
-            total += pair * tl.load(constants + REACH + k)
-        tl.store(out + field * 3 * height * width + at, total, here)
-
-
-@jit
-def differentiate_pair(
-    fed, along, out, distances, constants, height, width, BLOCK: tl.constexpr, FORMULAS: tl.constexpr
-):  # fmt: skip
-    """Sums of 1 - S, and its slopes: four fields."""
-    at, _x, y, here = pixels(height, width, BLOCK)
-    size = 3 * height * width
-    m = windowed(fed, at, y, width, height, constants, here)
-    p = windowed(fed + size, at, y, width, height, constants, here)
-    mean, variance = moments(along, at, y, height, width, constants, here)
-    found = pair_slopes(m, p, mean, variance)
-    partial_sum(found[0], here, distances)
-    for j in tl.static_range(4):
-        tl.store(out + j * size + at, found[1 + j], here)
+def differentiate_pair(fed, along, out, distances, constants, height, width, BLOCK: tl.constexpr):
+    """Sums of 1 - S, and the four fields of `pair_slopes`."""
+    at, _x, y, here, size = pixels(height, width, BLOCK)
+    m, p = windowed_down(fed, at, y, height, width, constants, here, 2)
+    mean, variance = windowed_moments(along, at, y, height, width, constants, here)
+    distance, in_m, in_p, in_mean, in_variance = pair_slopes(m, p, mean, variance)
+    partial_sum(distance, here, distances)
+    store_all(out, at, size, (in_m, in_p, in_mean, in_variance), here, 4)
 
 
 @jit
 def finish_pair(
     blurred, x, y, in_x, in_y, losses, constants, height, width,
-    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr, FORMULAS: tl.constexpr,
+    KIND: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums of the pixel loss, and the gradients of the loss in x and in y."""
-    at, _column, row, here = pixels(height, width, BLOCK)
-    size = 3 * height * width
+    at, _column, row, here, _size = pixels(height, width, BLOCK)
     one, other = tl.load(x + at, here, other=0.0), tl.load(y + at, here, other=0.0)
-    r = one - other
-    value, slope = pixel_slope(r, KIND, tl.load(constants + EPS))
+    value, slope = pixel_slope(one - other, KIND, tl.load(constants + EPS))
     partial_sum(value, here, losses)
-    apart, along = slope * tl.load(constants + PIXEL), r * 0.0
+    slope = slope * tl.load(constants + PIXEL)
+    one_bar, other_bar = slope, -slope
     if SSIM:
-        structural = tl.load(constants + STRUCTURAL)
-        bm = windowed(blurred, at, row, width, height, constants, here)
-        bp = windowed(blurred + size, at, row, width, height, constants, here)
-        ba = windowed(blurred + 2 * size, at, row, width, height, constants, here)
-        bv = windowed(blurred + 3 * size, at, row, width, height, constants, here)
-        apart += structural * (bm + 2.0 * r * bp)
-        along = structural * (0.5 * ba + (0.5 * (one + other) - CENTRE) * bv)
-    tl.store(in_x + at, along + apart, here)
-    tl.store(in_y + at, along - apart, here)
+        bm, bp, ba, bv = windowed_down(blurred, at, row, height, width, constants, here, 4)
+        one_bar, other_bar = pair_adjoint(one, other, slope, tl.load(constants + STRUCTURAL), bm, bp, ba, bv)
+    tl.store(in_x + at, one_bar, here)
+    tl.store(in_y + at, other_bar, here)

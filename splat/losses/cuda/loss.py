@@ -1,6 +1,6 @@
-"""The losses on the GPU: the classes of `losses_cpu.py` for tensors there.
+"""The losses on the GPU: the classes of `losses/cpu/loss.py` for tensors there.
 
-Planes are images without padding, (3 or 4, h, w).  Only `LinearLoss.value`, where it is read, waits for the device.
+Planes are images without padding, (3 or 4, h, w).  Only reading `CudaLinearLoss.value` waits for the device.
 """
 
 from functools import cached_property
@@ -12,26 +12,25 @@ from triton import cdiv
 
 from splat.backend.gpu.compile import launch
 from splat.losses.cuda import kernels
-from splat.losses.formulas import CHARBONNIER, L1, L2, SECONDS
+from splat.losses.formulas import KINDS, SECONDS
 from splat.losses.reference import LossSettings, window
 
-KINDS = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
 BLOCK = 256
-FORMULAS = kernels.FORMULAS
 
 
 class CudaImageLoss:
-    """A loss of images of one size: what its kernels are told."""
+    """A loss of images of one size: the constants, sizes and flags that its kernels take."""
 
     def __init__(self, image: Float[Tensor, "3 h w"], settings: LossSettings):
-        self.like, self.settings, self.shape = image.new_empty(0), settings, tuple(image.shape[-2:])
+        self.like, self.shape = image.new_empty(0), tuple(image.shape[-2:])
         count = 3 * self.shape[0] * self.shape[1]
         self.pixel, self.structural = settings.pixel_weight / count, settings.ssim_weight / count
         numbers = torch.tensor([settings.eps, self.pixel, self.structural], dtype=torch.float64)
         taps = window(torch.float64)
         self.constants = torch.cat([taps, numbers]).to(image, non_blocking=True)
         self.squared = (taps.to(image.dtype) ** 2).to(image, non_blocking=True)
-        self.kind, self.ssim = KINDS[settings.pixel], settings.ssim_weight > 0
+        self.ssim = settings.ssim_weight > 0
+        self.which = {"KIND": KINDS[settings.pixel], "SSIM": self.ssim}
 
     @property
     def programs(self) -> int:
@@ -42,7 +41,7 @@ class CudaImageLoss:
         return self.like.new_empty(*sizes, 3, *self.shape)
 
     def sums(self, *sizes: int) -> Float64[Tensor, "2 *sizes b"]:
-        """Places for every program's sums of two numbers: the pixel loss and 1 - S, say."""
+        """Zeros for every program's sums of two numbers, such as the pixel loss and 1 - S."""
         return self.like.new_zeros(2, *sizes, self.programs, dtype=torch.float64)
 
     def total(self, sums: Float64[Tensor, "2 b"]) -> Float64[Tensor, ""]:
@@ -67,25 +66,30 @@ class CudaImageLoss:
         self.run(kernels.blur_along, fields, out, taps, vectors=len(fields))
         return out
 
-    def moments_along(self, x: Tensor, y: Tensor) -> Tensor:
-        """Mean and variance of (x + y) / 2 along the rows."""
+    def moments_along(self, image: Tensor) -> Tensor:
+        """The window's mean and variance along the rows."""
         out = self.fields(2)
-        self.run(kernels.moments_along, x, y, out, self.constants)
+        self.run(kernels.moments_along, image, out, self.constants)
+        return out
+
+    def fed(self, vectors: Tensor, residual: Tensor, target: Tensor, fields: int) -> Tensor:
+        """The first so many of v, r v and (y - c) v of every vector (k, 3 or more, h, w), blurred along the rows."""
+        out = self.fields(len(vectors), fields)
+        inputs = vectors, vectors.stride(0), residual, target
+        self.run(kernels.feed, *inputs, out, self.constants, vectors=len(vectors), FIELDS=fields)
         return out
 
     def consistency(self, x: Tensor, y: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """The loss between two images, and its gradients in both: `consistency_kernels.py`."""
+        """The loss between two images, and its gradients in both."""
         sums, slopes = self.sums(), self.like
         if self.ssim:
-            fed, slopes = self.fields(2), self.fields(4)
-            self.run(kernels.feed_pair, x, y, fed, self.constants)
-            along = self.moments_along(x, y)
-            self.run(kernels.differentiate_pair, fed, along, slopes, sums[1], self.constants, FORMULAS=FORMULAS)
+            r, slopes = x - y, self.fields(4)
+            fed, along = self.fed(r[None], r, y, 2), self.moments_along(0.5 * (x + y))
+            self.run(kernels.differentiate_pair, fed, along, slopes, sums[1], self.constants)
             slopes = self.blurred(slopes, self.constants)
         in_x, in_y = self.fields(), self.fields()
         self.run(
-            kernels.finish_pair, slopes, x, y, in_x, in_y, sums[0], self.constants, KIND=self.kind, SSIM=self.ssim,
-            FORMULAS=FORMULAS,
+            kernels.finish_pair, slopes, x, y, in_x, in_y, sums[0], self.constants, **self.which,
         )  # fmt: skip
         return self.total(sums).to(self.like.dtype), (in_x, in_y)
 
@@ -97,48 +101,36 @@ class CudaViewLoss(CudaImageLoss):
         super().__init__(target.to(dtype), settings)
         self.target, self.moments = self.padded(target), self.like
         if self.ssim:
-            along, self.moments = self.moments_along(self.target, self.target), self.fields(2)
+            along, self.moments = self.moments_along(self.target), self.fields(2)
             self.run(kernels.moments_down, along, self.moments, self.constants)
 
-    def _start(self, image: Tensor, slopes: bool, second: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The residual, the sums with those of 1 - S, S_m, S_p, S_q (or nothing), and the second derivatives (or nothing)."""
+    def _evaluate(self, image: Tensor, slopes: bool, second: bool) -> tuple[Tensor, ...]:
+        """The loss, the gradient, the residual, S's second derivatives and blur(S_p); empty what is not asked for."""
         residual, sums = image[:3] - self.target, self.sums()
-        first = self.fields(3) if self.ssim and slopes else self.like
-        bends = self.fields(SECONDS) if self.ssim and second else self.like
+        gradient = self.like.new_zeros(4, *self.shape) if slopes else self.like
+        first = bends = sp = self.like
         if self.ssim:
-            fed = self.fields(3)
-            self.run(kernels.feed, residual, 0, residual, self.target, fed, self.constants)
-            self.run(
-                kernels.differentiate, fed, self.moments, first, bends, sums[1], self.constants, SLOPES=slopes,
-                SECOND=second, FORMULAS=FORMULAS,
-            )  # fmt: skip
-        return residual, sums, first, bends
-
-    def _finish(self, residual: Tensor, sums: Tensor, blurred: Tensor, gradient: Tensor, sp: Tensor) -> None:
-        """The sums of the pixel loss and, where there is a place for it, the gradient."""
-        self.run(
-            kernels.finish_gradient, blurred, residual, self.target, gradient, sp, sums[0], self.constants, KIND=self.kind,
-            SSIM=self.ssim, SLOPES=gradient.numel() > 0, FORMULAS=FORMULAS,
-        )  # fmt: skip
+            first, sp = (self.fields(3), self.fields()) if slopes else (first, sp)
+            bends = self.fields(SECONDS) if second else bends
+            fed = self.fed(residual[None], residual, self.target, 3)
+            outputs = first, bends, sums[1]
+            self.run(kernels.differentiate, fed, self.moments, *outputs, self.constants, SLOPES=slopes, SECOND=second)
+            first = self.blurred(first, self.constants) if slopes else first
+        inputs, outputs = (first, residual, self.target), (gradient, sp, sums[0])
+        self.run(kernels.finish_gradient, *inputs, *outputs, self.constants, **self.which, SLOPES=slopes)
+        return self.total(sums), gradient, residual, bends, sp
 
     def value(self, image: Tensor) -> float:
         """The loss at an image."""
-        residual, sums, first, _ = self._start(image, slopes=False, second=False)
-        self._finish(residual, sums, first, self.like, self.like)
-        return float(self.total(sums))
+        return float(self._evaluate(image, slopes=False, second=False)[0])
 
     def linearize(self, image: Tensor, second_order: bool = True) -> "CudaLinearLoss":
         """Value and gradient at an image (at least three planes), and what the Hessian's product needs if second_order."""
-        residual, sums, first, second = self._start(image, slopes=True, second=second_order)
-        gradient = self.like.new_zeros(4, *self.shape)
-        sp = self.fields() if self.ssim else self.like
-        blurred = self.blurred(first, self.constants) if self.ssim else self.like
-        self._finish(residual, sums, blurred, gradient, sp)
-        return CudaLinearLoss(self, self.total(sums), gradient, residual, second, sp)
+        return CudaLinearLoss(self, *self._evaluate(image, slopes=True, second=second_order))
 
 
 class CudaLinearLoss:
-    """A loss held still at an image: value, gradient (4, h, w; that of alpha is 0) and Hessian-vector products."""
+    """A loss, linearised at an image: value, gradient (4, h, w; that of alpha is 0) and Hessian-vector products."""
 
     def __init__(
         self, loss: CudaViewLoss, total: Tensor, gradient: Tensor, residual: Tensor, second: Tensor, blurred: Tensor
@@ -146,7 +138,7 @@ class CudaLinearLoss:
         self.loss, self.total, self.gradient = loss, total, gradient
         self._residual, self._second, self._blurred = residual, second, blurred
 
-    @cached_property
+    @property
     def value(self) -> float:
         return float(self.total)
 
@@ -159,44 +151,37 @@ class CudaLinearLoss:
         loss, K = self.loss, len(tangents)
         tangents, blurred = tangents.contiguous(), loss.like
         if loss.ssim:
-            fed, bends = self._fed(tangents), loss.fields(K, 3)
-            loss.run(kernels.curve, fed, self._second, bends, loss.constants, vectors=K, FORMULAS=FORMULAS)
+            fed, bends = loss.fed(tangents, self._residual, loss.target, 3), loss.fields(K, 3)
+            loss.run(kernels.curve, fed, self._second, bends, loss.constants, vectors=K)
             blurred = loss.blurred(bends.flatten(0, 1), loss.constants)
         products = self.gradient.new_empty(K, *self.gradient.shape) if out is None else out
         loss.run(
             kernels.finish_product, tangents, tangents.stride(0), blurred, self._residual, loss.target, self._blurred,
-            products, products.stride(0), loss.constants, vectors=K, KIND=loss.kind, SSIM=loss.ssim, FORMULAS=FORMULAS,
+            products, products.stride(0), loss.constants, vectors=K, **loss.which,
         )  # fmt: skip
         products[:, 3] = 0
         return products
-
-    def _fed(self, tangents: Float[Tensor, "k p h w"]) -> Float[Tensor, "k 3 3 h w"]:
-        """v, r v and (y - c) v of every tangent, blurred along the rows."""
-        loss, fed = self.loss, self.loss.fields(len(tangents), 3)
-        held = self._residual, loss.target
-        loss.run(kernels.feed, tangents, tangents.stride(0), *held, fed, loss.constants, vectors=len(tangents))
-        return fed
 
     def curvatures(self, tangents: Float[Tensor, "k p h w"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
         """v . l'' v for K tangents (at least three planes each), and v . D v with the diagonal D of l''."""
         loss, K = self.loss, len(tangents)
         tangents = tangents.contiguous()
-        fed, sums = self._fed(tangents) if loss.ssim else loss.like, loss.sums(K)
+        fed, sums = loss.fed(tangents, self._residual, loss.target, 3) if loss.ssim else loss.like, loss.sums(K)
         loss.run(
             kernels.forms, tangents, tangents.stride(0), fed, self._second, self._residual, self._blurred, self.diagonal,
-            *sums, loss.constants, vectors=K, KIND=loss.kind, SSIM=loss.ssim, FORMULAS=FORMULAS,
+            *sums, loss.constants, vectors=K, **loss.which,
         )  # fmt: skip
         full, pixelwise = sums.sum(dim=2)
         return full, pixelwise
 
     @property
     def bytes(self) -> int:
-        """Memory of what is held, the target's included."""
-        held = (self.gradient, self._residual, self._second, self._blurred, self.loss.target, self.loss.moments)
-        return sum(tensor.nbytes for tensor in held)
+        """Memory of what is kept, the target's included."""
+        kept = (self.gradient, self._residual, self._second, self._blurred, self.loss.target, self.loss.moments)
+        return sum(tensor.nbytes for tensor in kept)
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that `hvp` of so many tangents takes beside its result: two times nine blurred planes each."""
+        """Bytes that `hvp` of so many tangents takes beside its result: twice nine blurred planes each."""
         return vectors * 18 * self.gradient[0].nbytes
 
     @cached_property
@@ -206,6 +191,6 @@ class CudaLinearLoss:
         along = loss.blurred(self._second, loss.squared) if loss.ssim else loss.like
         loss.run(
             kernels.finish_diagonal, along, self._residual, loss.target, self._blurred, diagonal, loss.constants,
-            loss.squared, KIND=loss.kind, SSIM=loss.ssim, FORMULAS=FORMULAS,
+            loss.squared, **loss.which,
         )  # fmt: skip
         return diagonal

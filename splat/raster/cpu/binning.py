@@ -2,10 +2,8 @@
 
 A splat is drawn where its alpha is at least alpha_min, inside the ellipse a dx^2 + 2 b dx dy + c dy^2 <= 2 ln(o / alpha_min)
 (or contour_sigma^2, where that is less).  Its rows in a tile are those of the ellipse within the tile's columns, found in
-double precision and rounded outwards.  Splats are (n, 9) arrays: mean x, y; conic a, b, c; opacity; colour.
+double precision and rounded outwards.  Splats: (n, 9), as in `projection/whitening.py`.
 """
-
-from math import inf
 
 import numpy as np
 
@@ -13,9 +11,8 @@ from splat.backend.cpu.jit import kernel
 from splat.backend.cpu.planes import TILE_ROWS
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
-from splat.model.settings import RenderSettings
 from splat.raster.cpu.tile import CAPPED, Lists
-from splat.raster.formulas import box_of, ellipse_of, rows_of_strip
+from splat.raster.formulas import Thresholds, box_of, ellipse_of, rows_of_strip
 
 RADIX_BITS = 11
 
@@ -69,17 +66,9 @@ def list_tiles(
     for i in range(start, stop):
         count[i] = 0
         if place[i + 1] > place[i]:
+            own_tiles, own_rows = tiles[place[i] :], rows[place[i] :]
             count[i] = list_splat(
-                splats[order[i]],
-                tile,
-                columns,
-                width,
-                height,
-                alpha_min,
-                contour,
-                cap,
-                tiles[place[i] :],
-                rows[place[i] :],
+                splats[order[i]], tile, columns, width, height, alpha_min, contour, cap, own_tiles, own_rows
             )
 
 
@@ -101,8 +90,8 @@ def list_splat(splat, tile, columns, width, height, alpha_min, contour, cap, til
 
 
 @kernel
-def fill_lists(order, place, count, tiles, rows, start, splat_of, entry_rows):
-    """Sort the entries by tile, in order of depth within each; start: (tiles + 1,) becomes where each tile's begin."""
+def fill_lists(order, place, count, tiles, rows, start, splat_of, rows_of):
+    """Sort the intersections by tile, in order of depth within each; start: (tiles + 1,) becomes where each tile's begin."""
     start[:] = 0
     for i in range(order.size):
         for k in range(place[i], place[i] + count[i]):
@@ -115,64 +104,63 @@ def fill_lists(order, place, count, tiles, rows, start, splat_of, entry_rows):
             e = following[tiles[k]]
             following[tiles[k]] = e + 1
             splat_of[e] = order[i]
-            entry_rows[e] = rows[k]
+            rows_of[e] = rows[k]
 
 
 def bin_splats(
-    splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, settings: RenderSettings
+    splats: np.ndarray, depths: np.ndarray, drawn: np.ndarray, width: int, height: int, thresholds: Thresholds
 ) -> Lists:
-    """The tile lists of a view; the tiles are ordered heaviest first.  Slots come with `reached_lists`."""
+    """The tile lists of a view; the tiles are ordered heaviest first.  Accumulators come with `reached_lists`."""
     tile = lanes_of(depths.dtype)
     columns = -(-width // tile)
     tile_count = columns * -(-height // TILE_ROWS)
     order = depth_order(depths, drawn)
-    contour = inf if settings.contour_sigma is None else settings.contour_sigma
-    where = (tile, width, height, settings.alpha_min, contour)
+    where = (tile, width, height, thresholds.alpha_min, thresholds.contour)
     bound = np.empty(order.size, np.int64)
     over_range(order.size, count_tiles, splats, order, *where, bound)
     place = np.zeros(order.size + 1, np.int64)
     np.cumsum(bound, out=place[1:])
     count = np.empty(order.size, np.int32)
     tiles, rows = np.empty(place[-1], np.int32), np.empty(place[-1], np.int32)
-    cap = np.inf if settings.gradient_through_cap else settings.alpha_max
-    over_range(order.size, list_tiles, splats, order, tile, columns, *where[1:], cap, place, count, tiles, rows)
-    entries, start = int(count.sum()), np.empty(tile_count + 1, np.int64)
-    splat_of, entry_rows = np.empty(entries, np.int32), np.empty(entries, np.int32)
-    fill_lists(order, place, count, tiles, rows, start, splat_of, entry_rows)
-    return Lists(start, splat_of, entry_rows, np.empty(0, np.int32), heaviest_first(np.diff(start)))
+    found = (place, count, tiles, rows)
+    over_range(order.size, list_tiles, splats, order, tile, columns, *where[1:], thresholds.free, *found)
+    intersections, start = int(count.sum()), np.empty(tile_count + 1, np.int64)
+    splat_of, rows_of = np.empty(intersections, np.int32), np.empty(intersections, np.int32)
+    fill_lists(order, place, count, tiles, rows, start, splat_of, rows_of)
+    return Lists(start, splat_of, rows_of, np.empty(0, np.int32), heaviest_first(np.diff(start)))
 
 
 @kernel
-def keep_reached(lists, kept_start, splat_of, rows, slots, slot_start):
-    """Copy the entries that some pixel reaches, and number them splat-major.
+def keep_reached(lists, kept_start, splat_of, rows, accumulator, splat_start):
+    """Copy the intersections that some pixel reaches, and number them splat by splat.
 
-    kept_start: (tiles + 1,) where each tile's kept entries begin; splat i's slots are slot_start[i] .. slot_start[i + 1] - 1.
+    kept_start: (tiles + 1,) where each tile's begin; splat i's are numbers splat_start[i] .. splat_start[i + 1] - 1.
     """
-    slot_start[:] = 0
+    splat_start[:] = 0
     for t in range(kept_start.size - 1):
         first = lists.start[t]
         for e in range(kept_start[t], kept_start[t + 1]):
             splat_of[e], rows[e] = lists.splat[first + e - kept_start[t]], lists.rows[first + e - kept_start[t]]
-            slot_start[splat_of[e] + 1] += 1
-    for i in range(slot_start.size - 1):
-        slot_start[i + 1] += slot_start[i]
-    next_slot = slot_start[:-1].copy()
+            splat_start[splat_of[e] + 1] += 1
+    for i in range(splat_start.size - 1):
+        splat_start[i + 1] += splat_start[i]
+    following = splat_start[:-1].copy()
     for e in range(splat_of.size):
-        slots[e] = next_slot[splat_of[e]]
-        next_slot[splat_of[e]] += 1
+        accumulator[e] = following[splat_of[e]]
+        following[splat_of[e]] += 1
 
 
 def reached_lists(lists: Lists, reached: np.ndarray, n: int) -> tuple[Lists, np.ndarray]:
-    """The lists without the entries behind each tile's last stop, with slots; and slot_start (n + 1,).
+    """The lists without the intersections behind each tile's last stop, with accumulators; and splat_start (n + 1,).
 
-    reached: (tiles,) how many entries of each tile some pixel reaches.
+    reached: (tiles,) how many intersections of each tile some pixel reaches.
     """
     start = np.zeros(reached.size + 1, np.int64)
     np.cumsum(reached, out=start[1:])
-    splat_of, rows, slots = (np.empty(start[-1], np.int32) for _ in range(3))
-    slot_start = np.empty(n + 1, np.int64)
-    keep_reached(lists, start, splat_of, rows, slots, slot_start)
-    return Lists(start, splat_of, rows, slots, heaviest_first(reached)), slot_start
+    splat_of, rows, accumulator = (np.empty(start[-1], np.int32) for _ in range(3))
+    splat_start = np.empty(n + 1, np.int64)
+    keep_reached(lists, start, splat_of, rows, accumulator, splat_start)
+    return Lists(start, splat_of, rows, accumulator, heaviest_first(reached)), splat_start
 
 
 def heaviest_first(work: np.ndarray) -> np.ndarray:

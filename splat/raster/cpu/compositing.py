@@ -1,103 +1,106 @@
-"""The compositing kernels of first order: `forward` front to back, `backward` back to front (`formulas.py`)."""
+"""The compositing kernels of first order: `forward` front to back, `backward` back to front (`raster/formulas.py`)."""
 
 import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.planes import TILE_ROWS, scratch
-from splat.backend.cpu.simd import any_lane, broadcast, fma, lanes, load, maximum, prefetch, select, store
+from splat.backend.cpu.simd import any_lane, fma, lanes, load, maximum, prefetch, select, store
 from splat.raster.cpu.tile import (
     AHEAD,
-    CAPPED,
+    BACKWARD,
+    FORWARD,
+    GRAD,
+    IMAGE,
     NEVER,
     PARAMS,
-    RED,
-    SUMS,
+    REST,
+    STOP,
+    T,
     add_row,
-    alpha_terms,
-    broadcast3,
-    clear_entries,
+    clear_sums,
     corner_of,
     dark,
+    intersection,
     load3,
     load_cotangent,
     next_tile,
     no_moments,
     reached,
-    row_range,
     row_v,
     store3,
     store_moments,
 )
-from splat.raster.formulas import alpha_row, behind_all, plus, step_back
+from splat.raster.formulas import SPLAT, alpha_row, behind_all, plus, step_back
 
 # --- forward ----------------------------------------------------------------------------------------------------------
 
 
 @kernel
 def forward(counter, params, lists, frame, pixels):
-    """Render: fill `pixels`."""
+    """Render: fill `pixels`.  A row's T is negative once a pixel has stopped."""
     L = lanes(params)
-    state = scratch(params, 5 * L * TILE_ROWS)  # a row: T (negative once stopped), image (3), stop
+    state = scratch(params, FORWARD * L * TILE_ROWS)
     tile = next_tile(counter, lists)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            b = 5 * L * y
-            store(state, b, 1.0)
-            for j in range(1, 4):
-                store(state, b + j * L, 0.0)
-            store(state, b + 4 * L, NEVER)
+            b = FORWARD * L * y
+            store(state, b + T * L, 1.0)
+            store(state, b + STOP * L, NEVER)
+            store3(state, b + IMAGE * L, L, (0.0, 0.0, 0.0))
         first = np.int64(lists.start[tile])
         count = lists.start[tile + 1] - first
         some_stopped = False
         for k in range(count):
             prefetch(params, np.int64(lists.splat[first + min(k + AHEAD, count - 1)]) * PARAMS)
-            some_stopped |= forward_entry(params, lists, first + k, k, x0, y0, frame, state)
+            some_stopped |= composite(params, lists, first + k, k, x0, y0, frame, state)
             if some_stopped and (k & 15) == 15:
                 some_stopped = False
                 if all_stopped(state, L):
                     break
         for y in range(TILE_ROWS):
-            b, p = 5 * L * y, corner + y * frame.stride
-            T = maximum(load(state, b), -load(state, b))
-            store(pixels.transmittance, p, T)
-            store(pixels.stop, p, load(state, b + 4 * L))
-            for c in range(3):
-                store(pixels.planes, c * frame.size + p, load(state, b + (1 + c) * L) + T * frame.background[c])
-            store(pixels.planes, 3 * frame.size + p, 1.0 - T)
+            end_row(state, FORWARD * L * y, L, frame, pixels, corner + y * frame.stride)
         tile = next_tile(counter, lists)
 
 
 @formula
-def forward_entry(params, lists, e, k, x0, y0, frame, state):
-    """Composite one entry; True if it stopped a pixel."""
+def composite(params, lists, e, k, x0, y0, frame, state):
+    """Composite intersection e; True if it stopped a pixel."""
     L = lanes(params)
-    o = np.int64(lists.splat[e]) * PARAMS
-    _u, terms = alpha_terms(params, o, x0, y0)
-    colour = broadcast3(params, o + RED)
-    top, bottom = row_range(lists.rows[e])
+    _splat, _u, terms, colour, _index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
     stopped = False
     for y in range(top, bottom):
-        b = 5 * L * y
-        T = load(state, b)
-        alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, T > 0.0, frame.cap)
-        w = alpha * T
-        after = fma(-alpha, T, T)  # T - w, to the last bit even where alpha is near 1
-        ends = (after < frame.floor) & (T > 0.0)
-        if any_lane(ends):
+        b = FORWARD * L * y
+        before = load(state, b + T * L)
+        alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, before > 0.0, frame.cap)
+        w = alpha * before
+        after = fma(-alpha, before, before)  # T - w, to the last bit even where alpha is near 1
+        ends = (after < frame.floor) & (before > 0.0)
+        if any_lane(ends):  # these pixels stop in front of the splat
             w = select(ends, 0.0, w)
-            after = select(ends, -T, after)
-            store(state, b + 4 * L, select(ends, k, load(state, b + 4 * L)))
+            after = select(ends, -before, after)
+            store(state, b + STOP * L, select(ends, k, load(state, b + STOP * L)))
             stopped = True
-        store(state, b, after)
-        store3(state, b + L, L, plus(load3(state, b + L, L), w, colour))
+        store(state, b + T * L, after)
+        store3(state, b + IMAGE * L, L, plus(load3(state, b + IMAGE * L, L), w, colour))
     return stopped
+
+
+@formula
+def end_row(state, b, L, frame, pixels, p):
+    """Add the background to a row, and write it."""
+    last = maximum(load(state, b + T * L), -load(state, b + T * L))
+    store(pixels.transmittance, p, last)
+    store(pixels.stop, p, load(state, b + STOP * L))
+    image = plus(load3(state, b + IMAGE * L, L), last, frame.background)
+    store3(pixels.planes, p, frame.size, image)
+    store(pixels.planes, 3 * frame.size + p, 1.0 - last)
 
 
 @formula
 def all_stopped(state, L):
     for y in range(TILE_ROWS):
-        if any_lane(load(state, 5 * L * y) > 0.0):
+        if any_lane(load(state, (FORWARD * y + T) * L) > 0.0):
             return False
     return True
 
@@ -106,56 +109,52 @@ def all_stopped(state, L):
 
 
 @kernel
-def backward(counter, params, lists, frame, pixels, cotangent, sums):
-    """Moments of every entry, (entries, SUMS), from the cotangent of the planes."""
+def backward(counter, params, lists, frame, pixels, v_planes, sums):
+    """The nine sums of every intersection from the cotangent of the planes."""
     L = lanes(params)
-    state = scratch(params, 6 * L * TILE_ROWS)  # a row: T, R, g (3), stop
+    state = scratch(params, BACKWARD * L * TILE_ROWS)
     tile = next_tile(counter, lists)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            begin_backward_row(state, 6 * L * y, L, frame, pixels, cotangent, corner + y * frame.stride)
+            begin_backward_row(state, BACKWARD * L * y, L, frame, pixels, v_planes, corner + y * frame.stride)
         first, count = reached(lists, tile, pixels, corner, frame.stride)
-        if dark(cotangent, 0, 4, corner, frame.size, frame.stride):
-            clear_entries(lists, first, count, SUMS, sums)
+        if dark(v_planes, 0, 4, corner, frame.size, frame.stride):
+            clear_sums(lists, first, count, SPLAT, sums)
             count = 0
         for k in range(count - 1, -1, -1):
             later = first + max(k - AHEAD, 0)
             prefetch(params, np.int64(lists.splat[later]) * PARAMS)
-            prefetch(sums, np.int64(lists.slots[later]) * SUMS)
-            backward_entry(params, lists, first + k, k, x0, y0, frame, state, sums)
+            prefetch(sums, np.int64(lists.accumulator[later]) * SPLAT)
+            differentiate(params, lists, first + k, k, x0, y0, frame, state, sums)
         tile = next_tile(counter, lists)
 
 
 @formula
-def begin_backward_row(state, b, L, frame, pixels, cotangent, p):
-    T, g = load(pixels.transmittance, p), load_cotangent(cotangent, p, frame.size)
-    store(state, b, T)
-    store(state, b + L, T * behind_all(g, frame.background))
-    store3(state, b + 2 * L, L, g)
-    store(state, b + 5 * L, load(pixels.stop, p))
+def begin_backward_row(state, b, L, frame, pixels, v_planes, p):
+    last, v_pixel = load(pixels.transmittance, p), load_cotangent(v_planes, p, frame.size)
+    store(state, b + T * L, last)
+    store(state, b + STOP * L, load(pixels.stop, p))
+    store(state, b + REST * L, last * behind_all(v_pixel, frame.background))
+    store3(state, b + GRAD * L, L, v_pixel)
 
 
 @formula
-def backward_entry(params, lists, e, k, x0, y0, frame, state, sums):
+def differentiate(params, lists, e, k, x0, y0, frame, state, sums):
+    """Undo intersection e, and write its sums."""
     L = lanes(params)
-    o = np.int64(lists.splat[e]) * PARAMS
-    u, terms = alpha_terms(params, o, x0, y0)
-    colour = broadcast3(params, o + RED)
-    capped = lists.rows[e] & CAPPED
-    index = broadcast(params, k)
+    _splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
     moments = no_moments(params)
-    top, bottom = row_range(lists.rows[e])
     for y in range(top, bottom):
-        b = 6 * L * y
+        b = BACKWARD * L * y
         v = row_v(frame, L, y, terms)
-        alpha, uncapped = alpha_row(v, terms, index < load(state, b + 5 * L), frame.cap)
-        R, g = load(state, b + L), load3(state, b + 2 * L, L)
-        T, after, w, beta, _r, we = step_back(alpha, load(state, b), R, g, colour)
+        alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
+        R, v_image = load(state, b + REST * L), load3(state, b + GRAD * L, L)
+        before, rest, w, beta, _r, we = step_back(alpha, load(state, b + T * L), R, v_image, colour)
         s = we - beta * R
         if capped:
             s = select(uncapped <= frame.cap, s, 0.0)
-        store(state, b, T)
-        store(state, b + L, after)
-        moments = add_row(moments, v, s, w, g)
-    store_moments(sums, np.int64(lists.slots[e]), moments, u)
+        store(state, b + T * L, before)
+        store(state, b + REST * L, rest)
+        moments = add_row(moments, v, s, w, v_image)
+    store_moments(sums, np.int64(lists.accumulator[e]), moments, u)

@@ -1,13 +1,6 @@
 """From splats to what the compositing kernels read, and from their sums back to splats, for the splats start..stop.
 
-A splat is nine numbers: mean x, y; conic a, b, c; opacity; colour.  Tangents carry K vectors side by side: (n, K, 9).
-They and the adjoints are in double precision; the kernels' numbers are in the splat's whitened coordinates (`whitening.py`),
-in which the conic is ROUND times the identity.  There, with S, Su, ... the moments of a splat's entries (`formulas.py`):
-
-    gradient   mean ROUND (Su, Sv);  a -Suu / 2;  b -Suv;  c -Svv / 2;  opacity S / o;  colour G
-    its tangent, with the moments S', ... of the tangent pass
-               mean ROUND (S'u - mu' S, S'v - mv' S) + Q' (Su, Sv);  a -(S'uu - 2 mu' Su) / 2;  b -(S'uv - mu' Sv - mv' Su)
-               c -(S'vv - 2 mv' Sv) / 2;  opacity (S' - S o' / o) / o;  colour G'
+Splats and the coordinates of their tangents and adjoints: `projection/whitening.py`.
 """
 
 from math import log2
@@ -16,25 +9,8 @@ import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
 from splat.projection.whitening import LOG2_E, put, whitening
-from splat.raster.cpu.tile import (
-    ACROSS,
-    ALONG,
-    BLUE,
-    CUT,
-    DBLUE,
-    DGREEN,
-    DRED,
-    GREEN,
-    LO,
-    MX,
-    MY,
-    PARAMS,
-    RED,
-    SHEAR,
-    SUMS,
-    TANGENTS,
-)
-from splat.raster.formulas import exponent_tangent, first_order, second_order
+from splat.raster.cpu.tile import ACROSS, ALONG, CUT, LO, MX, MY, PARAMS, RED, SHEAR
+from splat.raster.formulas import SPLAT, second_order
 
 
 @formula
@@ -56,28 +32,17 @@ def pack_splats(start, stop, splats, log2_alpha_min, contour, params):
         level = log2(opacity) if opacity > 0 else -np.inf
         params[p + LO] = level
         params[p + CUT] = max(log2_alpha_min, level - LOG2_E / 2 * contour * contour)
-        params[p + RED], params[p + GREEN], params[p + BLUE] = splats[i, 6], splats[i, 7], splats[i, 8]
-
-
-@kernel
-def pack_tangents(start, stop, splats, directions, tangents):
-    """tangents (n * K * TANGENTS) of directions (n, K, 9)."""
-    K = directions.shape[1]
-    for i in range(start, stop):
-        W = whitening(splats[i])
-        for k in range(K):
-            t, y = (i * K + k) * TANGENTS, directions[i, k]
-            put(tangents[t : t + 6], exponent_tangent(W, splats[i, 5], y))
-            tangents[t + DRED], tangents[t + DGREEN], tangents[t + DBLUE] = y[6], y[7], y[8]
+        for c in range(3):
+            params[p + RED + c] = splats[i, 6 + c]
 
 
 @formula
-def sum_of_slots(sums, first, last, stride, offset):
-    """The nine sums of the slots first..last - 1; slot i's lie at i * stride + offset.  In registers."""
+def total_of(sums, first, last, stride, offset):
+    """The nine totals of the accumulators first..last - 1; the sums of i lie at i * stride + offset.  In registers."""
     zero = 0.0
     s0, s1, s2, s3, s4, s5, s6, s7, s8 = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for slot in range(first, last):
-        p = slot * stride + offset
+    for i in range(first, last):
+        p = i * stride + offset
         s0 += sums[p]
         s1 += sums[p + 1]
         s2 += sums[p + 2]
@@ -91,23 +56,18 @@ def sum_of_slots(sums, first, last, stride, offset):
 
 
 @kernel
-def reduce_gradient(start, stop, splats, slot_start, sums, moments, gradient):
-    """gradient (n, 9) and the moments S, Su, Sv (n, 3) from the sums of the entries (slots, SUMS)."""
+def reduce_sums(start, stop, splat_start, sums, moments):
+    """The adjoints, moments (n, 9), from the sums of the intersections (accumulators, SPLAT)."""
     for i in range(start, stop):
-        total = sum_of_slots(sums, slot_start[i], slot_start[i + 1], SUMS, 0)
-        moments[i, 0], moments[i, 1], moments[i, 2] = total[0], total[1], total[2]
-        put(gradient[i], first_order(whitening(splats[i]), splats[i, 5], total))
-        gradient[i, 6], gradient[i, 7], gradient[i, 8] = total[6], total[7], total[8]
+        put(moments[i], total_of(sums, splat_start[i], splat_start[i + 1], SPLAT, 0))
 
 
 @kernel
-def reduce_curvature(start, stop, splats, directions, slot_start, sums, moments, product):
-    """product (n, K, 9) from the sums of the entries (slots, K, SUMS) and the moments of the gradient."""
-    K = directions.shape[1]
+def reduce_tangents(start, stop, tangents, splat_start, sums, moments, product):
+    """The adjoints' tangents (n, K, 9) along tangents (n, K, 9), from the sums (accumulators, K, SPLAT) and the adjoints."""
+    K = tangents.shape[1]
     for i in range(start, stop):
-        W, opacity = whitening(splats[i]), splats[i, 5]
         for k in range(K):
-            total = sum_of_slots(sums, slot_start[i], slot_start[i + 1], K * SUMS, k * SUMS)
-            out = product[i, k]
-            put(out, second_order(W, opacity, directions[i, k], moments[i], total))
-            out[6], out[7], out[8] = total[6], total[7], total[8]
+            total = total_of(sums, splat_start[i], splat_start[i + 1], K * SPLAT, k * SPLAT)
+            put(product[i, k], total)
+            put(product[i, k], second_order(tangents[i, k], moments[i], total))

@@ -1,10 +1,10 @@
 """The arrays of the compositing kernels on the CPU, and how a tile of them is read and written.
 
-A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  Every entry (a splat in a tile) writes its nine
-sums to its own slot, splat-major, so that no sum depends on the order in which threads finish.  Every kernel
-(`compositing.py`, `tangents.py`, `blocks.py`) takes tiles from a counter until none is left (`threads.over_tiles`).  Arrays
-are flat: `params`
-holds PARAMS floats a splat, `tangents` K x TANGENTS floats a splat, a plane stride x height floats.
+A tile is `lanes` pixels wide and TILE_ROWS high; a row of it is one vector.  An intersection is a splat in a tile.  Each writes
+its nine sums to an accumulator of its own, and those of a splat lie side by side, so that no sum depends on the order in which
+threads finish.  Every kernel (`compositing.py`, `tangents.py`, `blocks.py`) takes tiles from a counter until none is left
+(`threads.over_tiles`).  Arrays are flat: `params` holds PARAMS floats a splat, `tangents` K x SPLAT floats a splat, a plane
+stride x height floats.
 """
 
 from typing import NamedTuple
@@ -26,30 +26,35 @@ from splat.backend.cpu.simd import (
     store,
     store_sums,
 )
-from splat.raster.formulas import along_row, column_terms, row_terms
+from splat.raster.formulas import SPLAT, along_row, column_terms, row_terms
 
 NEVER = 1e30  # the stop index of a pixel that does not stop
-AHEAD = 6  # entries between a prefetch and its use
+AHEAD = 6  # intersections between a prefetch and its use
 
 PARAMS = 16  # one cache line in float32: mean x, y (pixel index units), the whitening, LO = log2 o; _REST: of a rounded number
 MX, MX_REST, MY, MY_REST, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT = range(13)
-CAPPED = 1 << 16  # in an entry's rows: its splat's alpha can reach the cap
-TANGENTS = 12  # q' = Q0 + QU u + QV v + QUU u^2 + QUV u v + QVV v^2, colour'
-DRED, DGREEN, DBLUE = 6, 7, 8
-SUMS = 9  # S, Su, Sv, Suu, Suv, Svv, G (3)
+CAPPED = 1 << 16  # in an intersection's rows: its splat's alpha can reach the cap
+
+# The vectors that a kernel keeps of a row of pixels, in this order; a number is the first of its channels.
+T, STOP = 0, 1  # transmittance, and the index of the intersection at which a pixel stops
+IMAGE, FORWARD = 2, 5
+REST, GRAD, BACKWARD = 2, 3, 6  # R and v_image
+DT, DIMAGE, TANGENT = 0, 1, 4  # after T and STOP, for each of K tangents
+TAU, DREST, DGRAD, BACKWARD_TANGENT = 0, 1, 2, 5  # after those of `backward`, for each of K tangents
 
 
 class Lists(NamedTuple):
-    """Which splats touch which tiles. An entry is a splat in a tile; the entries of a tile are in order of depth.
+    """Which splats touch which tiles, in order of depth within a tile.
 
-    start: (tiles + 1,) first entry of each tile; splat: (entries,); rows: (entries,) first row | last row << 8 within the
-    tile, and CAPPED; slots: (entries,) where an entry's sums go, splat-major; order: the tiles as they are handed out.
+    start: (tiles + 1,) first intersection of each tile; splat: (intersections,); rows: (intersections,) first row |
+    last row << 8 within the tile, and CAPPED; accumulator: (intersections,) where their sums go, splat by splat;
+    order: the tiles as they are handed out.
     """
 
     start: np.ndarray
     splat: np.ndarray
     rows: np.ndarray
-    slots: np.ndarray
+    accumulator: np.ndarray
     order: np.ndarray
 
 
@@ -69,7 +74,7 @@ class Frame(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """What `forward` leaves in each pixel: planes (red, green, blue, alpha), the final T, the entry at which it stopped."""
+    """What `forward` leaves in each pixel: planes (red, green, blue, alpha), the final T, and where it stopped."""
 
     planes: np.ndarray
     transmittance: np.ndarray
@@ -92,7 +97,7 @@ def corner_of(tile, lanes, columns, stride):
 
 @formula
 def row_range(packed):
-    """First row and one past the last row of an entry."""
+    """First row and one past the last row of an intersection."""
     return packed & 255, ((packed >> 8) & 255) + 1
 
 
@@ -113,6 +118,19 @@ def alpha_terms(params, o, x0, y0):
 
 
 @formula
+def intersection(params, lists, e, k, x0, y0):
+    """Intersection e, which is number k of its tile, as all kernels read it.
+
+    Its splat, u of the columns, `alpha_terms`, colour, k, whether the cap may hold, its first row and one past the last.
+    """
+    splat = np.int64(lists.splat[e])
+    u, terms = alpha_terms(params, splat * PARAMS, x0, y0)
+    top, bottom = row_range(lists.rows[e])
+    colour = broadcast3(params, splat * PARAMS + RED)
+    return splat, u, terms, colour, broadcast(params, k), lists.rows[e] & CAPPED, top, bottom
+
+
+@formula
 def row_v(frame, L, y, terms):
     """v of a tile's row y."""
     return fma(load(frame.row_offsets, L * y), terms[1], terms[0])
@@ -120,10 +138,10 @@ def row_v(frame, L, y, terms):
 
 @formula
 def tangent_terms(tangents, j, u):
-    A, B, C = along_row(
-        (tangents[j], tangents[j + 1], tangents[j + 2], tangents[j + 3], tangents[j + 4], tangents[j + 5]), u
-    )
-    return A, B, broadcast(tangents, C)
+    """q' of a row as a quadratic in v, and the colour's tangent."""
+    q = (tangents[j], tangents[j + 1], tangents[j + 2], tangents[j + 3], tangents[j + 4], tangents[j + 5])
+    A, B, C = along_row(q, u)
+    return (A, B, broadcast(tangents, C)), broadcast3(tangents, j + 6)
 
 
 @formula
@@ -145,14 +163,13 @@ def store3(array, i, step, values):
 
 @formula
 def load_cotangent(planes, p, size):
-    """(g, g_A) of a row."""
-    g = load3(planes, p, size)
-    return g[0], g[1], g[2], load(planes, p + 3 * size)
+    """v_image and v_alpha of a row."""
+    return load(planes, p), load(planes, p + size), load(planes, p + 2 * size), load(planes, p + 3 * size)
 
 
 @formula
 def reached(lists, tile, pixels, corner, stride):
-    """The first entry of a tile, and how many of its entries some pixel reaches before it stops."""
+    """The first intersection of a tile, and how many of its intersections some pixel reaches before it stops."""
     furthest = load(pixels.stop, corner)
     for y in range(1, TILE_ROWS):
         furthest = maximum(furthest, load(pixels.stop, corner + y * stride))
@@ -174,10 +191,10 @@ def dark(planes, first_plane, count, corner, size, stride):
 
 
 @formula
-def clear_entries(lists, first, count, width, sums):
-    """Zeros for the sums, `width` an entry, of a tile's entries."""
+def clear_sums(lists, first, count, width, sums):
+    """Zeros for the sums, `width` an intersection, of a tile's intersections."""
     for e in range(first, first + count):
-        at = np.int64(lists.slots[e]) * width
+        at = np.int64(lists.accumulator[e]) * width
         for j in range(width):
             sums[at + j] = 0
 
@@ -189,18 +206,12 @@ def no_moments(params):
 
 
 @formula
-def add_row(moments, v, s, w, h):
+def add_row(m, v, s, w, h):
+    """The sums over rows, with a row more."""
     t = row_terms(v, s, w, h)
-    return (
-        moments[0] + t[0],
-        moments[1] + t[1],
-        moments[2] + t[2],
-        moments[3] + t[3],
-        moments[4] + t[4],
-        moments[5] + t[5],
-    )
+    return m[0] + t[0], m[1] + t[1], m[2] + t[2], m[3] + t[3], m[4] + t[4], m[5] + t[5]
 
 
 @formula
-def store_moments(sums, slot, moments, u):
-    store_sums(sums, slot * SUMS, column_terms(moments, u))
+def store_moments(sums, accumulator, moments, u):
+    store_sums(sums, accumulator * SPLAT, column_terms(moments, u))

@@ -4,12 +4,12 @@ The same ellipses as on the CPU (`binning.py`, whose formulas are compiled here 
 a thread more work for a larger splat:
 
     strips     of every splat, the columns of tiles of its box: a count, a prefix sum, one item a strip
-    entries    of every strip, its rows of tiles inside the ellipse: a count, a prefix sum, one item an entry
-    sort       entries are made in order of depth (ties in the order of the splats), so a stable radix sort by tile leaves
+    intersections    of every strip, its rows of tiles inside the ellipse: a count, a prefix sum, one item an intersection
+    sort       intersections are made in order of depth (ties in the order of the splats), so a stable radix sort by tile leaves
                them in order of (tile, depth); tile numbers are 16 bits wide where they fit, which halves the passes
 
-Before that sort an entry's place is splat-major: from it comes its slot, where its sums go.  Two sizes are read back: the
-numbers of strips and of entries.
+Before that sort the intersections of a splat lie side by side: their places there number the accumulators of their sums.
+Two sizes are read back: the numbers of strips and of intersections.
 """
 
 from typing import NamedTuple
@@ -20,39 +20,42 @@ import triton.language as tl
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splat.backend.gpu.compile import jit, launch, sized, twins
+from landscape.errors import InputError
+from splat.backend.gpu.compile import jit, launch, sized
+from splat.backend.gpu.formula import triton_formula
 from splat.raster import formulas
 
 WIDTH, HEIGHT = 16, 16  # of a tile, in pixels
 BLOCK = 256
-LIMIT = 2**31  # places and slots of entries are 32 bits wide
+LIMIT = 2**31  # places and accumulators of intersections are 32 bits wide
 
-ellipse_of, box_of, rows_of_strip = twins(formulas.ellipse_of, formulas.box_of, formulas.rows_of_strip)
+ellipse_of, box_of = triton_formula(formulas.ellipse_of), triton_formula(formulas.box_of)
+rows_of_strip = triton_formula(formulas.rows_of_strip)
 
 
 class Lists(NamedTuple):
-    """Which splats touch which tiles. An entry is a splat in a tile; the entries of a tile are in order of depth.
+    """Which splats touch which tiles. An intersection is a splat in a tile; those of a tile are in order of depth.
 
-    start: (tiles + 1,) first entry of each tile; tile, splat: (entries,); place: (entries,) the entry's number, splat-major;
-    splat_start: (n + 1,) first place of the splats in order of depth; order: (n,) which splats these are.
+    start: (tiles + 1,) first intersection of each tile; tile, splat: (intersections,); place: (intersections,) their numbers,
+    splat by splat; splat_start: (n + 1,) first place of the splats in order of depth; order: (n,) which splats these are.
     """
 
     start: Int[Tensor, "tiles_1"]
-    tile: Int[Tensor, "entries"]
-    splat: Int[Tensor, "entries"]
-    place: Int[Tensor, "entries"]
+    tile: Int[Tensor, "intersections"]
+    splat: Int[Tensor, "intersections"]
+    place: Int[Tensor, "intersections"]
     splat_start: Int[Tensor, "n_1"]
     order: Int[Tensor, "n"]
 
 
-class Slots(NamedTuple):
-    """Where the sums go of the entries that some pixel reaches.
+class Accumulators(NamedTuple):
+    """Where the sums go of the intersections that some pixel reaches.
 
-    slot: (entries,), that of an entry which none reaches has no meaning; first, last: (n,) splat i's slots are first[i] ..
+    place: (intersections,), without meaning for those that none reaches; first, last: (n,), splat i's are first[i] ..
     last[i] - 1.
     """
 
-    slot: Int[Tensor, "entries"]
+    place: Int[Tensor, "intersections"]
     first: Int[Tensor, "n"]
     last: Int[Tensor, "n"]
 
@@ -106,15 +109,15 @@ def count_rows(
     tl.store(count + i, tl.where(y0 <= y1, y1 // HEIGHT - y0 // HEIGHT + 1, 0), inside)
 
 
-@sized("entries", "columns")
-def list_entries(
-    entry_strip, strip_rank, order, entry_start, first_tile, tile, splat, entries, columns, BLOCK: tl.constexpr
+@sized("intersections", "columns")
+def list_intersections(
+    strip_of, strip_rank, order, first_of, first_tile, tile, splat, intersections, columns, BLOCK: tl.constexpr
 ):
-    """The tile and the splat of every entry."""
+    """The tile and the splat of every intersection."""
     e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    inside = e < entries
-    strip = tl.load(entry_strip + e, inside, other=0)
-    down = (e - tl.load(entry_start + strip, inside, other=0)).to(tl.int32)
+    inside = e < intersections
+    strip = tl.load(strip_of + e, inside, other=0)
+    down = (e - tl.load(first_of + strip, inside, other=0)).to(tl.int32)
     tl.store(tile + e, tl.load(first_tile + strip, inside, other=0) + down * columns, inside)
     tl.store(splat + e, tl.load(order + tl.load(strip_rank + strip, inside, other=0), inside, other=0), inside)
 
@@ -134,7 +137,7 @@ def repeated(count: Int[Tensor, "n"], start: Int[Tensor, "n_1"]) -> Int[Tensor, 
     """The index i, count[i] times over; reads the total back.  ValueError where it is beyond what the kernels count to."""
     total = int(start[-1])
     if total >= LIMIT:
-        raise ValueError(
+        raise InputError(
             f"expected fewer than 2^31 tiles that splats touch in a view, got {total}; render smaller images, or Gaussians "
             "that are fewer or smaller"
         )
@@ -167,34 +170,35 @@ def bin_splats(
         count_rows, grid(strips), strip_rank, order, splats, limits, first_column, strip_start, first_tile, rows, strips,
         columns, width, height, WIDTH=WIDTH, HEIGHT=HEIGHT, BLOCK=BLOCK,
     )  # fmt: skip
-    entry_start = starts(rows)
-    entry_strip = repeated(rows, entry_start)
-    entries = len(entry_strip)
-    tile = torch.empty(entries, dtype=torch.int16 if tiles < 2**15 else torch.int32, device=device)
-    splat = torch.empty(entries, dtype=torch.int32, device=device)
+    first_of = starts(rows)
+    strip_of = repeated(rows, first_of)
+    intersections = len(strip_of)
+    tile = torch.empty(intersections, dtype=torch.int16 if tiles < 2**15 else torch.int32, device=device)
+    splat = torch.empty(intersections, dtype=torch.int32, device=device)
     launch(
-        list_entries, grid(entries), entry_strip, strip_rank, order, entry_start, first_tile, tile, splat, entries, columns,
+        list_intersections, grid(intersections), strip_of, strip_rank, order, first_of, first_tile, tile, splat,
+        intersections, columns,
         BLOCK=BLOCK,
     )  # fmt: skip
     tile, place = torch.sort(tile, stable=True)
     start = torch.searchsorted(tile, torch.arange(tiles + 1, dtype=tile.dtype, device=device), out_int32=True)
-    return Lists(start, tile, splat[place], place.to(torch.int32), entry_start[strip_start], order)
+    return Lists(start, tile, splat[place], place.to(torch.int32), first_of[strip_start], order)
 
 
-def kept_entries(lists: Lists, reached: Int[Tensor, "tiles"]) -> Bool[Tensor, "entries"]:
-    """Which entries some pixel reaches, given how many of each tile's."""
+def kept_intersections(lists: Lists, reached: Int[Tensor, "tiles"]) -> Bool[Tensor, "intersections"]:
+    """Which intersections some pixel reaches, given how many of each tile's."""
     tile = lists.tile.to(torch.int32)
     index = torch.arange(len(tile), dtype=torch.int32, device=tile.device)
     return index < (lists.start[:-1] + reached)[tile]
 
 
-def number_slots(lists: Lists, reached: Int[Tensor, "tiles"]) -> Slots:
-    """The slots of the entries that some pixel reaches, splat by splat."""
-    kept, n = kept_entries(lists, reached), len(lists.order)
+def number_accumulators(lists: Lists, reached: Int[Tensor, "tiles"]) -> Accumulators:
+    """The accumulators of the intersections that some pixel reaches, splat by splat."""
+    kept, n = kept_intersections(lists, reached), len(lists.order)
     by_place = torch.empty_like(kept)
     by_place[lists.place] = kept
-    slot = starts(by_place)
-    edges = slot[lists.splat_start]
+    number = starts(by_place)
+    edges = number[lists.splat_start]
     first, last = (torch.empty(n, dtype=torch.int64, device=kept.device) for _ in range(2))
     first[lists.order], last[lists.order] = edges[:-1], edges[1:]
-    return Slots(slot[lists.place].to(torch.int32), first, last)
+    return Accumulators(number[lists.place].to(torch.int32), first, last)

@@ -1,41 +1,37 @@
-"""The compositing kernels on the GPU: `formulas.py`, whose glossary and formulas hold here, in Triton.
+"""The compositing kernels on the GPU: `raster/formulas.py`, whose glossary and formulas hold here, in Triton.
 
-A program is one warp.  It has one tile of 16 x 16 pixels, eight a thread, and goes through the tile's entries one by one:
+A program is one warp.  It has one tile of 16 x 16 pixels, eight a thread, and goes through the tile's intersections (splats
+that touch it) one by one:
 
-- the sums of an entry over a tile cost a warp the same instructions whatever the tile's size, and several warps to a tile
-  would have to wait for one another at every entry; with one there is no barrier and no shared memory
+- the sums of an intersection over a tile cost a warp the same instructions whatever the tile's size, and several warps to a
+  tile would have to wait for one another at every splat; with one there is no barrier and no shared memory
 - a thread's eight pixels are independent, which hides the latency that more warps would
-- an entry's numbers are the same for all threads: the loads are uniform, from one cache line of 64 bytes a splat, and the index
-  of the next entry is loaded one entry ahead
-- K tangents are the first axis of every array, in registers: one code for every K, and an entry's primal quantities are
-  computed once for all.  K = 2 takes all 255 registers; K = 4 would spill (`cuda.TOGETHER`)
+- a splat's numbers are the same for all threads: the loads are uniform, from one cache line of 64 bytes a splat, and the index
+  of the next splat is loaded one step ahead
+- K tangents are the first axis of every array, in registers: one code for every K, and a splat's primal quantities are
+  computed once for all.  K = 2 takes all 255 registers; K = 4 would spill (`raster.TOGETHER`)
 - sums as products with a matrix of ones are for the tensor cores, which round to 10 bits; in full precision they would take
   more instructions than the exchanges of `nine_sums`
 
-In deterministic mode every entry writes its sums to its own slot, to be added in a fixed order (`cuda_packing.sum_slots`); in
-the other, entries add them atomically to their splat, in whatever order they come.
+For deterministic accumulation every intersection writes its sums to an accumulator of its own, to be added in a fixed order
+(`packing.reduce_sums`); for atomic accumulation they are added to those of the splat, in whatever order they come.
 
 Decisions are those of the CPU up to the last bits of l and alpha: the exponential is the hardware's (2 units in the last
 place), u and v are rounded at other places (`exponent_terms`).
 
-What an entry costs, counted in the machine code for sm_90 in single precision, for all 256 pixels of its tile; operations are
-counted from the formulas a pixel as `analysis/bench/speed/scene.py` does; bytes come from and go to memory or a cache:
+What an intersection costs: operations are counted from the formulas a pixel as `analysis/bench/speed/scene.py` does; bytes, in
+single precision, come from and go to memory or a cache:
 
-                     instructions a warp   operations a pixel   bytes an entry             bytes a pixel of the image
-    forward          169                   17                   4 + 64                     24
-    backward         362                   30                   8 + 64 + 36               24
-    tangent K = 1    235                   25                   4 + 64 + 48                4 + 20
-    tangent K = 2    335                   36                   4 + 64 + 96                4 + 40
-    curvature K = 1  518                   46                   8 + 64 + 48 + 36          24 + 20
-    curvature K = 2  827                   70                   8 + 64 + 96 + 72          24 + 40
+                            operations a pixel   bytes an intersection      bytes a pixel of the image
+    forward                 17                   4 + 64                     24
+    backward                30                   8 + 64 + 36                24
+    tangent K = 1           25                   4 + 64 + 36                4 + 20
+    tangent K = 2           36                   4 + 64 + 72                4 + 40
+    backward_tangent K = 1  46                   8 + 64 + 36 + 36           24 + 20
+    backward_tangent K = 2  70                   8 + 64 + 72 + 72           24 + 40
 
-Deterministic mode reads the 36 bytes (a tangent) of an entry once more.  Around that a splat costs 72 + 64 bytes to pack,
-72 + 48 a tangent to pack, 72 for the totals and 3 x 72 to turn them into a gradient, 5 x 72 into the gradient's tangent.
-
-The loops of gsplat 1.5.3 (by nvcc 13.5, for the same processor) take 31 instructions forward and 39 backward for each of a
-tile's eight warps, 52 and 236 where an entry reaches a pixel of the warp.  On 500,000 Gaussians at 1600 x 1060 (200 tiles of
-the synthetic scene) those here are 0.48 of its instructions forward and 0.38 backward, on fern after 2,000 steps 0.30 and 0.23:
-there are fewer entries (0.82 and 0.50), and it adds up nine sums by 45 exchanges in every warp.
+Deterministic accumulation reads the 36 bytes (a tangent) of an intersection once more.  Around that a splat costs 72 + 64 bytes
+to pack.
 """
 
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false, reportGeneralTypeIssues=false
@@ -43,7 +39,8 @@ there are fewer entries (0.82 and 0.50), and it adds up nine sums by 45 exchange
 
 import triton.language as tl
 
-from splat.backend.gpu.compile import fma, jit, twins
+from splat.backend.gpu.compile import jit, sized
+from splat.backend.gpu.formula import triton_formula
 from splat.raster import formulas
 from splat.raster.cuda.packing import (
     ACROSS,
@@ -64,18 +61,18 @@ from splat.raster.cuda.packing import (
 )
 
 NEVER = tl.constexpr(2**31 - 1)  # the stop index of a pixel that does not stop
-CHUNK = tl.constexpr(16)  # entries between two looks whether all pixels of a tile have stopped
+CHUNK = tl.constexpr(16)  # intersections between two looks whether all pixels of a tile have stopped
 
-alpha_row, quadratic, along_row, plus, behind_all = twins(
-    formulas.alpha_row, formulas.quadratic, formulas.along_row, formulas.plus, formulas.behind_all
-)
-step_back, step_tangent, step_curvature, row_terms, column_terms = twins(
-    formulas.step_back,
-    formulas.step_tangent,
-    formulas.step_curvature,
-    formulas.row_terms,
-    formulas.column_terms,
-)
+alpha_row = triton_formula(formulas.alpha_row)
+quadratic = triton_formula(formulas.quadratic)
+along_row = triton_formula(formulas.along_row)
+plus = triton_formula(formulas.plus)
+behind_all = triton_formula(formulas.behind_all)
+step_back = triton_formula(formulas.step_back)
+step_tangent = triton_formula(formulas.step_tangent)
+step_backward_tangent = triton_formula(formulas.step_backward_tangent)
+row_terms = triton_formula(formulas.row_terms)
+column_terms = triton_formula(formulas.column_terms)
 
 
 # --- what the kernels share -------------------------------------------------------------------------------------------
@@ -98,10 +95,10 @@ def exponent_terms(params, x0, y0, x, y):
     """
     along, across, shear = tl.load(params + ALONG), tl.load(params + ACROSS), tl.load(params + SHEAR)
     dx, dy = x0 - tl.load(params + X), y0 - tl.load(params + Y)
-    u = fma(x, along, fma(along, dx, tl.load(params + U)))
-    corner = fma(across, fma(tl.load(params + SHEAR_REST), dx, fma(shear, dx, dy)), tl.load(params + V))
-    v = fma(y, across, fma(x, across * shear, corner))
-    return u, v, (v, across, fma(-u, u, tl.load(params + LO)), tl.load(params + CUT))
+    u = tl.fma(x, along, tl.fma(along, dx, tl.load(params + U)))
+    corner = tl.fma(across, tl.fma(tl.load(params + SHEAR_REST), dx, tl.fma(shear, dx, dy)), tl.load(params + V))
+    v = tl.fma(y, across, tl.fma(x, across * shear, corner))
+    return u, v, (v, across, tl.fma(-u, u, tl.load(params + LO)), tl.load(params + CUT))
 
 
 @jit
@@ -184,7 +181,7 @@ def place_of_sums():
 
 @jit
 def put_sums(sums, at, total, K: tl.constexpr, ATOMIC: tl.constexpr):
-    """Write or add an entry's sums, K times nine from at * K * 9."""
+    """Write or add the sums of an intersection, K times nine from at * K * 9."""
     j, kept = place_of_sums()
     k = tl.arange(0, K)[:, None]
     place = sums + (at.to(tl.int64) * K + k) * 9 + j
@@ -195,11 +192,11 @@ def put_sums(sums, at, total, K: tl.constexpr, ATOMIC: tl.constexpr):
 
 
 @jit
-def clear_slots(slots, first, count, sums, WIDTH: tl.constexpr):
-    """Zeros for the sums, WIDTH an entry, of a tile's entries."""
+def clear_sums(accumulators, first, count, sums, WIDTH: tl.constexpr):
+    """Zeros for the sums, WIDTH an intersection, of a tile."""
     j = tl.arange(0, 16)
     for e in range(first, first + count):
-        at = tl.load(slots + e).to(tl.int64) * WIDTH
+        at = tl.load(accumulators + e).to(tl.int64) * WIDTH
         for start in range(0, WIDTH, 16):
             tl.store(sums + at + start + j, tl.zeros((16,), sums.dtype.element_ty), start + j < WIDTH)
 
@@ -212,7 +209,7 @@ def forward(
     order, start, splat_of, packed, frame, planes, transmittance, stop, reached, columns, width, height,
     WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
 ):  # fmt: skip
-    """Render planes (4, h, w), the final T and the entry at which each pixel stopped; how many entries each tile reached."""
+    """Render planes (4, h, w), the final T and where each pixel stopped; how many intersections each tile reached."""
     real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
     x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
@@ -232,7 +229,7 @@ def forward(
             following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
             _u, v, terms = exponent_terms(splat, x0, y0, x, y)
             alpha, _uncapped = alpha_row(v, terms, T > 0, cap)
-            w, after = alpha * T, fma(-alpha, T, T)
+            w, after = alpha * T, tl.fma(-alpha, T, T)
             ends = (after < floor) & (T > 0)
             w, T = tl.where(ends, 0.0, w), tl.where(ends, -T, after)
             stopped = tl.where(ends, k, stopped)
@@ -250,22 +247,22 @@ def forward(
 
 @jit
 def backward(
-    order, start, reached, splat_of, slots, packed, frame, transmittance, stop, cotangent, sums, columns, width, height,
+    order, start, reached, splat_of, accumulators, packed, frame, transmittance, stop, v_planes, sums, columns, width, height,
     WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
 ):  # fmt: skip
-    """The nine sums of every entry or, added up, of every splat, from the cotangent of the planes."""
+    """The nine sums of every intersection or, added up, of every splat, from the cotangent of the planes."""
     real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
     x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
     x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
     cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
     first, count = tl.load(start + tile), tl.load(reached + tile)
-    T, g = tl.load(transmittance + p, inside, other=1.0), load_planes(cotangent, p, size, inside)
+    T, v_pixel = tl.load(transmittance + p, inside, other=1.0), load_planes(v_planes, p, size, inside)
     stopped = tl.load(stop + p, inside, other=0)
-    R = T * behind_all(g, load_background(frame, real))
-    if not any_lit(g):
+    R = T * behind_all(v_pixel, load_background(frame, real))
+    if not any_lit(v_pixel):
         if not ATOMIC:
-            clear_slots(slots, first, count, sums, 9)
+            clear_sums(accumulators, first, count, sums, 9)
         count = 0
     following = tl.load(splat_of + first + count - 1, count > 0, other=0)
     for back in range(0, count):
@@ -274,11 +271,11 @@ def backward(
         splat = packed + s_index.to(tl.int64) * 16
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
-        T, after, w, beta, _r, we = step_back(alpha, T, R, g, load3(splat, RED))
+        T, after, w, beta, _r, we = step_back(alpha, T, R, v_pixel, load3(splat, RED))
         s = tl.where(uncapped <= tl.load(splat + CAP), we - beta * R, 0.0)
         R = after
-        at = s_index if ATOMIC else tl.load(slots + first + k)
-        put_sums(sums, at, nine_sums(v, u, s, w, g, 1, HEIGHT), 1, ATOMIC)
+        at = s_index if ATOMIC else tl.load(accumulators + first + k)
+        put_sums(sums, at, nine_sums(v, u, s, w, v_pixel, 1, HEIGHT), 1, ATOMIC)
 
 
 @jit
@@ -291,35 +288,36 @@ def load_background(frame, real: tl.constexpr):
 
 
 @jit
-def tangents_of(tangents, splat, k, K):
-    """K tangents of a splat: the coefficients of q', and of its colour."""
-    at = tangents + (splat.to(tl.int64) * K + k) * 12
+def tangents_of(tangents, splat, k, stride):
+    """Tangents k of a splat, which has `stride` in all: the coefficients of q', and of its colour."""
+    at = tangents + (splat.to(tl.int64) * stride + k) * 9
     q = (tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3), tl.load(at + 4), tl.load(at + 5))
     return q, load3(at, 6)
 
 
 @jit
-def any_moved(moved, splat_of, first, count, K: tl.constexpr):
-    """Whether any of K tangents moves a splat of a tile's entries; a look at the first few, unless few splats are moved."""
+def any_moved(moved, splat_of, first, count, begin, stride, K: tl.constexpr):
+    """Whether any of K tangents moves a splat of a tile; a look at the first few, unless few splats are moved."""
     k, lane = tl.arange(0, K)[:, None], tl.arange(0, 32)[None, :]
     done, found = 0, 0
     while done < count:
         e = done + lane
         splat = tl.load(splat_of + first + e, e < count, other=0).to(tl.int64)
-        some = tl.load(moved + splat * K + k, e < count, other=0)
+        some = tl.load(moved + splat * stride + begin + k, e < count, other=0)
         found = tl.max(tl.max(some.to(tl.int32), 1), 0)
         done = tl.where(found > 0, count, done + 32)
     return found > 0
 
 
-@jit
+@sized("begin", "stride")
 def tangent(
-    order, start, reached, splat_of, packed, frame, stop, tangents, moved, planes, transmittances, moves, columns, width,
-    height, K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
+    order, start, reached, splat_of, packed, frame, stop, tangents, moved, planes, transmittances, moves, begin, stride,
+    columns, width, height, K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr,
 ):  # fmt: skip
     """J u for K tangents: their planes (K, 4, h, w) and the tangents of the final transmittance (K, h, w).
 
-    moved: (n, K), which splats the tangents move; moves: whether they move any in a tile.  Where none, all is 0.
+    tangents: begin, begin + 1, ... of (n, stride, 9); moved: (n, stride), which splats they move; moves: whether they move
+    any in a tile.  Where none, all is 0.
     """
     real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
@@ -332,7 +330,7 @@ def tangent(
     T = tl.full((1, HEIGHT, WIDTH), 1.0, real)
     dT = tl.zeros((K, HEIGHT, WIDTH), real)
     red, green, blue = dT, dT, dT
-    some = any_moved(moved, splat_of, first, count, K)
+    some = any_moved(moved, splat_of, first, count, begin, stride, K)
     tl.store(moves + tile, some.to(tl.int32))
     count = tl.where(some, count, 0)
     following = tl.load(splat_of + first, count > 0, other=0)
@@ -343,8 +341,8 @@ def tangent(
         u, v, terms = exponent_terms(splat, x0, y0, x, y)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         w = alpha * T
-        T = fma(-alpha, T, T)
-        q, dcolour = tangents_of(tangents, s_index, i, K)
+        T = tl.fma(-alpha, T, T)
+        q, dcolour = tangents_of(tangents, s_index, begin + i, stride)
         w_dq = tl.where(uncapped <= tl.load(splat + CAP), w, 0.0) * quadratic(v, along_row(q, u))
         dT, image = step_tangent(dT, (red, green, blue), alpha, w, w_dq, load3(splat, RED), dcolour)
         red, green, blue = image
@@ -354,15 +352,15 @@ def tangent(
     tl.store(transmittances + i * size + p, dT, inside & (i < K))
 
 
-@jit
-def curvature(
-    order, start, reached, splat_of, slots, packed, frame, transmittance, stop, cotangent, tangents, moves, transmittances,
-    cotangents, sums, columns, width, height,
+@sized("begin", "stride")
+def backward_tangent(
+    order, start, reached, splat_of, accumulators, packed, frame, transmittance, stop, v_planes, tangents, moves,
+    transmittances, dv_planes, begin, stride, sums, columns, width, height,
     K: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, ATOMIC: tl.constexpr,
 ):  # fmt: skip
-    """The nine sums of the tangent of `backward`, K times nine an entry or, added up, a splat.
+    """The nine sums of the tangent of `backward`, K times nine an intersection or, added up, a splat.
 
-    cotangent: g, 4 planes; cotangents: g' of every tangent, (K, 4, h, w); moves, transmittances: as `tangent` left them.
+    v_planes: the cotangent, 4 planes; dv_planes: its tangents, (K, 4, h, w); moves, transmittances: as `tangent` left them.
     """
     real: tl.constexpr = packed.dtype.element_ty
     tile = tl.load(order + tl.program_id(0))
@@ -372,17 +370,17 @@ def curvature(
     first, count = tl.load(start + tile), tl.load(reached + tile)
     stopped = tl.load(stop + p, inside, other=0)
     i = tl.arange(0, K)[:, None, None]
-    T, g = tl.load(transmittance + p, inside, other=1.0), load_planes(cotangent, p, size, inside)
+    T, v_pixel = tl.load(transmittance + p, inside, other=1.0), load_planes(v_planes, p, size, inside)
     dT = tl.load(transmittances + i * size + p, inside & (i < K), other=0.0)
-    dg = load_planes(cotangents, i * 4 * size + p, size, inside & (i < K))
+    dv_pixel = load_planes(dv_planes, i * 4 * size + p, size, inside & (i < K))
     background = load_background(frame, real)
-    behind = behind_all(g, background)
+    behind = behind_all(v_pixel, background)
     R = T * behind
-    dR = dT * behind + T * behind_all(dg, background)
+    dR = dT * behind + T * behind_all(dv_pixel, background)
     tau = dT / T
-    if not ((any_lit(g) & (tl.load(moves + tile) != 0)) | any_lit(dg)):
+    if not ((any_lit(v_pixel) & (tl.load(moves + tile) != 0)) | any_lit(dv_pixel)):
         if not ATOMIC:
-            clear_slots(slots, first, count, sums, 9 * K)
+            clear_sums(accumulators, first, count, sums, 9 * K)
         count = 0
     following = tl.load(splat_of + first + count - 1, count > 0, other=0)
     for back in range(0, count):
@@ -393,10 +391,12 @@ def curvature(
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         free = uncapped <= tl.load(splat + CAP)
         colour = load3(splat, RED)
-        T, after, w, beta, r, _we = step_back(alpha, T, R, g, colour)
-        q, dcolour = tangents_of(tangents, s_index, i, K)
+        T, after, w, beta, r, _we = step_back(alpha, T, R, v_pixel, colour)
+        q, dcolour = tangents_of(tangents, s_index, begin + i, stride)
         dq = tl.where(free, quadratic(v, along_row(q, u)), 0.0)
-        tau, dR, ds, h = step_curvature(tau, dR, (dg[0], dg[1], dg[2]), w, beta, r * R, dq, g, colour, dcolour)
+        tau, dR, ds, h = step_backward_tangent(
+            tau, dR, (dv_pixel[0], dv_pixel[1], dv_pixel[2]), w, beta, r * R, dq, v_pixel, colour, dcolour
+        )
         R = after
-        at = s_index if ATOMIC else tl.load(slots + first + k)
+        at = s_index if ATOMIC else tl.load(accumulators + first + k)
         put_sums(sums, at, nine_sums(v, u, tl.where(free, ds, 0.0), w, h, K, HEIGHT), K, ATOMIC)

@@ -1,8 +1,8 @@
-"""From splats to what the compositing kernels on the GPU read, and from their sums back to splats: `packing.py` in Triton.
+"""From splats to what the compositing kernels on the GPU read, and from their sums back to splats.
 
-Every thread holds one splat; splats, tangents and totals are in double precision.  A splat's numbers for the kernels are those
-of the CPU but for the mean, of which a pixel near by is kept, and the whitened offset from it: an offset between pixels is a
-whole number, exact in single precision, so the kernels need no double precision to tell what is left of a needle's v.
+Every thread holds one splat, in double precision.  A splat's numbers for the kernels are those of the CPU but for the mean, of
+which a pixel near by is kept, and the whitened offset from it: an offset between pixels is a whole number, exact in single
+precision, so the kernels need no double precision to tell what is left of a needle's v.
 
     X, Y    the pixel nearest to the mean          U, V    the whitened offset of that pixel from the mean
     CAP     alpha above which derivatives in ln alpha are 0: infinite where the splat cannot reach it
@@ -13,26 +13,20 @@ whole number, exact in single precision, so the kernels need no double precision
 
 import triton.language as tl
 
-from splat.backend.gpu.compile import jit, sized, twin, twins
+from splat.backend.gpu.compile import jit, sized
+from splat.backend.gpu.formula import triton_formula
 from splat.projection import whitening
 from splat.raster import formulas
 from splat.raster.cuda.binning import load_splat
 
 PARAMS = 16
 X, Y, U, V, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT, CAP = (tl.constexpr(i) for i in range(14))
-TANGENTS = 12
-SUMS = 9
 FARTHEST = tl.constexpr(2.0**22)  # a pixel farther out is not exact in single precision
-# what all pixels share, in double precision
-ALPHA_MIN, CONTOUR, LEAST_LOG2_ALPHA, ALPHA_MAX, FREE_CAP, FLOOR = (tl.constexpr(i) for i in range(6))
-BACKGROUND = tl.constexpr(6)
-FRAME = 9
+# what all pixels share, in double precision: `formulas.Thresholds`, and the background
+CONTOUR, LEAST, ALPHA_MAX, FREE, FLOOR, BACKGROUND = (tl.constexpr(i) for i in range(1, 7))
 HALF_LOG2_E = tl.constexpr(whitening.LOG2_E / 2)
 
-whiten = twin(whitening.whitening)
-exponent_tangent, first_order, second_order = twins(
-    formulas.exponent_tangent, formulas.first_order, formulas.second_order
-)
+whiten, second_order = triton_formula(whitening.whitening), triton_formula(formulas.second_order)
 
 
 @jit
@@ -51,12 +45,6 @@ def load_six(array, at, inside):
         tl.load(array + at + 4, inside, other=0.0).to(tl.float64),
         tl.load(array + at + 5, inside, other=0.0).to(tl.float64),
     )
-
-
-@jit
-def store_six(array, at, numbers, inside):
-    for j in tl.static_range(6):
-        tl.store(array + at + j, numbers[j], inside)
 
 
 @jit
@@ -87,78 +75,58 @@ def pack_splats(splats, frame, packed, n, BLOCK: tl.constexpr):
     opacity = splat[5]
     level = tl.where(opacity > 0, tl.log2(tl.where(opacity > 0, opacity, 1.0)), float("-inf"))
     contour = tl.load(frame + CONTOUR)
-    cut = tl.maximum(tl.load(frame + LEAST_LOG2_ALPHA), level - HALF_LOG2_E * contour * contour)
-    cap = tl.load(frame + FREE_CAP)
+    cut = tl.maximum(tl.load(frame + LEAST), level - HALF_LOG2_E * contour * contour)
+    cap = tl.load(frame + FREE)
     tl.store(p + LO, level, inside)
     tl.store(p + CUT, cut, inside)
     tl.store(p + CAP, tl.where(opacity > cap, cap, float("inf")), inside)
     copy_colour(p, RED - 6, splats, i.to(tl.int64) * 9, inside)
 
 
-@sized("n", "K", "begin", "size")
-def pack_tangents(splats, directions, tangents, moved, n, K, begin, size, BLOCK: tl.constexpr):
-    """tangents (n, size, 12) of the directions begin, begin + 1, ... of (n, K, 9); a program has one of them.
-
-    moved: (n, size), whether the direction moves the splat.
-    """
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = i < n
-    splat = load_splat(splats, i, inside)
-    k = tl.program_id(1)
-    at, to = (i.to(tl.int64) * K + begin + k) * 9, (i.to(tl.int64) * size + k) * 12
-    direction = load_six(directions, at, inside)
-    store_six(tangents, to, exponent_tangent(whiten(splat), splat[5], direction), inside)
-    copy_colour(tangents, to, directions, at, inside)
-    some = direction[0] != 0
-    for j in tl.static_range(1, 6):
-        some = some | (direction[j] != 0)
-    for j in tl.static_range(6, 9):
-        some = some | (tl.load(directions + at + j, inside, other=0.0) != 0)
-    tl.store(moved + i.to(tl.int64) * size + k, some.to(tl.int8), inside)
-
-
 @sized("n", "K")
-def sum_slots(
-    first, last, sums, totals, n, K, WIDTH: tl.constexpr, PADDED: tl.constexpr, SLOTS: tl.constexpr, BLOCK: tl.constexpr
+def reduce_sums(
+    first,
+    last,
+    sums,
+    totals,
+    n,
+    K,
+    WIDTH: tl.constexpr,
+    PADDED: tl.constexpr,
+    TOGETHER: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
-    """totals (n, K, WIDTH) in double precision of the sums (slots, K, WIDTH): in a fixed order.
+    """totals (n, K, WIDTH) in double precision of the sums (accumulators, K, WIDTH): in a fixed order.
 
-    A splat's slots lie side by side and are read SLOTS at a time: a splat in thousands of tiles would have the others wait.  A
-    row of threads has a slot's sums, so that it reads whole sectors.  PADDED: WIDTH rounded up to a power of 2.
+    A splat's accumulators lie side by side and are read TOGETHER at a time: a splat in thousands of tiles would have the others
+    wait.  A row of threads has the sums of one, so that it reads whole sectors.  PADDED: WIDTH rounded up to a power of 2.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    ahead, j = tl.arange(0, SLOTS)[None, :, None], tl.arange(0, PADDED)[None, None, :]
+    ahead, j = tl.arange(0, TOGETHER)[None, :, None], tl.arange(0, PADDED)[None, None, :]
     start, stop = tl.load(first + i, i < n, other=0), tl.load(last + i, i < n, other=0)
     k = tl.program_id(1)
-    total = tl.zeros((BLOCK, SLOTS, PADDED), tl.float64)
+    total = tl.zeros((BLOCK, TOGETHER, PADDED), tl.float64)
     longest = tl.max(stop - start, 0)
-    for s in range(0, longest, SLOTS):
-        slot = (start + s)[:, None, None] + ahead
-        inside = (slot < stop[:, None, None]) & (j < WIDTH)
-        total += tl.load(sums + (slot * K + k) * WIDTH + j, inside, other=0.0).to(tl.float64)
+    for s in range(0, longest, TOGETHER):
+        place = (start + s)[:, None, None] + ahead
+        inside = (place < stop[:, None, None]) & (j < WIDTH)
+        total += tl.load(sums + (place * K + k) * WIDTH + j, inside, other=0.0).to(tl.float64)
     at, j = (i.to(tl.int64)[:, None] * K + k) * WIDTH, tl.arange(0, PADDED)[None, :]
     tl.store(totals + at + j, tl.sum(total, 1), (i < n)[:, None] & (j < WIDTH))
 
 
-@sized("n")
-def reduce_gradient(splats, totals, gradient, n, BLOCK: tl.constexpr):
-    """gradient (n, 9) from totals (n, 9)."""
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = i < n
-    splat, at = load_splat(splats, i, inside), i.to(tl.int64) * 9
-    store_six(gradient, at, first_order(whiten(splat), splat[5], load_six(totals, at, inside)), inside)
-    copy_colour(gradient, at, totals, at, inside)
-
-
 @sized("n", "K", "begin", "size")
-def reduce_curvature(splats, directions, moments, totals, product, n, K, begin, size, BLOCK: tl.constexpr):
-    """product (n, K, 9) along the directions begin, begin + 1, ... from totals (n, size, 9); moments: the gradient's totals."""
+def reduce_tangents(tangents, moments, totals, product, n, K, begin, size, BLOCK: tl.constexpr):
+    """product (n, K, 9) along the tangents begin, begin + 1, ... of (n, K, 9) from totals (n, size, 9).
+
+    moments: (n, 9), the adjoints.
+    """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
-    splat = load_splat(splats, i, inside)
     k = tl.program_id(1)
     at, source = (i.to(tl.int64) * K + begin + k) * 9, (i.to(tl.int64) * size + k) * 9
-    y, total = load_six(directions, at, inside), load_six(totals, source, inside)
-    moment = load_six(moments, i.to(tl.int64) * 9, inside)
-    store_six(product, at, second_order(whiten(splat), splat[5], y, moment, total), inside)
+    q, total = load_six(tangents, at, inside), load_six(totals, source, inside)
+    found = second_order(q, load_six(moments, i.to(tl.int64) * 9, inside), total)
+    for j in tl.static_range(6):
+        tl.store(product + at + j, found[j], inside)
     copy_colour(product, at, totals, source, inside)

@@ -1,84 +1,79 @@
-"""The compositing of splats on the GPU: a view held still, with the interface of `cpu.Raster` for tensors.
+"""The compositing of the splats of one view on a GPU: `raster.dispatch.Raster` by Triton kernels.
 
-`CudaRaster` has done all that depends on the splats alone (order, tile lists, final transmittances, stops); its methods are
-passes over the pixels.  Images are planes without padding, (planes, height, width), contiguous, in the precision of the pixels
-(that of `depths`); a splat is nine numbers (`packing.py`), in double precision.
+Planes have no padding: (planes, height, width), contiguous, in the precision of the pixels (that of `depths`).
 
-Sums (`settings.sums`) are "ordered": they go through slots and are added in a fixed order, so every result is the same to the
-last bit from run to run; or "atomic": entries are added to their splats as they come, which is faster and takes less memory.
+Accumulation (`settings.accumulation`) is "deterministic": each intersection has an accumulator for its sums, and these are
+added in a fixed order, so every result is the same to the last bit from run to run; or "atomic": sums are added to those of
+their splats in whatever order, which is faster and takes less memory.
 
-Two sizes are read back by the constructor, the numbers of strips and of entries (`cuda_binning`), for which arrays are made;
-no later call waits for the device: there is room for the sums of all entries, also of those that no pixel reaches.
+Two sizes are read back by the constructor, the numbers of strips and of intersections (`binning.py`), for which arrays are
+made; no later call waits for the device: there is room for the sums of all intersections, also of those that no pixel reaches.
 Everything runs on the current stream of the splats' device.
 """
 
-from math import inf, log2
+from functools import cached_property
 
 import torch
 import triton
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from splat.backend.gpu.compile import launch
 from splat.model.settings import RenderSettings
-from splat.raster.cuda import binning as cuda_binning
-from splat.raster.cuda import blocks as cuda_blocks
-from splat.raster.cuda import compositing as cuda_compositing
-from splat.raster.cuda import packing as cuda_packing
-from splat.raster.cuda.binning import HEIGHT, WIDTH, Slots, grid
+from splat.raster.cuda import binning, blocks, compositing, packing
+from splat.raster.cuda.binning import HEIGHT, WIDTH, Accumulators, grid
+from splat.raster.formulas import SPLAT, thresholds_of
 
-LEAST_TRANSMITTANCE = {torch.float32: 1e-30, torch.float64: 1e-290}  # beneath it T would underflow
-LEAST_LOG2_ALPHA = {torch.float32: -126.0, torch.float64: -1022.0}  # the range of exp2
-TOGETHER = (
-    2  # tangents that one launch has in registers: with 4, a thread of `curvature` would need more than there are
-)
+# Tangents that one launch has in registers: with 4, a thread of `backward_tangent` would need more than there are.
+TOGETHER = 2
 TILE = {"WIDTH": WIDTH, "HEIGHT": HEIGHT}
 LAUNCH = {"num_warps": 1}
 BLOCK = 128  # splats a program of the kernels that run over splats
 SPLATS = {"BLOCK": BLOCK, "num_warps": 4}
-ROWS = 2  # splats whose slots a program sums
-SIDE_BY_SIDE = 256  # numbers of a splat's slots that it reads at a time
+ROWS = 2  # splats whose accumulators a program sums
+SIDE_BY_SIDE = 256  # numbers of a splat's accumulators that it reads at a time
 
 
 class CudaRaster:
-    """One view of one set of splats, composited and held still.
-
-    splats: (n, 9), finite, in double precision; depths: (n,) positive where drawn, in the precision of the pixels.  With
-    transmittance_min = 0 a pixel still stops at LEAST_TRANSMITTANCE.  planes: red, green, blue and accumulated alpha.
-    """
+    """One view of one set of splats, composited."""
 
     def __init__(
         self,
-        splats: Float[Tensor, "n 9"],
-        depths: Float[Tensor, "n"],
-        drawn: Bool[Tensor, "n"],
+        splats: Float64[Tensor, "n 9"],
+        depths: Float[Tensor, " n"],
+        drawn: Bool[Tensor, " n"],
         background: Float[Tensor, "3"],
         width: int,
         height: int,
         settings: RenderSettings,
     ):
         self.splats, self.dtype, self.device = splats.double().contiguous(), depths.dtype, splats.device
-        self.width, self.height, self.ordered = width, height, settings.sums == "ordered"
-        self.frame = _frame(background, settings, self.dtype, self.device)
-        self.lists = cuda_binning.bin_splats(self.splats, depths, drawn, width, height, self.frame)
-        self.params = self._empty(len(splats), cuda_packing.PARAMS)
+        self.width, self.height, self.deterministic = width, height, settings.accumulation == "deterministic"
+        thresholds = torch.tensor(thresholds_of(settings, self.dtype), dtype=torch.float64)
+        shared = (thresholds.to(self.device, non_blocking=True), background.to(self.device, torch.float64))
+        self.frame = torch.cat(shared)
+        self.lists = self.bin(depths, drawn)
+        self.params = self._empty(len(splats), packing.PARAMS)
         self.planes = self._empty(4, height, width)
         self._transmittance, self._stop = self._empty(height, width), self._empty(height, width, dtype=torch.int32)
         self._reached = self._empty(len(self.lists.start) - 1, dtype=torch.int32)
-        self._slots: Slots | None = None
         self.pack()
         self.forward()
+
+    def bin(self, depths: Float[Tensor, " n"], drawn: Bool[Tensor, " n"]) -> binning.Lists:
+        """The tile lists."""
+        return binning.bin_splats(self.splats, depths, drawn, self.width, self.height, self.frame)
 
     def pack(self) -> None:
         """The splats as the passes over the pixels read them."""
         n = len(self.splats)
-        launch(cuda_packing.pack_splats, grid(n, BLOCK), self.splats, self.frame, self.params, n, **SPLATS)
+        launch(packing.pack_splats, grid(n, BLOCK), self.splats, self.frame, self.params, n, **SPLATS)
 
     def forward(self) -> None:
         """The image, and where its pixels stop."""
         self._order = _heaviest_first(self.lists.start.diff())
         self._launch(
-            cuda_compositing.forward, self.lists.start, self.lists.splat, self.params, self.frame, self.planes,
+            compositing.forward, self.lists.start, self.lists.splat, self.params, self.frame, self.planes,
             self._transmittance, self._stop, self._reached,
         )  # fmt: skip
         self._order = _heaviest_first(self._reached)
@@ -88,194 +83,162 @@ class CudaRaster:
 
     def _launch(self, kernel, *arguments, **constants) -> None:
         """A kernel on every tile, heaviest first."""
-        columns = -(-self.width // WIDTH)
-        programs = (len(self._order),)
-        launch(
-            kernel, programs, self._order, *arguments, columns, self.width, self.height, **constants, **TILE, **LAUNCH
-        )
+        size = (-(-self.width // WIDTH), self.width, self.height)
+        launch(kernel, (len(self._order),), self._order, *arguments, *size, **constants, **TILE, **LAUNCH)
 
     @property
-    def entries(self) -> int:
-        """How many entries the tile lists have: splats in tiles."""
+    def intersections(self) -> int:
+        """How many pairs of a splat and a tile the lists have."""
         return len(self.lists.splat)
 
     @property
-    def order(self) -> int:
-        """Which splats each tile draws, in which order: the same number for the same lists."""
-        splat = self.lists.splat.long()
-        mixed = (splat + 1) * 0x1E3779B97F4A7C15 ^ torch.arange(len(splat), device=self.device) * 0x3F58476D1CE4E5B9
+    def draw_order(self) -> int:
+        """The same number for rasters of which every tile draws the same splats in the same order."""
+        numbers = torch.cat([self.lists.start, self.lists.splat]).long()
+        place = torch.arange(len(numbers), device=self.device)
+        mixed = (numbers + 1) * 0x1E3779B97F4A7C15 ^ place * 0x3F58476D1CE4E5B9
         return int(((mixed ^ (mixed >> 31)) * 0x14D049BB133111EB).sum())
 
-    @property
-    def slots(self) -> Slots:
-        """Where the sums of the entries go that some pixel reaches."""
-        if self._slots is None:
-            self._slots = self.number_slots()
-        return self._slots
+    @cached_property
+    def accumulators(self) -> Accumulators:
+        """`number_accumulators`, kept from the first pass that sums over pixels on."""
+        return self.number_accumulators()
 
-    def number_slots(self) -> Slots:
-        return cuda_binning.number_slots(self.lists, self._reached)
+    def number_accumulators(self) -> Accumulators:
+        """Where the sums go of the intersections that some pixel reaches."""
+        return binning.number_accumulators(self.lists, self._reached)
 
     @property
-    def entries_reached(self) -> int:
-        """How many entries some pixel reaches; reads their number back."""
+    def intersections_reached(self) -> int:
+        """How many intersections some pixel reaches; reads their number back."""
         return int(self._reached.sum())
 
     @property
-    def touched(self) -> Int[Tensor, "m"]:
-        """The splats that have entries that some pixel reaches; reads their number back."""
-        kept = cuda_binning.kept_entries(self.lists, self._reached)
+    def touched(self) -> Int[Tensor, " m"]:
+        """The splats that have intersections that some pixel reaches; reads their number back."""
+        kept = binning.kept_intersections(self.lists, self._reached)
         count = torch.zeros(len(self.splats), dtype=torch.int32, device=self.device)
         return count.index_add_(0, self.lists.splat, kept.to(torch.int32)).nonzero()[:, 0]
 
     def dark_tiles(self, adjoint: "CudaAdjoint", curvature: Float[Tensor, "3 h w"]) -> int:
-        """How many tiles with entries have neither cotangent nor curvature anywhere; reads their number back."""
+        """How many tiles have neither cotangent nor curvature in any pixel; reads their number back."""
         lit = ((adjoint.cotangent != 0).any(0) | (curvature != 0).any(0)).float()
         tiles = torch.nn.functional.max_pool2d(lit[None], (HEIGHT, WIDTH), ceil_mode=True).flatten()
         return int(((self._reached > 0) & (tiles == 0)).sum())
 
     @property
     def bytes(self) -> int:
-        """Memory of what is held."""
+        """Memory of what is kept."""
         tensors = [self.splats, self.params, *self.lists, self.planes, self._transmittance, self._stop, self._reached]
-        tensors += self._slots or ()
+        tensors += vars(self).get("accumulators", ())
         return sum(tensor.nbytes for tensor in tensors)
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that `jvp` and `curvature` of so many directions take, directions and result included."""
+        """Bytes that `jvp` and `backward_tangent` of so many tangents take, tangents and result included."""
         n, pixels, item = len(self.splats), 5 * self.height * self.width, self.dtype.itemsize
-        each = item * (pixels + cuda_packing.SUMS * self.entries + cuda_packing.TANGENTS * n)
-        return vectors * (each + (2 * 9 + cuda_packing.SUMS) * 8 * n)
+        return vectors * (item * (pixels + SPLAT * (self.intersections + 2 * n)) + (SPLAT * 8 + 1) * n)
 
-    def crop(self, planes: Float[Tensor, "*planes h w"]) -> Float[Tensor, "*planes h w"]:
+    def crop(self, planes: Float[Tensor, "*k h w"]) -> Float[Tensor, "*k h w"]:
         """The planes themselves: they have no padding here."""
         return planes
 
-    def pad(self, planes: Float[Tensor, "*planes h w"]) -> Float[Tensor, "*planes h w"]:
+    def pad(self, planes: Float[Tensor, "*k h w"]) -> Float[Tensor, "*k h w"]:
         """Planes as the kernels take them: contiguous, in the precision of the pixels."""
         return planes.to(self.dtype).contiguous()
 
     def totals(self, kernel, vectors: int, width: int, *arguments, **constants) -> Float[Tensor, "n vectors width"]:
-        """The totals over every splat's entries of a kernel that leaves `vectors` times `width` sums an entry.
+        """The totals over every splat's intersections of a kernel that leaves `vectors` times `width` sums for each.
 
         Its first arguments are those of `backward`, its last the sums.
         """
-        n, ordered = len(self.splats), self.ordered
-        sums = self._empty(self.entries if ordered else n, vectors, width)
+        n, each = len(self.splats), self.deterministic
+        sums = self._empty(self.intersections if each else n, vectors, width)
+        where = self.accumulators.place if each else self.lists.splat
         self._launch(
-            kernel, self.lists.start, self._reached, self.lists.splat, self.slots.slot if ordered else self.lists.splat,
-            self.params, self.frame, self._transmittance, self._stop, *arguments, sums if ordered else sums.zero_(),
-            ATOMIC=not ordered, **constants,
+            kernel, self.lists.start, self._reached, self.lists.splat, where, self.params, self.frame, self._transmittance,
+            self._stop, *arguments, sums if each else sums.zero_(), ATOMIC=not each, **constants,
         )  # fmt: skip
-        if not ordered:
+        if not each:
             return sums
         totals = self._empty(n, vectors, width, dtype=torch.float64)
-        sum_slots(self.slots.first, self.slots.last, sums, totals)
+        reduce_sums(self.accumulators.first, self.accumulators.last, sums, totals)
         return totals
 
     def backward(self, cotangent: Float[Tensor, "4 h w"]) -> "CudaAdjoint":
-        """The gradient in the splats from cotangent planes."""
+        """The adjoint of the splats, given that of the planes."""
         return CudaAdjoint(self, cotangent)
 
     def gaussian_blocks(
-        self, adjoint: "CudaAdjoint", curvature: Float[Tensor, "3 h w"], index: Int[Tensor, "m"], gauss_newton: bool
-    ) -> Float[Tensor, "m 9 9"]:
-        """Own blocks of the splats at index: of the Hessian or of its Gauss-Newton part.
+        self, adjoint: "CudaAdjoint", curvature: Float[Tensor, "3 h w"], index: Int[Tensor, " m"], gauss_newton: bool
+    ) -> Float64[Tensor, "m 9 9"]:
+        """Diagonal blocks of the splats at index: of the Hessian or of its Gauss-Newton part."""
+        v_planes = torch.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent
+        totals = self.totals(blocks.block_moments, 1, blocks.BLOCK_SUMS, v_planes, self.pad(curvature))[:, 0]
+        return blocks.gaussian_blocks(totals[index], adjoint.moments[index], not gauss_newton)
 
-        adjoint: that of the loss's gradient; curvature: the pixel-diagonal of l''.
-        """
-        gradient = torch.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent
-        totals = self.totals(cuda_blocks.block_moments, 1, cuda_blocks.BLOCK_SUMS, gradient, self.pad(curvature))[:, 0]
-        moments = torch.zeros_like(adjoint.moments) if gauss_newton else adjoint.moments
-        return cuda_blocks.gaussian_blocks(self.splats[index], totals[index].double(), moments[index].double())
-
-    def jvp(self, directions: Float[Tensor, "n K 9"]) -> "CudaTangent":
-        """J u for directions of the splats."""
+    def jvp(self, directions: Float[Tensor, "n k 9"]) -> "CudaTangent":
+        """J u for tangents of the splats."""
         return CudaTangent(self, directions)
 
 
-def sum_slots(first: Int[Tensor, "n"], last: Int[Tensor, "n"], sums: Tensor, totals: Tensor) -> None:
-    """totals (n, vectors, width) of the sums (slots, vectors, width): those of splat i lie at first[i] .. last[i] - 1."""
+def reduce_sums(first: Int[Tensor, " n"], last: Int[Tensor, " n"], sums: Tensor, totals: Tensor) -> None:
+    """totals (n, vectors, width) of the sums (accumulators, vectors, width): those of splat i are first[i] .. last[i] - 1."""
     n, vectors, width = totals.shape
     padded = triton.next_power_of_2(width)
     launch(
-        cuda_packing.sum_slots, (*grid(n, ROWS), vectors), first, last, sums, totals, n, vectors,
-        WIDTH=width, PADDED=padded, SLOTS=SIDE_BY_SIDE // padded, BLOCK=ROWS, num_warps=1,
+        packing.reduce_sums, (*grid(n, ROWS), vectors), first, last, sums, totals, n, vectors,
+        WIDTH=width, PADDED=padded, TOGETHER=SIDE_BY_SIDE // padded, BLOCK=ROWS, num_warps=1,
     )  # fmt: skip
 
 
-def _frame(background: Tensor, settings: RenderSettings, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """What all pixels share, in double precision (`cuda_packing`)."""
-    least = max(log2(settings.alpha_min) if settings.alpha_min else -inf, LEAST_LOG2_ALPHA[dtype])
-    contour = inf if settings.contour_sigma is None else settings.contour_sigma
-    free = inf if settings.gradient_through_cap else settings.alpha_max
-    floor = max(settings.transmittance_min, LEAST_TRANSMITTANCE[dtype])
-    numbers = [settings.alpha_min, contour, least, settings.alpha_max, free, floor]
-    shared = torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
-    return torch.cat([shared, background.to(device, torch.float64)])
-
-
-def _heaviest_first(work: Int[Tensor, "tiles"]) -> Int[Tensor, "tiles"]:
+def _heaviest_first(work: Int[Tensor, " tiles"]) -> Int[Tensor, " tiles"]:
     """Tiles with the most work first, so that the last programs to start are short."""
     return torch.argsort(work, descending=True, stable=True).to(torch.int32)
 
 
 class CudaAdjoint:
-    """The first-order adjoint of the splats: `gradient` (n, 9), `moments` S, Su, Sv (n, 3), and the cotangent it came from."""
+    """The adjoint of the splats: moments, and the cotangent that they are of."""
 
     def __init__(self, raster: CudaRaster, cotangent: Float[Tensor, "4 h w"]):
-        n, self.cotangent = len(raster.splats), raster.pad(cotangent)
-        self.totals = raster.totals(cuda_compositing.backward, 1, cuda_packing.SUMS, self.cotangent)[:, 0]
-        self.gradient = torch.empty_like(raster.splats)
-        arguments = (raster.splats, self.totals, self.gradient, n)
-        launch(cuda_packing.reduce_gradient, grid(n, BLOCK), *arguments, **SPLATS)
+        self.cotangent = raster.pad(cotangent)
+        totals = raster.totals(compositing.backward, 1, SPLAT, self.cotangent)
+        self.moments: Float[Tensor, "n 9"] = totals[:, 0].to(raster.dtype)
 
     @property
     def bytes(self) -> int:
-        """Memory of what is held beside the cotangent."""
-        return self.gradient.nbytes + self.totals.nbytes
-
-    @property
-    def moments(self) -> Float[Tensor, "n 3"]:
-        return self.totals[:, :3]
+        """Memory of what is kept beside the cotangent."""
+        return self.moments.nbytes
 
 
 class CudaTangent:
-    """J u of K directions: `planes` (K, 4, h, w), and what the second-order pass needs of it."""
+    """J u of K tangents of the splats, and what the second-order pass needs of it."""
 
-    def __init__(self, raster: CudaRaster, directions: Float[Tensor, "n K 9"]):
-        self.raster, self.directions = raster, directions.double().contiguous()
-        n, K = directions.shape[:2]
-        self.planes = raster._empty(K, 4, raster.height, raster.width)
+    def __init__(self, raster: CudaRaster, directions: Float[Tensor, "n k 9"]):
+        self.raster, self._directions = raster, directions.to(raster.dtype).contiguous()
+        K = directions.shape[1]
+        moved = (self._directions != 0).any(dim=2).to(torch.int8)
+        self.planes: Float[Tensor, "k 4 h w"] = raster._empty(K, 4, raster.height, raster.width)
         self._transmittances = raster._empty(K, raster.height, raster.width)
         self._moves = raster._empty(len(_parts(K)), len(raster._reached), dtype=torch.int32)
-        self._packed: list[Tensor] = []
         for part, moves in zip(_parts(K), self._moves, strict=True):
-            size = part.stop - part.start
-            packed, moved = raster._empty(n, size, cuda_packing.TANGENTS), raster._empty(n, size, dtype=torch.int8)
-            arguments = (raster.splats, self.directions, packed, moved, n, K, part.start, size)
-            launch(cuda_packing.pack_tangents, (*grid(n, BLOCK), size), *arguments, **SPLATS)
             raster._launch(
-                cuda_compositing.tangent, raster.lists.start, raster._reached, raster.lists.splat, raster.params,
-                raster.frame, raster._stop, packed, moved, self.planes[part], self._transmittances[part], moves, K=size,
+                compositing.tangent, raster.lists.start, raster._reached, raster.lists.splat, raster.params, raster.frame,
+                raster._stop, self._directions, moved, self.planes[part], self._transmittances[part],
+                moves, part.start, K, K=part.stop - part.start,
             )  # fmt: skip
-            self._packed.append(packed)
 
-    def curvature(self, adjoint: CudaAdjoint, cotangents: Float[Tensor, "K 4 h w"]) -> Float[Tensor, "n K 9"]:
-        """The tangent of `CudaRaster.backward` along the directions.
-
-        cotangents: the tangents of the adjoint's cotangent; 0 for the second derivative of the compositing alone.
-        """
-        raster, (n, K) = self.raster, self.directions.shape[:2]
-        cotangents, product = raster.pad(cotangents), torch.empty_like(self.directions)
-        for packed, moves, part in zip(self._packed, self._moves, _parts(K), strict=True):
+    def backward_tangent(self, adjoint: CudaAdjoint, cotangents: Float[Tensor, "k 4 h w"]) -> Float[Tensor, "n k 9"]:
+        """The tangent of `backward` along the splats' tangents, given those of the adjoint's cotangent."""
+        raster, (n, K) = self.raster, self._directions.shape[:2]
+        cotangents, product = raster.pad(cotangents), torch.empty_like(self._directions)
+        for moves, part in zip(self._moves, _parts(K), strict=True):
             size = part.stop - part.start
             totals = raster.totals(
-                cuda_compositing.curvature, size, cuda_packing.SUMS, adjoint.cotangent, packed, moves,
-                self._transmittances[part], cotangents[part], K=size,
+                compositing.backward_tangent, size, SPLAT, adjoint.cotangent, self._directions, moves,
+                self._transmittances[part], cotangents[part], part.start, K, K=size,
             )  # fmt: skip
-            arguments = (raster.splats, self.directions, adjoint.totals, totals, product, n, K, part.start, size)
-            launch(cuda_packing.reduce_curvature, (*grid(n, BLOCK), size), *arguments, **SPLATS)
+            arguments = (self._directions, adjoint.moments, totals, product, n, K, part.start, size)
+            launch(packing.reduce_tangents, (*grid(n, BLOCK), size), *arguments, **SPLATS)
         return product
 
 

@@ -1,7 +1,7 @@
 """Scenes from COLMAP models, binary or text, read with pycolmap.
 
 A model is three files, cameras, images and points3D (.bin or .txt), in `sparse/0`, `sparse` or the scene folder itself.
-COLMAP's frames are ours: world to camera, +x right, +y down, +z forward, pixel centres at + 0.5.
+COLMAP's conventions are those of this package: world to camera, +x right, +y down, +z forward, pixel centres at + 0.5.
 """
 
 import re
@@ -11,13 +11,14 @@ import numpy as np
 import pycolmap
 import torch
 
+from landscape.errors import InputError, lacks_memory
 from splat.scenes.images import Photo, image_files, image_folder
 from splat.scenes.view import Points
 
 MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 MODEL_FILES = ("cameras", "images", "points3D")
 SMALLEST_RECORD = {"cameras": 40, "images": 73, "points3D": 51}  # bytes in a binary model, after a count of 8 bytes
-LISTS = {"images": (64, 24), "points3D": (43, 8)}  # bytes of a record before its list (and a name's), and of an entry
+LISTS = {"images": (64, 24), "points3D": (43, 8)}  # bytes of a record before its list (and the name), and of an entry
 
 
 def find_model(root: Path) -> Path | None:
@@ -32,18 +33,20 @@ def find_model(root: Path) -> Path | None:
 def read_colmap(
     root: Path, model: Path, images: str | None = None, *, points: bool = True
 ) -> tuple[list[Photo], Points | None]:
-    """Photographs sorted by name, and the model's points with their tracks, where they are wanted."""
+    """Photographs sorted by name, and the model's points with their tracks unless points is False."""
     _require_plausible_counts(model)
     try:
         reconstruction = pycolmap.Reconstruction(model)
         registered = (reconstruction.images[i] for i in reconstruction.reg_image_ids())
         posed = sorted(registered, key=lambda image: image.name)  # which may be no text
-    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        raise ValueError(
+    except (ValueError, RuntimeError, IndexError) as error:
+        if lacks_memory(error):
+            raise
+        raise InputError(
             f"expected a COLMAP model, cannot read the one in {model}: {error}; export it again"
         ) from error
     if not posed:
-        raise ValueError(
+        raise InputError(
             f"expected images with poses in the COLMAP model {model}, got none among {len(reconstruction.images)}; "
             "run `colmap mapper` to compute them"
         )
@@ -57,13 +60,16 @@ def read_colmap(
 
 
 def _require_plausible_counts(model: Path) -> None:
-    """COLMAP allocates what a file promises, reads on behind its end, and ends the process when it is not one of its files."""
+    """InputError where a binary file promises more than it has.
+
+    COLMAP would allocate the promised memory, read beyond the end, or abort the process.
+    """
     for name, record in SMALLEST_RECORD.items():
         path = model / f"{name}.bin"
         content = path.read_bytes() if path.is_file() else bytes(8)
         count = int.from_bytes(content[:8], "little")
         if len(content) < 8 + count * record or (name in LISTS and not _lists_fit(content, count, name)):
-            raise ValueError(
+            raise InputError(
                 f"expected a COLMAP model, {path} promises {count} {name} with more in them than its {len(content)} bytes; "
                 "it is cut short or no COLMAP file: export the model again"
             )

@@ -1,4 +1,4 @@
-"""Scenes of DTU (Jensen et al. 2014), and how its files number the views.
+"""Scenes of DTU (Jensen et al. 2014).
 
     Rectified/scanN/rect_III_L_rX.png       III the view from 001, L the light (0 to 6, or max), X 5000, or 7000 from view 50
     Calibration/cal18/pos_III.txt           the 3 x 4 matrix P = K [R | -R c] of view III, px and mm, for all scans
@@ -16,6 +16,7 @@ import pycolmap
 import scipy
 import torch
 
+from landscape.errors import InputError
 from splat.scenes.images import Photo, image_header
 
 LIGHT = 3
@@ -52,12 +53,12 @@ def read_dtu(root: Path) -> list[Photo]:
         try:
             matrix = np.loadtxt(position, dtype=np.float64).reshape(3, 4)
         except ValueError as error:
-            raise ValueError(f"expected a 3 x 4 matrix in {position}, cannot read it: {error}") from error
+            raise InputError(f"expected a 3 x 4 matrix in {position}, cannot read it: {error}") from error
         calibration, rotation, centre = decompose(matrix)
         size = image_header(path)[0]
         skew = abs(calibration[0, 1]) * size[1] / calibration[1, 1]
         if not skew < LARGEST_SKEW:
-            raise ValueError(f"expected a camera without skew in {position}, got one that shears by {skew:.2g} px")
+            raise InputError(f"expected a camera without skew in {position}, got one that shears by {skew:.2g} px")
         fx, fy, cx, cy = calibration[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         lens = pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=[fx, fy, cx, cy])
         photos.append(Photo(path.name, path, lens, torch.from_numpy(rotation), torch.from_numpy(centre)))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from landscape.errors import InputError
 from splat.scenes.images import Photo, checked_lens, image_files, image_folder
 from splat.scenes.layers import read_array
 
@@ -22,21 +23,21 @@ def read_llff(root: Path, images: str | None = None) -> list[Photo]:
     try:
         rows = read_array(path).astype(np.float64)
     except (ValueError, OSError) as error:
-        raise ValueError(
+        raise InputError(
             f"expected an array in {path}, cannot read it: {error}; make it again with LLFF's imgs2poses"
         ) from error
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
-        raise ValueError(f"expected finite rows of 17 numbers in {path}, got shape {rows.shape}; see LLFF's imgs2poses")
+        raise InputError(f"expected finite rows of 17 numbers in {path}, got shape {rows.shape}; see LLFF's imgs2poses")
     folder = image_folder(root, images)
     files = image_files(folder)
     if len(files) != len(rows):
-        raise ValueError(
+        raise InputError(
             f"expected one image for each of the {len(rows)} poses in {path}, got {len(files)} in {folder}; "
             "restore the images that the poses were computed from, or choose their folder with images=..."
         )
     for file, (near, far) in zip(files, rows[:, 15:]):
         if not 0 < near < far:
-            raise ValueError(
+            raise InputError(
                 f"expected 0 < nearest < farthest depth at the end of each row of {path}, got {near:g} and {far:g} for "
                 f"{file.name!r}; make it again with LLFF's imgs2poses"
             )

@@ -16,7 +16,9 @@ files, because the sparse-view protocols count them.  Frames of a single file ar
 """
 
 import json
+import re
 from collections.abc import Mapping
+from io import BytesIO
 from math import isfinite, pi, tan
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ import torch
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.scenes.images import (
     PINHOLE_MODELS,
     UNDISTORTED_HERE,
@@ -75,13 +78,13 @@ def _load(path: Path) -> dict[str, Any]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"), parse_int=float)  # of which the largest is infinite
     except (ValueError, OSError, RecursionError) as error:
-        raise ValueError(f"expected a JSON file with frames, cannot read {path}: {error}") from error
+        raise InputError(f"expected a JSON file with frames, cannot read {path}: {error}") from error
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise ValueError(f"expected a non-empty list 'frames' in {path}; every frame is an image with its pose")
+        raise InputError(f"expected a non-empty list 'frames' in {path}; every frame is an image with its pose")
     for i, frame in enumerate(frames):
         if not (isinstance(frame, dict) and "transform_matrix" in frame and isinstance(frame.get("file_path"), str)):
-            raise ValueError(f"expected 'file_path' and 'transform_matrix' in frame {i} of {path}")
+            raise InputError(f"expected 'file_path' and 'transform_matrix' in frame {i} of {path}")
     return data
 
 
@@ -109,7 +112,7 @@ def _file(values: Mapping[str, Any], key: str, path: Path) -> str | None:
     """The name of a file, where there is one."""
     name = values.get(key)
     if name is not None and not isinstance(name, str):
-        raise ValueError(f"expected the name of a file, got {key} = {name!r} in {path}")
+        raise InputError(f"expected the name of a file, got {key} = {name!r} in {path}")
     return name
 
 
@@ -120,7 +123,7 @@ def _pose(matrix: Any, name: str, path: Path) -> tuple[Tensor, Tensor]:
     except (TypeError, ValueError):
         pose = np.empty(0)
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
-        raise ValueError(f"expected a finite 4 x 4 transform_matrix for {name!r} in {path}, got {matrix!r}")
+        raise InputError(f"expected a finite 4 x 4 transform_matrix for {name!r} in {path}, got {matrix!r}")
     rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3].T
     return torch.from_numpy(rotation), torch.from_numpy(pose[:3, 3].copy())
 
@@ -129,17 +132,17 @@ def _lens(values: Mapping[str, Any], size: tuple[int, int], name: str, path: Pat
     """The pycolmap camera of one frame's intrinsics."""
     wrong = [key for key in NUMBERS if key in values and not (isinstance(values[key], float) and isfinite(values[key]))]
     if wrong:
-        raise ValueError(f"expected a finite number, got {wrong[0]} = {values[wrong[0]]!r} for {name!r} in {path}")
+        raise InputError(f"expected a finite number, got {wrong[0]} = {values[wrong[0]]!r} for {name!r} in {path}")
     model = str(values.get("camera_model", "OPENCV"))
     if values.get("is_fisheye") or model not in PINHOLE_MODELS + UNDISTORTED_HERE:
         kind = "a fisheye lens" if values.get("is_fisheye") else f"camera_model {model}"
-        raise ValueError(
+        raise InputError(
             f"expected pinhole images or radial and tangential distortion, got {kind} for {name!r} in {path}: a "
             "pinhole renderer cannot draw it; undistort the photographs to pinhole images first"
         )
     rational = [key for key in REFUSED_TERMS if values.get(key)]
     if rational:
-        raise ValueError(
+        raise InputError(
             f"expected at most k1, k2, k3, p1 and p2, got {', '.join(rational)} for {name!r} in {path}, whose meaning "
             "differs between tools; undistort the photographs to pinhole images first"
         )
@@ -159,15 +162,18 @@ def _focal(values: Mapping[str, Any], width: int, name: str, path: Path) -> floa
     if "camera_angle_x" in values:
         angle = float(values["camera_angle_x"])
         if not 0 < angle < pi:
-            raise ValueError(f"expected camera_angle_x above 0 and below pi, got {angle} for {name!r} in {path}")
+            raise InputError(f"expected camera_angle_x above 0 and below pi, got {angle} for {name!r} in {path}")
         return width / (2 * tan(angle / 2))
-    raise ValueError(f"expected fl_x or camera_angle_x for {name!r} in {path}, got neither; add the focal length in px")
+    raise InputError(f"expected fl_x or camera_angle_x for {name!r} in {path}, got neither; add the focal length in px")
 
 
 def read_points(path: Path, names: tuple[str, ...]) -> Points:
     """Points of a PLY file: x y z, red green blue (0 to 255; grey where there are none), and `views` if it is there."""
     try:
-        vertex = PlyData.read(path)["vertex"]
+        promised = re.search(rb"^element vertex (\d+)", content := path.read_bytes(), re.M)
+        if promised and int(promised[1]) > len(content):  # memory for so many would be asked for
+            raise ValueError(f"it promises {int(promised[1])} points in {len(content)} bytes")
+        vertex = PlyData.read(BytesIO(content))["vertex"]
         present = {prop.name for prop in vertex.properties}
         xyz = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=1)
         rgb = np.full(xyz.shape, 0.5, dtype=np.float32)
@@ -178,6 +184,6 @@ def read_points(path: Path, names: tuple[str, ...]) -> Points:
             seen = [np.asarray(views, dtype=np.int64) for views in vertex["views"]]
             point = np.repeat(np.arange(len(seen)), [len(views) for views in seen])
             observations = torch.from_numpy(np.stack([point, np.concatenate(seen)], axis=1)) if seen else None
-    except (OSError, PlyParseError, KeyError, ValueError, TypeError, MemoryError) as error:
-        raise ValueError(f"expected a PLY file of points, cannot read {path}: {error}; restore or remove it") from error
+    except (OSError, PlyParseError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"expected a PLY file of points, cannot read {path}: {error}; restore or remove it") from error
     return Points(torch.from_numpy(xyz), torch.from_numpy(rgb), observations, names)

@@ -1,17 +1,16 @@
 """A scene from photographs: structure from motion with pycolmap.
 
     features     SIFT in every photograph
-    cameras      one for photographs of one size and, where the files say it, one make and focal length: SIMPLE_RADIAL, a
-                 focal length and one term of distortion, which few photographs determine
+    cameras      one for all photographs of one size and, where the files say it, one make and focal length: SIMPLE_RADIAL,
+                 a focal length and one term of distortion, which few photographs suffice for
     matches      every pair of photographs
     mapping      incremental; of several models the one with the most photographs is kept
     images       undistorted to PINHOLE
 
-The scene is a folder with `images` and `sparse/0`, as 3DGS's own tools want it, which appears when it is complete.
+The scene is a folder with `images` and `sparse/0`, as the tools of 3DGS expect it, which appears when it is complete.
 """
 
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,10 +20,12 @@ from typing import Literal
 import pycolmap
 from PIL import ExifTags, Image
 
+from landscape.errors import InputError
 from splat.scenes.images import IMAGE_SUFFIXES, image_files, image_header, image_pixels
 from splat.scenes.layers import FORMATS
 from splat.scenes.scene import load_scene
 from splat.scenes.sfm.triangulation import SEED, matching, quiet, verification
+from splat.scenes.write import finished_folder
 
 Stage = Literal["features", "matches", "mapping", "images"]
 Progress = Callable[[Stage, int, int], None]  # stage, photographs done, photographs in all
@@ -34,10 +35,10 @@ CAMERA = "SIMPLE_RADIAL"
 
 @dataclass(frozen=True)
 class Mapped:
-    """What became of the photographs.
+    """The result of structure from motion.
 
-    left_out: names of those that the model could not place; models: how many photographs every model has, the kept one
-    first, then those with photographs that it has not; error: mean reprojection error, px.
+    placed: photographs in the kept model.  left_out: names of the others.  models: numbers of photographs of the kept model
+    and of those with photographs that it lacks.  points: in the kept model.  error: mean reprojection error, px.
     """
 
     placed: int
@@ -53,21 +54,11 @@ def scene_from_photos(photos: Path, out: Path, on_progress: Progress = lambda *_
     ValueError where the photographs are too few or make no model; nothing is left behind then.
     """
     files = _photographs(photos)
-    if out.exists():
-        raise FileExistsError(
-            f"expected a folder that does not exist yet, got {out}; remove it or choose another --out"
-        )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    try:
-        with quiet():
-            models = _models(files, building / "work", on_progress)
-            scene = building / "scene"
-            _write_images(models[0], photos, building / "work", scene, on_progress)
+    with finished_folder(out) as scene:
+        with tempfile.TemporaryDirectory(dir=scene.parent, prefix=f".{out.name}-") as work, quiet():
+            models = _models(files, Path(work), on_progress)
+            _write_images(models[0], photos, Path(work), scene, on_progress)
         load_scene(scene)
-        os.replace(scene, out)
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
     placed, *others = ({model.images[i].name for i in model.reg_image_ids()} for model in models)
     return Mapped(
         placed=len(placed),
@@ -79,7 +70,7 @@ def scene_from_photos(photos: Path, out: Path, on_progress: Progress = lambda *_
 
 
 def _photographs(folder: Path) -> list[Path]:
-    """The image files, all of which can be read."""
+    """The image files, each read once to see that it is whole."""
     if not folder.is_dir():
         raise FileNotFoundError(
             f"expected a folder of photographs, {folder} {'is not a folder' if folder.exists() else 'does not exist'}; "
@@ -87,7 +78,7 @@ def _photographs(folder: Path) -> list[Path]:
         )
     files = image_files(folder)
     if len(files) < FEWEST:
-        raise ValueError(
+        raise InputError(
             f"expected at least {FEWEST} photographs ({', '.join(IMAGE_SUFFIXES)}) in {folder}, got {len(files)}; "
             "take more, or name the folder that holds them"
         )
@@ -98,9 +89,9 @@ def _photographs(folder: Path) -> list[Path]:
 
 
 def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[pycolmap.Reconstruction]:
-    """The models that the photographs make, the one with the most photographs first."""
+    """The reconstructed models, the one with the most photographs first."""
     database, photos, models = work / "database.db", work / "photos", work / "models"
-    photos.mkdir(parents=True)
+    photos.mkdir()
     models.mkdir()
     own_names = {f"{i:06d}{path.suffix}": path.name for i, path in enumerate(files)}
     for path, name in zip(files, own_names):  # the list of pairs that COLMAP reads has no names with spaces
@@ -133,7 +124,7 @@ def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[py
         next_image_callback=lambda: on_progress("mapping", next(placed, len(names)), len(names)),
     )
     if not found:
-        raise ValueError(_why_there_is_no_model(database, len(names)))
+        raise InputError(_why_there_is_no_model(database, len(names)))
     for model in found.values():
         for image in model.images.values():
             image.name = own_names[image.name]
@@ -141,7 +132,7 @@ def _models(files: Sequence[Path], work: Path, on_progress: Progress) -> list[py
 
 
 def _by_camera(files: Sequence[Path]) -> list[list[int]]:
-    """The places of photographs that may share a camera."""
+    """The indices of photographs that may share a camera, in groups."""
     groups: dict[tuple, list[int]] = {}
     for i, path in enumerate(files):
         with Image.open(path, formats=FORMATS) as file:
@@ -153,7 +144,7 @@ def _by_camera(files: Sequence[Path]) -> list[list[int]]:
 
 
 def _match(database: Path, names: Sequence[str], pairs: Path, on_progress: Progress) -> None:
-    """Every photograph with all before it, one after the other, so that progress shows and Ctrl-C is heard."""
+    """Match every photograph with all before it; one call each, so that progress shows and Ctrl-C is heard."""
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = pairs
     on_progress("matches", 1, len(names))

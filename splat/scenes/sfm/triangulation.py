@@ -1,12 +1,12 @@
-"""Points from some views alone, whose poses are known: nothing of the views held out goes into the start of a training.
+"""Points triangulated from some views with known poses, so that a training starts from nothing of the views held out.
 
     features     SIFT with affine shapes and pooling over scales, in the pictures as the training sees them
     matches      of every pair of views
-    points       triangulated with COLMAP's thresholds (reprojection error 4 px, angle 1.5 degrees), poses and lenses held
+    points       triangulated with COLMAP's thresholds (reprojection error 4 px, angle 1.5 degrees), poses and lenses fixed
 
-as FSGS and CoR-GS make them (their `tools/colmap_llff.py`, before dense stereo), except that points which only two
-views see are kept, for of three views hardly any other is left; and that matching is not guided by epipolar geometry a
-second time, for where two views are all that see a point, nothing refutes the wrong matches which that adds.
+as FSGS and CoR-GS make them (their `tools/colmap_llff.py`, before dense stereo), with two differences.  Points that only two
+views see are kept, because three views have hardly any others.  Matching is not guided by epipolar geometry a second time,
+because nothing refutes the wrong matches that it adds where only two views see a point.
 """
 
 import tempfile
@@ -19,6 +19,7 @@ import pycolmap
 import torch
 from PIL import Image
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.scenes.formats.colmap import points_of
 from splat.scenes.view import Points, View
@@ -27,9 +28,9 @@ SEED = 0  # of RANSAC: the same views give the same points
 
 
 def triangulated_points(views: Sequence[View]) -> Points:
-    """The points that at least two of these views show.  ValueError where there are fewer than two views, or no point."""
+    """The points that at least two of these views show.  InputError where there are fewer than two views, or no point."""
     if len(views) < 2:
-        raise ValueError(f"expected at least 2 views to triangulate from, got {len(views)}; start from random points")
+        raise InputError(f"expected at least 2 views to triangulate from, got {len(views)}; start from random points")
     with tempfile.TemporaryDirectory() as folder, quiet():
         database, pictures, output = (Path(folder) / name for name in ("database.db", "images", "output"))
         pictures.mkdir()
@@ -51,7 +52,7 @@ def triangulated_points(views: Sequence[View]) -> Points:
         model = pycolmap.triangulate_points(posed, database, pictures, output, options=options)
     points = points_of(model, _in_order(model))
     if points is None:
-        raise ValueError(
+        raise InputError(
             f"expected places that two of the {len(views)} training views show, found none that match; "
             "choose views that overlap more, or start from random points"
         )
@@ -59,7 +60,7 @@ def triangulated_points(views: Sequence[View]) -> Points:
 
 
 def matching() -> pycolmap.FeatureMatchingOptions:
-    """Matching on the processor, so that a machine with a GPU finds the same."""
+    """Matching on the CPU, so that machines with and without a GPU give the same points."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     return options
@@ -74,7 +75,7 @@ def verification() -> pycolmap.TwoViewGeometryOptions:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without COLMAP's own log, but for what ends the process."""
+    """Silence COLMAP's log, but for errors that end the process."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     try:
@@ -84,7 +85,7 @@ def quiet() -> Iterator[None]:
 
 
 def _posed_without_points(views: Sequence[View]) -> pycolmap.Reconstruction:
-    """Image i + 1 with a camera of its own for view i; names are numbers, whatever the views are called."""
+    """A model with image i + 1 and camera i + 1 for view i; images are named by their numbers."""
     model = pycolmap.Reconstruction()
     for i, view in enumerate(views, start=1):
         model.add_camera_with_trivial_rig(_lens(view.camera, i))
@@ -104,7 +105,7 @@ def _lens(camera: Camera, camera_id: int) -> pycolmap.Camera:
 
 
 def _write_database(model: pycolmap.Reconstruction, path: Path) -> None:
-    """The same ids as in the model, which `triangulate_points` joins them by."""
+    """Write cameras and images under the ids of the model, by which `triangulate_points` finds them."""
     database = pycolmap.Database.open(path)
     try:
         for camera in model.cameras.values():

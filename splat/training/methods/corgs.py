@@ -1,8 +1,8 @@
-"""CoR-GS (Zhang et al., ECCV 2024): two fields on the same views, each held to what the other confirms.
+"""CoR-GS (Zhang et al., ECCV 2024): two fields on the same views; each keeps the Gaussians that the other confirms.
 
-Both start from the same Gaussians and see the same view at every step; they drift apart because each draws its own splits.
-The training's own Gaussians are the one field, which is also the result; the regularizer holds the other, the partner, as
-a second training with its own optimiser, density control and generator.
+Both start from the same Gaussians and see the same view at every step; they drift apart because each draws other splits.
+The training's Gaussians are one field, which is also the result.  The other, the partner, is a second training, with
+optimiser, density control and generator, which the method holds.
 
 co-pruning      every `prune_every` steps after `prune_start`, after density control: a Gaussian of either field stays only if
                 the other has one within `distance` of it, between the means; both fields are looked at before either changes
@@ -13,8 +13,8 @@ co-regularisation   after `pseudo_start` steps, at every step, for both fields:
 P, the pseudo-view, is a random training camera m: its intrinsics, the rotation half way to that of the camera that is
 nearest to it, n, and the centre t_m + noise r N(0, 1), r the cameras' mean distance from their centroid.
 
-The published code (jiaw-z/CoR-GS) has the whole weight from the first step of the co-regularisation on: it works out FSGS's
-ramp over 500 steps and does not apply it.  It differs from this in that it
+The published code (jiaw-z/CoR-GS, train.py) has the whole weight from the first step of the co-regularisation on: it works out
+FSGS's ramp over 500 steps and does not apply it.  It differs from this in that it
 
     draws the centre of P from the box of the cameras and looks at a common focus, for which it needs a depth range;
     co-regularises at the steps 2000 to 10,000, here from 2001 to the end;
@@ -31,21 +31,22 @@ from typing import Any, Literal
 
 import scipy
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
-from splat.losses.autograd import consistency_loss
+from landscape.errors import InputError
 from splat.model.camera import Camera, slerp
 from splat.model.gaussians import Gaussians
+from splat.model.typed import Count, NonNegative, Positive
 from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
-from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.densify import Densified
-from splat.training.state import Method, Regularizer, Step, ThreeDGS, Training
+from splat.training.methods.agreement import agreement_gradients
+from splat.training.state import Method, MethodSettings, Step, ThreeDGS, TrainConfig, Training
 
 
 @dataclass(frozen=True)
-class CoRGS(Method):
+class CoRGS(MethodSettings):
     """distance: world units; noise: in units of the cameras' mean distance from their centroid.
 
     prune_every, prune_start, pseudo_start: steps; weight: of the co-regularisation.  prune_every 0 leaves out
@@ -53,61 +54,50 @@ class CoRGS(Method):
     """
 
     name: Literal["cor-gs"] = "cor-gs"
-    prune_every: int = 500
-    prune_start: int = 500
-    distance: float = 5.0
-    pseudo_start: int = 2000
-    weight: float = 1.0
-    noise: float = 0.1
+    prune_every: Count = 500
+    prune_start: Count = 500
+    distance: Positive = 5.0
+    pseudo_start: Count = 2000
+    weight: NonNegative = 1.0
+    noise: NonNegative = 0.1
 
-    def __post_init__(self) -> None:
-        if min(self.prune_every, self.prune_start, self.pseudo_start) < 0:
-            raise ValueError(
-                "expected prune_every, prune_start and pseudo_start of at least 0, got "
-                f"{self.prune_every}, {self.prune_start} and {self.pseudo_start}"
-            )
-        if not (0 < self.distance < inf and 0 <= self.weight < inf and 0 <= self.noise < inf):
-            raise ValueError(
-                "expected a finite distance above 0, weight and noise of at least 0, got "
-                f"{self.distance}, {self.weight} and {self.noise}"
-            )
+    def create(self, seed: int) -> "CoRGSMethod":
+        return CoRGSMethod(self, seed)
 
-    def regularizer(self, seed: int) -> "CoRegularizer":
-        return CoRegularizer(self, seed)
+    def parts(self, config: TrainConfig) -> dict[str, int]:
+        pruning = {"prune_start": self.prune_start} if self.prune_every else {}
+        return pruning | ({"pseudo_start": self.pseudo_start} if self.weight else {})
 
 
-class CoRegularizer(Regularizer):
+class CoRGSMethod(Method[CoRGS]):
     """partner: the other field's training, None before the first step.  history: how many Gaussians co-pruning removed."""
 
-    def __init__(self, settings: CoRGS, seed: int):
-        super().__init__(seed)
-        self.settings = settings
-        self.partner: Training | None = None
+    partner: Training | None = None
 
-    def begin(self, training: Training, views: Sequence[View]) -> None:
+    def on_start(self, training: Training, views: Sequence[View]) -> None:
         if self.partner is None:
             seed = int(torch.randint(2**63 - 1, (), generator=self.generator))
             config = replace(training.config, seed=seed, method=ThreeDGS())
             self.partner = Training.start(training.gaussians, training.extent, config)
         self.partner.move(training.gaussians.flat.device)  # one that was restored is on the CPU
 
-    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
+    def gradient(self, step: Step, base: LossAndGradient) -> LossAndGradient:
         """The first field's; the partner makes its whole step here."""
-        settings, partner, config = self.settings, self.partner, step.config
+        settings, partner = self.settings, self.partner
         assert partner is not None
         partner.raise_sh_degree(step.gaussians.sh_degree)
-        other = loss_and_gradient(partner.gaussians, step.camera, step.loss, step.background, config.render)
-        own, theirs = base.gradient, other.gradient
+        other = loss_and_gradient(partner.gaussians, step.camera, step.loss, step.background, step.config.render)
         if settings.weight and step.number > settings.pseudo_start:
             pose = pseudo_view([view.camera for view in step.views], settings.noise, self.generator)
-            pulls = disagreement(step, partner.gaussians, pose)
-            own, theirs = own + settings.weight * pulls[0], theirs + settings.weight * pulls[1]
-        partner.descend(theirs, step.number)
+            if found := agreement_gradients(step, (step.gaussians, partner.gaussians), pose):
+                base = replace(base, gradient=base.gradient + settings.weight * found[0])
+                other = replace(other, gradient=other.gradient + settings.weight * found[1])
+        partner.descend(other.gradient, step.number)
         partner.control_density(step.number, step.camera, other)
         partner.step = step.number
-        return own
+        return base
 
-    def after(self, step: Step) -> None:
+    def after_step(self, step: Step) -> None:
         settings, training, partner = self.settings, step.training, self.partner
         assert partner is not None
         if not settings.prune_every or step.number <= settings.prune_start or step.number % settings.prune_every:
@@ -115,7 +105,7 @@ class CoRegularizer(Regularizer):
         own, theirs = training.gaussians, partner.gaussians
         keep = confirmed(own, theirs, settings.distance), confirmed(theirs, own, settings.distance)
         if not keep[0].any():  # then there is no pair at all, and none of the partner stays either
-            raise ValueError(
+            raise InputError(
                 f"expected Gaussians of the two fields within {settings.distance} of each other, got none at step "
                 f"{step.number}; raise distance, which is in world units"
             )
@@ -124,7 +114,7 @@ class CoRegularizer(Regularizer):
         )
         for each, stays in zip((training, partner), keep, strict=True):
             if not stays.all():
-                each.follow(_pruned(each.gaussians, stays))
+                each.replace_gaussians(_pruned(each.gaussians, stays))
 
     def state(self) -> dict[str, Any]:
         return {**super().state(), "partner": self.partner}
@@ -132,7 +122,7 @@ class CoRegularizer(Regularizer):
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
         if not isinstance(state["partner"], Training | None):
-            raise ValueError("'partner' is no training")
+            raise InputError("'partner' is no training")
         self.partner = state["partner"]
 
 
@@ -146,17 +136,6 @@ def pseudo_view(cameras: Sequence[Camera], noise: float, generator: torch.Genera
     radius = (centres - centres.mean(dim=0)).norm(dim=1).mean()
     rotation = slerp(camera.rotation, cameras[int(apart.argmin())].rotation, 0.5)
     return replace(camera, rotation=rotation, centre=camera.centre + radius * jitter)
-
-
-def disagreement(step: Step, partner: Gaussians, pose: Camera) -> tuple[Float[Tensor, " p"], Float[Tensor, " q"]]:
-    """The gradients of the loss between the two fields' images, in the one's parameters and in the other's."""
-    fields = step.gaussians, partner
-    flats = [field.flat.detach().requires_grad_() for field in fields]
-    images = [
-        render(field.with_flat(flat), pose, step.background, step.config.render).image
-        for field, flat in zip(fields, flats, strict=True)
-    ]
-    return torch.autograd.grad(consistency_loss(images[0], images[1], step.config.loss), flats)  # pyright: ignore
 
 
 def confirmed(gaussians: Gaussians, others: Gaussians, distance: float) -> Bool[Tensor, " n"]:

@@ -8,17 +8,20 @@ dropoutgs       the image without a random share of the Gaussians agrees with th
 fsgs            new Gaussians between distant neighbours; depth correlates with the user's depth maps
 dngaussian      depth has the shape of the user's depth maps, globally and in small patches
 cor-gs          two fields: each keeps the Gaussians that the other confirms, and agrees with it between the views
+
+>>> METHODS["stablegs"](warm_up=100).warm_up
+100
 """
 
 from splat.training.methods.corgs import CoRGS
-from splat.training.methods.dngaussian import DNGaussian
-from splat.training.methods.dropgaussian import DropGaussian
-from splat.training.methods.dropoutgs import DropoutGS
-from splat.training.methods.fsgs import FSGS
+from splat.training.methods.depth.dngaussian import DNGaussian
+from splat.training.methods.depth.fsgs import FSGS
+from splat.training.methods.dropout.dropgaussian import DropGaussian
+from splat.training.methods.dropout.dropoutgs import DropoutGS
 from splat.training.methods.sam import SAM
 from splat.training.methods.stablegs.stablegs import StableGS
-from splat.training.state import Method, ThreeDGS
+from splat.training.state import MethodSettings, ThreeDGS
 
-METHODS: dict[str, type[Method]] = {
+METHODS: dict[str, type[MethodSettings]] = {
     method.name: method for method in (ThreeDGS, StableGS, SAM, DropGaussian, DropoutGS, FSGS, DNGaussian, CoRGS)
 }

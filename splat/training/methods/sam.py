@@ -2,7 +2,7 @@
 
     L_SAM(Theta) = max_{|eps| <= rho} L(Theta + eps)                                    Foret's Eq. (1), p = 2
     eps = rho D (D g) / |D g|,   g the gradient of L at Theta                           Eq. (2), where D = 1
-    Theta descends the gradient of L at Theta + eps, with eps held constant             Eq. (3)
+    Theta descends the gradient of L at Theta + eps, with eps constant                  Eq. (3)
 
 L is the loss of the step's sampled view; the copy costs one more render with its backward pass.  Where g is 0, so is eps.
 
@@ -13,51 +13,41 @@ The ball mixes units: a world unit, an e-fold in size and a logit count alike.  
                  as one full step of Adam, whatever the number of Gaussians
 """
 
-from dataclasses import dataclass
-from math import inf, sqrt
+from dataclasses import dataclass, replace
+from math import sqrt
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splat.model.typed import Positive
 from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
-from splat.training.state import Method, Regularizer, Step
+from splat.training.state import Method, MethodSettings, Step
 
 
 @dataclass(frozen=True)
-class SAM(Method):
+class SAM(MethodSettings):
     """rho: radius of the ball in the metric's units; 0.05 is Foret's default (their Sec. 3.1) and goes with "parameters"."""
 
     name: Literal["sam"] = "sam"
-    rho: float = 0.05
+    rho: Positive = 0.05
     metric: Literal["parameters", "rates"] = "parameters"
 
-    def __post_init__(self) -> None:
-        if not 0 < self.rho < inf:
-            raise ValueError(f"expected a finite rho above 0, got {self.rho}; for rho 0 use the method 3dgs")
-        if self.metric not in ("parameters", "rates"):
-            raise ValueError(f"expected metric 'parameters' or 'rates', got {self.metric!r}")
-
-    def regularizer(self, seed: int) -> "SAMRegularizer":
-        return SAMRegularizer(self, seed)
+    def create(self, seed: int) -> Method:
+        return SAMMethod(self, seed)
 
 
-class SAMRegularizer(Regularizer):
-    """Holds nothing between steps."""
-
-    def __init__(self, settings: SAM, seed: int):
-        super().__init__(seed)
-        self.settings = settings
-
-    def gradient(self, step: Step, base: LossAndGradient) -> Float[Tensor, " p"]:
+class SAMMethod(Method[SAM]):
+    def gradient(self, step: Step, base: LossAndGradient) -> LossAndGradient:
         if self.settings.metric == "parameters":
             eps = ascent(base.gradient, torch.ones_like(base.gradient), self.settings.rho)
         else:
             rates = step.training.rates(step.number)
             eps = ascent(base.gradient, rates, self.settings.rho * sqrt(rates.numel()))
         worst = step.gaussians.with_flat(step.gaussians.flat + eps)
-        return loss_and_gradient(worst, step.camera, step.loss, step.background, step.config.render).gradient
+        there = loss_and_gradient(worst, step.camera, step.loss, step.background, step.config.render)
+        return replace(base, gradient=there.gradient)
 
 
 def ascent(gradient: Float[Tensor, " p"], units: Float[Tensor, " p"], length: float) -> Float[Tensor, " p"]:

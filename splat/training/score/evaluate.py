@@ -1,6 +1,6 @@
-"""How well Gaussians show views that they were not trained on.
+"""Scores of Gaussians on views that they were not trained on.
 
-Where views have masks, only what is inside counts, as on DTU since pixelNeRF (RegNeRF, DNGaussian and CoR-GS, in its
+Where views have masks, only the pixels inside count, as on DTU since pixelNeRF (RegNeRF, DNGaussian and CoR-GS, in its
 `metrics_dtu.py`): PSNR is over the pixels inside; for SSIM and LPIPS, whose windows reach across the edge, both images are
 white outside.
 """
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.reference import psnr, ssim
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -35,7 +36,7 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of every view; their means are what papers report.  masked: whether they are of what is inside masks."""
+    """Scores of every view, and their means, which papers report.  masked: whether only pixels inside masks count."""
 
     views: tuple[ViewScore, ...]
     masked: bool = False
@@ -64,7 +65,13 @@ def evaluate(
     lpips: Perceptual | None = None,
     on_image: Callable[[str, Float[Tensor, "3 h w"]], None] | None = None,
 ) -> Evaluation:
-    """Render every view and score it; on_image(name, image) receives each image as it is rendered."""
+    """Render every view and score it; on_image(name, image) receives each image as it is rendered.
+
+    >>> from splat import SyntheticSettings, synthetic_scene
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> evaluate(made.truth, made.scene.load()).psnr > 60  # dB: the pictures are renders of these Gaussians
+    True
+    """
     if not views:
         raise ValueError("expected at least one view to evaluate on, got none")
     masked = have_masks(views)
@@ -78,10 +85,10 @@ def evaluate(
 
 
 def have_masks(views: Sequence[View]) -> bool:
-    """Whether the views have masks.  ValueError where only some do: their scores would have no mean."""
+    """Whether the views have masks.  InputError where only some do: their scores would have no mean."""
     without = [view.name for view in views if view.mask is None]
     if 0 < len(without) < len(views):
-        raise ValueError(
+        raise InputError(
             f"expected a mask for each of {len(views)} views that are scored together or for none, got "
             f"{len(views) - len(without)}, and none for {without[0]}; add those that are missing"
         )

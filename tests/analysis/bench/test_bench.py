@@ -11,20 +11,21 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from analysis.bench.command import run_bench
-from analysis.bench.speed.kernels import own_stages
+from analysis.bench.options import BenchOptions
+from analysis.bench.speed.kernels import random_splats, splat_problem, stages_of
 from analysis.bench.speed.meters import HostMeter, bandwidth
 from analysis.bench.speed.peak import CHAINS, STEPS, fma_peak, multiply_add
-from analysis.bench.speed.prototype import prototype_in
 from analysis.bench.speed.reference import reference_cost
 from analysis.bench.speed.scene import SCALED, ViewBench
-from analysis.bench.workloads import Size, random_splats, splat_problem, synthetic_workload
+from analysis.bench.workloads import Size, synthetic_workload
 from analysis.commands.cli import main
-from analysis.console.options import BenchOptions
 from analysis.console.timing import Timing, interleaved
 from figures import bench as figure
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import SceneObjective
-from splat.raster.cpu.tile import SUMS
+from splat.projection.dispatch import plain_gradient
+from splat.raster.formulas import SPLAT
+from tests.splat.raster.compositing_cases import plain_jvp, plain_product
 
 ROOT = Path(__file__).parents[3]
 TINY = Size(60, 40, 24)
@@ -82,19 +83,21 @@ def test_random_splats_are_ellipses_spread_over_the_image():
 
 
 def test_the_stages_of_the_kernels_leave_what_the_raster_computes():
-    rng = np.random.default_rng(2)
-    problem = splat_problem(TINY, *random_splats(TINY, rng), rng)
-    stages = own_stages(problem)
-    for call in stages.calls.values():
+    problem = splat_problem(TINY, np.random.default_rng(2))
+    calls, results, raster = stages_of(problem)
+    for call in calls.values():
         call()
-    results, raster = stages.results(), stages.raster
-    planes = raster.pad(np.concatenate([problem.cotangents, np.zeros_like(problem.cotangents[:, :1])], axis=1))
+    results = results()
+    cotangents = torch.from_numpy(problem.cotangents)
+    planes = raster.pad(torch.cat([cotangents, torch.zeros_like(cotangents[:, :1])], dim=1))
     adjoint = raster.backward(planes[0])
-    np.testing.assert_array_equal(results["backward + reduce"], adjoint.gradient)
+    np.testing.assert_array_equal(results["backward + reduce"], plain_gradient(raster.splats, adjoint.moments))
     for K in (1, 4):
-        tangent = raster.jvp(problem.directions[:, :K])
+        tangent = plain_jvp(raster, torch.from_numpy(problem.directions[:, :K]))
         np.testing.assert_array_equal(results[f"J u {K}"], raster.crop(tangent.planes[:, :3]))
-        np.testing.assert_array_equal(results[f"reduce {K}"], tangent.curvature(adjoint, planes[1 : 1 + K]))
+        np.testing.assert_array_equal(
+            results[f"reduce {K}"], plain_product(raster, tangent, adjoint, planes[1 : 1 + K])
+        )
 
 
 def test_the_timed_gradients_are_the_gradient_of_the_view(bench):
@@ -110,13 +113,13 @@ def test_the_stages_of_a_scene_run_and_leave_the_view_as_it_was(bench):
     for call in {**bench.stages(), **bench.wholes()}.values():
         call()
     np.testing.assert_array_equal(bench.gradient(), before)
-    np.testing.assert_array_equal(bench.adjoint.gradient, bench.raster.backward(bench.cotangent).gradient)
+    np.testing.assert_array_equal(bench.adjoint.moments, bench.raster.backward(bench.cotangent).moments)
 
 
 def test_pairs_are_the_pixels_of_the_rows_that_are_passed(bench):
-    lists = bench.raster.lists
+    lists, _ = bench.raster.reached
     count = sum((int(r) >> 8 & 255) - (int(r) & 255) + 1 for r in lists.rows)
-    assert bench.linearized.entries == lists.rows.size > 0
+    assert bench.linearized.intersections == lists.rows.size > 0
     assert bench.pairs == count * lanes_of(np.float32)
 
 
@@ -124,8 +127,8 @@ def test_memory_is_that_of_the_arrays(bench):
     view = bench.linearized
     shared = 4 * 3 * view._raster.frame.size  # the image, which the loss holds as a view of the raster's planes
     assert view.bytes - shared <= bench.kept() <= 1.1 * view.bytes
-    for K in (1, 8):  # the sums of the entries, the planes of the tangents
-        least = 4 * K * (SUMS * view.entries + 5 * view._raster.frame.size)
+    for K in (1, 8):  # the sums of the intersections, the planes of the tangents
+        least = 4 * K * (SPLAT * view.intersections + 5 * view._raster.frame.size)
         blocks = 4 * 4 * K * view.gradient.numel()  # the argument, the result and their copies
         objects = 64 * 1024  # Python's own
         assert least <= bench.workspace(K, HostMeter()) <= view.workspace(K) + blocks + objects
@@ -236,12 +239,10 @@ def test_a_checkpoint_and_a_scene_can_be_the_subject(tmp_path):
     ("arguments", "message"),
     [
         (["--repetitions", "0"], "at least 1 repetition"),
-        (["--prototype", "elsewhere"], "bench kernels --prototype"),
         (["--sizes", "many"], "GAUSSIANS@WIDTHxHEIGHT"),
         (["nowhere"], "nowhere"),
         (["--downscale", "2"], "--downscale with a scene's folder"),
         (["kernels", "--images", "images_4"], "--images and --downscale with a scene's folder"),
-        (["kernels", "--prototype", "nowhere"], "expected a prototype's"),
         (["kernels", "--device", "cuda"], "which measures the CPU's kernels; leave out --device"),
     ],
 )
@@ -249,20 +250,3 @@ def test_bad_input_gets_one_sentence(tmp_path, capsys, arguments, message):
     assert main(["bench", *arguments, "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err.strip()
     assert said.startswith("landscape: ") and message in said and "\n" not in said
-
-
-def test_a_prototype_runs_from_a_copy_that_leaves_nothing_behind(tmp_path):
-    folder = tmp_path / "prototype"
-    folder.mkdir()
-    kernels = "from pathlib import Path\nHERE = Path(__file__).parent\n"
-    (folder / "gen.py").write_text(
-        kernels + "def get(*a, **k):\n    (HERE / 'made.py').write_text('')\n    return HERE"
-    )
-    for name in ("rast", "binning", "simd", "tmpl"):
-        (folder / f"{name}.py").write_text("")
-    before, path = set(sys.modules), list(sys.path)
-    with prototype_in(folder) as prototype:
-        copy = prototype.kernels
-        assert copy != folder and (copy / "made.py").exists()
-    assert not copy.exists() and not (folder / "made.py").exists()
-    assert sys.path == path and not {"gen", "rast"} & (set(sys.modules) - before)

@@ -13,11 +13,11 @@ from rich.console import Console
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from analysis.bench import command as bench
+from analysis.bench.options import BenchOptions
 from analysis.bench.speed.meters import HostMeter
 from analysis.bench.speed.peak_cuda import BLOCK, UNROLLED, WARPS, multiply_add, multiply_adds
 from analysis.bench.speed.peer import MissingPeer, gsplat_gradient
 from analysis.bench.speed.scene import BYTES, ViewBench
-from analysis.console.options import BenchOptions
 from analysis.console.timing import Timing
 from splat.backend.gpu.compile import launch
 from splat.losses.autograd import loss_against
@@ -48,7 +48,7 @@ def gpu(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     return device
 
 
-def test_a_bench_on_the_gpus_kernels_measures_every_stage_and_says_that_gsplat_is_missing(gpu, monkeypatch, tmp_path):
+def test_a_bench_on_a_gpu_measures_every_stage_and_names_a_missing_peer(gpu, monkeypatch, tmp_path):
     made: list[ViewBench] = []
     monkeypatch.setattr(bench, "ViewBench", lambda workload: made.append(ViewBench(workload)) or made[-1])
     monkeypatch.setattr(bench, "synthetic_workload", lambda size: toy())
@@ -75,7 +75,7 @@ def test_a_bench_on_the_gpus_kernels_measures_every_stage_and_says_that_gsplat_i
     expected = ViewBench(toy())
     for gradient in found:
         assert relative_error(gradient.cpu(), expected.gradient()) < 1e-5
-    entries = own.raster.entries_reached
+    entries = own.raster.intersections_reached
     assert own.pairs == 256 * entries > 0 and own.bytes_of("forward") == 68 * entries + 24 * 16 * 12
     assert BYTES.keys() == bench.OPERATIONS.keys()
 

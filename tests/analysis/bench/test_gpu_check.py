@@ -17,19 +17,16 @@ from analysis.bench.gpu_check import (
     Check,
     _with_other_last_bits,
     agreement,
-    checks_of,
     in_turn,
     main,
     probe,
     recordings,
-    table,
     training,
 )
 from analysis.bench.speed.meters import HostMeter
 from analysis.bench.workloads import Workload
 from splat.backend.gpu.graphs import CudaGraphCache
 from splat.curvature.hessian import SceneHessian
-from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.synthetic import SyntheticSettings
 from tests.splat.held_scenes import two_views
@@ -59,7 +56,7 @@ def test_a_device_agrees_with_the_cpu(device, monkeypatch):
     last_emulated(device, monkeypatch, 2)
     checks = agreement(toy(torch.float64), device)  # in single precision so few Gaussians' traces cancel
     assert [check.name for check in checks][:3] == ["loss", "gradient", "H v"] and len(checks) == 8
-    assert all(check.holds for check in checks), checks
+    assert all(check.verdict == "holds" for check in checks), checks
     assert [check.bound for check in checks] == [1e-10] + [1e-9] * 7
 
 
@@ -88,7 +85,7 @@ def test_other_last_bits_are_those_next_to_them():
     assert (steps > 0).any() and (steps < 0).any()
 
 
-def test_a_trained_scene_is_compared_in_both_precisions_and_in_single_to_its_round_off(monkeypatch):
+def test_a_trained_scene_is_compared_in_both_precisions(monkeypatch):
     monkeypatch.setattr("analysis.bench.gpu_check.workload_of", lambda path: toy())
 
     def stand_in(workload, device, neighbours=0):
@@ -105,12 +102,12 @@ def test_recorded_products_are_held_against_launched_ones(off, monkeypatch):
         result = call()
         return result, lambda: result.copy_(call() + off)
 
-    monkeypatch.setattr(SceneObjective, "recordable", lambda self, vectors: vectors == 8)
+    monkeypatch.setattr(SceneHessian, "recordable", lambda self, vectors: vectors == 8)
     monkeypatch.setattr(SceneHessian, "_recordings", CudaGraphCache(capture))
     alone, difference, ratio = recordings(toy(), HostMeter())
     assert alone.value is None and alone.reason == "not recorded here"
     assert difference.name == "H v 8, recorded - launched" and difference.value == pytest.approx(off, rel=1e-4)
-    assert difference.holds == (off == 0) and ratio.value is not None and ratio.value > 0
+    assert difference.fails == (off != 0) and ratio.value is not None and ratio.value > 0
 
 
 def test_a_training_is_timed_at_its_pace():
@@ -120,7 +117,7 @@ def test_a_training_is_timed_at_its_pace():
 
 
 def test_a_probe_is_timed_from_its_checkpoint_on(monkeypatch):
-    monkeypatch.setattr("analysis.console.recording.draw", lambda module, target: [])
+    monkeypatch.setattr("analysis.console.recording.draw", lambda module, target, *options: [])
     settings = SyntheticSettings(60, 4, 16, 12)
     code, seconds = probe(settings, torch.device("cpu"), quick=True, seconds=0.1, slice_points=5)
     assert code == Check("exit code", 0, 0) and seconds.value is not None and 0 < seconds.value < 600
@@ -136,8 +133,8 @@ def test_a_part_that_fails_or_hangs_leaves_the_others_as_they_are(tmp_path):
         "good": (60.0, [sys.executable, "-c", say]),
     }
     console = Console(width=100, record=True)
-    found = in_turn(commands, tmp_path / "found.json", 60.0, console)
-    assert {name: checks[0].holds for name, checks in found.items()} == {
+    found = in_turn(commands, tmp_path / "found.json", console)
+    assert {name: not checks[0].fails for name, checks in found.items()} == {
         "crash": False, "hang": False, "silent": False, "good": True,
     }  # fmt: skip
     assert found["good"] == [Check("loss", 1e-7, 1e-6)]
@@ -145,21 +142,6 @@ def test_a_part_that_fails_or_hangs_leaves_the_others_as_they_are(tmp_path):
     assert "failed with exit code 3" in text and "not done in 0 s" in text and "holds" in text
     written = json.loads((tmp_path / "found.json").read_text())
     assert list(written) == list(commands) and written["good"] == checks
-    late = in_turn({"good": commands["good"]}, tmp_path / "late.json", 0.0, console)
-    assert late == {"good": [Check("good", None, 0.0, "no time was left")]}
-
-
-def test_times_are_held_against_what_is_asked_of_them_and_what_has_no_peer_is_said(capsys):
-    seconds = {"gradient": 1.0, "gradient, autograd": 1.5, "gradient, atomic": 1.0, "H v 1": 2.5, "H v 8": 1.1}
-    seconds |= {"block diagonal": 2.0, "linearize": 3.0}
-    alone = {check.name: check for check in checks_of(seconds, "gsplat cannot be imported")}
-    assert alone["H v 1 / gradient"] == Check("H v 1 / gradient", 2.5, 2.0, "gsplat cannot be imported")
-    assert [check.holds for check in alone.values()] == [None, None, False, True, True, True]
-    beside = {check.name: check.value for check in checks_of(seconds | {"gsplat": 0.5}, None)}
-    assert (beside["gradient, atomic / gsplat"], beside["gradient, autograd / gsplat"]) == (2.0, 3.0)
-    Console(width=100).print(table("x", list(alone.values())))
-    text = capsys.readouterr().out
-    assert "does not hold" in text and text.count("gsplat cannot be imported") == 2
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

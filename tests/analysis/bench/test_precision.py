@@ -8,7 +8,7 @@ import torch
 
 from analysis.bench.precision import precision, same_decisions
 from analysis.bench.workloads import Size, Workload, synthetic_workload
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.model.settings import RenderSettings
 from splat.projection.cpu import project_arrays
 from splat.projection.formulas import lens_of
@@ -61,7 +61,7 @@ def test_gaussians_that_change_places_in_the_order_are_told_apart(workload):
 
 def test_an_error_in_single_precision_alone_is_seen(workload, monkeypatch):
     def spoiled(image, loss, like):
-        return ViewLoss(image.numpy() * (1.01 if like.dtype == torch.float32 else 1.0), loss, like.numpy().dtype)
+        return CpuViewLoss(image * (1.01 if like.dtype == torch.float32 else 1.0), loss, like.dtype)
 
     monkeypatch.setattr("analysis.bench.precision.loss_against", spoiled)
     lines = {line.quantity: line.error for line in precision(workload) if line.decisions == "held equal"}

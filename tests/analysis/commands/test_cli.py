@@ -119,7 +119,7 @@ def test_the_same_command_gives_the_same_checkpoint_bit_for_bit(finished, origin
     assert (again / "checkpoint.pt").read_bytes() == (finished / "checkpoint.pt").read_bytes()
 
 
-def test_a_run_killed_at_an_arbitrary_moment_and_resumed_is_the_run_that_was_not(original, tmp_path):
+def test_a_run_killed_at_any_moment_and_resumed_is_the_run_that_was_not(original, tmp_path):
     longer = ["--iterations", "60", "--checkpoint-every", "1"]  # so that the kill comes well before the end
     out, whole = tmp_path / "killed", tmp_path / "whole"
     command = [sys.executable, "-m", "analysis.commands.cli", *arguments(original, out, *longer)]
@@ -256,7 +256,7 @@ def test_a_checkpoint_that_is_not_one_is_refused_on_resuming(finished, original,
     refuse(capsys, arguments(original, out, "--resume"), "not one or is damaged")
 
 
-def test_a_checkpoint_whose_scene_has_moved_or_changed_says_so_and_takes_another_folder(scene, tmp_path, capsys):
+def test_a_checkpoint_whose_scene_has_moved_says_so_and_takes_its_folder(scene, tmp_path, capsys):
     path = tmp_path / "run" / "checkpoint.pt"
     assert main(arguments(scene, path.parent)) == 0
     loaded = load_checkpoint(path)
@@ -300,8 +300,8 @@ def test_what_the_system_refuses_is_said_with_the_path(original, tmp_path, capsy
     one_sentence(capsys, f"landscape: cannot use {tmp_path / 'file'}", ": Not a directory")
 
 
-def test_the_process_of_a_command_says_all_that_it_printed_and_ends_with_its_exit_code():
-    program = "from analysis import cli\ncli.main = lambda: print('the last words') or 3\ncli.command()"
+def test_a_process_prints_everything_and_ends_with_its_exit_code():
+    program = "from analysis.commands import cli\ncli.main = lambda: print('the last words') or 3\ncli.command()"
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     result = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, env=buffered, capture_output=True, text=True, timeout=60

@@ -17,7 +17,7 @@ def small(monkeypatch):
     monkeypatch.setattr("analysis.console.recording.draw", lambda module, target: [])
 
 
-def test_the_demo_makes_a_scene_trains_probes_and_says_what_to_open_and_again(small, tmp_path, capsys):
+def test_the_demo_makes_a_scene_trains_probes_and_says_what_to_open(small, tmp_path, capsys):
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out)]) == 0
     said = capsys.readouterr().out

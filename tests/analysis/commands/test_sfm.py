@@ -21,7 +21,7 @@ def said(capsys) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
-def test_the_scene_lies_beside_the_photographs_and_what_was_left_out_is_said(photos, capsys, monkeypatch):
+def test_the_scene_lies_beside_the_photographs_and_says_what_was_left_out(photos, capsys, monkeypatch):
     asked = []
 
     def make(folder, out, show):

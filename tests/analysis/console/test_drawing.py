@@ -21,7 +21,7 @@ def figures(tmp_path, monkeypatch):
     return tmp_path / "figures"
 
 
-def test_an_interruption_ends_the_drawing_with_the_processes_that_it_has_started(figures):
+def test_an_interruption_ends_the_drawing_and_its_processes(figures):
     (figures / "stuck.py").write_text(STUCK)
     deadline = monotonic() + 15
     with drawing("stuck"):

@@ -55,7 +55,7 @@ def test_each_type_is_read_from_text_and_from_a_plain_value():
         ("background", "0,1", "expected a list of a number for background"),
         ("probe.attributes", "colour", "expected means or"),
         ("iterations", "none", "expected a whole number"),
-        ("every", "0", "every >= 1"),
+        ("every", "0", "'every': expected int >= 1, got 0"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_what_was_expected(key, value, message):

@@ -165,7 +165,7 @@ def test_a_step_along_the_rays_that_swaps_two_gaussians_is_seen():
     ray = torch.nn.functional.normalize(gaussians.means[0] - camera.centre, dim=0)
     gaussians.means[1] = gaussians.means[0] + 1e-6 * ray
     found = depth_rises(objective_of(gaussians, views=1), generator(), (1e-7, 1.0), draws=8)
-    assert found.crossed[0].tolist() == [0, 0] and 0 < float(found.crossed[1, 0]) < 1
+    assert found.discontinuous[0].tolist() == [0, 0] and 0 < float(found.discontinuous[1, 0]) < 1
 
 
 def test_fewer_than_two_draws_are_refused(objective):

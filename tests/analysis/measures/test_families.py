@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from msgspec import UNSET
 from rich.console import Console
 from scipy.stats import binom
 
@@ -18,9 +19,10 @@ from analysis.commands.cli import main
 from analysis.measures.families import FamilyFindings, FamilyOptions, _seconds_a_product, measure_families, quotient
 from analysis.measures.split_control import split_in_two
 from analysis.probe.command import scene_objective
-from analysis.records.family_table import Cell, family_lines, family_table
-from analysis.records.records import Record, read_record
+from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.report import render_report
+from analysis.records.schema import End, Index
+from analysis.records.tables import Cell, family_lines, family_table
 from landscape import Bracket, DenseOperator, EigenSettings, FamilySettings, extreme_eigenpairs, families
 from landscape.eigen.pairs import EigenEnds
 from splat.curvature.block_eigenvectors import BlockEigenvectors
@@ -81,12 +83,12 @@ def split(objective: SceneObjective, checkpoint: Checkpoint) -> FamilyFindings:
 
 
 @pytest.fixture(scope="module")
-def record(path: Path) -> Record:
+def record(path: Path) -> Record[ProbeRecord]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(lambda target: []))
         command = ["probe", str(path), "--split-control", "--metric", "optimiser", *QUICK]
         assert main([*command, "--out", str(path.parent / "recorded")]) == 0
-    return read_record(path.parent / "recorded")
+    return read_record(path.parent / "recorded", ProbeRecord)
 
 
 def dense(objective: SceneObjective, training, operator: str) -> torch.Tensor:
@@ -161,9 +163,9 @@ def test_the_effect_of_the_split_brackets_the_quotient_of_the_dense_indices(spli
         before, after = (spectra(of, checkpoint, operator) for of in (objective, of_split(objective, checkpoint)))
         for effect in (e for e in split.effects if e.operator == operator and e.index in ("share", "effective_rank")):
             true = indices(after[effect.block])[effect.index] / indices(before[effect.block])[effect.index]
-            held.append(effect.factor.low <= true <= effect.factor.high)
+            held.append(effect.low <= true <= effect.high)
             values = [getattr(row.family.indices, effect.index).value for row in split.rows if matches(row, effect)]
-            assert effect.factor.value == values[1] / values[0]
+            assert effect.value == values[1] / values[0]
     assert held.count(False) <= most_misses(len(held), 0.1), held
 
 
@@ -180,8 +182,9 @@ def test_a_quotient_is_undetermined_where_a_bracket_reaches_zero_or_has_no_end()
 
 def test_the_trained_scenes_numbers_are_the_same_without_the_split_control(split, objective, checkpoint):
     alone = found(objective, checkpoint, metric="optimiser")
-    assert alone.control is None and alone.effects == () and "split_control" not in alone.record()
-    assert [row.record() for row in alone.rows] == [row.record() for row in split.rows if row.scene == "trained"]
+    assert alone.control is None and alone.effects == ()
+    numbers = [[row.record("optimiser", "") for row in of.rows if row.scene == "trained"] for of in (alone, split)]
+    assert numbers[0] == numbers[1] and len(numbers[0]) == len(alone.rows)
 
 
 def test_the_metrics_have_the_units_that_they_name(objective, checkpoint, split):
@@ -196,15 +199,15 @@ def test_the_metrics_have_the_units_that_they_name(objective, checkpoint, split)
 
 
 def test_the_record_and_the_page_hold_every_family_and_what_the_split_does(record, split):
-    rows = record.data["families"]
-    assert len(rows) == 24 and {row["metric"] for row in rows} == {"optimiser"} and rows[0]["unit"] == split.unit
-    assert [row["block"] for row in rows[:6]] == BLOCKS and sum(row["split"] for row in rows) == 12
-    control = record.data["split_control"]
-    assert control["psnr"] == pytest.approx(split.control.psnr) and len(control["effects"]) == 60
+    rows = record.data.families
+    assert len(rows) == 24 and {row.metric for row in rows} == {"optimiser"} and rows[0].unit == split.unit
+    assert [row.block for row in rows[:6]] == BLOCKS and sum(row.split for row in rows) == 12
+    control = record.data.split_control
+    assert control.psnr == pytest.approx(split.control.psnr) and len(control.effects) == 60
     starts, nodes = record.arrays["families"][
         "split.gauss-newton.sh.nodes"
     ].shape  # eigenvalues that are known are nodes, too
-    assert starts == rows[-1]["starts"] and nodes >= rows[-1]["steps"]
+    assert starts == rows[-1].starts and nodes >= rows[-1].steps
     page = Tables((record.folder / "report.html").read_text(encoding="utf-8"))
     lines = page.rows("families")
     assert len(lines) == 1 + 3 * 12 and all(len(line) == len(lines[0]) == 12 for line in lines)
@@ -214,9 +217,9 @@ def test_the_record_and_the_page_hold_every_family_and_what_the_split_does(recor
 
 def test_a_family_whose_small_end_is_not_resolved_is_given_by_its_bound(record):
     data = copy.deepcopy(record.data)
-    literal, quantile = (data["families"][0]["indices"][name] for name in ("literal", "mass_quantile"))
-    literal |= {"value": 7.0, "low": 34.2, "high": None, "note": "lambda_min is not resolved"}
-    quantile |= {"value": 7.0, "low": 0.0, "high": None, "note": "2 steps"}
+    indices = data.families[0].indices
+    indices.literal = Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")
+    indices.mass_quantile = Index(value=7.0, low=0.0, high=None, note="2 steps")
     cells = family_lines(data)[0].indices
     assert cells[0].value == "≥ 34.2" and cells[0].note == "lambda_min is not resolved"
     assert cells[-1].value == "–"  # a bound that says nothing
@@ -225,27 +228,32 @@ def test_a_family_whose_small_end_is_not_resolved_is_given_by_its_bound(record):
 
 
 def test_an_end_that_was_not_reached_says_so_with_its_bound(record):
-    row = copy.deepcopy(record.data["families"][0])
-    row["lambda_min"] |= {"value": 1e-5, "residual": 2.4e-4, "reason": "matvec budget"}
-    for beyond, bracket in ((0.03, "−0.0302 … 2.50 × 10⁻⁴"), (None, "≤ 2.50 × 10⁻⁴")):
-        (line,) = family_lines({"families": [row | {"beyond": beyond}]})
-        assert line.ends[1] == Cell("not reached", bracket, "matvec budget")
-    row["lambda_max"] |= {"value": 2.0, "residual": 0.1, "reason": "time budget"}
-    (line,) = family_lines({"families": [row | {"beyond": 0.5}]})
-    assert line.ends[0] == Cell("not reached", "1.90 … 2.60", "time budget")
-    row["lambda_min"] |= {"reason": "tolerance"}
-    assert family_lines({"families": [row]})[0].ends[1].value == "(0.1 ± 2.4) × 10⁻⁴"
-    assert "beyond" in record.data["families"][0]
+    data = copy.deepcopy(record.data)
+    row = data.families[0]
+    data.families, data.split_control = [row], UNSET
+
+    def ends() -> tuple[Cell, ...]:
+        return family_lines(data)[0].ends
+
+    row.lambda_min = End(value=1e-5, residual=2.4e-4, reason="matvec budget")
+    for row.beyond, bracket in ((0.03, "−0.0302 … 2.50 × 10⁻⁴"), (None, "≤ 2.50 × 10⁻⁴")):
+        assert ends()[1] == Cell("not reached", bracket, "matvec budget")
+    row.lambda_max, row.beyond = End(value=2.0, residual=0.1, reason="time budget"), 0.5
+    assert ends()[0] == Cell("not reached", "1.90 … 2.60", "time budget")
+    row.lambda_min.reason = "tolerance"
+    assert ends()[1].value == "(0.1 ± 2.4) × 10⁻⁴"
+    assert record.data.families[0].beyond is not None
 
 
 def test_at_80_columns_every_number_and_label_of_the_terminals_table_is_whole(record):
     data = copy.deepcopy(record.data)
-    wide = {"value": -1.234e-4, "low": -1.235e-4, "high": -1.233e-4, "note": ""}
-    bracket = {"value": 2.5e-4, "low": 7.45e-4, "high": 1.02e4, "note": ""}
-    for entry in [row["indices"] for row in data["families"]]:
-        entry |= {"literal": wide, "share": bracket, "mass_quantile": bracket}
-    for effect in data["split_control"]["effects"]:
-        effect |= wide if effect["index"] == "literal" else bracket
+    wide = Index(value=-1.234e-4, low=-1.235e-4, high=-1.233e-4, note="")
+    bracket = Index(value=2.5e-4, low=7.45e-4, high=1.02e4, note="")
+    for row in data.families:
+        row.indices.literal, row.indices.share, row.indices.mass_quantile = wide, bracket, bracket
+    for effect in data.split_control.effects:
+        numbers = wide if effect.index == "literal" else bracket
+        effect.value, effect.low, effect.high, effect.note = numbers.value, numbers.low, numbers.high, ""
     console = Console(width=80, file=io.StringIO())
     console.print(family_table(data))
     assert isinstance(console.file, io.StringIO)
@@ -261,10 +269,10 @@ def test_at_80_columns_every_number_and_label_of_the_terminals_table_is_whole(re
 def test_the_families_leave_the_other_numbers_as_they_are(path, record, monkeypatch, capsys):
     monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(lambda target: []))
     assert main(["probe", str(path), *QUICK, "--out", str(path.parent / "plain")]) == 0
-    plain = read_record(path.parent / "plain")
-    assert "families" not in plain.data and "split_control" not in plain.data and "families" not in plain.arrays
+    plain = read_record(path.parent / "plain", ProbeRecord)
+    assert not plain.data.families and not plain.data.split_control and "families" not in plain.arrays
     for key in ("traces", "eigenvalues", "anisotropy", "slice"):
-        assert plain.data[key] == record.data[key]
+        assert getattr(plain.data, key) == getattr(record.data, key)
     assert "Anisotropy by attribute" not in (plain.folder / "report.html").read_text(encoding="utf-8")
     assert "Anisotropy by attribute" not in capsys.readouterr().out
 
@@ -293,7 +301,7 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
         else:
             known = BlockEigenvectors(objective, pixelwise if gauss_newton else own, pixelwise, attribute, scale)
             upwards = gauss_newton or block == "means"
-            assert torch.equal(lead.start, known.steepest(1, 0) if upwards else known.leads())
+            assert torch.equal(lead.start, known.steepest(1, 0) if upwards else known.warm_start())
     eye = torch.eye(objective.active.flat.numel(), dtype=torch.float64)
     diagonals = {newton: seen[newton, "all"][0].apply(eye).diagonal() for newton in (False, True)}
     for (gauss_newton, block), (_, lead) in seen.items():

@@ -71,9 +71,7 @@ def test_every_kernel_has_worked_before_the_time_runs_and_own_blocks_are_made_on
     counted(measurement, "Budget")
     objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
     settings = replace(ProbeSettings.quick(), slice_points=5, seconds=60.0)
-    found = measure(
-        objective, LossSettings(), settings, torch.Generator().manual_seed(0), lambda name: nullcontext(lambda *_: None)
-    )
+    found = measure(objective, settings, torch.Generator().manual_seed(0), lambda name: nullcontext(lambda *_: None))
     first = calls[: calls.index("Budget")]
     assert {"block_diagonal", "evaluate", "check_against_gradient"} <= {*first}
     assert calls.count("block_diagonal") == 1 and calls.count("gauss_newton") == 1
@@ -93,9 +91,7 @@ def test_the_slices_model_has_the_hessians_curvature_between_its_directions():
         random_gaussians(15, 1, logit=1.0).to(torch.float64), two_views(), LossSettings(), BACKGROUND.double()
     )
     settings = replace(ProbeSettings.quick(), slice_points=5, seconds=60.0)
-    found = measure(
-        objective, LossSettings(), settings, torch.Generator().manual_seed(0), lambda name: nullcontext(lambda *_: None)
-    )
+    found = measure(objective, settings, torch.Generator().manual_seed(0), lambda name: nullcontext(lambda *_: None))
     assert found.plane is not None and found.plane.slice.curvature is not None
     E = found.ends.largest.vectors[:, :2]
     between = E.T @ SceneHessian(objective).apply(E)
@@ -110,7 +106,7 @@ def test_a_search_for_the_ends_begins_with_several_directions_as_one_alone_takes
     seeds, loose, fine = range(3), EigenSettings(rtol=0.1), EigenSettings(rtol=1e-6)
     true = extreme_eigenpairs(case.operator, torch.Generator().manual_seed(9), fine)
     own = BlockEigenvectors(case.objective, case.objective.block_diagonal())
-    for start, certain in ((own.steepest(1, 1), False), (own.leads(), True)):
+    for start, certain in ((own.steepest(1, 1), False), (own.warm_start(), True)):
         found = [extreme_eigenpairs(case.operator, torch.Generator().manual_seed(s), loose, start) for s in seeds]
         errors = [
             abs(float(getattr(run, end).values[0] / getattr(true, end).values[0]) - 1)

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from analysis.measures.depth import STEPS, depth_split
 from analysis.probe.record import literal_index
-from analysis.probe.table import probe_table
+from analysis.records.tables import probe_table
 from landscape import DenseOperator, EigenSettings, PowerSettings, extreme_eigenpairs, power_ends
 
 ATTRIBUTES = ["means", "log_scales", "quats", "opacity_logits", "sh"]
@@ -23,42 +23,42 @@ def rounding(H) -> float:
 
 def test_traces_are_within_four_standard_errors_of_the_dense_hessian(record, dense):
     objective, H, _, _ = dense
-    assert list(record.data["traces"]) == ATTRIBUTES
-    for name, trace in record.data["traces"].items():
+    assert list(record.data.traces) == ATTRIBUTES
+    for name, trace in record.data.traces.items():
         rows = objective.blocks[name]
         exact = float(H[rows, rows].trace())
-        assert abs(trace["value"] - exact) <= 4 * trace["standard_error"] + rounding(H), name
+        assert abs(trace.value - exact) <= 4 * trace.standard_error + rounding(H), name
         size = float(H[rows, rows].diagonal().abs().sum())
-        assert trace["standard_error"] < 0.1 * size, name  # so that the line above says something
+        assert trace.standard_error < 0.1 * size, name  # so that the line above says something
         each = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 3 * objective.active.sh.shape[1]}
-        assert trace["dim"] == len(objective.active) * each[name]
-        assert trace["tau"] == math.sqrt(max(trace["value"], 0) / trace["dim"])
-        assert record.arrays["traces"][name].mean() == pytest.approx(trace["value"], rel=1e-12)
+        assert trace.dim == len(objective.active) * each[name]
+        assert trace.tau == math.sqrt(max(trace.value, 0) / trace.dim)
+        assert record.arrays["traces"][name].mean() == pytest.approx(trace.value, rel=1e-12)
 
 
 def test_eigenvalues_are_those_of_the_dense_hessian_within_their_residuals(record, dense):
     _, H, _, _ = dense
     true = torch.linalg.eigvalsh((H + H.T) / 2)
     for name, index in (("max", -1), ("second", -2), ("min", 0)):
-        end = record.data["eigenvalues"][name]
-        assert abs(end["value"] - float(true[index])) <= end["residual"] + rounding(H), name
-        assert end["residual"] <= 1e-3 * abs(end["value"]) and end["reason"] == "tolerance"
-        assert sum(end["shares"].values()) == pytest.approx(1) and list(end["shares"]) == ATTRIBUTES
-    saddle = record.data["anisotropy"]["saddle"]
-    assert saddle["low"] <= float(-true[-1] / true[0]) <= saddle["high"]
-    share = record.data["anisotropy"]["share"]
-    assert share["low"] <= float(true[-1] / true.abs().sum()) <= share["high"]
+        end = getattr(record.data.eigenvalues, name)
+        assert abs(end.value - float(true[index])) <= end.residual + rounding(H), name
+        assert end.residual <= 1e-3 * abs(end.value) and end.reason == "tolerance"
+        assert sum(end.shares.values()) == pytest.approx(1) and list(end.shares) == ATTRIBUTES
+    saddle = record.data.anisotropy.saddle
+    assert saddle.low <= float(-true[-1] / true[0]) <= saddle.high
+    share = record.data.anisotropy.share
+    assert share.low <= float(true[-1] / true.abs().sum()) <= share.high
 
 
 def test_the_literal_index_is_the_papers_power_iteration_beside_the_certain_bracket(record, dense):
     _, H, _, _ = dense
-    ends, literal = record.data["eigenvalues"], record.data["anisotropy"]["literal"]
+    ends, literal = record.data.eigenvalues, record.data.anisotropy.literal
     true = torch.linalg.eigvalsh((H + H.T) / 2)
-    assert literal["low"] <= float(true[-1] / true[0]) <= literal["high"]
-    paper = ends["power_max"]["value"] / ends["power_min"]["value"]
-    arrived = literal["low"] <= paper <= literal["high"]
-    assert literal["value"] == (paper if arrived else ends["max"]["value"] / ends["min"]["value"])
-    assert ("did not arrive" in literal["note"]) == (not arrived)
+    assert literal.low <= float(true[-1] / true[0]) <= literal.high
+    paper = ends.power_max.value / ends.power_min.value
+    arrived = literal.low <= paper <= literal.high
+    assert literal.value == (paper if arrived else ends.max.value / ends.min.value)
+    assert ("did not arrive" in literal.note) == (not arrived)
 
 
 @pytest.mark.parametrize(("steps", "says"), [(2, "by Lanczos"), (2000, "by power iteration")])
@@ -66,8 +66,8 @@ def test_a_power_iteration_that_did_not_arrive_gives_no_index(steps, says):
     operator, generator = DenseOperator(torch.diag(torch.linspace(-1, 3, 40, dtype=torch.float64))), torch.Generator()
     power = power_ends(operator, generator.manual_seed(0), PowerSettings(rtol=1e-9, max_matvecs=steps))
     index = literal_index(extreme_eigenpairs(operator, generator), power)
-    assert index["value"] == pytest.approx(-3, rel=1e-2) and index["note"].startswith(says)
-    assert index["low"] <= index["value"] <= index["high"]
+    assert index.value == pytest.approx(-3, rel=1e-2) and index.note.startswith(says)
+    assert None not in (index.low, index.value, index.high) and index.low <= index.value <= index.high  # pyright: ignore[reportOptionalOperand, reportOperatorIssue]
 
 
 def test_within_a_bracket_without_bound_a_power_iteration_that_ran_out_has_not_arrived():
@@ -80,23 +80,23 @@ def test_within_a_bracket_without_bound_a_power_iteration_that_ran_out_has_not_a
         power_ends(operator, generator, PowerSettings(0.1, atol=1e-2, max_matvecs=steps)) for steps in (2, 3000)
     )
     index = literal_index(ends, late)
-    assert index["high"] is None and index["note"].startswith("by Lanczos: the paper's power iteration did not arrive")
-    assert literal_index(ends, arrived)["note"].startswith("by power iteration")
+    assert index.high is None and index.note.startswith("by Lanczos: the paper's power iteration did not arrive")
+    assert literal_index(ends, arrived).note.startswith("by power iteration")
 
 
 def test_the_slice_is_made_of_true_losses_along_the_two_steepest_directions(record, dense):
     objective, H, value, _ = dense
-    about, arrays = record.data["slice"], record.arrays["slice"]
+    about, arrays = record.data.slice, record.arrays["slice"]
     assert arrays["loss"].shape == arrays["model"].shape == arrays["crossed"].shape == (5, 5)
-    assert about["center_loss"] == pytest.approx(value, rel=1e-12)
-    assert about["points"] == 25 and about["evaluated_points"] == arrays["evaluated"].sum() == about["evaluations"] - 1
-    assert arrays["loss"][2, 2] == about["center_loss"] == arrays["model"][2, 2] and not arrays["crossed"][2, 2]
+    assert about.center_loss == pytest.approx(value, rel=1e-12)
+    assert about.points == 25 and about.evaluated_points == arrays["evaluated"].sum() == about.evaluations - 1
+    assert arrays["loss"][2, 2] == about.center_loss == arrays["model"][2, 2] and not arrays["crossed"][2, 2]
     values, vectors = torch.linalg.eigh((H + H.T) / 2)
     for axis, (name, index) in enumerate((("x", -1), ("y", -2))):
-        unit = math.sqrt(2 * about["loss_scale"] / float(values[index]))
-        assert about["directions"][axis]["unit"] == pytest.approx(unit, rel=1e-4)
+        unit = math.sqrt(2 * about.loss_scale / float(values[index]))
+        assert about.directions[axis].unit == pytest.approx(unit, rel=1e-4)
         assert arrays[name] == pytest.approx(np.linspace(-3, 3, 5) * unit, rel=1e-4)
-    assert about["loss_scale"] == pytest.approx(1e-3 * value)
+    assert about.loss_scale == pytest.approx(1e-3 * value)
     # a vector is known up to its sign and its error: the losses on the axis are those along the dense one
     for sign in (1, -1):
         along = [objective.loss(objective.active.flat + sign * x * vectors[:, -1]) for x in arrays["x"]]
@@ -110,39 +110,39 @@ def test_the_eigenvectors_are_said_to_live_where_the_dense_ones_do(record, dense
     objective, H, _, _ = dense
     vectors = torch.linalg.eigh((H + H.T) / 2).eigenvectors
     for name, index in (("max", -1), ("min", 0)):
-        where = record.data["eigenvalues"][name]["lives_on"]
+        where = getattr(record.data.eigenvalues, name).lives_on
         v = objective.active.with_flat(vectors[:, index])
         mass = torch.stack([part.reshape(len(v), -1).square().sum(dim=1) for part in v.attributes.values()]).sum(dim=0)
-        assert where["participation"] == pytest.approx(float(1 / mass.square().sum()), rel=1e-2)
-        heaviest, share = where["heaviest"][0]
+        assert where.participation == pytest.approx(float(1 / mass.square().sum()), rel=1e-2)
+        heaviest, share = where.heaviest[0]
         assert heaviest == int(mass.argmax()) and share == pytest.approx(float(mass.max()), rel=1e-2)
 
 
 def test_the_finite_probe_meets_the_curvature_where_nothing_is_crossed(record):
-    probe = record.data["finite_probe"]
-    assert probe["infinitesimal"] == pytest.approx(record.data["eigenvalues"]["max"]["value"], rel=1e-5)
-    best = probe["best"]
-    bound = probe["round_off"][best] + probe["truncation"][best]
-    assert not probe["crossed"][best]
-    assert abs(probe["curvatures"][best] - probe["infinitesimal"]) <= bound < 0.1 * probe["infinitesimal"]
+    probe = record.data.finite_probe
+    assert probe.infinitesimal == pytest.approx(record.data.eigenvalues.max.value, rel=1e-5)
+    best = probe.best
+    bound = probe.round_off[best] + probe.truncation[best]
+    assert not probe.crossed[best]
+    assert abs(probe.curvatures[best] - probe.infinitesimal) <= bound < 0.1 * probe.infinitesimal
 
 
 def test_positions_are_split_along_and_across_the_rays(record, dense):
-    found, objective = record.data["depth"], dense[0]
+    found, objective = record.data.depth, dense[0]
     split = depth_split(objective, torch.Generator().manual_seed(1))
-    assert found["gradient_ratio"] == pytest.approx(split.gradient_ratio, rel=1e-6)
-    assert found["gradient_median"] == pytest.approx(split.median_ratio, rel=1e-6)
-    assert found["pairs"] == len(split.components) <= len(objective.active) * len(objective.views)
-    depth, lateral = found["curvature"]["depth"], found["curvature"]["lateral"]
-    whole = record.data["traces"]["means"]
-    error = math.hypot(*(trace["standard_error"] for trace in (depth, lateral, whole)))
-    assert abs(depth["value"] + lateral["value"] - whole["value"]) < 5 * error
-    assert found["curvature_ratio"]["value"] == pytest.approx(2 * depth["value"] / lateral["value"], rel=1e-12)
-    assert [row["pixels"] for row in found["rises"]] == list(STEPS)
-    for row in found["rises"]:
-        assert row["ratio"] == pytest.approx(row["depth"] / row["lateral"], rel=1e-12)
-        assert min(row[f"{kind}_error"] for kind in ("depth", "lateral", "ratio")) > 0
-        assert 0 <= row["depth_crossed"] <= 1
+    assert found.gradient_ratio == pytest.approx(split.gradient_ratio, rel=1e-6)
+    assert found.gradient_median == pytest.approx(split.median_ratio, rel=1e-6)
+    assert found.pairs == len(split.components) <= len(objective.active) * len(objective.views)
+    depth, lateral = found.curvature.depth, found.curvature.lateral
+    whole = record.data.traces["means"]
+    error = math.hypot(*(trace.standard_error for trace in (depth, lateral, whole)))
+    assert abs(depth.value + lateral.value - whole.value) < 5 * error
+    assert found.curvature_ratio.value == pytest.approx(2 * depth.value / lateral.value, rel=1e-12)
+    assert [row.pixels for row in found.rises] == list(STEPS)
+    for row in found.rises:
+        assert row.ratio == pytest.approx(row.depth / row.lateral, rel=1e-12)
+        assert min(row.depth_error, row.lateral_error, row.ratio_error) > 0
+        assert 0 <= row.depth_crossed <= 1
     console = Console(width=140, record=True, file=StringIO())
     console.print(probe_table(record.data))
     table = console.export_text()
@@ -152,15 +152,15 @@ def test_positions_are_split_along_and_across_the_rays(record, dense):
 
 def test_quantiles_ascend_and_hold_those_of_the_dense_spectrum(record, dense):
     _, H, _, _ = dense
-    found, null = record.data["quantiles"], len(H) - record.data["counts"]["rank"]
+    found, null = record.data.quantiles, len(H) - record.data.counts.rank
     true = torch.linalg.eigvalsh((H + H.T) / 2)
     true = true[true.abs().argsort()][null:].sort().values  # the exact null space left out
-    values = [found[share]["value"] for share in found]
+    values = [found[share].value for share in found]
     assert values == sorted(values) and len(values) == 7
     held = 0
     for share, entry in found.items():
         at = float(true[min(int(float(share) * len(true)), len(true) - 1)])
-        low = -math.inf if entry["low"] is None else entry["low"]
-        high = math.inf if entry["high"] is None else entry["high"]
+        low = -math.inf if entry.low is None else entry.low
+        high = math.inf if entry.high is None else entry.high
         held += low - rounding(H) <= at <= high + rounding(H)
     assert held == 7

@@ -8,10 +8,13 @@ import pytest
 
 from analysis.commands.cli import main
 from analysis.console.budget import SHARES
-from analysis.console.options import ProbeOptions
 from analysis.probe.command import run_probe
 from analysis.probe.measurement import ProbeSettings
+from analysis.probe.options import ProbeOptions
+from analysis.records.json_files import plain
 from analysis.records.records import Record, read_record
+from analysis.records.schema import INDICES
+from splat.curvature.hessian import SceneHessian
 from splat.training.checkpoint import load_checkpoint
 from tests.analysis.probe.probed import unlimited
 
@@ -19,44 +22,43 @@ from tests.analysis.probe.probed import unlimited
 def test_the_record_has_the_layout_and_says_what_was_skipped_and_from_where_it_comes(record, dense, run):
     objective, H, value, gradient = dense
     data = record.data
-    for key in ("traces", "eigenvalues", "anisotropy", "counts", "checks", "timing", "provenance"):
-        assert data[key], key
-    assert {"max", "min"} <= set(data["eigenvalues"]) and {"literal", "saddle"} <= set(data["anisotropy"])
-    counts, loaded = data["counts"], load_checkpoint(run / "double.pt")
-    assert counts["gaussians"] == len(loaded.training.gaussians) and counts["views"] == 3
-    assert counts["visible_gaussians"] == counts["gaussians"] - counts["skipped_gaussians"] == len(objective.active)
-    assert counts["active_parameters"] == len(H) - len(objective.active) and counts["rank"] <= len(H)
-    assert all(check["passed"] for check in data["checks"].values())
-    assert set(data["checks"]) == {"symmetry", "round_off", "finiteness", "finite_difference"}
-    assert data["objective"]["value"] == pytest.approx(value, rel=1e-12)
-    assert data["objective"]["gradient_norm"] == pytest.approx(float(gradient.norm()), rel=1e-9)
-    stages = ["load", "linearise", "checks", *SHARES, "skips", "pictures"]
-    assert list(data["timing"]) == [*stages, "total"]
-    assert sum(data["timing"][stage] for stage in stages) <= data["timing"]["total"]
-    provenance = data["provenance"]
-    assert (provenance["seed"], provenance["iteration"], provenance["dtype"]) == (0, 30, "float64")
-    assert provenance["scene_folder"] == str(run.parent / "still") and provenance["command"].startswith(
-        "landscape probe"
-    )
-    assert record.arrays["spectrum"]["ritz_values"][-1] == pytest.approx(data["eigenvalues"]["max"]["value"], rel=1e-9)
+    assert list(dict(data.eigenvalues.items())) == ["max", "second", "min", "power_max", "power_min"]
+    assert tuple(dict(data.anisotropy.items())) == INDICES
+    counts, loaded = data.counts, load_checkpoint(run / "double.pt")
+    assert counts.gaussians == len(loaded.training.gaussians) and counts.views == 3
+    assert counts.visible_gaussians == counts.gaussians - counts.skipped_gaussians == len(objective.active)
+    assert counts.active_parameters == len(H) - len(objective.active) and counts.rank <= len(H)
+    assert all(check.passed for check in data.checks.values())
+    assert set(data.checks) == {"symmetry", "round_off", "finiteness", "finite_difference"}
+    assert data.objective.value == pytest.approx(value, rel=1e-12)
+    assert data.objective.gradient_norm == pytest.approx(float(gradient.norm()), rel=1e-9)
+    stages = ["load", "linearise", "checks", *SHARES, "pictures"]
+    assert list(data.timing) == [*stages, "total"]
+    assert sum(data.timing[stage] for stage in stages) <= data.timing["total"]
+    provenance = data.provenance
+    assert (provenance.seed, provenance.iteration, provenance.dtype) == (0, 30, "float64")
+    assert provenance.scene_folder == str(run.parent / "still") and provenance.command.startswith("landscape probe")
+    assert record.arrays["spectrum"]["ritz_values"][-1] == pytest.approx(data.eigenvalues.max.value, rel=1e-9)
     files = ["slice2d.png", "spectrum.png", "surface.png", "traces.png", "report.html", "probe.json"]
     assert all((record.folder / file).stat().st_size > 5000 for file in files)
 
 
 def test_what_was_skipped_is_counted_and_its_time_said(record, dense, run):
     objective, _, _, _ = dense
-    skipped, gaussians = record.data["skipped"], load_checkpoint(run / "double.pt").training.gaussians
+    skipped, gaussians = record.data.skipped, load_checkpoint(run / "double.pt").training.gaussians
     views = list(objective.linearized)
-    assert {name: skip["count"] for name, skip in skipped.items()} == {
+    assert {name: skip.count for name, skip in skipped.items()} == {
         "gaussians_out_of_sight": len(gaussians) - len(objective.active),
         "sh_bands_not_in_use": 0,
-        "entries_behind_opaque_fronts": sum(view.entries_behind for view in views),
+        "entries_behind_opaque_fronts": sum(view.intersections_behind for view in views),
         "tiles_of_zero_cotangent": sum(view.dark_tiles for view in views),
         "products_of_views_not_concerned": 0,
-        "samples_of_finished_traces": sum(128 - trace["probes"] for trace in record.data["traces"].values()),
+        "samples_of_finished_traces": sum(128 - trace.probes for trace in record.data.traces.values()),
         "points_of_the_slice_predicted": int((~record.arrays["slice"]["evaluated"]).sum()),
     }
-    assert all((skip["seconds_saved"] > 0) <= (skip["count"] > 0) for skip in skipped.values())
+    undone = [skipped[name] for name in ("samples_of_finished_traces", "points_of_the_slice_predicted")]
+    assert all((skip.seconds_saved > 0) == (skip.count > 0) for skip in undone)
+    assert [skip.seconds_saved for skip in skipped.values()].count(None) == 5
 
 
 def test_the_record_is_strict_json(record):
@@ -65,7 +67,7 @@ def test_the_record_is_strict_json(record):
 
 def numbers(record: Record) -> tuple[dict, dict]:
     """All that may not differ between two runs."""
-    data = {key: value for key, value in record.data.items() if key not in ("timing", "provenance")}
+    data = {key: value for key, value in plain(record.data).items() if key not in ("timing", "provenance")}
     data["skipped"] = {name: skip["count"] for name, skip in data["skipped"].items()}
     return data, {group: {k: v.tolist() for k, v in arrays.items()} for group, arrays in record.arrays.items()}
 
@@ -81,19 +83,19 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     assert main(["probe", str(run / "checkpoint.pt"), "--quick"]) == 0
     said = capsys.readouterr()
     data = read_record(run / "probe").data
-    assert data["provenance"]["dtype"] == "float32" and data["slice"]["points"] == 41 * 41
-    assert set(data["eigenvalues"]) == {"max", "second", "min"} and "power iteration" not in said.out
+    assert data.provenance.dtype == "float32" and data.slice.points == 41 * 41
+    assert set(dict(data.eigenvalues.items())) == {"max", "second", "min"} and "power iteration" not in said.out
     # what it left out is said, in the record and aloud
-    assert any("surface was left out" in note for note in data["notes"]) and "surface was left out" in " ".join(
+    assert any("surface was left out" in note for note in data.notes) and "surface was left out" in " ".join(
         said.out.split()
     )
-    assert data["finite_probe"] is None and "the finite probe was left out" in data["notes"]
-    assert data["depth"] is None and "positions along and across the rays were left out" in data["notes"]
-    assert data["anisotropy"]["share"]["value"] is None and "density" not in data["timing"]
-    assert "the spectral density was left out, and the indices that need it" in data["notes"]
-    skips = data["skipped"]
-    assert skips["entries_behind_opaque_fronts"]["seconds_saved"] is None
-    assert skips["gaussians_out_of_sight"]["count"] == data["counts"]["skipped_gaussians"]
+    assert data.finite_probe is None and "the finite probe was left out" in data.notes
+    assert data.depth is None and "positions along and across the rays were left out" in data.notes
+    assert data.anisotropy.share.value is None and "density" not in data.timing
+    assert "the spectral density was left out, and the indices that need it" in data.notes
+    skips = data.skipped
+    assert skips["entries_behind_opaque_fronts"].seconds_saved is None
+    assert skips["gaussians_out_of_sight"].count == data.counts.skipped_gaussians
     for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
         assert f"trace of {label}" in said.out
     for label in ("largest eigenvalue", "smallest eigenvalue", "literal", "saddle", "check: symmetry"):
@@ -121,19 +123,17 @@ def test_a_budget_that_ends_is_said_and_what_was_reached_is_recorded(run, tmp_pa
     out = tmp_path / "short"
     assert main(["probe", str(run / "checkpoint.pt"), "--out", str(out), "--seconds", "1e-6"]) == 0
     data = read_record(out).data
-    assert data["eigenvalues"]["max"]["reason"] == "time budget"
-    assert data["slice"]["points"] == 41 * 41 > 30 * data["slice"]["evaluated_points"]
-    assert any("the slice's interpolation stopped" in note for note in data["notes"])
-    assert data["anisotropy"]["share"]["value"] is None
-    assert any("density was left out" in note for note in data["notes"])
-    assert data["depth"]["rises"] == [] and any("steps along the rays were left out" in note for note in data["notes"])
+    assert data.eigenvalues.max.reason == "time budget"
+    assert data.slice.points == 41 * 41 > 30 * data.slice.evaluated_points
+    assert any("the slice's interpolation stopped" in note for note in data.notes)
+    assert data.anisotropy.share.value is None
+    assert any("density was left out" in note for note in data.notes)
+    assert data.depth.rises == [] and any("steps along the rays were left out" in note for note in data.notes)
     assert "density was left out" in " ".join(capsys.readouterr().out.split())
 
 
-def skewed(run):
+def skewed():
     """SceneHessian.apply with a hundredth of the result moved to the next row."""
-    from splat.curvature.hessian import SceneHessian
-
     original = SceneHessian.apply
 
     def apply(self, V):
@@ -144,13 +144,13 @@ def skewed(run):
 
 
 def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_path, no_pictures, monkeypatch, capsys):
-    monkeypatch.setattr("splat.curvature.objective.hessian.SceneHessian.apply", skewed(run))
+    monkeypatch.setattr(SceneHessian, "apply", skewed())
     quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
     assert main([*quick, str(tmp_path / "lenient")]) == 0
     assert main([*quick, str(tmp_path / "strict"), "--strict"]) == 1
     for name in ("lenient", "strict"):
-        checks = read_record(tmp_path / name).data["checks"]
-        assert checks["symmetry"]["passed"] is False and checks["finite_difference"]["passed"] is False
+        checks = read_record(tmp_path / name).data.checks
+        assert checks["symmetry"].passed is False and checks["finite_difference"].passed is False
     assert "The check of symmetry failed" in " ".join(capsys.readouterr().out.split())
 
 

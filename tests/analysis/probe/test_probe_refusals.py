@@ -65,7 +65,7 @@ def test_a_scene_that_has_moved_is_named_with_the_option_and_found_there(run, tm
         assert main(["probe", str(run / "checkpoint.pt"), *options]) == 0
     finally:
         away.rename(still)
-    assert read_record(tmp_path / "probe").data["provenance"]["scene_folder"] == str(away)
+    assert read_record(tmp_path / "probe").data.provenance.scene_folder == str(away)
 
 
 def test_a_probe_that_is_killed_leaves_the_old_record_whole(run, record, tmp_path):
@@ -82,7 +82,7 @@ def test_a_probe_that_is_killed_leaves_the_old_record_whole(run, record, tmp_pat
         time.sleep(0.002)
     process.kill()
     assert process.wait() == -signal.SIGKILL
-    assert (out / "probe.json").read_bytes() == before and read_record(out).data["provenance"]["dtype"] == "float64"
+    assert (out / "probe.json").read_bytes() == before and read_record(out).data.provenance.dtype == "float64"
 
 
 def test_an_interrupted_probe_writes_nothing(run, tmp_path, monkeypatch):
@@ -100,5 +100,5 @@ def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
 
     monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(fail))
     assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 0
-    assert "drawing failed: no fonts" in read_record(tmp_path / "probe").data["notes"]
+    assert "drawing failed: no fonts" in read_record(tmp_path / "probe").data.notes
     assert "Drawing failed: no fonts." in (tmp_path / "probe" / "report.html").read_text()

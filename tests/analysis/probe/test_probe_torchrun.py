@@ -47,15 +47,15 @@ def test_two_processes_write_the_record_of_one(checkpoint, tmp_path):
     assert done.returncode == 0, done.stderr
     assert main([*words, "--seconds", "inf", "--out", str(tmp_path / "one")]) == 0
     two, one = (read_record(tmp_path / name) for name in ("two", "one"))
-    for name, trace in one.data["traces"].items():
+    for name, trace in one.data.traces.items():
         # the order of a sum of views in single precision, of a trace some of whose parts cancel
-        scale = 1e-5 * max(abs(each["value"]) for each in one.data["traces"].values())
-        assert two.data["traces"][name]["value"] == pytest.approx(trace["value"], abs=scale), name
-        assert two.data["traces"][name]["probes"] == trace["probes"]
+        scale = 1e-5 * max(abs(each.value) for each in one.data.traces.values())
+        assert two.data.traces[name].value == pytest.approx(trace.value, abs=scale), name
+        assert two.data.traces[name].probes == trace.probes
     largest = [np.max(record.arrays["spectrum"]["ritz_values"]) for record in (two, one)]
     assert largest[0] == pytest.approx(largest[1], rel=1e-4)
-    assert all(check["passed"] for check in two.data["checks"].values())
-    counts = [{name: each["count"] for name, each in record.data["skipped"].items()} for record in (two, one)]
+    assert all(check.passed for check in two.data.checks.values())
+    counts = [{name: each.count for name, each in record.data.skipped.items()} for record in (two, one)]
     assert counts[0] == counts[1]
     assert done.stdout.count("report.html") == 1  # the second process is silent
 

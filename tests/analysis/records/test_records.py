@@ -5,19 +5,35 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
+from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
 
-from analysis.records.records import FORMAT, read_record, record_folder, write_data, write_record
-from tests.recorded import synthetic
+from analysis.records.findings import findings, of_slice
+from analysis.records.json_files import plain
+from analysis.records.records import ProbeRecord, SliceRecord, read_record, record_folder, write_data
+from analysis.records.run_files import read_trajectory
+from analysis.records.tables import family_table, probe_table
+from tests import recorded
+from tests.figures.test_trajectory_figure import rows
+from tests.recorded import probe_of, synthetic
 
 
 def written(folder, data=None, arrays=None):
     plain_data, plain_arrays = synthetic()
-    with record_folder(folder) as partial:
-        write_record(partial, data or plain_data, plain_arrays if arrays is None else arrays)
-    return folder
+    return recorded.written(folder, data or plain_data, plain_arrays if arrays is None else arrays).folder
+
+
+def holds(found, expected) -> bool:
+    """Whether what is found has all that is expected, and perhaps defaults beside it."""
+    if isinstance(expected, dict):
+        return all(key in found and holds(found[key], value) for key, value in expected.items())
+    if isinstance(expected, list):
+        return len(found) == len(expected) and all(map(holds, found, expected))
+    return found == expected
 
 
 def leftovers(parent):
@@ -27,7 +43,7 @@ def leftovers(parent):
 def test_a_record_comes_back_as_it_was_written(tmp_path):
     data, arrays = synthetic()
     record = read_record(written(tmp_path / "run" / "probe", data, arrays))
-    assert {key: record.data[key] for key in data} == data
+    assert holds(plain(record.data), data)
     for group, names in arrays.items():
         for name, array in names.items():
             np.testing.assert_array_equal(record.arrays[group][name], array)
@@ -38,20 +54,24 @@ def test_a_record_comes_back_as_it_was_written(tmp_path):
 @pytest.mark.parametrize("number", [1e-12, -1e9, 5e-324, 1.7976931348623157e308, 0.1, math.inf, -math.inf])
 def test_a_number_of_any_size_survives_exactly(tmp_path, number):
     data, arrays = synthetic()
-    data["traces"]["means"]["value"] = np.float64(number)
-    data["counts"]["gaussians"] = np.int64(7)
-    record = read_record(written(tmp_path / "probe", data, arrays))
-    assert record.data["traces"]["means"]["value"] == number
-    assert record.data["counts"]["gaussians"] == 7
+    record = recorded.written(tmp_path / "probe", data, arrays)
+    record.data.traces["means"].value = np.float64(number)
+    record.data.counts.gaussians = np.int64(7)
+    write_data(record.folder, record.data)
+    record = read_record(record.folder, ProbeRecord)
+    assert record.data.traces["means"].value == number
+    assert record.data.counts.gaussians == 7
 
 
 def test_data_are_written_anew_beside_the_arrays_that_are_there(tmp_path):
     data, arrays = synthetic()
     folder = written(tmp_path / "probe", data, arrays)
     files = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.npz")}
-    write_data(folder, {**data, "notes": ["later"]}, arrays)
     record = read_record(folder)
-    assert record.data["notes"] == ["later"] and set(record.arrays) == set(arrays)
+    record.data.notes = ["later"]
+    write_data(folder, record.data)
+    record = read_record(folder)
+    assert record.data.notes == ["later"] and set(record.arrays) == set(arrays)
     assert {path.name: path.stat().st_mtime_ns for path in folder.glob("*.npz")} == files != {}
 
 
@@ -65,44 +85,87 @@ def test_what_is_not_finite_is_written_as_text_in_strict_json(tmp_path):
 
     raw = json.loads((folder / "probe.json").read_text(encoding="utf-8"), parse_constant=refuse)["traces"]["sh"]
     assert (raw["value"], raw["standard_error"], raw["low"]) == ("NaN", "Infinity", "-Infinity")
-    read = read_record(folder).data["traces"]["sh"]
-    assert math.isnan(read["value"]) and read["standard_error"] == math.inf and read["low"] == -math.inf
+    read = read_record(folder, ProbeRecord).data.traces["sh"]
+    assert read.value is not None and math.isnan(read.value)
+    assert read.standard_error == math.inf and read.low == -math.inf
 
 
 def test_a_record_may_have_no_slice_and_no_arrays(tmp_path):
     data, _ = synthetic()
     record = read_record(written(tmp_path / "probe", data | {"slice": None}, {}))
-    assert record.data["slice"] is None and record.arrays == {}
+    assert record.data.slice is None and record.arrays == {}
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda d: d["traces"]["means"].pop("standard_error"), "traces.means.standard_error"),
-        (lambda d: d["eigenvalues"].pop("min"), "eigenvalues.min"),
-        (lambda d: d.pop("checks"), '"checks"'),
-        (lambda d: d["slice"]["directions"][1].pop("unit"), "slice.directions.unit"),
-        (lambda d: d["slice"].pop("center_loss"), "center_loss"),
-        (lambda d: d["slice"]["directions"].__setitem__(0, None), "slice.directions"),
-        (lambda d: d["slice"].update(directions=2), "2 .directions"),
-        (lambda d: d.update(slice=3), '"slice"'),
-        (lambda d: d["counts"].update(visible_gaussians=None), "counts.visible_gaussians"),
-        (lambda d: d["slice"].update(points=None), "slice.points"),
-        (lambda d: d["slice"].update(crossed_points="many"), "slice.crossed_points"),
-        (lambda d: d.update(notes=None), '"notes"'),
-        (lambda d: d.update(notes=[3]), '"notes"'),
-        (lambda d: d["anisotropy"].update(saddle=3.0), "anisotropy.saddle"),
-        (lambda d: d["traces"]["quats"].update(value=np.zeros(3)), "traces.quats.value.*npz"),
-        (lambda d: d["notes"].append("NaN"), r"notes\[1\]"),
-        (lambda d: d["timing"].update({3: 1.0}), "timing"),
+        (lambda d: d["traces"]["means"].pop("standard_error"), 'the key "traces.means.standard_error", got none'),
+        (lambda d: d["eigenvalues"].pop("min"), 'the key "eigenvalues.min", got none'),
+        (lambda d: d.pop("checks"), 'the key "checks", got none'),
+        (lambda d: d["slice"]["directions"][1].pop("unit"), r'the key "slice.directions\[1\].unit", got none'),
+        (lambda d: d["slice"].pop("center_loss"), 'the key "slice.center_loss", got none'),
+        (lambda d: d["slice"]["directions"].__setitem__(0, None), r'`object`, got None as "slice.directions\[0\]"'),
+        (lambda d: d["slice"].update(directions=2), '`array`, got 2 as "slice.directions"'),
+        (lambda d: d["slice"]["directions"].pop(), "expected 2 slice.directions, got 1"),
+        (lambda d: d.update(slice=3), 'got 3 as "slice"'),
+        (lambda d: d["counts"].update(visible_gaussians=None), '`int`, got None as "counts.visible_gaussians"'),
+        (lambda d: d["counts"].update(views=-1), 'as "counts.views"'),
+        (lambda d: d["slice"].update(crossed_points="many"), "`int`, got 'many' as \"slice.crossed_points\""),
+        (lambda d: d.update(notes=None), '`array`, got None as "notes"'),
+        (lambda d: d.update(notes=[3]), r'`str`, got 3 as "notes\[0\]"'),
+        (lambda d: d["notes"].append("NaN"), r'`str`, got nan as "notes\[1\]"'),
+        (lambda d: d["anisotropy"].update(saddle=3.0), 'got 3.0 as "anisotropy.saddle"'),
+        (lambda d: d["traces"]["quats"].update(value=[1.0]), r'got \[1.0\] as "traces.quats.value"'),
+        (lambda d: d["traces"]["quats"].update(standard_error=-1.0), 'at least 0, got -1.0 as "traces.quats"'),
+        (lambda d: d["traces"]["sh"].update(sign="?"), 'invalid enum value .* as "traces.sh.sign"'),
+        (lambda d: d["timing"].update(load="long"), "`float`, got 'long' as \"timing.load\""),
+        (lambda d: d.update(arrays={"spectrum": 3}), '`object`, got 3 as "arrays.spectrum"'),
+        (lambda d: d["arrays"]["spectrum"].pop("residuals"), r"residuals of shape \[\] instead of \[k\]"),
+        (lambda d: d["arrays"]["slice"].pop("y"), "loss of shape"),
     ],
 )
-def test_data_that_has_no_place_is_refused_by_name_and_nothing_is_written(tmp_path, change, words):
-    data, arrays = synthetic()
-    change(data)
-    with pytest.raises(ValueError, match=words):
-        written(tmp_path / "probe", data, arrays)
+def test_a_changed_record_is_refused_by_file_and_key(tmp_path, change, words):
+    path = written(tmp_path / "probe") / "probe.json"
+    raw = json.loads(path.read_text(encoding="utf-8"))
+    change(raw)
+    path.write_text(json.dumps(raw), encoding="utf-8")
+    with pytest.raises(ValueError, match=f"(?s){words}.*; probe again") as refused:
+        read_record(tmp_path / "probe")
+    assert str(tmp_path) in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("key", "value"), [("value", "high"), ("value", np.zeros(3)), ("method", 3)])
+def test_what_could_not_be_read_again_is_not_written(tmp_path, key, value):
+    record = probe_of(synthetic()[0])
+    setattr(record.traces["quats"], key, value)
+    with pytest.raises((ValueError, TypeError)), record_folder(tmp_path / "probe") as partial:
+        write_data(partial, record)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("array", "words"),
+    [
+        (np.zeros((21, 17), complex), "loss of complex128 instead of floating values"),
+        (np.array([["a"] * 17] * 21), "loss of <U1 instead of floating values"),
+        (np.zeros((17, 21)), r"loss of shape \[17, 21\] instead of \[21, 17\]"),
+        (None, "no loss"),
+    ],
+)
+def test_a_changed_array_is_refused_by_file_and_name(tmp_path, array, words):
+    folder, arrays = written(tmp_path / "probe"), synthetic()[1]["slice"]
+    arrays |= {"loss": array}
+    known: dict[str, Any] = {name: values for name, values in arrays.items() if values is not None}
+    np.savez(folder / "slice.npz", **known)
+    with pytest.raises(ValueError, match=rf"slice\.npz, got {words}.*; probe again"):
+        read_record(folder)
+
+
+def test_steps_that_do_not_increase_are_refused(tmp_path):
+    data, arrays = synthetic()
+    arrays["slice"]["x"][3] = math.nan
+    with pytest.raises(ValueError, match="steps x that do not increase"):
+        written(tmp_path / "probe", data, arrays)
 
 
 def test_arrays_of_objects_are_refused(tmp_path):
@@ -132,17 +195,18 @@ def test_a_new_record_replaces_all_of_the_old_one(tmp_path):
     data, _ = synthetic(seed=5)
     written(folder, data, {})
     assert sorted(path.name for path in folder.iterdir()) == ["probe.json"]
-    assert read_record(folder).data["provenance"]["seed"] == 5
+    assert read_record(folder).data.provenance.seed == 5
     assert leftovers(tmp_path) == []
 
 
 KILLED = """
 import sys, time
 sys.path[:0] = sys.argv[2:]
-from analysis.records import record_folder, write_record
-from tests.recorded import synthetic
+from analysis.records.records import record_folder, write_record
+from tests.recorded import probe_of, synthetic
+data, arrays = synthetic(seed=9)
 with record_folder(sys.argv[1]) as partial:
-    write_record(partial, *synthetic(seed=9))
+    write_record(partial, probe_of(data), arrays)
     (partial / "report.html").write_text("half a page")
     print("written", flush=True)
     time.sleep(60)
@@ -158,7 +222,7 @@ def test_a_process_killed_while_it_writes_leaves_the_old_record_whole(tmp_path, 
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
-    assert read_record(folder).data["provenance"]["seed"] == 0
+    assert read_record(folder).data.provenance.seed == 0
     assert not (folder / "report.html").exists()
     (abandoned,) = tmp_path.glob(".probe.partial-*")
     long_ago = time.time() - 7200
@@ -174,7 +238,7 @@ def test_a_replacement_interrupted_between_its_two_renames_is_mended(tmp_path):
         read_record(folder)
     with pytest.raises(RuntimeError), record_folder(folder):
         raise RuntimeError
-    assert read_record(folder).data["provenance"]["seed"] == 0
+    assert read_record(folder).data.provenance.seed == 0
     assert leftovers(tmp_path) == []
 
 
@@ -195,7 +259,7 @@ def test_what_is_missing_is_said_with_what_to_do(tmp_path):
     written(tmp_path / "probe")
     with pytest.raises(FileNotFoundError, match=r"which is a run; name .*probe"):
         read_record(tmp_path)
-    assert read_record(tmp_path / "probe" / "probe.json").data["counts"]["views"] == 3
+    assert read_record(tmp_path / "probe" / "probe.json").data.counts.views == 3
     (tmp_path / "probe" / "slice.npz").unlink()
     with pytest.raises(FileNotFoundError, match=r"slice\.npz.*probe again"):
         read_record(tmp_path / "probe")
@@ -214,7 +278,7 @@ def test_a_truncated_file_is_named(tmp_path, name, share):
 def test_an_array_of_another_shape_than_recorded_is_named(tmp_path):
     folder = written(tmp_path / "probe")
     np.savez(folder / "traces.npz", means=np.zeros(2))
-    with pytest.raises(ValueError, match=r"expected means of shape \[16\].*got \[2\]"):
+    with pytest.raises(ValueError, match=r"means of shape \[2\] instead of \[16\]"):
         read_record(folder)
 
 
@@ -225,19 +289,10 @@ def test_json_of_something_else_is_refused(tmp_path, foreign):
         read_record(tmp_path)
 
 
-@pytest.mark.parametrize("shapes", [None, 3, [4]])
-def test_arrays_that_are_no_shapes_by_name_are_refused(tmp_path, shapes):
-    path = written(tmp_path / "probe") / "probe.json"
-    raw = json.loads(path.read_text(encoding="utf-8"))
-    path.write_text(json.dumps(raw | {"arrays": raw["arrays"] | {"spectrum": shapes}}), encoding="utf-8")
-    with pytest.raises(ValueError, match=r'"arrays\.spectrum".*probe again'):
-        read_record(path)
-
-
 def test_a_newer_format_is_refused_with_what_to_do(tmp_path):
     folder = written(tmp_path / "probe")
     raw = json.loads((folder / "probe.json").read_text(encoding="utf-8"))
-    raw["format"]["version"] = int(FORMAT["version"]) + 1
+    raw["format"]["version"] = ProbeRecord.FORMAT.version + 1
     (folder / "probe.json").write_text(json.dumps(raw))
     with pytest.raises(ValueError, match="got version 2; update"):
         read_record(folder)
@@ -246,3 +301,95 @@ def test_a_newer_format_is_refused_with_what_to_do(tmp_path):
 def test_records_reports_and_figures_need_no_torch():
     program = "import sys, analysis.records.report, figures.make_all; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+OLD = Path(__file__).parent / "old"
+"""Records as version 1 was written before it had types: a probe, with families, and a slice, without their arrays."""
+
+
+@pytest.mark.parametrize("name", ["probe", "slice"])
+def test_a_record_written_before_is_read_and_written_the_same(tmp_path, name):
+    text = (OLD / f"{name}.json").read_text(encoding="utf-8")
+    (tmp_path / f"{name}.json").write_text(text, encoding="utf-8")
+    record = read_record(tmp_path)
+    write_data(tmp_path, record.data)
+    assert json.loads((tmp_path / f"{name}.json").read_text(encoding="utf-8")) == json.loads(text)
+
+
+def attempted(folder):
+    """The record, or what is said of it."""
+    try:
+        return read_record(folder), ""
+    except ValueError as error:
+        return None, str(error)
+
+
+NOTHING = object()
+WRONG = (None, -1, 0, 3.5, 1e300, 2**70, True, "NaN", "-Infinity", "text", [], {}, [None], {"a": 1}, NOTHING)
+
+
+def changed(raw, random):
+    """Another value, or none, in a random place of JSON."""
+    place, path = raw, []
+    while isinstance(place, dict | list) and len(place) and (not path or random.random() < 0.85):
+        path.append((place, random.choice(list(place) if isinstance(place, dict) else list(range(len(place))))))
+        place = path[-1][0][path[-1][1]]
+    owner, key = path[-1]
+    wrong = WRONG[random.randrange(len(WRONG))]
+    if wrong is NOTHING:
+        del owner[key]
+    else:
+        owner[key] = wrong
+    return [key for _, key in path]
+
+
+@pytest.mark.parametrize("name", ["probe", "slice"])
+def test_a_record_changed_anywhere_is_read_or_refused_in_a_sentence(tmp_path, name):
+    """What is read has all its sentences and tables."""
+    random, read = Random(0), 0
+    text = (OLD / f"{name}.json").read_text(encoding="utf-8")
+    for _ in range(1000):
+        raw = json.loads(text)
+        place = changed(raw, random)
+        (tmp_path / f"{name}.json").write_text(json.dumps(raw), encoding="utf-8")
+        record, said = attempted(tmp_path)
+        if record is None:
+            assert f"{name} again" in said and str(tmp_path) in said and "\n" not in said, place
+            continue
+        read += 1
+        if isinstance(record.data, ProbeRecord):
+            said = findings(record.data)
+            assert said and probe_table(record.data).row_count and family_table(record.data).row_count is not None, (
+                place
+            )
+        else:
+            assert isinstance(record.data, SliceRecord) and of_slice(record.data.slice) is not None
+    assert 100 < read < 900
+
+
+@pytest.mark.parametrize("name", ["slice.npz", "spectrum.npz", "traces.npz"])
+def test_an_archive_with_changed_bytes_is_read_or_refused_in_a_sentence(tmp_path, name):
+    random, path = Random(1), written(tmp_path / "probe") / name
+    whole = path.read_bytes()
+    for _ in range(150):
+        content = bytearray(whole)
+        for _ in range(random.choice([1, 3, 30])):
+            content[random.randrange(len(content))] = random.randrange(256)
+        path.write_bytes(content)
+        record, said = attempted(path.parent)
+        assert record is not None or (str(path) in said and "probe again" in said), said
+
+
+def test_damaged_trajectories_are_refused_by_file_and_column(tmp_path):
+    rows().to_csv(path := tmp_path / "trajectory.csv", index=False)
+    assert len(read_trajectory(path)) == len(rows())
+    for change, words in (
+        (lambda t: t.drop(columns="trace_sh_low"), "got no column trace_sh_low"),
+        (lambda t: t.assign(lambda_max="steep"), "expected a number as lambda_max in .*, got 'steep' in row 1"),
+        (lambda t: t.assign(step=None), "expected a number as step in"),
+        (lambda t: t.assign(state="lost"), "expected whole or cut or skipped as state in .*, got 'lost' in row 1"),
+        (lambda t: t.head(0)[[]], "got No columns"),
+    ):
+        change(rows()).to_csv(path, index=False)
+        with pytest.raises(ValueError, match=words):
+            read_trajectory(path)

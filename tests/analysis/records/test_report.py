@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.records.findings import verdict
-from analysis.records.records import read_record, record_folder, write_record
+from analysis.records.findings import findings
+from analysis.records.records import record_folder, write_record
 from analysis.records.report import interactive_surface, write_report
-from tests.recorded import depth_section, synthetic
+from tests.recorded import depth_section, probe_of, synthetic, written
 
 PIXEL = bytes.fromhex("89504e470d0a1a0a") + b"not looked into"
 
@@ -47,7 +47,7 @@ class Page(HTMLParser):
 
 def page(folder, data, arrays, picture=None):
     with record_folder(folder) as partial:
-        write_record(partial, data, arrays)
+        write_record(partial, probe_of(data), arrays)
         if picture:
             (partial / f"{picture}.png").write_bytes(PIXEL)
         path = write_report(partial)
@@ -57,13 +57,14 @@ def page(folder, data, arrays, picture=None):
 
 def test_a_surface_that_is_known_already_is_not_made_again(tmp_path):
     with record_folder(tmp_path / "probe") as partial:
-        write_record(partial, *synthetic())
+        data, arrays = synthetic()
+        write_record(partial, probe_of(data), arrays)
         text = write_report(partial, "<p>a surface that is known</p>").read_text(encoding="utf-8")
     assert text.count("<p>a surface that is known</p>") == 1 and 'id="surface"' not in text and "Plotly" in text
 
 
 def sentences(data, level=None):
-    return " | ".join(line.text for line in verdict(data) if level in {None, line.level})
+    return " | ".join(line.text for line in findings(probe_of(data)) if level in {None, line.level})
 
 
 def test_the_page_fetches_nothing_and_carries_its_pictures(tmp_path):
@@ -129,9 +130,7 @@ def test_of_depth_only_what_was_determined_is_said():
 def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
     data, arrays = synthetic()
     data["slice"]["directions"][0]["name"] = '<a href="http://example.org">e₁</a>'
-    with record_folder(tmp_path / "probe") as partial:
-        write_record(partial, data, arrays)
-    figure = interactive_surface(read_record(tmp_path / "probe"))
+    figure = interactive_surface(written(tmp_path / "probe", data, arrays))
     assert figure is not None
     title = figure.to_dict()["layout"]["scene"]["xaxis"]["title"]["text"]
     assert "<" not in title and "&lt;a href" in title
@@ -164,7 +163,7 @@ def test_records_of_extreme_size_and_without_numbers_make_a_page(tmp_path, scale
     assert "not a number" in text and "The ends of the spectrum were not determined" in text
 
 
-def test_the_verdict_names_the_attribute_that_carries_the_curvature():
+def test_the_findings_names_the_attribute_that_carries_the_curvature():
     data, _ = synthetic()
     assert "Position carries most of the curvature" in sentences(data) and "98%" in sentences(data)
     data["traces"]["quats"] |= {"value": -3.9e5, "standard_error": 4e4}
@@ -191,13 +190,13 @@ def test_most_of_the_curvature_is_more_than_half_of_it_and_whom_the_error_does_n
         (5.0, 3.0, "No direction of negative curvature was found"),
     ],
 )
-def test_the_verdict_calls_indefinite_what_the_residual_proves(low, residual, words):
+def test_the_findings_calls_indefinite_what_the_residual_proves(low, residual, words):
     data, _ = synthetic()
     data["eigenvalues"]["min"] |= {"value": low, "residual": residual}
     assert words in sentences(data)
 
 
-def test_an_end_that_the_budget_did_not_reach_is_a_bound_and_the_verdict_says_so():
+def test_an_end_that_the_budget_did_not_reach_is_a_bound_and_the_findings_says_so():
     data, _ = synthetic()
     data["eigenvalues"]["min"] |= {"reason": "tolerance"}
     assert "farther out" not in sentences(data)
@@ -218,19 +217,19 @@ def test_a_failed_check_comes_first_and_in_red(tmp_path):
     data, arrays = synthetic()
     assert sentences(data, "failure") == ""
     data["checks"]["symmetry"] |= {"value": 0.5, "passed": False}
-    first = verdict(data)[0]
+    first = findings(probe_of(data))[0]
     assert first.level == "failure" and "symmetry failed: 0.500" in first.text
     assert 'class="failure">The check of symmetry failed' in page(tmp_path / "probe", data, arrays)
 
 
-def test_the_verdict_says_what_was_skipped_and_what_could_not_run():
+def test_the_findings_says_what_was_skipped_and_what_could_not_run():
     said = sentences(synthetic()[0])
     assert "217 of 10,091 Gaussians touch no pixel" in said
     assert "degree 0 of 3" in said and "326 of the slice's 357 rendered points" in said
     assert "finite difference could not run (every direction crosses a sort)" in said
 
 
-def test_the_verdict_says_how_much_of_the_slice_is_interpolated_and_how_well():
+def test_the_findings_says_how_much_of_the_slice_is_interpolated_and_how_well():
     data, _ = synthetic()
     data["slice"] |= {"evaluated_points": 80, "crossed_points": 70, "interpolation_error": 0.004, "holdout_points": 30}
     said = sentences(data)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from analysis.console.options import TrainOptions
-from analysis.records.run_files import read_scores
+from analysis.records.run_files import Scores, ViewScores, read_scores
 from analysis.runs.sweep.sweep_file import Cell
 from analysis.runs.sweep.sweep_results import results
+from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 
 SCORES = {"psnr": 20.0, "ssim": 0.5, "lpips": None}
@@ -26,13 +26,19 @@ def swept(run: Path) -> float:
 @pytest.mark.parametrize(
     ("text", "got"),
     [
-        ("", "a damaged file (Expecting value"),
-        ('{"test":', "a damaged file (Expecting"),
-        ("[1]", "[1] instead of an object"),
-        (json.dumps(METRICS | {"train": 3}), "3 as train;"),
-        (json.dumps(METRICS | {"test": SCORES | {"ssim": "good"}}), "'good' as test.ssim;"),
-        (json.dumps({"train": SCORES}), "None as gaussians;"),
-        (json.dumps(METRICS | {"seconds": {"wall": "long"}}), "'long' as seconds.wall;"),
+        ("", "a damaged file (Input data was truncated)"),
+        ('{"test":', "a damaged file (Input data was truncated)"),
+        ("[1]", "another: expected `object`, got `array`;"),
+        (json.dumps(METRICS | {"train": 3}), 'another: expected `object | null`, got 3 as "train";'),
+        (
+            json.dumps(METRICS | {"test": SCORES | {"ssim": "good"}}),
+            "another: expected `float | null`, got 'good' as \"test.ssim\";",
+        ),
+        (json.dumps({"train": SCORES}), 'another: expected the key "gaussians", got none;'),
+        (
+            json.dumps(METRICS | {"seconds": {"wall": "long"}}),
+            "another: expected `float | null`, got 'long' as \"seconds.wall\";",
+        ),
     ],
 )
 def test_damaged_scores_are_named_with_what_to_do(tmp_path, text, got):
@@ -48,18 +54,17 @@ def test_damaged_scores_are_named_with_what_to_do(tmp_path, text, got):
 
 def test_scores_that_are_whole_are_read(tmp_path):
     (tmp_path / "metrics.json").write_text(json.dumps(METRICS))
-    assert read_scores(tmp_path) == METRICS | {"train": SCORES | {"psnr": float("inf")}} and swept(tmp_path) == float(
-        "inf"
-    )
+    train = ViewScores(psnr=float("inf"), ssim=0.5, lpips=None)
+    assert read_scores(tmp_path) == Scores(gaussians=9, train=train) and swept(tmp_path) == float("inf")
 
 
 @pytest.mark.parametrize(
     ("text", "got"),
     [
-        ("", "a damaged file (Expecting value"),
-        ("3", "3 instead of an object"),
-        (json.dumps({"foo": 1}), "None as step;"),
-        (json.dumps(SECONDS | {"wall": "long"}), "'long' as wall;"),
+        ("", "a damaged file (Input data was truncated)"),
+        ("3", "another: expected `object`, got `int`;"),
+        (json.dumps({"foo": 1}), 'another: expected the key "step", got none;'),
+        (json.dumps(SECONDS | {"wall": "long"}), "another: expected `float`, got 'long' as \"wall\";"),
     ],
 )
 def test_damaged_seconds_are_named_with_what_to_do(tmp_path, text, got):

@@ -9,15 +9,15 @@ import pandas as pd
 import pytest
 
 from analysis.commands.cli import main
-from analysis.records.family_table import bracketed
 from analysis.records.quantities import measured, quantity
-from analysis.records.records import read_record, record_folder, write_record
+from analysis.records.schema import Index
+from analysis.records.tables import bracketed
 from splat.losses.reference import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from tests.figures.test_trajectory_figure import rows
-from tests.recorded import depth_section, synthetic
+from tests.recorded import depth_section, synthetic, written
 
 ITERATIONS = 4
 FACTOR = {"value": 2.5, "low": 2.0, "high": 3.1, "note": ""}
@@ -42,8 +42,7 @@ def record(folder: Path, scale: float, **changes) -> None:
     family = {"gaussians": 10091, "dim": 30273, "rank": 30000, "lambda_max": end, "lambda_min": end}
     family |= {"indices": dict.fromkeys(names, index)}
     data["families"] = [about | family, about | family | {"split": True, "gaussians": 20000}]
-    with record_folder(folder) as partial:
-        write_record(partial, data, arrays)
+    written(folder, data, arrays)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +81,7 @@ def changed(run: str, **config) -> None:
 
 def other_units(run: str) -> dict:
     """A family of the run in other units."""
-    return read_record(Path(run) / "probe").data["families"][0] | {"unit": "steps of the optimiser"}
+    return json.loads((Path(run) / "probe/probe.json").read_text())["families"][0] | {"unit": "steps of the optimiser"}
 
 
 def refused(capsys, words: list[str], *expected: str) -> None:
@@ -101,11 +100,7 @@ def test_depth_over_lateral_is_compared_where_a_probe_has_it(runs, tmp_path, no_
     path.write_text(json.dumps(json.loads(path.read_text()) | {"depth": depth_section()}))
     assert main(["compare", *runs, "--out", str(tmp_path / "with")]) == 0
     lines = {line.strip().split("  ")[0]: line for line in capsys.readouterr().out.splitlines() if "depth" in line}
-    for name, value in (
-        ("gradient", "0.00680"),
-        ("curvature", "3.80"),
-        ("rise at 0.1 px", "0.280"),
-    ):
+    for name, value in (("gradient", "0.00680"), ("curvature", "3.80"), ("rise at 0.1 px", "0.280")):
         assert value in lines[f"depth / lateral {name}"] and lines[f"depth / lateral {name}"].rstrip().endswith("–")
     table = pd.read_csv(tmp_path / "with/compare.csv").set_index(["section", "quantity", "run"])
     rise = table.loc[("depth over lateral", "rise at 0.1 px", "plain/0")]
@@ -144,13 +139,13 @@ def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(train
     assert "which hardly changes the image" in page
     for scale in (1.0, 0.5):
         data, _ = synthetic(scale)
-        trace, saddle = data["traces"]["means"], bracketed(data["anisotropy"]["saddle"])
+        trace, saddle = data["traces"]["means"], bracketed(Index(**data["anisotropy"]["saddle"]))
         for text in (measured(trace["value"], trace["standard_error"]), saddle.value, "× 2.50", "2.00 … 3.10"):
             assert text in said and text in page
         assert (
             f"by {quantity(0.01 * scale)} (root mean square; {quantity(40 / scale)} dB), and 182 of the halves" in page
         )
-        assert bracketed({"value": 7 * scale, "low": 6 * scale, "high": 9 * scale, "note": ""}).bracket in page
+        assert bracketed(Index(value=7 * scale, low=6 * scale, high=9 * scale, note="")).bracket in page
 
 
 def test_pictures_are_drawn_from_the_records_and_lie_in_the_page(trained, tmp_path):
@@ -216,8 +211,7 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         "settings": {"eigen": {"rtol": 0.5}, "quick": True},
     }
     data["checks"]["symmetry"]["passed"] = False
-    with record_folder(Path(runs[1]) / "probe") as partial:
-        write_record(partial, data, arrays)
+    written(Path(runs[1]) / "probe", data, arrays)
     (Path(runs[1]) / "metrics.json").unlink()
     changed(runs[1], seed=3)
     assert main(["compare", *runs]) == 0
@@ -241,8 +235,7 @@ def test_families_that_only_one_run_has_are_in_no_other_units(runs, capsys, no_p
     data, arrays = synthetic()
     data["provenance"] |= {"iteration": ITERATIONS}
     for changes, said in (({"families": []}, False), ({"families": [other_units(runs[0])]}, True)):
-        with record_folder(folder) as partial:
-            write_record(partial, data | changes, arrays)
+        written(folder, data | changes, arrays)
         assert main(["compare", *runs]) == 0
         assert (words in capsys.readouterr().out) == said
 

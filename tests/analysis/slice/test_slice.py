@@ -12,11 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from msgspec import convert
 
 from analysis.commands.cli import main
 from analysis.probe.command import scene_objective
 from analysis.probe.record import loss_name
-from analysis.records.records import Record, read_record, record_folder, write_record
+from analysis.records.records import Record, read_record
+from analysis.records.schema import FiniteProbe
 from analysis.slice.command import _finite_curvature
 from figures.make_all import recorded_figures
 from splat.curvature.hessian import SceneHessian
@@ -27,7 +29,7 @@ from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import ScreenGradients
 from splat.training.optim.adam import Adam
-from tests.recorded import synthetic, synthetic_line
+from tests.recorded import synthetic, synthetic_line, written
 
 ROOT = Path(__file__).parents[3]
 SCENE = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
@@ -106,9 +108,9 @@ def check_renders(record: Record, objective: SceneObjective) -> None:
         truth[0] * 0 + objective.loss(objective.active.flat) + points @ slope + ((points @ span) * points).sum(1) / 2
     )
     assert arrays["model"].ravel().tolist() == pytest.approx(model.tolist(), rel=1e-9)
-    for direction, curvature, first in zip(record.data["slice"]["directions"], span.diagonal(), slope, strict=True):
-        assert direction["curvature"] == pytest.approx(float(curvature), rel=1e-9)
-        assert direction["slope"] == pytest.approx(float(first), rel=1e-9, abs=1e-15)
+    for direction, curvature, first in zip(record.data.slice.directions, span.diagonal(), slope, strict=True):
+        assert direction.curvature == pytest.approx(float(curvature), rel=1e-9)
+        assert direction.slope == pytest.approx(float(first), rel=1e-9, abs=1e-15)
 
 
 @pytest.fixture(scope="module")
@@ -123,21 +125,20 @@ def test_the_default_is_the_plane_of_the_two_largest_eigenvalues(eigen, objectiv
     check_renders(eigen, objective)
     H = SceneHessian(objective).apply(torch.eye(objective.active.flat.numel(), dtype=torch.float64))
     true = torch.linalg.eigvalsh((H + H.T) / 2)
-    first, second = eigen.data["slice"]["directions"]
-    assert abs(first["curvature"] - float(true[-1])) <= first["residual"] <= 1e-3 * first["curvature"]
-    assert abs(second["curvature"] - float(true[-2])) <= second["residual"] <= 1e-3 * second["curvature"]
+    first, second = eigen.data.slice.directions
+    assert abs(first.curvature - float(true[-1])) <= first.residual <= 1e-3 * first.curvature
+    assert abs(second.curvature - float(true[-2])) <= second.residual <= 1e-3 * second.curvature
     x = eigen.arrays["slice"]["x"]
-    assert (x[0], x[4], x[-1]) == pytest.approx((-3 * first["unit"], 0.0, 3 * first["unit"]), rel=4 * EPS, abs=0.0)
-    assert first["unit"] == pytest.approx(math.sqrt(2e-3 * eigen.data["slice"]["center_loss"] / first["curvature"]))
-    assert eigen.data["counts"]["renders"] == 3 * (81 + 1) and eigen.data["finite_probe"] is None
+    assert (x[0], x[4], x[-1]) == pytest.approx((-3 * first.unit, 0.0, 3 * first.unit), rel=4 * EPS, abs=0.0)
+    assert first.unit == pytest.approx(math.sqrt(2e-3 * eigen.data.slice.center_loss / first.curvature))
+    assert eigen.data.counts.renders == 3 * (81 + 1) and eigen.data.finite_probe is None
 
 
 def probed(folder: Path, value: float, vectors: np.ndarray, loss: LossSettings) -> None:
     """The record of a probe with these eigenvectors, beside a checkpoint whose loss has this value."""
     data, _ = synthetic()
     data["objective"] |= {"loss": loss_name(loss), "operator": "hessian", "value": value}
-    with record_folder(folder / "probe") as partial:
-        write_record(partial, data, {"eigenvectors": {"largest": vectors}})
+    written(folder / "probe", data, {"eigenvectors": {"largest": vectors}})
 
 
 def test_eigenvectors_of_the_probe_beside_the_checkpoint_are_taken_where_they_are_its_own(run, eigen, tmp_path):
@@ -145,18 +146,35 @@ def test_eigenvectors_of_the_probe_beside_the_checkpoint_are_taken_where_they_ar
     path.parent.mkdir()
     shutil.copy(run / "double.pt", path)
     loss = load_checkpoint(path).training.config.loss
-    vectors, value = eigen.arrays["directions"]["vectors"], eigen.data["slice"]["center_loss"]
-    probed(path.parent, value, vectors[:, ::-1].copy(), loss)  # told apart from those that Lanczos finds
+    vectors, value = eigen.arrays["directions"]["vectors"], eigen.data.slice.center_loss
+    probed(path.parent, value, -vectors, loss)  # told apart from those that Lanczos finds
     taken = sliced(tmp_path / "taken", path, *scene, *POINTS)
-    assert np.array_equal(taken.arrays["directions"]["vectors"], vectors[:, ::-1])
-    assert taken.data["counts"]["products"] == 6  # of two vectors: to confirm them, for their curvatures, for the model
+    assert np.array_equal(taken.arrays["directions"]["vectors"], -vectors)
+    assert taken.data.counts.products == 6  # of two vectors: to confirm them, for their curvatures, for the model
     turned = vectors @ np.array([[0.8, -0.6], [0.6, 0.8]])
-    for number, (recorded, of) in enumerate([(vectors, 1.001 * value), (turned, value), (vectors[:-1], value)]):
+    swapped = np.ascontiguousarray(vectors[:, ::-1])  # true eigenvectors, but the first is not the steepest
+    cases = [(vectors, 1.001 * value), (turned, value), (vectors[:-1], value), (swapped, value)]
+    for number, (recorded, of) in enumerate(cases):
         probed(path.parent, of, recorded, loss)
         computed = sliced(tmp_path / str(number), path, *scene, *POINTS)
-        assert computed.data["counts"]["products"] > 6
-        for found, exact in zip(computed.data["slice"]["directions"], eigen.data["slice"]["directions"], strict=True):
-            assert abs(found["curvature"] - exact["curvature"]) <= found["residual"] + exact["residual"]
+        assert computed.data.notes == []
+        assert computed.data.counts.products > 6
+        for found, exact in zip(computed.data.slice.directions, eigen.data.slice.directions, strict=True):
+            assert abs(found.curvature - exact.curvature) <= found.residual + exact.residual
+
+
+def test_a_probe_and_eigenvectors_that_cannot_be_read_are_named(run, tmp_path, capsys):
+    path, out = tmp_path / "run" / "double.pt", tmp_path / "run" / "slice-eigenvectors-1d"
+    (path.parent / "probe").mkdir(parents=True)
+    shutil.copy(run / "double.pt", path)
+    (path.parent / "probe" / "probe.json").write_text("{")
+    unfinished = out.with_name(f".{out.name}.unfinished")
+    unfinished.mkdir()
+    (unfinished / "eigenvectors.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', ")
+    record = sliced(out, path, "--scene", str(run.parent / "still"), "--dimension", "1", *POINTS)
+    said = " ".join(capsys.readouterr().out.split())
+    for note, file in zip(record.data.notes, ("eigenvectors.npy", "probe.json"), strict=True):
+        assert file in note and "damaged" in note and note in said
 
 
 def test_random_directions_are_as_long_as_each_attribute_of_each_gaussian(run, objective, tmp_path):
@@ -178,26 +196,29 @@ def test_random_directions_are_as_long_as_each_attribute_of_each_gaussian(run, o
 def test_along_the_gradient_the_slope_is_its_length_and_finite_steps_are_second_differences(run, objective, tmp_path):
     record = sliced(tmp_path / "slice", run / "double.pt", "--along", "gradient", "--points", "21")
     check_renders(record, objective)
-    (direction,) = record.data["slice"]["directions"]
-    assert direction["slope"] == pytest.approx(float(objective.gradient.norm()), rel=1e-9)
-    assert direction["length"] == pytest.approx(1) and record.data["slice"]["cosine"] is None
-    probe, v = record.data["finite_probe"], torch.from_numpy(record.arrays["directions"]["vectors"][:, 0])
-    assert probe["infinitesimal"] == pytest.approx(direction["curvature"], rel=1e-12)
-    assert probe["steps"][-1] == pytest.approx(record.arrays["slice"]["x"][-1]) == 1e4 * probe["steps"][0]
+    (direction,) = record.data.slice.directions
+    assert direction.slope == pytest.approx(float(objective.gradient.norm()), rel=1e-9)
+    assert direction.length == pytest.approx(1) and record.data.slice.cosine is None
+    probe, v = record.data.finite_probe, torch.from_numpy(record.arrays["directions"]["vectors"][:, 0])
+    assert probe.infinitesimal == pytest.approx(direction.curvature, rel=1e-12)
+    assert probe.steps[-1] == pytest.approx(record.arrays["slice"]["x"][-1]) == 1e4 * probe.steps[0]
     center = objective.active.flat
-    for step, value, bound in zip(probe["steps"], probe["curvatures"], probe["round_off"], strict=True):
+    for step, value, bound in zip(probe.steps, probe.curvatures, probe.round_off, strict=True):
         ends = objective.loss(center + step * v), objective.loss(center - step * v)
         assert abs((sum(ends) - 2 * objective.loss(center)) / step**2 - value) <= bound
-    assert record.data["counts"]["renders"] == 3 * (record.data["slice"]["evaluations"] + probe["evaluations"])
+    assert record.data.counts.renders == 3 * (record.data.slice.evaluations + probe.evaluations)
 
 
 def test_what_finite_steps_see_is_said_as_the_range_over_those_that_round_off_does_not_hide():
     probe = synthetic_line()[0]["finite_probe"]
-    said = _finite_curvature(probe)
+    said = _finite_curvature(convert(probe, FiniteProbe))
     assert "from 41.0 to 70.0, at the 3 of 4 steps that round-off does not hide (±1.00 × 10⁻⁵ to ±0.00100)" in said
     assert said.endswith(", 2 of them with another order of splats")
     hidden = probe | {"curvatures": [None] * 4, "round_off": [None] * 4, "crossed": None}
-    assert _finite_curvature(hidden) == "at finite steps: round-off hides the curvature at all 4 steps"
+    assert (
+        _finite_curvature(convert(hidden, FiniteProbe))
+        == "at finite steps: round-off hides the curvature at all 4 steps"
+    )
 
 
 def test_a_line_leads_to_the_other_checkpoint_and_what_is_in_sight_there_alone(run, tmp_path):
@@ -226,21 +247,21 @@ def test_of_two_kinds_the_second_is_put_at_a_right_angle_and_keeps_its_length(ru
     gradient = objective.gradient.numpy() / float(objective.gradient.norm())
     assert vectors[:, 0] == pytest.approx(gradient, abs=1e-12)
     assert vectors.T @ vectors == pytest.approx(np.eye(2), abs=1e-12)
-    assert abs(record.data["slice"]["cosine"]) > 1e-6  # so that there was something to do
-    first, second = record.data["slice"]["directions"]
-    assert (first["kind"], second["kind"], second["name"]) == ("gradient", "eigenvectors", "e₁⊥")
-    assert second["residual"] is None
+    assert abs(record.data.slice.cosine) > 1e-6  # so that there was something to do
+    first, second = record.data.slice.directions
+    assert (first.kind, second.kind, second.name) == ("gradient", "eigenvectors", "e₁⊥")
+    assert second.residual is None
     assert record.arrays["slice"]["x"][-1] == 0.01
-    assert record.arrays["slice"]["y"][-1] == pytest.approx(2 * second["unit"])
+    assert record.arrays["slice"]["y"][-1] == pytest.approx(2 * second.unit)
 
 
 def test_an_adaptive_slice_says_what_it_rendered_and_stays_below_the_most(run, objective, tmp_path, capsys):
     record = sliced(tmp_path / "slice", run / "double.pt", "--max-renders", "80", "--tolerance", "1e-6")
     check_renders(record, objective)
-    about = record.data["slice"]
-    assert about["evaluations"] <= 80 and about["points"] == 41 * 41 and about["reason"] == "evaluation budget"
+    about = record.data.slice
+    assert about.evaluations <= 80 and about.points == 41 * 41 and about.reason == "evaluation budget"
     said = capsys.readouterr()
-    assert "evaluation budget" in said.out and f"{about['evaluated_points']} are renders" in said.out
+    assert "evaluation budget" in said.out and f"{about.evaluated_points} are renders" in said.out
     assert str(tmp_path / "slice") in said.out and "slice.json" in said.out
 
 
@@ -256,8 +277,8 @@ def test_workers_change_no_number(run, tmp_path):
 BLOCKED = """
 import sys, threading, time
 import landscape.slices.grid_evaluations as grid
-from analysis.cli import main
-from splat.curvature import SceneObjective
+from analysis.commands.cli import main
+from splat.curvature.objective import SceneObjective
 grid.SAVE_EVERY, evaluate, calls = 0.0, SceneObjective.evaluate, []
 def blocked(self, flat):
     calls.append(flat)
@@ -293,7 +314,7 @@ def test_a_killed_slice_leaves_the_old_record_whole_and_continues(run, eigen, tm
     whole = sliced(tmp_path / "whole", run / "double.pt", *command[4:])
     assert np.array_equal(record.arrays["slice"]["loss"], whole.arrays["slice"]["loss"])
     assert np.array_equal(record.arrays["directions"]["vectors"], whole.arrays["directions"]["vectors"])
-    assert record.data["counts"]["products"] == 6 < whole.data["counts"]["products"]  # its eigenvectors were kept too
+    assert record.data.counts.products == 6 < whole.data.counts.products  # its eigenvectors were kept too
     # of the 60 evaluations before it was killed, a few were of the centre; the rest of the 121 are made now
     assert len(calls) - 2 * 121 <= -50 + 2 * 5
 
@@ -333,7 +354,7 @@ def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):
 
     monkeypatch.setattr("analysis.console.recording.draw", fail)
     record = sliced(tmp_path / "slice", run / "double.pt", "--along", "gradient", *POINTS)
-    assert "drawing failed: no fonts" in record.data["notes"]
+    assert "drawing failed: no fonts" in record.data.notes
 
 
 def test_the_pictures_are_those_of_a_plane_or_of_a_line(run, eigen, tmp_path, monkeypatch):
@@ -381,7 +402,7 @@ def few(run: Path, tmp_path: Path) -> str:
         (["NOWHERE"], ["nowhere.pt", "no such file"]),
     ],
 )
-def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys, options, words):
+def test_bad_input_gets_one_sentence_and_leaves_no_record(run, tmp_path, capsys, options, words):
     named = {"OTHER": str(run / "turned.pt"), "SAME": str(run / "double.pt"), "NOWHERE": str(tmp_path / "nowhere.pt")}
     if "FEW" in options:
         named["FEW"] = few(run, tmp_path)
@@ -393,7 +414,8 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys, o
     assert message.startswith("landscape: ") and "Traceback" not in said.err and said.out == ""
     for part in words:
         assert part in message, message
-    assert not out.parent.exists() or list(out.parent.iterdir()) == []
+    kept = [] if "100" not in options else [".slice.unfinished"]  # no error deletes what was rendered
+    assert [path.name for path in out.parent.glob("*")] == kept
 
 
 def test_a_folder_of_something_else_is_not_replaced(run, tmp_path, capsys):

@@ -12,13 +12,15 @@ from PIL import Image
 from torch import Tensor
 
 from analysis.commands.cli import main
-from analysis.console.options import TrainOptions
-from analysis.train.command import _beginnings_after, planned
+from analysis.train.command import _not_reached, planned
+from analysis.train.options import TrainOptions
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
 from splat.training.methods.corgs import CoRGS
+from splat.training.methods.stablegs.stablegs import StableGS
+from splat.training.state import TrainConfig
 
 SIZE = (24, 18)
 
@@ -138,13 +140,25 @@ def test_a_method_that_lacks_its_depth_maps_is_refused_before_there_is_a_folder(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_method_that_begins_after_the_last_step_is_pointed_out(original, tmp_path, capsys):
-    assert train(original, tmp_path / "late", "--method", "stablegs") == 0
-    assert "stablegs: what begins after step warm_up = 1000 is not reached in" in capsys.readouterr().err
-    assert train(original, tmp_path / "early", "--method", "stablegs", "--set", "warm_up=0") == 0
-    assert "begins after" not in capsys.readouterr().err
-    assert _beginnings_after(3000, CoRGS()) == ""
-    said = _beginnings_after(500, CoRGS())
+def test_a_method_that_would_never_act_is_refused_before_there_is_a_folder(original, tmp_path, capsys):
+    assert train(original, tmp_path / "late", "--method", "stablegs", "--set", "warm_up=1000") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "expected a training in which the method acts, got stablegs which never does in" in said
+    assert "(warm_up = 1000); take more steps" in said and not (tmp_path / "late").exists()
+
+
+def test_the_schedule_of_stablegs_is_scaled_to_the_length_and_said(original, tmp_path, capsys):
+    assert train(original, tmp_path / "scaled", "--method", "stablegs", "--set", "densify.reset_every=7") == 0
+    said = " ".join(capsys.readouterr().err.split())
+    config = load_checkpoint(tmp_path / "scaled" / "checkpoint.pt").training.config
+    assert f"stablegs: its published schedule is scaled to {config.iterations} steps: densify.start 500 to" in said
+    assert "warm_up 1000 to 0;" in said and "reset_every" not in said
+    assert config.method == StableGS(warm_up=0) and config.densify.reset_every == 7
+
+
+def test_a_part_of_a_method_that_a_run_does_not_reach_is_pointed_out():
+    assert _not_reached(TrainConfig(3000, method=CoRGS())) == ""
+    said = _not_reached(TrainConfig(500, method=CoRGS()))
     assert (
         "cor-gs: what begins after step prune_start = 500 and pseudo_start = 2000 is not reached in 500 steps" in said
     )

@@ -7,15 +7,7 @@ from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.pairs import EigenEnds, Eigenpairs
 from landscape.eigen.power import PowerSettings, power_ends
 from landscape.operators.operator import DenseOperator
-from landscape.spectrum.anisotropy import (
-    _quotients,
-    anisotropy,
-    effective_rank,
-    literal,
-    mass_quantile,
-    saddle,
-    share,
-)
+from landscape.spectrum.anisotropy import _quotients, anisotropy, effective_rank, literal, mass_quantile, saddle, share
 from landscape.spectrum.density import spectral_density
 from tests.landscape.spectra import ROUNDING, N, eigenvalues, generator, operator
 

@@ -191,7 +191,7 @@ def test_a_time_budget_holds_for_every_task_of_a_method(method, monkeypatch):
             return super().apply(V)
 
     for module in ("trace", "hutchinson", "sketched"):
-        monkeypatch.setattr(f"landscape.{module}.monotonic", lambda: seconds[0])
+        monkeypatch.setattr(f"landscape.traces.{module}.monotonic", lambda: seconds[0])
     settings = TraceSettings(rtol=1e-6, max_probes=300, max_seconds=40, method=method)
     estimate = estimate_traces(Timed(matrix), generator(), settings)["all"]
     assert estimate.reason == "time budget" and 40 < estimate.matvecs == seconds[0] < 40 + 8 + 2 * settings.batch

@@ -59,10 +59,7 @@ def test_fixed_intervals_cover_at_the_nominal_rate(name, distribution, probes):
 
 @pytest.mark.parametrize(
     ("name", "distribution", "settings"),
-    [
-        ("1/i", "gaussian", {"rtol": 0.3}),
-        ("one dominant", "rademacher", {"rtol": 0.0, "atol": 0.8}),
-    ],
+    [("1/i", "gaussian", {"rtol": 0.3}), ("one dominant", "rademacher", {"rtol": 0.0, "atol": 0.8})],
 )
 def test_adaptive_intervals_cover_at_the_nominal_rate(name, distribution, settings):
     H = matrix(name)

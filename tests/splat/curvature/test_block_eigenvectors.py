@@ -8,8 +8,7 @@ import torch
 
 from landscape import ScaledOperator
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
-from splat.curvature import block_eigenvectors as own_directions
-from splat.curvature.block_eigenvectors import BlockEigenvectors, evened
+from splat.curvature.block_eigenvectors import BlockEigenvectors, blurred_share, eigendecomposed
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS, PerGaussianBlocks
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
@@ -25,7 +24,7 @@ def objective() -> SceneObjective:
     return SceneObjective(random_gaussians(40, 1, logit=1.0), two_views(), LossSettings(ssim_weight=0.0), BACKGROUND)
 
 
-def test_the_curvature_along_them_is_the_largest_and_least_of_any_gaussian_alone(objective):
+def test_curvature_along_them_is_the_extreme_of_single_gaussians(objective):
     H = SceneHessian(objective)
     dense, n = H.apply(torch.eye(H.dim, dtype=H.dtype)), len(objective.active)
     # of one Gaussian: rows of its mean, log-scales, quaternion and logit
@@ -44,7 +43,7 @@ def test_the_curvature_along_them_is_the_largest_and_least_of_any_gaussian_alone
 
 
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
-def test_the_blocks_are_the_hessians_own_with_what_the_window_keeps_of_their_pixelwise_parts(ssim_weight):
+def test_blocks_hold_the_share_of_their_pixelwise_part_that_ssim_leaves(ssim_weight):
     far, near = two_views()
     near = replace(near, camera=replace(near.camera, centre=near.camera.centre + 4 * near.camera.rotation[2]))
     gaussians, loss = random_gaussians(12, 1, logit=1.0), LossSettings(ssim_weight=ssim_weight)
@@ -55,7 +54,11 @@ def test_the_blocks_are_the_hessians_own_with_what_the_window_keeps_of_their_pix
     found = vectors.double() * values[:, None] @ vectors.double().mT
     single = (4 * pi * SIGMA**2) ** -1  # the square of a Gaussian, added up over the pixels
     splats = [project(objective.active, view.camera) for view in (far, near)]
-    rho = torch.stack([torch.where(each.drawn, evened(each.conics), nan) for each in splats]).nanmean(dim=0).detach()
+    rho = (
+        torch.stack([torch.where(each.drawn, blurred_share(each.conics), nan) for each in splats])
+        .nanmean(dim=0)
+        .detach()
+    )
     assert splats[0].drawn.all() and 0 < splats[1].drawn.sum() < n  # some are behind the second camera
     left_out = 1 - (1 - rho) / (1 - single)
     for i in range(n):
@@ -68,7 +71,7 @@ def test_the_blocks_are_the_hessians_own_with_what_the_window_keeps_of_their_pix
 
 
 @pytest.mark.parametrize("conic", [(0.05, 0.0, 0.05), (0.9, 0.3, 0.4), (3.0, 0.2, 0.02)])
-def test_what_the_window_keeps_of_a_splat_that_moves_across_its_narrower_axis_is_that_of_its_blur(conic):
+def test_the_blurred_share_of_a_moved_splat_is_that_of_its_image_on_a_grid(conic):
     """On a grid so fine and wide that sums over it are integrals, blurred by Fourier transform."""
     n, spacing = 512, 0.25
     at = (torch.arange(n, dtype=torch.float64) - n // 2) * spacing
@@ -79,10 +82,10 @@ def test_what_the_window_keeps_of_a_splat_that_moves_across_its_narrower_axis_is
     squared = (2 * pi * torch.fft.fftfreq(n, spacing, dtype=torch.float64)) ** 2
     blurred = torch.fft.fft2(slope) * torch.exp(-(SIGMA**2) * (squared[None, :] + squared[:, None]) / 2)
     expected = float(blurred.abs().square().sum() / torch.fft.fft2(slope).abs().square().sum())
-    assert float(evened(torch.tensor([conic], dtype=torch.float64))) == pytest.approx(expected, rel=1e-6)
+    assert float(blurred_share(torch.tensor([conic], dtype=torch.float64))) == pytest.approx(expected, rel=1e-6)
 
 
-def test_near_a_fit_the_steepest_values_are_five_times_nearer_to_the_hessians_than_pixel_by_pixel():
+def test_near_a_fit_values_are_five_times_closer_than_pixel_by_pixel():
     made = synthetic_scene(SyntheticSettings(60, 2, 24, 18, sh_degree=0))
     near = made.truth.with_flat(made.truth.flat + 0.02 * random_like(made.truth.flat.shape, 0).to(made.truth.flat))
     objective = SceneObjective(near, made.scene.load())
@@ -97,7 +100,7 @@ def test_near_a_fit_the_steepest_values_are_five_times_nearer_to_the_hessians_th
 
 
 @pytest.mark.parametrize("attribute", [None, "means", "log_scales", "quats", "opacity_logits"])
-def test_in_a_metric_and_of_one_attribute_they_are_those_of_the_scaled_operators_own_blocks(attribute):
+def test_scaled_or_of_one_attribute_they_are_those_of_the_dense_blocks(attribute):
     loss = LossSettings("l2", ssim_weight=0.0)  # which does not couple pixels
     objective = SceneObjective(random_gaussians(20, 1, logit=1.0), two_views(), loss, BACKGROUND)
     scale = random_like(tuple(objective.active.flat.shape), 3).to(objective.active.flat).exp()
@@ -118,28 +121,28 @@ def test_in_a_metric_and_of_one_attribute_they_are_those_of_the_scaled_operators
 
 
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
-def test_a_recurrence_from_the_steepest_finds_the_same_ends(ssim_weight):
+def test_a_search_from_the_warm_start_finds_the_same_ends(ssim_weight):
     """On so few Gaussians, all over each other, it needs as many products as from a random vector."""
     loss = LossSettings(ssim_weight=ssim_weight)
     objective = SceneObjective(random_gaussians(40, 1, logit=1.0), two_views(), loss, BACKGROUND)
     H, settings = SceneHessian(objective), EigenSettings(2, 1, rtol=1e-3)
-    start = BlockEigenvectors(objective, *objective.gaussian_blocks).leads()
+    start = BlockEigenvectors(objective, *objective.gaussian_blocks).warm_start()
     led = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings, start)
     truth = torch.linalg.eigvalsh(H.apply(torch.eye(H.dim, dtype=H.dtype)).double())
     for pairs, true in ((led.largest, truth[-2:].flip(0)), (led.smallest, truth[:1])):
         assert pairs.reason == "tolerance" and torch.allclose(pairs.values, true, rtol=2e-3)
 
 
-def test_no_more_blocks_are_taken_apart_at_once_than_a_gpu_takes(monkeypatch):
+def test_no_more_blocks_are_eigendecomposed_at_once_than_a_gpu_takes(monkeypatch):
     sizes, eigh, n = [], torch.linalg.eigh, 40_000
     monkeypatch.setattr(torch.linalg, "eigh", lambda blocks: sizes.append(len(blocks)) or eigh(blocks))
     blocks = torch.diag_embed(torch.arange(2.0 * n, dtype=torch.float64).view(n, 2))
-    values, _ = own_directions._taken_apart(blocks, blocks.new_zeros(n, 2), blocks.new_ones(n, 2))
+    values, _ = eigendecomposed(blocks, blocks.new_zeros(n, 2), blocks.new_ones(n, 2))
     assert torch.equal(values, blocks.diagonal(dim1=1, dim2=2))
     assert sum(sizes) == n and max(sizes) <= 8192
 
 
-def test_blocks_that_curve_up_alone_do_not_lead_along_the_quaternions_lengths(objective):
+def test_positive_definite_blocks_give_no_direction_along_a_quaternion(objective):
     n, k = len(objective.active), objective.active.sh.shape[1]
     flat = objective.active.flat
     eye = torch.eye(11, dtype=flat.dtype).repeat(n, 1, 1)
@@ -150,7 +153,7 @@ def test_blocks_that_curve_up_alone_do_not_lead_along_the_quaternions_lengths(ob
 
 
 @pytest.mark.parametrize(("low", "others"), [(-3.0, -1.0), (-1.2, -1.0), (0.1, 1.0)])
-def test_few_blocks_are_taken_apart_for_their_ends_and_none_that_has_one_is_left_out(monkeypatch, low, others):
+def test_few_blocks_are_eigendecomposed_and_every_end_is_among_them(monkeypatch, low, others):
     """Ten blocks are larger than the one that has the least eigenvalue; where none is beneath zero no block may be left out."""
     gaussians = random_gaussians(90, 0, logit=1.0)
     objective = SceneObjective(gaussians, two_views(), LossSettings("l2", ssim_weight=0.0), BACKGROUND)

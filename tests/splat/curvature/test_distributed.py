@@ -9,7 +9,6 @@ from analysis.measures.depth import depth_rises, depth_split
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.operators.distributed import Ranks
 from landscape.traces.trace import TraceSettings
-from splat.curvature.distributed import DistributedHessian, DistributedObjective
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
@@ -43,7 +42,7 @@ def measured(objective: SceneObjective, hessians: list[SceneHessian]) -> Finding
         "pairs": split.components,
         "depth": torch.stack([split.depth.samples, split.lateral.samples]),
         "rises": torch.stack([rises.values, rises.errors]),
-        "crossed": rises.crossed,
+        "discontinuous": rises.discontinuous,
         "traces": torch.stack([trace.samples for trace in traces.values()]),
         "ends": torch.cat([ends.largest.values, ends.smallest.values]),
         **{f"product {i}": hessian.apply(V) for i, hessian in enumerate(hessians)},
@@ -54,10 +53,10 @@ def measured(objective: SceneObjective, hessians: list[SceneHessian]) -> Finding
 
 def work(ranks: Ranks) -> Findings:
     views = ranks.share(tiny_views(torch.float64))
-    objective = DistributedObjective(gaussians(), views, ranks, LOSS)
-    hessians: list[SceneHessian] = [DistributedHessian(objective, gauss_newton=gn) for gn in (False, True)]
-    here, again = (objective.signature(objective.active.flat.clone()) for _ in range(2))
-    away = objective.signature(objective.active.flat + 0.3)
+    objective = SceneObjective(gaussians(), views, LOSS, ranks=ranks)
+    hessians = [SceneHessian(objective, gauss_newton=gn) for gn in (False, True)]
+    here, again = (objective.evaluate(objective.active.flat.clone())[1] for _ in range(2))
+    away = objective.evaluate(objective.active.flat + 0.3)[1]
     own = int(SceneObjective(gaussians(), views, LOSS).mask.sum())
     found = measured(objective, hessians)
     return {
@@ -74,7 +73,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> list[Findings]:
     return on_ranks(2, folder, work)
 
 
-def test_loss_gradient_blocks_products_traces_and_ends_are_those_of_one_process(found: list[Findings]) -> None:
+def test_every_quantity_is_that_of_one_process(found: list[Findings]) -> None:
     objective = SceneObjective(gaussians(), tiny_views(torch.float64), LOSS)
     alone = measured(objective, [SceneHessian(objective, gauss_newton=gn) for gn in (False, True)])
     for rank in found:
@@ -90,5 +89,5 @@ def test_a_rank_holds_gaussians_that_only_others_see(found: list[Findings]) -> N
     assert any(int(rank["own"]) < everyone for rank in found)
 
 
-def test_the_signature_is_that_of_the_views_of_all_ranks(found: list[Findings]) -> None:
+def test_the_smooth_piece_is_that_of_the_views_of_all_ranks(found: list[Findings]) -> None:
     assert all(rank["steady"] and rank["moved"] for rank in found)

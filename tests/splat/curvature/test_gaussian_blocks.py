@@ -10,9 +10,11 @@ from torch import Tensor
 from landscape.traces.control import controlled
 from landscape.traces.trace import TraceSettings
 from splat.curvature.hessian import SceneHessian
+from splat.curvature.kept_views import VECTORS
+from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, SampledTrace, _signs, coupling_samples, exact_traces
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
@@ -69,15 +71,15 @@ def test_own_blocks_are_those_of_the_dense_hessian(loss: LossSettings, gauss_new
         assert abs(traces[name] - float(H.diagonal()[block].sum())) <= 1e-10 * float(H.diagonal()[block].abs().sum())
 
 
-def test_a_small_memory_budget_rebuilds_views_and_changes_no_product() -> None:
-    gaussians, loss = awkward_gaussians(), LossSettings()
+def test_memory_decides_which_views_are_kept_and_changes_no_bit(monkeypatch) -> None:
+    gaussians, loss, widths, hvp = awkward_gaussians(), LossSettings(), [], LinearizedView.hvp
+    monkeypatch.setattr(LinearizedView, "hvp", lambda view, U: widths.append(U.shape[1]) or hvp(view, U))
     roomy = objective_of(gaussians, loss, noise=0.3)
     tight = SceneObjective(gaussians, roomy.views, loss, BACKGROUND, memory=0)
-    assert (tight.memory_plan.kept, tight.memory_plan.vectors) == (1, 1)
-    assert roomy.memory_plan.kept == 2 and roomy.memory_plan.vectors > 1
-    V = torch.randn(SceneHessian(roomy).dim, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    kept, rebuilt = SceneHessian(roomy).apply(V), SceneHessian(tight).apply(V)
-    assert float((kept - rebuilt).norm() / kept.norm()) < 1e-13
+    assert (tight.linearized.kept, roomy.linearized.kept) == (1, 2)
+    V = random_like((SceneHessian(roomy).dim, VECTORS + 3), 0)
+    assert torch.equal(SceneHessian(roomy).apply(V), SceneHessian(tight).apply(V))
+    assert widths == [VECTORS, 3] * 4  # of two views, each time
 
 
 def test_under_l1_alone_the_appearance_has_no_curvature() -> None:
@@ -96,7 +98,7 @@ def test_traces_leave_the_radial_directions_of_the_quaternions_out() -> None:
 def test_the_pixel_diagonal_of_the_loss_is_that_of_its_dense_hessian(kind) -> None:
     target, generator = torch.rand(3, 9, 13, dtype=torch.float64), torch.Generator().manual_seed(0)
     image = target + 0.1 * torch.randn(3, 9, 13, generator=generator, dtype=torch.float64)
-    loss = ViewLoss.of(target, LossSettings(kind), torch.float64)
+    loss = CpuViewLoss(target, LossSettings(kind), torch.float64)
     linear = loss.linearize(loss.padded(image))
     units = torch.eye(image.numel(), dtype=torch.float64).view(-1, 3, 9, 13)
     columns = [loss.cropped(linear.hvp(loss.padded(unit)[None])[0]).reshape(-1) for unit in units]
@@ -159,7 +161,7 @@ def samples_of(
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.5], ids=["near a fit", "far from a fit"])
-def test_intervals_of_fixed_and_adaptive_budgets_cover_over_two_hundred_runs(noise: float) -> None:
+def test_intervals_of_fixed_and_adaptive_budgets_cover_as_stated(noise: float) -> None:
     """95% intervals: 200 runs of 95% stay within 89.5 to 99% with a probability of 0.9986 (four blocks in a hundred fail)."""
     objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise)
     H, names = dense(SceneHessian(objective)), list(objective.blocks)
@@ -209,7 +211,7 @@ def test_a_number_of_samples_that_is_asked_for_is_the_number_taken() -> None:
         exact_traces(objective, torch.Generator(), samples=3)
 
 
-def test_a_block_whose_error_is_small_enough_is_sampled_no_further_and_the_others_as_if_it_were() -> None:
+def test_a_block_that_stops_early_does_not_change_the_samples_of_others() -> None:
     objective = objective_of(random_gaussians(20, sh_degree=1, seed=7), LossSettings(), noise=0.1)
     settings = TraceSettings(rtol=0.02, min_probes=8, max_probes=40)
     adaptive = exact_traces(objective, torch.Generator().manual_seed(0), settings)
@@ -222,7 +224,7 @@ def test_a_block_whose_error_is_small_enough_is_sampled_no_further_and_the_other
                 assert estimate.value == fixed[name].value and estimate.standard_error == fixed[name].standard_error
 
 
-def test_the_control_variate_leaves_the_mean_unbiased_and_lowers_the_variance() -> None:
+def test_the_control_variate_is_unbiased_and_lowers_the_variance() -> None:
     generator, runs, count = torch.Generator().manual_seed(1), 4000, 12
     y = torch.randn(runs, count, generator=generator, dtype=torch.float64) + 3
     x = 2 * y + 0.1 * torch.randn(runs, count, generator=generator, dtype=torch.float64)

@@ -11,7 +11,7 @@ from scipy.ndimage import correlate1d
 from torch import Tensor
 
 from splat.losses.autograd import consistency_loss, view_loss
-from splat.losses.cpu.loss import ViewLoss
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import WINDOW, LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map, window
 from tests.oracles import similarity_by_windows
 from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, random_like, relative_error
@@ -111,12 +111,12 @@ def test_the_photometric_loss_weighs_its_parts_as_written():
 @each_size
 def test_kernels_give_the_specifications_value_gradient_and_products(size, settings, dtype):
     expected = truth(size, settings)
-    loss = ViewLoss.of(expected.target.to(dtype), settings, dtype)
+    loss = CpuViewLoss(expected.target.to(dtype), settings, dtype)
     held = loss.linearize(loss.padded(expected.image.to(dtype)))
     assert held.value == pytest.approx(float(expected.value), rel=IMAGE[dtype], abs=IMAGE[dtype])
     assert loss.value(loss.padded(expected.image.to(dtype))) == held.value
     assert relative_error(loss.cropped(held.gradient), expected.gradient) < DERIVATIVE[dtype]
-    tangents = np.stack([loss.padded(v.to(dtype)) for v in expected.v])
+    tangents = torch.stack([loss.padded(v.to(dtype)) for v in expected.v])
     products = held.hvp(tangents)
     for product, each in zip(products, expected.product, strict=True):
         assert relative_error(loss.cropped(product), each) < DERIVATIVE[dtype]
@@ -125,12 +125,12 @@ def test_kernels_give_the_specifications_value_gradient_and_products(size, setti
 @each_dtype
 @each_loss
 @each_size
-def test_quadratic_forms_are_those_of_the_specifications_products_and_of_the_diagonal(size, settings, dtype):
+def test_quadratic_forms_are_those_of_products_and_of_the_diagonal(size, settings, dtype):
     expected = truth(size, settings)
-    exact, loss = (ViewLoss.of(expected.target.to(each), settings, each) for each in (torch.float64, dtype))
+    exact, loss = (CpuViewLoss(expected.target.to(each), settings, each) for each in (torch.float64, dtype))
     diagonal = exact.cropped(exact.linearize(exact.padded(expected.image)).diagonal)
     held = loss.linearize(loss.padded(expected.image.to(dtype)))
-    full, pixelwise = held.curvatures(np.stack([loss.padded(v.to(dtype)) for v in expected.v]))
+    full, pixelwise = held.curvatures(torch.stack([loss.padded(v.to(dtype)) for v in expected.v]))
     for found, products in ((full, expected.product), (pixelwise, diagonal * expected.v)):
         terms = (expected.v * products).flatten(1)
         assert ((found - terms.sum(dim=1)).abs() <= DERIVATIVE[dtype] * terms.abs().sum(dim=1)).all()
@@ -149,7 +149,7 @@ def test_the_windows_mean_and_variance_of_a_target_are_scipys(size, contrast, dt
 
     picture = target.double().numpy()
     mean, square = blur(picture), blur(picture**2)
-    moments = ViewLoss.of(target, LossSettings(), dtype)._target_moments[:, :, : size[0], : size[1]]
+    moments = CpuViewLoss(target, LossSettings(), dtype)._target_moments[:, :, : size[0], : size[1]]
     assert relative_error(moments[0], mean) < IMAGE[dtype]
     variance = square - mean**2
     ratio = np.sqrt(square / variance)
@@ -166,9 +166,9 @@ def test_near_a_fit_of_a_smooth_picture_ssim_keeps_its_digits_in_float32():
     v = torch.randn(3, 60, 80, generator=generator)
     found = []
     for dtype in DTYPES:
-        loss = ViewLoss.of(target, LossSettings(ssim_weight=1.0), dtype)
+        loss = CpuViewLoss(target, LossSettings(ssim_weight=1.0), dtype)
         held = loss.linearize(loss.padded(image.to(dtype)))
-        product = held.hvp(np.concatenate([loss.padded(v.to(dtype)), loss.padded(v.to(dtype))[:1]])[None])[0]
+        product = held.hvp(torch.cat([loss.padded(v.to(dtype)), loss.padded(v.to(dtype))[:1]])[None])[0]
         found.append((torch.tensor(held.value), *map(loss.cropped, (held.gradient, product, held.diagonal))))
     bound = 2 * WINDOW * torch.finfo(torch.float32).eps  # two sums over a window's length, one after the other
     assert [relative_error(single, double) < bound for single, double in zip(*found, strict=True)] == [True] * 4
@@ -179,7 +179,7 @@ def test_near_a_fit_of_a_smooth_picture_ssim_keeps_its_digits_in_float32():
 def test_padding_and_alpha_have_no_derivative(settings, dtype):
     size = (7, 9)
     expected = truth(size, settings)
-    loss = ViewLoss.of(expected.target.to(dtype), settings, dtype)
+    loss = CpuViewLoss(expected.target.to(dtype), settings, dtype)
     held = loss.linearize(loss.padded(expected.image.to(dtype)))
     for planes in (held.gradient, held.hvp(loss.padded(expected.v[0].to(dtype))[None])[0]):
         assert planes.shape[0] == 4 and not planes[3].any()
@@ -187,28 +187,21 @@ def test_padding_and_alpha_have_no_derivative(settings, dtype):
 
 
 @each_loss
-def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_vectors(settings, monkeypatch):
+def test_threads_change_no_bit_and_products_may_overwrite_their_vectors(settings, monkeypatch):
     monkeypatch.setattr("splat.losses.cpu.loss.RINGS", 1 << 16)  # so that two vectors are two sweeps
     expected = truth((37, 53), settings)
     x, y = expected.image.clone().requires_grad_(), expected.target.clone().requires_grad_()
 
-    def everything() -> list[np.ndarray]:
-        loss = ViewLoss.of(expected.target, settings, torch.float64)
+    def everything() -> list[Tensor]:
+        loss = CpuViewLoss(expected.target, settings, torch.float64)
         held = loss.linearize(loss.padded(expected.image))
-        tangents = np.stack([loss.padded(v) for v in expected.v])
-        over = np.concatenate([tangents, tangents[:, :1]], axis=1)  # four planes, as the products have
+        tangents = torch.stack([loss.padded(v) for v in expected.v])
+        over = torch.cat([tangents, tangents[:, :1]], dim=1)  # four planes, as the products have
         held.hvp(over, out=over)
         consistency = consistency_loss(x, y, settings)
-        both = [each.numpy() for each in (consistency.detach(), *torch.autograd.grad(consistency, (x, y)))]
-        return [
-            np.array(held.value),
-            held.gradient,
-            held.hvp(tangents),
-            over,
-            held.diagonal,
-            *map(Tensor.numpy, held.curvatures(tangents)),
-            *both,
-        ]
+        both = consistency.detach(), *torch.autograd.grad(consistency, (x, y))
+        products = held.hvp(tangents), over, held.diagonal, *held.curvatures(tangents)
+        return [torch.tensor(held.value), held.gradient, *products, *both]
 
     before = torch.get_num_threads()
     try:
@@ -229,11 +222,11 @@ def test_the_number_of_threads_changes_no_bit_and_products_may_overwrite_their_v
 @pytest.mark.parametrize("size", [(17, 21), (1, 40)], ids=["17x21", "1x40"])
 def test_the_diagonal_is_that_of_the_dense_hessian(size, settings):
     expected = truth(size, settings)
-    loss = ViewLoss.of(expected.target, settings, torch.float64)
+    loss = CpuViewLoss(expected.target, settings, torch.float64)
     held = loss.linearize(loss.padded(expected.image))
     count = expected.image.numel()
     every = [loss.padded(row.view(3, *size)) for row in torch.eye(count, dtype=torch.float64)]
-    columns = [loss.cropped(product).reshape(-1) for product in held.hvp(np.stack(every))]
+    columns = [loss.cropped(product).reshape(-1) for product in held.hvp(torch.stack(every))]
     dense = torch.stack(columns, dim=1)
     assert relative_error(dense, dense.T) < 1e-12
     assert relative_error(loss.cropped(held.diagonal).reshape(-1), dense.diagonal()) < 1e-12
@@ -243,14 +236,14 @@ def test_the_diagonal_is_that_of_the_dense_hessian(size, settings):
 def test_autograd_reaches_the_kernels_twice(settings):
     image, target = image_and_target((9, 6))
     image = (target + 0.1 + 0.2 * (image - target).abs()).requires_grad_()  # no kink within the step
-    loss = ViewLoss.of(target, settings, torch.float64)
+    loss = CpuViewLoss(target, settings, torch.float64)
     assert torch.autograd.gradcheck(lambda x: 100 * view_loss(x, loss), (image,))
     assert torch.autograd.gradgradcheck(lambda x: 100 * view_loss(x, loss), (image,))
 
 
 def test_a_third_derivative_by_the_kernels_is_refused():
     image, target = image_and_target((9, 6))
-    x, loss = image.clone().requires_grad_(), ViewLoss.of(target, LossSettings(), torch.float64)
+    x, loss = image.clone().requires_grad_(), CpuViewLoss(target, LossSettings(), torch.float64)
     value = view_loss(x, loss)
     for _ in range(2):
         (gradient,) = torch.autograd.grad(value, x, create_graph=True)
@@ -271,7 +264,7 @@ def truth_of_both(size: tuple[int, int], settings: LossSettings) -> tuple[Tensor
 @each_dtype
 @each_loss
 @each_size
-def test_the_consistency_of_two_images_has_the_specifications_value_and_gradients(size, settings, dtype):
+def test_consistency_has_the_specifications_value_and_gradients(size, settings, dtype):
     value, *gradients = truth_of_both(size, settings)
     x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target(size))
     found = consistency_loss(x, y, settings)
@@ -315,7 +308,7 @@ def test_consistency_of_images_of_two_sizes_is_refused():
 
 def test_l1_has_no_slope_at_its_kink():
     image, target = image_and_target((8, 8))
-    loss = ViewLoss.of(target, LossSettings("l1", ssim_weight=0), torch.float64)
+    loss = CpuViewLoss(target, LossSettings("l1", ssim_weight=0), torch.float64)
     gradient = loss.cropped(loss.linearize(loss.padded(image)).gradient)
     assert ((gradient == 0) == (image == target)).all() and (image == target).any()
     assert torch.equal(gradient, torch.sign(image - target) / image.numel())

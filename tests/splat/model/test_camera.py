@@ -69,7 +69,7 @@ def test_a_camera_cannot_be_changed():
         camera.fx = 3.0  # pyright: ignore
 
 
-def test_a_camera_that_looks_at_a_target_sees_it_on_its_axis_and_is_held_level():
+def test_a_camera_looking_at_a_target_has_it_on_its_axis_and_is_level():
     centre, target, down = torch.randn(3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     rotation = look_at(centre, target, down)
     assert (rotation @ (target - centre)).tolist() == pytest.approx([0, 0, (target - centre).norm().item()], abs=1e-14)

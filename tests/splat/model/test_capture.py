@@ -41,7 +41,7 @@ def test_the_common_target_is_where_all_axes_meet() -> None:
     assert found.tolist() == pytest.approx(TARGET.tolist(), abs=1e-12)
 
 
-def test_axes_that_miss_each_other_have_the_middle_of_their_gap_for_a_target() -> None:
+def test_axes_that_miss_each_other_meet_in_the_middle_of_their_gap() -> None:
     x, y, z = torch.eye(3, dtype=torch.float64)
     along_z, along_x = camera(look_at(-z, z, y), -z), camera(look_at(-x + y, x + y, y), -x + y)
     found = common_target([along_z, along_x])  # the axes x = y = 0 and y = 1, z = 0
@@ -73,7 +73,7 @@ def test_cameras_that_look_inwards_from_all_sides_surround(
     assert capture_geometry(orbit(azimuths, outwards=outwards)).surrounding is surrounding
 
 
-def test_between_forward_facing_cameras_the_straight_way_stays_out_of_the_scene() -> None:
+def test_the_way_between_forward_facing_cameras_stays_off_the_scene() -> None:
     for apart in (30, 60, 89.9, 90.1, 150):
         first, second = orbit((0, apart), radius=1.0)
         nearest = float(((first.centre + second.centre) / 2 - TARGET).norm())

@@ -32,7 +32,7 @@ def test_smooth_switches_off_every_threshold_that_can_be():
         ({"blur": float("nan")}, "expected blur >= 0"),
         ({"near": float("inf")}, "all finite"),
         ({"contour_sigma": float("nan")}, "expected contour_sigma > 0 or None, got nan"),
-        ({"sums": "fast"}, "expected sums 'ordered' or 'atomic', got 'fast'"),
+        ({"accumulation": "fast"}, "expected accumulation 'deterministic' or 'atomic', got 'fast'"),
     ],
 )
 def test_thresholds_out_of_range_are_refused(wrong, message):

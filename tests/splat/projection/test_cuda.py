@@ -1,5 +1,6 @@
 """Projection on the GPU (without one, by `tests.ptx`), against the specification and the CPU's tests' own truth."""
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -8,9 +9,11 @@ pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.projection.cuda import CudaProjection, project, project_adjoint
+from splat.projection import cpu
+from splat.projection.cuda import CudaProjection, convert, project, project_adjoint
 from splat.projection.formulas import lens_of
 from splat.projection.reference import project as specified
+from splat.projection.whitening import COEFFICIENTS, MOMENTS, PLAIN_GRADIENT, PLAIN_TANGENT
 from tests.splat.projection.test_projection import SETTINGS, SPLAT_BLOCKS, N, camera_and_gaussians, truth
 from tests.splat.random_scenes import (
     DERIVATIVE,
@@ -47,31 +50,47 @@ def test_splats_and_their_adjoint_are_those_of_the_specification(degree, dtype, 
     assert max(errors_by_block(gradient.cpu(), expected.gradient, gaussians.blocks).values()) < DERIVATIVE[dtype]
 
 
-def held(device: torch.device, degree: int, dtype: torch.dtype) -> tuple[CudaProjection, Gaussians]:
+def linearized(device: torch.device, degree: int, dtype: torch.dtype) -> tuple[CudaProjection, Gaussians, Tensor]:
+    """The projection at the truth's adjoint, its Gaussians, and the splats."""
     gaussians, (lens, splats, _, drawn) = on(device, degree, dtype)
-    return CudaProjection(gaussians, lens, splats, truth(degree).bar.to(device), drawn.nonzero()[:, 0]), gaussians
+    moments = convert(MOMENTS, splats, truth(degree).bar.detach().to(device)).to(dtype)
+    return CudaProjection(gaussians, lens, splats, moments, drawn.nonzero()[:, 0]), gaussians, splats
+
+
+def each_converted(way: int, splats: Tensor, numbers: Tensor) -> Tensor:
+    """Tangents or adjoints (n, k, 9) in other coordinates."""
+    return torch.stack([convert(way, splats, each.contiguous()) for each in numbers.unbind(1)], dim=1)
 
 
 @pytest.mark.parametrize(("degree", "dtype"), [(1, torch.float64), (3, torch.float32), (3, torch.float64)])
 def test_products_and_blocks_are_those_of_the_specification(degree, dtype, device):
-    projection, gaussians = held(device, degree, dtype)
+    projection, gaussians, splats = linearized(device, degree, dtype)
     expected = truth(degree)
-    U, C = expected.U.to(device, dtype), expected.C.to(device)
-    pushed, pulled = projection.jvp(U).cpu(), projection.pull(C, U).cpu()
-    errors = errors_by_block(pushed.permute(2, 0, 1), expected.pushed.permute(2, 0, 1), SPLAT_BLOCKS)
+    U, C = expected.U.to(device, dtype), each_converted(MOMENTS, splats, expected.C.to(device)).to(dtype)
+    pushed, pulled = projection.jvp(U), projection.vjp(C, U).cpu()
+    plain = each_converted(PLAIN_TANGENT, splats, pushed).cpu()
+    errors = errors_by_block(plain.permute(2, 0, 1), expected.pushed.permute(2, 0, 1), SPLAT_BLOCKS)
     assert max(errors.values()) < DERIVATIVE[dtype], errors
     assert max(errors_by_block(pulled, expected.pulled, gaussians.blocks).values()) < DERIVATIVE[dtype]
-    first_order = projection.pull(C, None).double().cpu()
-    there, back = pushed * expected.C, first_order * expected.U
+    there, back = (pushed * C).double(), (projection.vjp(C) * U).double()
     assert abs(float(there.sum() - back.sum())) < 30 * torch.finfo(dtype).eps * float(there.norm() + back.norm())
     blocks_agree_with_products(projection, gaussians, dtype, device)
+
+
+@pytest.mark.parametrize("way", [COEFFICIENTS, PLAIN_TANGENT, MOMENTS, PLAIN_GRADIENT])
+def test_coordinates_of_splats_are_those_of_the_cpu(way, device):
+    _, (_, splats, _, _) = on(device, 0, torch.float64)
+    numbers = random_like(splats.shape, 8)
+    expected = np.empty(splats.shape)
+    cpu.convert(0, len(splats), way, splats.cpu().numpy(), numbers.numpy(), expected)
+    np.testing.assert_allclose(convert(way, splats, numbers.to(device)).cpu(), expected, rtol=1e-12)
 
 
 def blocks_agree_with_products(
     projection: CudaProjection, gaussians: Gaussians, dtype: torch.dtype, device: torch.device
 ) -> None:
     """P'^T own P' + bar . P'' applied by its blocks, and by pushing forward, own, and pulling back."""
-    index = projection.held.index
+    index = projection.jacobian.index
     own = random_like((len(index), 9, 9), 5).to(device)
     own = own + own.mT
     own[:, 6:, 6:] = torch.diag_embed(own[:, 6:, 6:].diagonal(dim1=1, dim2=2))
@@ -79,17 +98,17 @@ def blocks_agree_with_products(
     U = torch.zeros(gaussians.flat.numel(), 1, dtype=dtype, device=device)
     rows = torch.cat([torch.arange(len(gaussians.flat))[r].view(N, -1) for r in list(gaussians.blocks.values())[:4]], 1)
     U[rows.to(device)] = random_like((*rows.shape, 1), 6).to(device, dtype)
-    moved = projection.jvp(U)
+    moved = projection.jvp(U).double()
     cotangents = torch.zeros_like(moved)
     cotangents[index] = (own @ moved[index].mT).mT
-    expected = projection.pull(cotangents, U)[rows.to(device)]
+    expected = projection.vjp(cotangents.to(dtype), U)[rows.to(device)]
     found = geometry @ U[rows.to(device)]
     assert relative_error(found.cpu(), expected.cpu()) < DERIVATIVE[dtype]
 
 
 def test_the_diagonal_of_the_colours_blocks_is_that_of_products(device):
-    projection, gaussians = held(device, 1, torch.float64)
-    index = torch.as_tensor(projection.held.index)
+    projection, gaussians, _ = linearized(device, 1, torch.float64)
+    index = projection.jacobian.index
     own = random_like((len(index), 9, 9), 5).to(device)
     _, sh = projection.blocks(own, second_order=False)
     everywhere = torch.zeros(N, 9, 9, dtype=torch.float64, device=device).index_copy(0, index, own)
@@ -98,17 +117,17 @@ def test_the_diagonal_of_the_colours_blocks_is_that_of_products(device):
         rows = start + (torch.arange(N, device=device) * 4 + b) * 3 + c
         U = torch.zeros(gaussians.flat.numel(), 1, dtype=torch.float64, device=device)
         U[rows] = 1.0
-        back = projection.pull((everywhere @ projection.jvp(U).mT).mT, None)
+        back = projection.vjp((everywhere @ projection.jvp(U).mT).mT)
         assert relative_error(sh[:, b, c].cpu(), back[rows, 0].cpu()) < 1e-12
 
 
 def test_more_vectors_than_a_program_takes_are_pushed_and_pulled_alike(device):
-    projection, gaussians = held(device, 0, torch.float64)
+    projection, gaussians, _ = linearized(device, 0, torch.float64)
     U, C = (random_like(shape, 7).to(device) for shape in ((gaussians.flat.numel(), 11), (N, 11, 9)))
-    pushed, pulled = projection.jvp(U), projection.pull(C, U)
+    pushed, pulled = projection.jvp(U), projection.vjp(C, U)
     for k in (0, 7, 8, 10):
         assert torch.equal(pushed[:, k], projection.jvp(U[:, k : k + 1])[:, 0])
-        assert torch.equal(pulled[:, k], projection.pull(C[:, k : k + 1], U[:, k : k + 1])[:, 0])
+        assert torch.equal(pulled[:, k], projection.vjp(C[:, k : k + 1], U[:, k : k + 1])[:, 0])
 
 
 def test_a_splat_too_large_for_its_derivatives_is_named_on_the_gpu(device):

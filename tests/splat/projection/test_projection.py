@@ -1,5 +1,6 @@
 """Projection and SH colour: the specification against the textbook, the kernels against the specification."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -14,8 +15,9 @@ from splat.model.gaussians import Gaussians
 from splat.model.harmonics import harmonics
 from splat.model.settings import RenderSettings
 from splat.projection.cpu import attribute_arrays, project_adjoint, project_arrays
+from splat.projection.dispatch import moments_of, plain_tangents
 from splat.projection.formulas import GEOMETRY, lens_of
-from splat.projection.linear_cpu import Projection
+from splat.projection.linear_cpu import CpuProjection
 from splat.projection.reference import Splats, project, rotation_matrices
 from tests.oracles import (
     central_difference,
@@ -163,32 +165,39 @@ def test_the_adjoint_is_the_gradient_of_the_specification(degree, dtype):
     assert max(errors.values()) < DERIVATIVE[dtype], errors
 
 
-def held(degree: int, dtype: torch.dtype) -> tuple[Projection, Gaussians]:
+def linearized(degree: int, dtype: torch.dtype) -> tuple[CpuProjection, Gaussians, Tensor]:
+    """The projection at the truth's adjoint, its Gaussians, and the splats."""
     camera, gaussians = camera_and_gaussians(degree)
     gaussians = gaussians.to(dtype)
     lens = lens_of(camera, SETTINGS)
-    splats, _, drawn = project_arrays(gaussians, lens)
-    return Projection(gaussians, lens, splats, truth(degree).bar.to(dtype).numpy(), np.flatnonzero(drawn)), gaussians
+    splats, _, drawn = map(torch.from_numpy, project_arrays(gaussians, lens))
+    moments = moments_of(splats, truth(degree).bar.detach()).to(dtype)
+    return CpuProjection(gaussians, lens, splats, moments, drawn.nonzero()[:, 0]), gaussians, splats
+
+
+def each_converted(convert: Callable[[Tensor, Tensor], Tensor], splats: Tensor, numbers: Tensor) -> Tensor:
+    """Tangents or adjoints (n, k, 9) in other coordinates."""
+    return torch.stack([convert(splats, each.contiguous()) for each in numbers.unbind(1)], dim=1)
 
 
 @each_dtype
 @each_degree
 def test_jacobian_and_curvature_are_those_of_the_specification(degree, dtype):
-    projection, gaussians = held(degree, dtype)
+    projection, gaussians, splats = linearized(degree, dtype)
     expected = truth(degree)
-    U, C = expected.U.to(dtype).numpy(), expected.C.to(dtype).numpy()
-    pushed = torch.from_numpy(projection.jvp(U))
+    U, C = expected.U.to(dtype), each_converted(moments_of, splats, expected.C).to(dtype)
+    pushed = each_converted(plain_tangents, splats, projection.jvp(U))
     errors = errors_by_block(pushed.permute(2, 0, 1), expected.pushed.permute(2, 0, 1), SPLAT_BLOCKS)
     assert max(errors.values()) < DERIVATIVE[dtype], errors
-    errors = errors_by_block(torch.from_numpy(projection.pull(C, U)), expected.pulled, gaussians.blocks)
+    errors = errors_by_block(projection.vjp(C, U), expected.pulled, gaussians.blocks)
     assert max(errors.values()) < DERIVATIVE[dtype], errors
 
 
 @each_dtype
 def test_pulling_back_without_directions_is_the_transpose_of_pushing_forward(dtype):
-    projection, _ = held(3, dtype)
-    U, C = truth(3).U.to(dtype).numpy(), truth(3).C.to(dtype).numpy()
-    there, back = (projection.jvp(U) * C).astype(np.float64), (projection.pull(C, None) * U).astype(np.float64)
+    projection, _, _ = linearized(3, dtype)
+    U, C = truth(3).U.to(dtype), truth(3).C.to(dtype)
+    there, back = (projection.jvp(U) * C).double(), (projection.vjp(C) * U).double()
     eps = 30 * float(np.finfo(NUMPY[dtype]).eps)
     assert abs(there.sum() - back.sum()) < eps * (np.linalg.norm(there) + np.linalg.norm(back))
 
@@ -217,11 +226,13 @@ def test_jacobian_and_curvature_agree_with_finite_differences():
         over_range(len(moved), project_adjoint, *arguments)
         return result.flat.numpy()
 
-    projection = Projection(gaussians, lens, splats(0.0), bar, np.arange(len(gaussians)))
-    U = direction.numpy()[:, None]
-    curvature = projection.pull(np.zeros((len(gaussians), 1, 9)), U)
+    at = torch.from_numpy(splats(0.0))
+    moments = moments_of(at, torch.from_numpy(bar))
+    projection, U = CpuProjection(gaussians, lens, at, moments, torch.arange(len(gaussians))), direction[:, None]
+    pushed = projection.jvp(U)
+    curvature = projection.vjp(torch.zeros_like(pushed), U)
     # step^4 = 1e-12 times a fifth derivative, and round-off 1e-16 / step
-    assert relative_error(projection.jvp(U)[:, 0], central_difference(splats, 1e-3)) < 1e-9
+    assert relative_error(plain_tangents(at, pushed[:, 0]), central_difference(splats, 1e-3)) < 1e-9
     assert relative_error(curvature[:, 0], central_difference(gradient, 1e-3)) < 1e-9
 
 
@@ -276,8 +287,11 @@ def test_the_curvature_of_splats_beyond_all_measure_keeps_its_digits(shape, dtyp
     gaussians.quats[:] = torch.tensor([0.7, -0.4, 0.5, 0.3])
     gaussians = gaussians.to(dtype)
     lens = lens_of(camera, RenderSettings())
-    splats, _, _ = project_arrays(gaussians, lens)
-    packed = Projection(gaussians, lens, splats, bar, np.arange(1)).held.curvature[0].astype(np.float64)
+    splats = torch.from_numpy(project_arrays(gaussians, lens)[0])
+    moments = moments_of(splats, torch.from_numpy(bar)).to(dtype)
+    packed = (
+        CpuProjection(gaussians, lens, splats, moments, torch.arange(1)).jacobian.curvature[0].numpy().astype(float)
+    )
     curvature = np.zeros((GEOMETRY, GEOMETRY))
     curvature[np.tril_indices(GEOMETRY)] = packed
     pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)

@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from splat.model.settings import SMOOTH, RenderSettings
+from splat.projection.dispatch import coefficients_of, plain_gradient
 from splat.projection.reference import Splats, project
-from splat.raster.cpu.raster import Raster
+from splat.raster.cpu.raster import CpuRaster
+from splat.raster.dispatch import Adjoint, Raster, Tangent
 from splat.raster.reference import rasterize_reference
-from tests.splat.random_scenes import NUMPY, random_camera, random_gaussians, random_like
+from tests.splat.random_scenes import random_camera, random_gaussians, random_like
 
 BLOCKS = {"means": slice(0, 2), "conics": slice(2, 5), "opacities": slice(5, 6), "colours": slice(6, 9)}
 DIRECTIONS = 4
@@ -85,11 +87,22 @@ class Truth:
     jvp: Tensor
     curvature: Tensor
 
-    def raster(self, dtype: torch.dtype) -> Raster:
+    def raster(self, dtype: torch.dtype) -> CpuRaster:
         """The same view by the kernels."""
-        splats, depths = self.splats.numpy().astype(NUMPY[dtype]), self.depths.numpy().astype(NUMPY[dtype])
-        width, height = self.case.size
-        return Raster(splats, depths, self.drawn.numpy(), BACKGROUND.numpy(), width, height, self.case.settings)
+        return CpuRaster(
+            self.splats, self.depths.to(dtype), self.drawn, BACKGROUND, *self.case.size, self.case.settings
+        )
+
+
+def plain_jvp(raster: Raster, U: Tensor) -> Tangent:
+    """J u of plain tangents (n, k, 9)."""
+    return raster.jvp(torch.stack([coefficients_of(raster.splats, u.contiguous()) for u in U.unbind(1)], dim=1))
+
+
+def plain_product(raster: Raster, tangent: Tangent, adjoint: Adjoint, dG: Tensor) -> Tensor:
+    """The tangent of the plain gradient, (n, k, 9)."""
+    product = tangent.backward_tangent(adjoint, dG)
+    return torch.stack([plain_gradient(raster.splats, each.contiguous()) for each in product.unbind(1)], dim=1)
 
 
 def composite(splats: Tensor, depths: Tensor, drawn: Tensor, case: Case) -> Tensor:

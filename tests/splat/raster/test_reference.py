@@ -19,10 +19,7 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
 def by_hand(
     gaussians: Gaussians, camera: Camera, settings: RenderSettings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    clamp = (
-        settings.fov_clamp * camera.width / (2 * camera.fx),
-        settings.fov_clamp * camera.height / (2 * camera.fy),
-    )
+    clamp = (settings.fov_clamp * camera.width / (2 * camera.fx), settings.fov_clamp * camera.height / (2 * camera.fy))
     pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
     means, log_scales, quats, logits, sh = (value.numpy() for value in gaussians.attributes.values())
     splats = [

@@ -1,5 +1,7 @@
 """Rendering as a torch function: the kernels against plain torch, to the second derivative."""
 
+from itertools import product
+
 import pytest
 import torch
 from torch import Tensor
@@ -7,6 +9,7 @@ from torch import Tensor
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import SMOOTH, RenderSettings
+from splat.render.forward import rasterize_view
 from splat.render.render import Backend, render, render_depth
 from tests.splat.held_scenes import BACKGROUND
 from tests.splat.random_scenes import (
@@ -34,9 +37,9 @@ def everything(gaussians: Gaussians, camera: Camera, backend: Backend, settings:
         (shown.image**2 * weights[:3]).sum() + (shown.alpha * weights[3]).sum() + (shown.depth**2 * weights[4]).sum()
     )
     (gradient,) = torch.autograd.grad(value, flat, create_graph=True)
-    (product,) = torch.autograd.grad((gradient * direction).sum(), flat)
+    (curved,) = torch.autograd.grad((gradient * direction).sum(), flat)
     names = ("image", "alpha", "depth", "gradient", "product")
-    values = (shown.image, shown.alpha, shown.depth, gradient, product)
+    values = (shown.image, shown.alpha, shown.depth, gradient, curved)
     return {name: value.detach() for name, value in zip(names, values, strict=True)}
 
 
@@ -50,6 +53,35 @@ def test_kernels_and_plain_torch_agree_to_the_second_derivative(size, settings):
     for name in ("gradient", "product"):
         errors = errors_by_block(got[name], expected[name], gaussians.blocks)
         assert max(errors.values()) < DERIVATIVE[torch.float64], (name, errors)
+
+
+SWITCHES = {
+    "gradient_through_cap": (False, True), "alpha_min": (0.0, 1 / 255), "transmittance_min": (0.0, 1e-4),
+    "contour_sigma": (None, 3.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("values", product(*SWITCHES.values()), ids=str)
+def test_kernels_and_plain_torch_agree_for_every_combination_of_settings(values):
+    settings = RenderSettings(**dict(zip(SWITCHES, values, strict=True)))
+    gaussians, camera = random_gaussians(20, 1, logit=5.0), random_camera(36, 24, focal=60.0)
+    gaussians.log_scales.sub_(1.0)  # far from a splat its alpha underflows
+    got, expected = (everything(gaussians, camera, backend, settings) for backend in ("kernels", "reference"))
+    for name in ("image", "alpha", "depth"):
+        assert relative_error(got[name], expected[name]) < IMAGE[torch.float64], name
+    for name in ("gradient", "product"):
+        errors = errors_by_block(got[name], expected[name], gaussians.blocks)
+        assert max(errors.values()) < DERIVATIVE[torch.float64], (name, errors)
+
+
+@pytest.mark.parametrize("logit", [0.0, 5.0])
+def test_training_and_probe_see_the_same_image_to_the_last_bit(logit):
+    gaussians, camera = random_gaussians(60, 2, logit=logit).to(torch.float32), random_camera(300, 40, focal=200.0)
+    gaussians.log_scales[::2] = torch.tensor([1.0, -6.0, -6.0])  # needles, whose conics float32 would not hold
+    shown = render(gaussians, camera, BACKGROUND)
+    raster = rasterize_view(gaussians, camera, BACKGROUND, RenderSettings())
+    planes = raster.crop(raster.planes)
+    assert torch.equal(shown.image, planes[:3]) and torch.equal(shown.alpha, planes[3])
 
 
 def test_float32_renders_and_differentiates_within_its_tolerance():

@@ -37,7 +37,7 @@ def test_the_masks_of_a_scene_are_found_by_the_names_of_its_images(tmp_path: Pat
     assert views[1].mask is None and views[2].mask is None
 
 
-def test_nerfstudios_mask_path_names_a_mask_and_a_folder_given_wins_over_it(tmp_path: Path) -> None:
+def test_nerfstudios_mask_path_is_read_unless_a_folder_is_given(tmp_path: Path) -> None:
     content = folders.transforms()
     content["frames"][0]["mask_path"] = "elsewhere/first.png"  # type: ignore[index]
     folders.write_pictures(tmp_path / "images")
@@ -158,11 +158,11 @@ def test_depth_maps_that_cannot_be_are_refused(tmp_path: Path, values: np.ndarra
 
 def test_depth_of_8_bits_is_refused(tmp_path: Path) -> None:
     write_mask(tmp_path / "d.png", blob())
-    with pytest.raises(ValueError, match="mode L instead of 16 bits"):
+    with pytest.raises(ValueError, match="depth of 16 bits, got mode L"):
         read_depth(tmp_path / "d.png")
 
 
-def test_a_file_beside_a_photograph_has_its_name_with_the_folders_or_without(tmp_path: Path) -> None:
+def test_layers_are_found_by_name_with_folders_or_without(tmp_path: Path) -> None:
     (tmp_path / "train").mkdir()
     for file in ("train/r_3.npy", "r_4.npy", "025.png"):
         (tmp_path / file).touch()

@@ -27,7 +27,7 @@ def waves(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["transforms", "colmap"])
-def test_a_distorted_picture_becomes_what_the_pinhole_camera_would_have_seen(tmp_path: Path, kind: str) -> None:
+def test_a_distorted_picture_becomes_that_of_the_pinhole_camera(tmp_path: Path, kind: str) -> None:
     lens = {**LENS, "k3": 0.02} if kind == "transforms" else LENS
     exact = distorted_picture(waves, LENS_INTRINSICS, LENS_SIZE, lens)
     if kind == "transforms":
@@ -79,7 +79,7 @@ def test_lenses_as_strong_as_they_are_made_are_taken(tmp_path: Path) -> None:
         assert len(load_scene(tmp_path / name).frames) == 3
 
 
-def test_a_distorted_picture_stored_smaller_than_its_camera_is_scaled_first(tmp_path: Path) -> None:
+def test_a_distorted_picture_smaller_than_its_camera_is_scaled_first(tmp_path: Path) -> None:
     twice = [2 * value for value in LENS_INTRINSICS]
     model = folders.reconstruction("OPENCV", (*twice, *LENS.values()))
     model.cameras[1].width, model.cameras[1].height = 2 * LENS_SIZE[0], 2 * LENS_SIZE[1]

@@ -10,18 +10,19 @@ import torch
 from splat.model.camera import Camera
 from splat.model.capture import forward_facing
 from splat.scenes.scene import Scene, camera_extent, load_scene
-from splat.scenes.view import Frame
+from splat.scenes.view import Frame, View
 from tests.splat.scenes import folders
 from tests.splat.scenes.folders import NAMES
 
 
 def scene_of(cameras: list[Camera]) -> Scene:
-    frames = tuple(Frame(f"{i}", camera, lambda: (torch.zeros(3, 2, 2), None)) for i, camera in enumerate(cameras))
+    pictures = [View(f"{i}", camera, torch.zeros(3, 2, 2)) for i, camera in enumerate(cameras)]
+    frames = tuple(Frame(view.name, view.camera, lambda view=view: view) for view in pictures)
     return Scene("s", Path("s"), "synthetic", frames, None, torch.zeros(3))
 
 
 def camera_turned(degrees: float, centre: tuple[float, float, float] = (0, 0, 0)) -> Camera:
-    """StoppingRule along +z, turned about the vertical axis."""
+    """Looks along +z, turned about the vertical axis."""
     c, s = cos(degrees * pi / 180), sin(degrees * pi / 180)
     rotation = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]], dtype=torch.float64)
     return Camera(rotation, torch.tensor(centre, dtype=torch.float64), 10.0, 10.0, 1.0, 1.0, 2, 2)

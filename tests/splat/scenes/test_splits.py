@@ -43,7 +43,7 @@ def test_one_image_cannot_be_split() -> None:
         llff_split(["a"])
 
 
-def test_blender_takes_the_published_views_from_a_full_scene_and_from_a_reduced_one_alike(tmp_path: Path) -> None:
+def test_blender_has_the_published_views_in_full_and_reduced_scenes(tmp_path: Path) -> None:
     folders.write_blender(tmp_path / "full", tuple(range(100)), tuple(range(200)))
     folders.write_blender(tmp_path / "reduced", (2, 16, 26, 55, 73, 75, 86, 93), tuple(range(0, 200, 8)))
     full, reduced = (split_scene(load_scene(tmp_path / name), 8) for name in ("full", "reduced"))
@@ -53,7 +53,7 @@ def test_blender_takes_the_published_views_from_a_full_scene_and_from_a_reduced_
     assert split_scene(load_scene(tmp_path / "reduced"), 3).train == full.train[:3]
 
 
-def test_without_a_wish_blender_trains_on_the_eight_of_its_protocol_and_others_on_three(tmp_path: Path) -> None:
+def test_by_default_blender_trains_on_eight_views_and_others_on_three(tmp_path: Path) -> None:
     folders.write_blender(tmp_path / "blender", (2, 16, 26, 55, 73, 75, 86, 93), (0, 8))
     folders.write_colmap(tmp_path / "colmap")
     assert [usual_views(load_scene(tmp_path / name)) for name in ("blender", "colmap")] == [8, 3]

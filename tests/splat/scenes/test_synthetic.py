@@ -11,7 +11,7 @@ from splat.projection.reference import rotation_matrices
 from splat.render.render import render
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.synthetic import SyntheticScene, SyntheticSettings, synthetic_scene
-from splat.scenes.view import Frame, inside_image
+from splat.scenes.view import Frame, View, inside_image
 from splat.scenes.write import write_transforms_scene
 
 SMALL = SyntheticSettings(gaussians=120, views=4, width=40, height=30)
@@ -117,11 +117,9 @@ def test_tracks_follow_their_frames_into_the_order_of_the_file(small: SyntheticS
         assert torch.equal(scene.points.sightings(scene.select([name])), points.sightings(small.scene.select([name])))
 
 
-def test_frames_of_one_name_in_two_folders_and_a_background_survive_the_round_trip(
-    small: SyntheticScene, tmp_path: Path
-) -> None:
+def test_names_in_two_folders_and_a_background_survive_a_round_trip(small: SyntheticScene, tmp_path: Path) -> None:
     names = ("train/r_2", "test/r_2")
-    frames = tuple(Frame(name, f.camera, f.read) for name, f in zip(names, small.scene.frames))
+    frames = tuple(Frame(name, f.camera, f.view) for name, f in zip(names, small.scene.frames))
     write_transforms_scene(Scene("s", tmp_path, "blender", frames, None, torch.ones(3)), tmp_path / "s")
     scene = load_scene(tmp_path / "s")
     assert scene.names == ("images/test/r_2.png", "images/train/r_2.png")
@@ -130,7 +128,7 @@ def test_frames_of_one_name_in_two_folders_and_a_background_survive_the_round_tr
 
 
 def test_a_scene_is_written_whole_or_not_at_all(small: SyntheticScene, tmp_path: Path) -> None:
-    def fail() -> tuple[torch.Tensor, None]:
+    def fail() -> View:
         raise OSError("disk full")
 
     broken = (*small.scene.frames[:2], Frame("images/z.png", small.scene.frames[2].camera, fail))

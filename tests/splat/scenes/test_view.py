@@ -13,7 +13,7 @@ def camera(x: float = 0.0) -> Camera:
 
 
 def frame(name: str, x: float = 0.0) -> Frame:
-    return Frame(name, camera(x), lambda: (torch.zeros(3, 6, 8), None))
+    return Frame(name, camera(x), lambda: View(name, camera(x), torch.zeros(3, 6, 8)))
 
 
 def xyz(*rows: tuple[float, float, float]) -> torch.Tensor:
@@ -32,7 +32,7 @@ def test_a_point_falls_where_the_pinhole_equation_says() -> None:
     assert pixel.tolist() == [[10 * 1 / 5 + 4, 20 * 0.5 / 5 + 3]] and depth.tolist() == [5.0]
 
 
-def test_only_points_before_the_camera_inside_the_frame_and_the_depth_range_are_inside() -> None:
+def test_points_inside_are_before_the_camera_in_frame_and_in_range() -> None:
     points = xyz((0, 0, 1), (0, 0, -1), (0.5, 0, 1), (0.39, 0, 1), (0, 0, 9))
     assert inside_image(camera(), points).tolist() == [True, False, False, True, True]
     assert inside_image(camera(), points, (2.0, 10.0)).tolist() == [False, False, False, False, True]
@@ -45,7 +45,7 @@ def test_sightings_follow_the_tracks_and_only_the_views_asked_for() -> None:
     assert points.sightings([frame("c"), frame("not of this model")]).tolist() == [1, 0, 0]
 
 
-def test_without_tracks_a_point_is_seen_by_the_views_whose_image_it_falls_into() -> None:
+def test_without_tracks_a_point_is_seen_where_it_falls_into_the_image() -> None:
     points = Points(xyz((0, 0, 1), (1, 0, 1), (0.5, 0, 2)), torch.zeros(3, 3))
     assert points.sightings([frame("a", 0.0), frame("b", 1.0)]).tolist() == [1, 1, 2]
     assert points.sightings([frame("a", 0.0), frame("b", 0.5)]).tolist() == [1, 0, 2]

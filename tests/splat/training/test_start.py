@@ -86,7 +86,7 @@ def test_scales_follow_the_units_of_the_world() -> None:
         torch.testing.assert_close(change, torch.full_like(change, log(unit)), atol=1e-5, rtol=0)
 
 
-def test_coincident_points_get_a_small_finite_scale_and_a_heap_of_them_is_refused() -> None:
+def test_coincident_points_get_a_small_scale_and_a_heap_is_refused() -> None:
     points = some_points()
     everyone = torch.cartesian_prod(torch.arange(60), torch.arange(3))
     xyz = points.xyz.clone()
@@ -106,7 +106,7 @@ def test_too_few_points_are_refused_with_their_number() -> None:
         gaussians_from_points(few, views())
 
 
-def test_random_points_lie_where_two_views_see_them_in_the_colour_of_a_pixel_there() -> None:
+def test_random_points_lie_where_two_views_see_them_in_a_pixels_colour() -> None:
     chosen = views()
     points = points_in_common_volume(chosen, 500, torch.Generator().manual_seed(0))
     assert len(points) == 500
@@ -176,7 +176,7 @@ def test_views_with_nothing_in_common_are_refused() -> None:
 
 
 def test_a_scene_starts_from_its_points_and_without_them_from_random_ones() -> None:
-    frames = tuple(Frame(v.name, v.camera, lambda v=v: (v.image, None), depth_range=(3.0, 5.0)) for v in views())
+    frames = tuple(Frame(v.name, v.camera, lambda v=v: v, depth_range=(3.0, 5.0)) for v in views())
     with_points = Scene("s", Path("s"), "synthetic", frames, some_points(), torch.zeros(3))
     without = Scene("s", Path("s"), "synthetic", frames, None, torch.zeros(3))
     generator = torch.Generator().manual_seed(0)
@@ -214,7 +214,7 @@ def test_lego_starts_round_its_middle(lego: Path) -> None:
 
 
 def test_the_source_of_the_points_can_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = tuple(Frame(v.name, v.camera, lambda v=v: (v.image, None), depth_range=(3.0, 5.0)) for v in views())
+    frames = tuple(Frame(v.name, v.camera, lambda v=v: v, depth_range=(3.0, 5.0)) for v in views())
     with_points = Scene("s", Path("s"), "synthetic", frames, some_points(), torch.zeros(3))
     without = Scene("s", Path("s"), "synthetic", frames, None, torch.zeros(3))
     elsewhere = Points(some_points().xyz + 5, some_points().rgb, some_points().observations, NAMES)

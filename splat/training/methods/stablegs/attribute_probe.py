@@ -1,9 +1,7 @@
 """Attribute-space probes of StableGS: steps in all five attributes at once, towards where the loss rises or breaks.
 
-    tau     of an attribute: sqrt(max(tr H, 0) / dim), the root of the mean curvature; dim is N_active d, the number of its
-            parameters that curvature can come from, or the d of one Gaussian (the paper's letter), d = 3 for quats: the
-            trace is that on the unit quaternions, without their radial directions (`splat/curvature/traces.py`), since H_quats
-            scales with 1 / |q|^2
+    tau     of an attribute: sqrt(max(tr H, 0) / dim), `splat.curvature.traces.curvature_scale`; the trace of quats is that
+            on the unit quaternions, without their radial directions, since H_quats scales with 1 / |q|^2
     rho     c / (tau + eps), at most the attribute's cap                                                       Eq. (5)
     g, v    the gradient of the sampled view's loss; the unit vector from the camera's centre to the mean
     means   + rho u,  u the direction of gamma g_depth + (1 - gamma) g_lateral,  g_depth = (g.v) v             Eqs. (7), (8)
@@ -23,84 +21,73 @@ quaternions, where it is the right multiplication by exp(omega), an orthogonal m
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import inf, isfinite, isqrt, sqrt
-from typing import Literal
+from math import inf, isfinite, isqrt
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float, Float64
+from msgspec import Meta
 from torch import Tensor
 
+from landscape.errors import InputError
+from splat.curvature.traces import Dimension, curvature_scale
 from splat.model.camera import Camera
-from splat.model.gaussians import ATTRIBUTES, Gaussians
+from splat.model.gaussians import Gaussians
+from splat.model.typed import LARGEST, NonNegative, Positive, Settings, Share
 from splat.projection.reference import NEEDLE, Splats, condition, on_screen
 
 Attribute = Literal["means", "log_scales", "quats", "opacity_logits", "sh"]
+Cap = Annotated[float, Meta(gt=0)]
 DRAWN = ("quats", "log_scales", "sh")
 
 
 @dataclass(frozen=True)
-class Constants:
+class Constants(Settings):
     """c of Eq. (5) for each attribute; 0 switches its probe off."""
 
-    means: float = 0.01
-    log_scales: float = 0.01
-    quats: float = 0.01
-    opacity_logits: float = 0.01
-    sh: float = 0.01
-
-    def __post_init__(self) -> None:
-        if not all(0 <= getattr(self, name) < inf for name in ATTRIBUTES):
-            raise ValueError(f"expected finite constants of at least 0, got {self}")
+    means: NonNegative = 0.01
+    log_scales: NonNegative = 0.01
+    quats: NonNegative = 0.01
+    opacity_logits: NonNegative = 0.01
+    sh: NonNegative = 0.01
 
 
 @dataclass(frozen=True)
-class Caps:
+class Caps(Settings):
     """The largest rho of each attribute; inf for none.  Without them rho is 1e4 wherever a trace is not positive.
 
-    means: in units of the scene's extent (`splat/training/densify.py`): fern's 0.1 world units; log_scales: 0.2 is a fifth
-    in size;
+    means: in units of the scene's extent (`splat/training/densify.py`); log_scales: 0.2 is a fifth in size;
     quats: radians; opacity_logits: 0.5 is at most 0.125 in opacity; sh: 0.05 is 0.1 in colour at SH degree 3.
     """
 
-    means: float = 0.035
-    log_scales: float = 0.2
-    quats: float = 0.05
-    opacity_logits: float = 0.5
-    sh: float = 0.05
-
-    def __post_init__(self) -> None:
-        if not all(getattr(self, name) > 0 for name in ATTRIBUTES):
-            raise ValueError(f"expected caps above 0, got {self}; switch a probe off by leaving it out of attributes")
+    means: Cap = 0.035
+    log_scales: Cap = 0.2
+    quats: Cap = 0.05
+    opacity_logits: Cap = 0.5
+    sh: Cap = 0.05
 
 
 @dataclass(frozen=True)
-class ProbeSettings:
+class ProbeSettings(Settings):
     """attributes: which are probed; c, caps: of rho, for each; eps: of Eq. (5); kappa_full: the 100 of Eq. (10).
 
-    dimension: what a trace is divided by, "active": N_active d, "attribute": d.  gamma: how far means move along the viewing
-    ray, 1: along it alone, 0.5: along the gradient itself.
+    dimension: what tau divides a trace by (`splat.curvature.traces.curvature_scale`); "attribute", because with "active" rho is
+    larger by the root of the number of Gaussians, so that on any but a tiny scene the caps alone would decide.
+    gamma: how far means move along the viewing ray, 1: along it alone, 0.5: along the gradient itself.
     """
 
     attributes: tuple[Attribute, ...] = ("means", "log_scales", "quats", "opacity_logits", "sh")
     c: Constants = field(default_factory=Constants)
     caps: Caps = field(default_factory=Caps)
-    dimension: Literal["active", "attribute"] = "attribute"
-    eps: float = 1e-6
-    gamma: float = 0.7
-    kappa_full: float = NEEDLE
+    dimension: Dimension = "attribute"
+    eps: Positive = 1e-6
+    gamma: Share = 0.7
+    kappa_full: Positive = NEEDLE
 
     def __post_init__(self) -> None:
-        unknown = set(self.attributes) - set(ATTRIBUTES)
-        if unknown or len(set(self.attributes)) < len(self.attributes):
-            raise ValueError(f"expected attributes among {', '.join(ATTRIBUTES)}, each once, got {self.attributes}")
-        if self.dimension not in ("active", "attribute"):
-            raise ValueError(f"expected dimension 'active' or 'attribute', got {self.dimension!r}")
-        if not 0 < self.eps < inf:
-            raise ValueError(f"expected a finite eps above 0 (tau may be 0), got {self.eps}")
-        if not 0 <= self.gamma <= 1:
-            raise ValueError(f"expected gamma in [0, 1] (1: depth alone, 0.5: the gradient itself), got {self.gamma}")
-        if not 0 < self.kappa_full < inf:
-            raise ValueError(f"expected a finite kappa_full above 0, got {self.kappa_full}")
+        super().__post_init__()
+        if len(set(self.attributes)) < len(self.attributes):
+            raise InputError(f"expected each of the attributes once, got {', '.join(self.attributes)}")
 
     @property
     def on(self) -> tuple[Attribute, ...]:
@@ -109,17 +96,13 @@ class ProbeSettings:
 
 
 @dataclass(frozen=True)
-class Magnitude:
+class Magnitude(Settings):
     """How far an attribute is probed and why: its trace as given, tau, rho of Eq. (5) uncapped, and rho under its cap."""
 
-    trace: float
-    tau: float
-    uncapped: float
-    rho: float
-
-    def __post_init__(self) -> None:
-        if not (isfinite(self.trace) and all(0 <= value < inf for value in (self.tau, self.uncapped, self.rho))):
-            raise ValueError(f"expected a finite trace, and finite tau and rho of at least 0, got {self}")
+    trace: Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+    tau: NonNegative
+    uncapped: NonNegative
+    rho: NonNegative
 
     @property
     def capped(self) -> bool:
@@ -137,7 +120,7 @@ def magnitudes(
     """The magnitude of each attribute that is on.
 
     traces: of their Hessian blocks (of quats on the unit sphere), summed over `active` Gaussians; extent: of the scene, world
-    units, to which the cap of the means is relative.  ValueError where a trace is missing or not finite.
+    units, to which the cap of the means is relative.  InputError where a trace is missing or not finite.
     """
     if active < 1 or not 0 < extent < inf:
         raise ValueError(f"expected at least 1 active Gaussian and a finite extent above 0, got {active} and {extent}")
@@ -147,9 +130,8 @@ def magnitudes(
         c, cap = getattr(settings.c, name), getattr(settings.caps, name)
         trace = traces.get(name)
         if trace is None or not isfinite(trace):
-            raise ValueError(f"expected a finite trace of {name}, got {trace}; lower the rates or leave {name} out")
-        dim = each[name] * (active if settings.dimension == "active" else 1)
-        tau = sqrt(max(trace, 0.0) / dim)
+            raise InputError(f"expected a finite trace of {name}, got {trace}; lower the rates or leave {name} out")
+        tau = curvature_scale(trace, each[name] * active, active, settings.dimension)
         rho = c / (tau + settings.eps)
         result[name] = Magnitude(trace, tau, rho, min(rho, cap * extent if name == "means" else cap))
     return result

@@ -8,7 +8,7 @@ parallax        c += delta p,   delta ~ N(0, (parallax_sigma r)^2), r the camera
                 p = R_m^T (cos phi, sin phi, 0), phi ~ U(0, 2 pi): perpendicular to the viewing direction R_m^T e_z
                 (the paper's `R e_z` reads R as camera to world)
 in a 360 capture the parallax is a spherical shell instead: c = target + orbit u, u ~ Uniform(S^2), R looks at the target,
-                held level.  It replaces the interpolated pose, so that interpolation does nothing beside it.  The paper's
+                level.  It replaces the interpolated pose, so that interpolation does nothing beside it.  The paper's
                 sphere is whole: about an object that is seen from above only, more than half of it lies below all cameras
 edge rotation   R <- exp(theta R R_m^T n) R,   theta ~ N(0, theta_sigma^2), n = (n_x, n_y, 0) the axis in view m's camera
                 frame, from its occlusion edges.  The same as R exp(theta R_m^T n): the paper's line, with n in the world
@@ -22,18 +22,23 @@ mode's draw does not change when another is switched, and an ablation compares l
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import cos, pi, radians, sin
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera, look_at, rotation_about, slerp
 from splat.model.capture import CaptureGeometry
+from splat.model.typed import NonNegative, Settings
+
+Position = Annotated[float, Meta(ge=-1, le=2)]
 
 
 @dataclass(frozen=True)
-class ViewpointSettings:
+class ViewpointSettings(Settings):
     """Modes and magnitudes of the probes.
 
     edge_rotation, interpolation, parallax: whether each mode is on (in a 360 capture, parallax replaces interpolation).
@@ -47,26 +52,17 @@ class ViewpointSettings:
     interpolation: bool = True
     parallax: bool = True
     capture: Literal["auto", "forward", "360"] = "auto"
-    t_min: float = -0.2
-    t_max: float = 1.2
-    theta_sigma: float = 2.0
-    parallax_sigma: float = 0.1
+    t_min: Position = -0.2
+    t_max: Position = 1.2
+    theta_sigma: Annotated[float, Meta(ge=0, le=60)] = 2.0
+    parallax_sigma: NonNegative = 0.1
     axis: Literal["normal", "tangent"] = "normal"
 
     def __post_init__(self) -> None:
-        if not -1 <= self.t_min <= self.t_max <= 2:
-            raise ValueError(
-                f"expected -1 <= t_min <= t_max <= 2, got {self.t_min} and {self.t_max}; 0 is the view, 1 its neighbour"
-            )
-        if not (0 <= self.theta_sigma <= 60 and 0 <= self.parallax_sigma < float("inf")):
-            raise ValueError(
-                "expected theta_sigma of 0 to 60 degrees and a finite parallax_sigma of at least 0, got "
-                f"{self.theta_sigma} and {self.parallax_sigma}; to leave a mode out, switch it off"
-            )
-        if self.capture not in ("auto", "forward", "360") or self.axis not in ("normal", "tangent"):
-            raise ValueError(
-                "expected capture 'auto', 'forward' or '360' and axis 'normal' or 'tangent', got "
-                f"{self.capture!r} and {self.axis!r}"
+        super().__post_init__()
+        if self.t_min > self.t_max:
+            raise InputError(
+                f"expected t_min <= t_max (0 is the view, 1 its neighbour), got {self.t_min} and {self.t_max}"
             )
 
 
@@ -83,7 +79,7 @@ def composite_pose(
 
     normal: of view m's edges, in its pixels, from `dominant_edge`; zero where it has none, and then nothing turns.
     geometry: `capture_geometry(cameras)`.  A single camera has no neighbour and radius 0: only edge rotation moves it.
-    Raises ValueError where a 360 capture is asked for but the cameras have no common target.
+    InputError where a 360 capture is asked for but the cameras have no common target.
     """
     view = cameras[m]
     t, phi = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
@@ -141,7 +137,7 @@ def _surrounding(settings: ViewpointSettings, geometry: CaptureGeometry) -> bool
 def _on_shell(geometry: CaptureGeometry, gauss: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """Rotation and centre on the sphere about the target, in the direction of an isotropic Gaussian draw."""
     if geometry.target is None or geometry.orbit is None:
-        raise ValueError(
+        raise InputError(
             "expected cameras that look at a common place for a 360 capture, got parallel or diverging ones; "
             "use capture 'forward'"
         )

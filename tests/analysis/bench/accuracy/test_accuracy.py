@@ -16,7 +16,7 @@ from analysis.bench.accuracy.methods import JACOBIAN, PASS, Answer, Method, own_
 from analysis.bench.accuracy.peers import PACKAGES, peer_methods, scipy_methods
 from analysis.bench.accuracy.ratios import needed, points, ratios
 from analysis.bench.command import run_bench
-from analysis.console.options import BenchOptions
+from analysis.bench.options import BenchOptions
 from figures import accuracy as figure
 from landscape.operators.operator import DenseOperator, SumOperator
 from splat.losses.reference import LossSettings

@@ -6,10 +6,10 @@ import torch
 
 import analysis.bench.stress.command as stress
 from analysis.bench.command import run_bench
+from analysis.bench.options import BenchOptions
 from analysis.bench.stress.cases import cases, refusals, steady
 from analysis.bench.stress.command import PRECISIONS, Finding, Scene, Study, refused
 from analysis.bench.stress.condition import STEP, roundings
-from analysis.console.options import BenchOptions
 
 CASES = {case.name: case for case in cases(0)}
 FAST = [
@@ -65,7 +65,7 @@ def one_case(monkeypatch):
     return "one Gaussian"
 
 
-def test_the_command_prints_and_writes_every_case_and_says_whether_all_is_well(one_case, tmp_path, capsys):
+def test_the_command_prints_and_writes_every_case(one_case, tmp_path, capsys):
     assert run_bench(BenchOptions(subject="stress", out=tmp_path)) == 0
     table = pd.read_csv(tmp_path / "stress.csv")
     assert set(table["case"]) == {one_case, *REFUSALS} and set(table["precision"]) == set(PRECISIONS)

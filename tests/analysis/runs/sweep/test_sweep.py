@@ -17,18 +17,18 @@ import torch
 import tyro
 
 from analysis.commands.cli import main
-from analysis.console.options import TrainOptions
 from analysis.records.provenance import usable_cores
-from analysis.records.records import record_folder, write_record
 from analysis.runs.sweep.sweep import _Cells, locked, missing, probe_arguments
 from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import results
+from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from splat.render.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
+from tests import recorded
 from tests.recorded import synthetic
 
 FILE = """
@@ -262,8 +262,7 @@ def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, fold
     assert missing(cell, finished) == [] and missing(cell, with_probe) == missing(cell, control) == ["probe"]
     data, arrays = synthetic()
     data["provenance"]["iteration"] = 12
-    with record_folder(cell.out / "probe") as partial:
-        write_record(partial, data, arrays)
+    recorded.written(cell.out / "probe", data, arrays)
     try:
         assert missing(cell, with_probe) == [] and missing(cell, control) == ["probe"]
         assert probe_arguments(cell, control)[2:] == ["--split-control", "--family-seconds", "7.0"]

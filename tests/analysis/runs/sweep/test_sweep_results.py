@@ -10,8 +10,6 @@ import pytest
 import torch
 from rich.console import Console
 
-from analysis.console.options import TrainOptions
-from analysis.records.records import record_folder, write_record
 from analysis.runs.sweep.sweep_file import Cell
 from analysis.runs.sweep.sweep_results import (
     REASONS,
@@ -22,17 +20,17 @@ from analysis.runs.sweep.sweep_results import (
     unfinished,
     with_ratios,
 )
+from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from splat.training.loop import StepResult
-from tests.recorded import synthetic
+from tests.recorded import synthetic, written
 
 
 def test_an_index_of_which_only_a_bound_is_known_is_not_averaged(tmp_path):
     data, arrays = synthetic()
     data["anisotropy"]["literal"] = {"value": 7.0, "low": 34.2, "high": None, "note": "lambda_min is not resolved"}
     cell = Cell("still", "3dgs", TrainOptions(Path("still"), out=tmp_path / "0"))
-    with record_folder(cell.out / "probe") as partial:
-        write_record(partial, data, arrays)
+    written(cell.out / "probe", data, arrays)
     (cell.out / "metrics.json").write_text(json.dumps({"test": {}, "train": {}, "gaussians": 9}))
     rows = results([cell], {cell.name: "done"})
     assert rows.iloc[0]["literal_low"] == 34.2 and rows.iloc[0]["saddle"] == pytest.approx(3.1e4 / 220)
@@ -45,8 +43,7 @@ def test_ends_whose_search_ran_out_are_said_with_the_cells_and_have_their_reason
     cells = [Cell("still", "3dgs", TrainOptions(Path("still"), out=tmp_path / str(i), seed=i)) for i in range(3)]
     for cell, reason in zip(cells, ("tolerance", "noise floor", None), strict=True):
         data["eigenvalues"]["max"]["reason"] = reason
-        with record_folder(cell.out / "probe") as partial:
-            write_record(partial, data, arrays)
+        written(cell.out / "probe", data, arrays)
         (cell.out / "metrics.json").write_text(json.dumps({"test": {}, "train": {}, "gaussians": 9}))
     shutil.rmtree(cells[2].out / "probe")
     rows = results(cells, {cell.name: "done" for cell in cells})

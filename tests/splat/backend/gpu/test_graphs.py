@@ -40,7 +40,7 @@ class Fake:
         return result, replay
 
 
-def test_a_product_is_recorded_once_for_every_number_of_vectors_that_it_is_often_called_with():
+def test_a_product_is_recorded_once_for_each_frequent_number_of_vectors():
     fake = Fake()
     recordings = CudaGraphCache(fake)
     found = {k: [recordings(triple, torch.full((4, k), float(i))) for i in range(CALLS + 2)] for k in (1, 2)}
@@ -51,7 +51,7 @@ def test_a_product_is_recorded_once_for_every_number_of_vectors_that_it_is_often
         assert all(torch.equal(result, torch.full((4, k), 3.0 * i)) for i, result in enumerate(results))
 
 
-def test_where_recording_fails_it_is_said_once_and_products_are_made_all_the_same():
+def test_a_failed_recording_warns_once_and_products_go_on():
     tried = []
 
     def fail(call: Callable[[], Tensor]) -> tuple[Tensor, Callable[[], None]]:
@@ -65,7 +65,7 @@ def test_where_recording_fails_it_is_said_once_and_products_are_made_all_the_sam
     assert [float(each[0, 0]) for each in found] == [0.0, 3.0, 6.0, 9.0] * 2
 
 
-def test_captures_share_the_memory_and_the_stream_of_the_first_and_leave_the_stream_when_they_fail(monkeypatch):
+def test_captures_share_memory_and_stream_and_leave_it_when_they_fail(monkeypatch):
     """By stand-ins for torch's, with torch's own signature of `graph`."""
     noted, current, failing = [], ["default"], []
     signature = inspect.signature(torch.cuda.graph)
@@ -125,35 +125,34 @@ def objective(device: torch.device, views: int, memory: int = 2**30) -> SceneObj
 
 
 @pytest.mark.parametrize("gauss_newton", [False, True])
-def test_recorded_products_of_a_scene_are_those_that_are_not_recorded_to_the_last_bit(
-    device, monkeypatch, gauss_newton
-):
+def test_recorded_products_of_a_scene_equal_others_to_the_last_bit(device, monkeypatch, gauss_newton):
     monkeypatch.setattr(recording, "CALLS", 1)
     monkeypatch.setattr("splat.backend.device.EMULATED", device.type == "cpu")
     hessian = SceneHessian(objective(device, 1), gauss_newton=gauss_newton)
-    tape = None
+    fake = None
     if device.type == "cpu":
-        from tests.splat.tape import Tape
+        from tests.splat.fake_cuda_graph import FakeCudaGraph  # needs triton
 
-        tape = Tape(monkeypatch)
-        monkeypatch.setattr(SceneObjective, "recordable", lambda self, vectors: True)
-        vars(hessian)["_recordings"] = CudaGraphCache(tape.capture)
+        fake = FakeCudaGraph(monkeypatch)
+        monkeypatch.setattr(SceneHessian, "recordable", lambda self, vectors: True)
+        vars(hessian)["_recordings"] = CudaGraphCache(fake.capture)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         for seed in (1, 2):
             V = random_like((hessian.dim, 2), seed).to(device)
-            assert torch.equal(hessian.apply(V), hessian.project(hessian.launched(hessian.project(V))))
-    assert hessian.passes == 4 and (tape is None or tape.replays == 2)
+            assert torch.equal(hessian.apply(V), hessian.project(hessian.views.apply(hessian.project(V))))
+    assert fake is None or fake.replays == 2
 
 
-def test_products_on_the_cpu_of_large_views_and_of_views_that_are_not_kept_are_not_recorded(monkeypatch):
-    here, few = (objective(torch.device("cpu"), 2, memory) for memory in (2**30, 1))
-    assert (here.memory_plan.kept, few.memory_plan.kept, here.memory_plan.vectors) == (2, 1, 8)
+def test_products_on_the_cpu_and_of_large_or_unkept_views_are_not_recorded(monkeypatch):
+    here, few = (SceneHessian(objective(torch.device("cpu"), 2, memory)) for memory in (2**30, 1))
+    views = here.objective.linearized
+    assert (views.kept, few.objective.linearized.kept) == (2, 1)
     assert not here.recordable(1)
-    for made in (here, few):
-        vars(made)["active"] = SimpleNamespace(flat=SimpleNamespace(device=torch.device("cuda")))
+    for hessian in (here, few):
+        vars(hessian.objective)["active"] = SimpleNamespace(flat=SimpleNamespace(device=torch.device("cuda")))
     assert here.recordable(1) and not few.recordable(1)
-    monkeypatch.setattr("splat.curvature.objective.RECORDED", here._kept[0].workspace(8))
+    monkeypatch.setattr("splat.curvature.hessian.MOST_RECORDED", views.workspace(8))
     assert here.recordable(8) and here.recordable(9)  # nine take the memory of eight
-    monkeypatch.setattr("splat.curvature.objective.RECORDED", here._kept[0].workspace(8) - 1)
+    monkeypatch.setattr("splat.curvature.hessian.MOST_RECORDED", views.workspace(8) - 1)
     assert here.recordable(7) and not here.recordable(8)

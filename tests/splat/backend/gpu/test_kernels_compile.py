@@ -3,7 +3,7 @@
 from tests.splat.ahead_of_time import compile_kernel, run_as_script
 
 LONG, INTEGERS = ("index",), ("n", "m", "K", "height", "width", "start", "count", "v_stride", "out_stride", "steps")
-DOUBLES = ("lens", "splats", "bar", "cotangents", "opacity_bar", "distances", "losses")
+DOUBLES = ("lens", "splats", "bar", "distances", "losses")
 
 
 def types(kernel, double: tuple[str, ...] = ()) -> dict[str, str]:
@@ -24,16 +24,17 @@ def kernels() -> list[tuple]:
     few, lanes, wide = {"BLOCK": 128}, {"BLOCK": 8}, {"BLOCK": 16, "VECTORS": 8}
     bands, ssim, pixels = {"BANDS": 4}, {"KIND": 1, "SSIM": True}, {"BLOCK": 256}
     both = {"SLOPES": True, "SECOND": True}
-    found = [
+    return [
         (projection.project_splats, (), few | bands),
         (projection.project_adjoint, (), few | bands),
         (projection.linearize_geometry, (), lanes),
         (projection.linearize_colour, (), lanes | bands),
-        (projection.plain_jacobian, ("out",), few),
-        (projection.push_forward, ("out",), wide | bands),
+        (projection.convert, ("out",), few | {"WAY": 3}),
+        (projection.push_forward, (), wide | bands),
         (projection.pull_back, (), wide | bands | {"SECOND_ORDER": True}),
         (losses.blur_along, (), pixels),
-        (losses.feed, (), pixels),
+        (losses.feed, (), pixels | {"FIELDS": 3}),
+        (losses.feed, (), pixels | {"FIELDS": 2}),
         (losses.moments_along, (), pixels),
         (losses.moments_down, (), pixels),
         (losses.differentiate, (), pixels | both),
@@ -42,17 +43,11 @@ def kernels() -> list[tuple]:
         (losses.finish_product, (), pixels | ssim),
         (losses.forms, ("full", "pixelwise"), pixels | ssim),
         (losses.finish_diagonal, (), pixels | ssim),
-        (losses.feed_pair, (), pixels),
         (losses.differentiate_pair, (), pixels),
         (losses.finish_pair, (), pixels | ssim),
         (adam._step, ("numbers",), {"BLOCK": 1024, "BETA1": 0.9, "BETA2": 0.999, "EPS": 1e-15, "GRID": 1e-28}),
         (peak.multiply_add, (), {"BLOCK": peak.BLOCK, "UNROLLED": peak.UNROLLED}),
     ]
-    return [(kernel, double, constants | _formulas(kernel)) for kernel, double, constants in found]
-
-
-def _formulas(kernel) -> dict[str, str]:
-    return {"FORMULAS": "x"} if "FORMULAS" in kernel.arg_names else {}
 
 
 def test_every_kernel_of_projection_and_losses_compiles():

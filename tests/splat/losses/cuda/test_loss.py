@@ -22,7 +22,7 @@ each_case = pytest.mark.parametrize(("size", "settings", "dtype"), CASES)
 
 
 @each_case
-def test_kernels_on_the_gpu_give_the_specifications_value_gradient_and_products(size, settings, dtype, device):
+def test_value_gradient_and_products_on_the_gpu_are_the_specifications(size, settings, dtype, device):
     expected = truth(size, settings)
     loss, image = CudaViewLoss(expected.target.to(device), settings, dtype), expected.image.to(device, dtype)
     held = loss.linearize(image)

@@ -73,15 +73,14 @@ def test_tile_lists_hold_every_active_row_and_hardly_any_other(name, dtype):
 def test_tiles_are_handed_out_once_each():
     raster = truth("typical").raster(DTYPES[0])
     assert sorted(raster.lists.order) == list(range(raster.lists.start.size - 1))
-    _ = raster.slot_start
-    assert sorted(raster.lists.order) == list(range(raster.lists.start.size - 1))
+    assert sorted(raster.reached[0].order) == list(range(raster.lists.start.size - 1))
 
 
 def test_entries_that_no_pixel_reaches_are_dropped_and_the_others_numbered_splat_by_splat():
     raster = truth("walled").raster(DTYPES[0])
     before, columns = raster.lists, raster.frame.columns
     stops = raster.pixels.stop.reshape(-1, TILE_ROWS, columns, lanes_of(np.float32)).max(axis=(1, 3)).reshape(-1)
-    start, after = raster.slot_start, raster.lists
+    after, start = raster.reached
     assert after.splat.size < before.splat.size
     for tile, stop in enumerate(stops):
         all_of_it = slice(before.start[tile], before.start[tile + 1])
@@ -89,5 +88,5 @@ def test_entries_that_no_pixel_reaches_are_dropped_and_the_others_numbered_splat
         reached = int(min(stop, all_of_it.stop - all_of_it.start))
         assert after.splat[kept].tolist() == before.splat[all_of_it][:reached].tolist()
         assert after.rows[kept].tolist() == before.rows[all_of_it][:reached].tolist()
-    assert sorted(after.slots) == list(range(after.splat.size)) and start[-1] == after.splat.size
-    assert ((start[after.splat] <= after.slots) & (after.slots < start[after.splat + 1])).all()
+    assert sorted(after.accumulator) == list(range(after.splat.size)) and start[-1] == after.splat.size
+    assert ((start[after.splat] <= after.accumulator) & (after.accumulator < start[after.splat + 1])).all()

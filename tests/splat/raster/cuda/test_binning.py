@@ -6,7 +6,7 @@ import torch
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip install -e '.[gpu]'")
 
-from splat.raster.cuda.binning import HEIGHT, WIDTH, bin_splats, number_slots, repeated, starts
+from splat.raster.cuda.binning import HEIGHT, WIDTH, bin_splats, number_accumulators, repeated, starts
 from tests.splat.raster.compositing_cases import CASES, truth
 from tests.splat.raster.cpu.test_binning import active_pixels
 
@@ -37,19 +37,19 @@ def test_tile_lists_hold_the_tiles_that_a_splat_is_drawn_in_and_hardly_any_other
         assert keys == sorted(keys) and (lists.tile[entries] == tile).all()
 
 
-def test_the_entries_that_are_reached_are_numbered_splat_by_splat(device):
+def test_the_intersections_that_are_reached_are_numbered_splat_by_splat(device):
     lists = lists_of("opaque", device)
     per_tile = lists.start.diff()
     reached = per_tile - per_tile // 3
-    slots = number_slots(lists, reached)
+    found = number_accumulators(lists, reached)
     kept = torch.cat([torch.arange(int(a), int(a + r)) for a, r in zip(lists.start[:-1], reached, strict=True)])
-    slot, splat = slots.slot.cpu()[kept], lists.splat.cpu().long()[kept]
-    assert len(kept) < len(lists.splat) and sorted(slot.tolist()) == list(range(len(kept)))
-    assert ((slots.first.cpu()[splat] <= slot) & (slot < slots.last.cpu()[splat])).all()
-    assert (slots.last - slots.first).sum() == len(kept)
+    place, splat = found.place.cpu()[kept], lists.splat.cpu().long()[kept]
+    assert len(kept) < len(lists.splat) and sorted(place.tolist()) == list(range(len(kept)))
+    assert ((found.first.cpu()[splat] <= place) & (place < found.last.cpu()[splat])).all()
+    assert (found.last - found.first).sum() == len(kept)
 
 
-def test_more_entries_than_32_bits_number_are_refused():
+def test_more_intersections_than_32_bits_number_are_refused():
     count = torch.tensor([2**30, 2**30], dtype=torch.int32)
     with pytest.raises(ValueError, match=r"fewer than 2\^31 tiles.*got 2147483648"):
         repeated(count, starts(count))

@@ -10,13 +10,14 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="the kernels for GPUs need triton; pip install -e '.[gpu]'")
 
-from splat.model.settings import RenderSettings, Sums
+from splat.model.settings import Accumulation, RenderSettings
+from splat.projection.dispatch import plain_gradient
 from splat.projection.reference import Splats
-from splat.raster.cuda.packing import SUMS
-from splat.raster.cuda.raster import TOGETHER, CudaRaster, sum_slots
+from splat.raster.cuda.raster import TOGETHER, CudaRaster, reduce_sums
+from splat.raster.formulas import SPLAT
 from splat.render import autograd as functions
-from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, NUMPY, relative_error
-from tests.splat.raster.compositing_cases import BACKGROUND, BLOCKS, CASES, TINY, truth
+from tests.splat.random_scenes import DERIVATIVE, DTYPES, IMAGE, relative_error
+from tests.splat.raster.compositing_cases import BACKGROUND, BLOCKS, CASES, TINY, plain_jvp, plain_product, truth
 
 ALL = torch.cuda.is_available() or "LANDSCAPE_ALL_CASES" in os.environ  # ten minutes without a GPU
 each_case = pytest.mark.parametrize("name", [*CASES, *TINY] if ALL else TINY)
@@ -38,22 +39,26 @@ class Results:
     curvature: Tensor
 
 
-def raster_of(name: str, dtype: torch.dtype, device: torch.device, sums: Sums = "ordered") -> CudaRaster:
+def raster_of(
+    name: str, dtype: torch.dtype, device: torch.device, accumulation: Accumulation = "deterministic"
+) -> CudaRaster:
     expected = truth(name)
     splats, depths = expected.splats.to(device), expected.depths.to(device, dtype)
-    settings = replace(expected.case.settings, sums=sums)
+    settings = replace(expected.case.settings, accumulation=accumulation)
     drawn, background = expected.drawn.to(device), BACKGROUND.to(device)
     return CudaRaster(splats, depths, drawn, background, *expected.case.size, settings)
 
 
 @cache
-def results(name: str, dtype: torch.dtype, device: torch.device, sums: Sums = "ordered") -> Results:
+def results(
+    name: str, dtype: torch.dtype, device: torch.device, accumulation: Accumulation = "deterministic"
+) -> Results:
     expected, K = truth(name), vectors(name)
-    raster = raster_of(name, dtype, device, sums)
+    raster = raster_of(name, dtype, device, accumulation)
     adjoint = raster.backward(expected.G.to(device))
-    tangent = raster.jvp(expected.U[:, :K].to(device))
-    product = tangent.curvature(adjoint, expected.dG[:K].to(device))
-    return Results(raster, adjoint.gradient, tangent.planes, product)
+    tangent = plain_jvp(raster, expected.U[:, :K].to(device))
+    product = plain_product(raster, tangent, adjoint, expected.dG[:K].to(device))
+    return Results(raster, plain_gradient(raster.splats, adjoint.moments), tangent.planes, product)
 
 
 def errors(got: Tensor, expected: Tensor) -> dict[str, float]:
@@ -89,9 +94,9 @@ def test_tangents_and_curvature_are_those_of_the_specification(name, dtype, devi
     assert errors(got.curvature, expected.curvature[:, :K]) == at_most(DERIVATIVE[dtype])
 
 
-def test_the_cases_stop_pixels_leave_entries_unreached_and_reach_the_cap(device):
+def test_the_cases_stop_pixels_leave_intersections_unreached_and_reach_the_cap(device):
     walled = results("tiny walled", torch.float64, device).raster
-    assert walled.entries_reached < walled.entries
+    assert walled.intersections_reached < walled.intersections
     for name in ("tiny capped", "tiny through the cap"):
         mx, my, a, b, c, opacity = truth(name).splats[:, :6].T[:, :, None, None]
         width, height = truth(name).case.size
@@ -103,8 +108,8 @@ def test_the_cases_stop_pixels_leave_entries_unreached_and_reach_the_cap(device)
 
 
 @pytest.mark.parametrize("name", [*CASES, *TINY] if ALL else ["tiny equal depths"])
-def test_atomic_sums_differ_from_slots_by_round_off(name, device):
-    one, other = results(name, torch.float64, device), results(name, torch.float64, device, sums="atomic")
+def test_atomic_accumulation_differs_from_deterministic_by_round_off(name, device):
+    one, other = results(name, torch.float64, device), results(name, torch.float64, device, accumulation="atomic")
     assert torch.equal(one.raster.planes, other.raster.planes) and torch.equal(one.jvp, other.jvp)
     assert relative_error(one.gradient, other.gradient) < 1e-14
     assert relative_error(one.curvature, other.curvature) < 1e-13
@@ -122,10 +127,24 @@ def test_own_blocks_are_those_of_the_cpu(dtype, device):
     cpu, index = expected.raster(dtype), torch.arange(expected.case.n)
     h = torch.rand(3, got.height, got.width, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for gauss_newton in (False, True) if dtype == torch.float64 else (False,):
-        adjoint = cpu.backward(cpu.pad(expected.G.numpy()))
-        want = cpu.gaussian_blocks(adjoint, cpu.pad(h.numpy().astype(NUMPY[dtype])), index.numpy(), gauss_newton)
+        adjoint = cpu.backward(cpu.pad(expected.G))
+        want = cpu.gaussian_blocks(adjoint, cpu.pad(h), index, gauss_newton)
         blocks = got.gaussian_blocks(got.backward(expected.G.to(device)), h.to(device), index.to(device), gauss_newton)
         assert relative_error(blocks, want) < DERIVATIVE[dtype]
+
+
+def test_a_splat_that_passes_to_the_next_tile_changes_the_draw_order(device):
+    splats = torch.tensor([[8.0, 8.0, 9.0, 0.0, 9.0, 0.9, 1, 1, 1]] * 3, dtype=torch.float64)
+    splats[:, 0] = torch.tensor([8.0, 15.0, 24.0])
+    moved = splats.clone()
+    moved[1, 0] = 17.0  # from the end of one tile's list to the start of the next one's
+    depths, drawn = torch.tensor([1.0, 2.0, 3.0], device=device), torch.ones(3, dtype=torch.bool, device=device)
+    one, same, other = (
+        CudaRaster(each.to(device), depths, drawn, torch.zeros(3, device=device), 32, 16, RenderSettings())
+        for each in (splats, splats, moved)
+    )
+    assert one.lists.splat.tolist() == other.lists.splat.tolist() == [0, 1, 2]
+    assert one.draw_order == same.draw_order != other.draw_order
 
 
 @each_dtype
@@ -137,18 +156,18 @@ def test_nothing_drawn_is_the_background_and_has_no_derivative(dtype, device):
         raster = CudaRaster(splats[:n], depths[:n], drawn, background, 7, 5, RenderSettings())
         assert (raster.planes[:3] == background[:, None, None]).all() and (raster.planes[3] == 0).all()
         adjoint, tangent = raster.backward(raster.planes), raster.jvp(torch.ones(n, 2, 9, device=device))
-        product = tangent.curvature(adjoint, torch.zeros_like(tangent.planes))
-        assert not adjoint.gradient.any() and not tangent.planes.any() and not product.any()
-        assert (
-            adjoint.gradient.shape == (n, 9)
-            and product.shape == (n, 2, 9)
-            and raster.entries == len(raster.touched) == 0
-        )
+        product = tangent.backward_tangent(adjoint, torch.zeros_like(tangent.planes))
+        assert not adjoint.moments.any() and not tangent.planes.any() and not product.any()
+        assert adjoint.moments.shape == (n, 9) and product.shape == (n, 2, 9)
+        assert raster.intersections == len(raster.touched) == 0
 
 
 def test_tiles_with_a_cotangent_of_zero_add_nothing(device):
     expected, raster = truth("tiny equal depths"), raster_of("tiny equal depths", torch.float64, device)
-    tangent, whole = raster.jvp(expected.U[:, :1].to(device)), results("tiny equal depths", torch.float64, device)
+    tangent, whole = (
+        plain_jvp(raster, expected.U[:, :1].to(device)),
+        results("tiny equal depths", torch.float64, device),
+    )
     lit = torch.zeros(raster.height, raster.width, device=device, dtype=torch.float64)
     lit[:, :16] = 1  # the first of two tiles
     gradients, products = [], []
@@ -156,8 +175,8 @@ def test_tiles_with_a_cotangent_of_zero_add_nothing(device):
         adjoint = raster.backward(part * expected.G.to(device))
         curvature = (1 - part).expand(3, -1, -1)
         assert (raster.dark_tiles(adjoint, 0 * curvature), raster.dark_tiles(adjoint, curvature)) == (1, 0)
-        gradients.append(adjoint.gradient)
-        products.append(tangent.curvature(adjoint, part * expected.dG[:1].to(device)))
+        gradients.append(plain_gradient(raster.splats, adjoint.moments))
+        products.append(plain_product(raster, tangent, adjoint, part * expected.dG[:1].to(device)))
     assert min(gradient.abs().max() for gradient in gradients) > 0
     assert relative_error(gradients[0] + gradients[1], whole.gradient) < 1e-13
     assert relative_error(products[0] + products[1], whole.curvature[:, :1]) < 1e-13
@@ -173,8 +192,8 @@ def test_tiles_in_which_no_splat_is_moved_are_left_out(device):
     adjoint = raster.backward(expected.G.to(device))
 
     def products(U: Tensor, dG: Tensor) -> tuple[Tensor, Tensor]:
-        tangent = raster.jvp(U)
-        return tangent.planes, tangent.curvature(adjoint, dG)
+        tangent = plain_jvp(raster, U)
+        return tangent.planes, plain_product(raster, tangent, adjoint, dG)
 
     part, rest = products(moved * U, dG), products((1 - moved) * U, 0 * dG)
     whole = results("tiny equal depths", torch.float64, device)
@@ -190,23 +209,23 @@ def test_a_cotangent_that_is_not_a_number_is_not_taken_for_zero(device):
     raster = raster_of("tiny smooth", torch.float64, device)
     cotangent = torch.zeros_like(raster.planes)
     cotangent[1, raster.planes[3].argmax() // raster.width, raster.planes[3].argmax() % raster.width] = torch.nan
-    assert raster.backward(cotangent).gradient.isnan().any()
+    assert raster.backward(cotangent).moments.isnan().any()
 
 
-def test_the_splats_with_entries_are_those_with_slots(device):
+def test_the_touched_splats_are_those_with_accumulators(device):
     raster = results("tiny walled", torch.float64, device).raster
-    slots = raster.slots
-    assert raster.touched.tolist() == (slots.last > slots.first).nonzero()[:, 0].tolist()
+    found = raster.accumulators
+    assert raster.touched.tolist() == (found.last > found.first).nonzero()[:, 0].tolist()
     assert 0 < len(raster.touched) < len(raster.splats)
     assert raster.bytes > raster.params.nbytes
 
 
-def test_slots_are_summed_however_many_a_splat_has(device):
-    numbers, K, width = torch.tensor([0, 1, 40, 16, 0, 3]), 2, SUMS
+def test_accumulators_are_summed_however_many_a_splat_has(device):
+    numbers, K, width = torch.tensor([0, 1, 40, 16, 0, 3]), 2, SPLAT
     last = numbers.cumsum(0)
     sums = torch.randn(int(last[-1]), K, width, generator=torch.Generator().manual_seed(0))
     totals = torch.full((len(numbers), K, width), torch.nan, dtype=torch.float64, device=device)
-    sum_slots((last - numbers).to(device), last.to(device), sums.to(device), totals)
+    reduce_sums((last - numbers).to(device), last.to(device), sums.to(device), totals)
     expected = torch.stack([part.double().sum(0) for part in sums.split(numbers.tolist())])
     assert torch.allclose(totals.cpu(), expected, rtol=0, atol=1e-14)
 

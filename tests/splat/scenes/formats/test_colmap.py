@@ -60,7 +60,7 @@ def test_a_track_that_meets_an_image_twice_counts_it_once(tmp_path: Path) -> Non
     assert scene.points.sightings(scene.frames)[last] == 1
 
 
-def test_images_without_a_pose_are_left_out_and_a_model_without_poses_is_refused(tmp_path: Path) -> None:
+def test_images_without_pose_are_left_out_and_models_without_any_refused(tmp_path: Path) -> None:
     model = folders.reconstruction()
     model.deregister_frame(3)
     folders.write_colmap(tmp_path / "two", model=model)
@@ -112,9 +112,7 @@ def test_a_colmap_model_cut_short_inside_is_refused(tmp_path: Path, name: str) -
 
 
 @pytest.mark.parametrize(("name", "place"), [("images", 8 + 64 + len("a.png") + 1), ("points3D", 8 + 43)])
-def test_a_list_longer_than_its_file_is_refused_before_colmap_reads_on_behind_the_end(
-    tmp_path: Path, name: str, place: int
-) -> None:
+def test_a_list_longer_than_its_file_is_refused_before_colmap_reads_it(tmp_path: Path, name: str, place: int) -> None:
     folders.write_colmap(tmp_path)
     path = tmp_path / f"sparse/0/{name}.bin"
     content = bytearray(path.read_bytes())
@@ -163,7 +161,7 @@ def test_the_points_of_fern_fall_where_colmap_projects_and_observes_them(fern: P
     assert np.concatenate(errors).mean() < 1.5
 
 
-def test_the_points_of_fern_have_the_colour_of_the_photographs_there_and_not_half_a_pixel_away(fern: Path) -> None:
+def test_points_of_fern_have_the_photographs_colour_at_their_pixels(fern: Path) -> None:
     scene = load_scene(fern)
     points = scene.points
     assert points is not None and points.observations is not None

@@ -63,9 +63,7 @@ def in_left_half(scene: Scene, number: int) -> bool:
 
 
 @pytest.mark.parametrize(("scan", "views"), [("scan8", 49), ("scan40", 64)])
-def test_dtu_in_its_own_folders_has_the_cameras_of_its_matrices_and_its_masks(
-    tmp_path: Path, scan: str, views: int
-) -> None:
+def test_dtu_in_its_own_folders_has_its_cameras_and_masks(tmp_path: Path, scan: str, views: int) -> None:
     scene = load_scene(write_dtu(tmp_path, scan, views))
     assert scene.kind == "dtu" and len(scene.frames) == views and scene.frames[1].name == name(1)
     for i, frame in enumerate(scene.frames):
@@ -101,14 +99,14 @@ def test_more_views_than_the_protocol_of_dtu_has_or_none_are_refused(n: int) -> 
         dtu_split([name(i) for i in range(49)], n)
 
 
-def test_a_scan_without_a_training_view_is_refused_and_without_a_test_view_is_not() -> None:
+def test_a_scan_may_lack_test_views_but_no_training_view() -> None:
     names = [name(i) for i in range(49) if i not in (22, 2)]
     with pytest.raises(ValueError, match=r"without view 22 \(rect_023\)"):
         dtu_split(names, 3)
     assert dtu_split([*names, name(22)], 3).test == tuple(map(name, (1, *TEST[2:])))
 
 
-def test_a_colmap_model_of_dtus_images_follows_its_protocol_with_masks_from_anywhere(tmp_path: Path) -> None:
+def test_a_colmap_model_of_dtus_images_follows_dtus_protocol(tmp_path: Path) -> None:
     write_dtu(tmp_path)
     images = dict(zip(folders.NAMES, map(name, (28, 22, 25))))
     model = folders.reconstruction()
@@ -125,7 +123,7 @@ def test_a_colmap_model_of_dtus_images_follows_its_protocol_with_masks_from_anyw
     assert masks[0] is not None and torch.equal(masks[0], torch.eye(18, 24) > 0)
 
 
-def test_images_of_dtu_without_its_calibration_are_refused_with_where_it_belongs(tmp_path: Path) -> None:
+def test_a_missing_calibration_of_dtu_is_refused_with_its_place(tmp_path: Path) -> None:
     scene = write_dtu(tmp_path)
     path = tmp_path / "Calibration/cal18/pos_003.txt"
     path.write_text("1 2 3")

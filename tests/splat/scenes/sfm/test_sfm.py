@@ -130,7 +130,7 @@ def test_folders_that_cannot_be_photographs_are_refused(tmp_path: Path) -> None:
             scene_from_photos(tmp_path / "few", tmp_path / "scene")
         write_blank(tmp_path / "few", [name])
     (tmp_path / "scene").mkdir()
-    with pytest.raises(FileExistsError, match="remove it or choose another --out"):
+    with pytest.raises(FileExistsError, match="remove it or choose another"):
         scene_from_photos(tmp_path / "few", tmp_path / "scene")
     assert not list((tmp_path / "scene").iterdir())
 

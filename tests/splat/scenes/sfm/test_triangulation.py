@@ -36,9 +36,7 @@ def test_triangulated_points_lie_on_the_surface(points: Points) -> None:
     assert float((distance < depth_error).double().mean()) > 0.9
 
 
-def test_triangulated_points_are_seen_where_they_fall_in_the_colour_that_is_there(
-    points: Points, views: list[View]
-) -> None:
+def test_triangulated_points_have_the_colour_of_their_pixels(points: Points, views: list[View]) -> None:
     assert points.names == tuple(view.name for view in views) and points.observations is not None
     assert set(points.sightings(views).tolist()) == {2, 3}  # two views are enough for a point
     for i, view in enumerate(views):

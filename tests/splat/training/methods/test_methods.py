@@ -10,17 +10,17 @@ from splat.scenes.view import View
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.loop import train
 from splat.training.methods.corgs import CoRGS
-from splat.training.methods.dngaussian import DNGaussian
-from splat.training.methods.dropgaussian import DropGaussian
-from splat.training.methods.dropoutgs import DropoutGS
-from splat.training.methods.fsgs import FSGS
+from splat.training.methods.depth.dngaussian import DNGaussian
+from splat.training.methods.depth.fsgs import FSGS
+from splat.training.methods.dropout.dropgaussian import DropGaussian
+from splat.training.methods.dropout.dropoutgs import DropoutGS
 from splat.training.methods.methods import METHODS, ThreeDGS
 from splat.training.methods.sam import SAM
 from splat.training.methods.stablegs.stablegs import StableGS
-from splat.training.state import Method, Training
+from splat.training.state import MethodSettings, Training
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
-SHORT: dict[str, Method] = {
+SHORT: dict[str, MethodSettings] = {
     "3dgs": ThreeDGS(),
     "stablegs": StableGS(warm_up=3, every=4),
     "sam": SAM(),
@@ -50,7 +50,7 @@ def test_every_method_is_known_by_its_name():
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_training_by_any_method_continues_from_a_checkpoint_to_the_same_bits(tmp_path, name):
+def test_any_method_continues_from_a_checkpoint_to_the_same_bits(tmp_path, name):
     path, config = tmp_path / "checkpoint.pt", replace(tiny_config(), method=SHORT[name])
     whole = Training.start(tiny_gaussians(), EXTENT, config)
     kept = {}
@@ -83,11 +83,11 @@ NO_WHOLE_NUMBERS = ["many", -1, 2.5, None, 10**400, torch.zeros(3)]
 @pytest.mark.parametrize(
     ("name", "place", "values", "words"),
     [
-        ("stablegs", ("history", 0, "step"), NO_WHOLE_NUMBERS, "row of the history with plain values, its step"),
-        ("stablegs", ("history", 0, "count"), NO_WHOLE_NUMBERS, "row of the history with plain values, its step"),
-        ("cor-gs", ("history", 0, "pruned"), [-1, 10**400, None], "row of the history with plain values, its step"),
-        ("cor-gs", ("history", 0), [{}, [], "row"], "row of the history with plain values, its step"),
-        ("cor-gs", ("history",), [{}, 3, "rows"], "expected the history as a list of rows"),
+        ("stablegs", ("history", 0, "step"), NO_WHOLE_NUMBERS, "'history"),
+        ("stablegs", ("history", 0, "count"), NO_WHOLE_NUMBERS, "'history"),
+        ("cor-gs", ("history", 0, "pruned"), [-1, 10**400, None], "'history.* expected"),
+        ("cor-gs", ("history", 0), [{}, [], "row"], "expected a step|expected object"),
+        ("cor-gs", ("history",), [{}, 3, "rows"], "'history': expected array"),
         ("cor-gs", ("partner", "step"), NO_WHOLE_NUMBERS, "step"),
         ("cor-gs", ("partner", "adam", "updates"), NO_WHOLE_NUMBERS, "updates"),
         ("cor-gs", ("partner", "config", "iterations"), NO_WHOLE_NUMBERS, "iteration"),
@@ -98,7 +98,7 @@ NO_WHOLE_NUMBERS = ["many", -1, 2.5, None, 10**400, torch.zeros(3)]
             ["much", -1, None, 10**400, float("nan")],
             "magnitude|finite tau and",
         ),
-        ("stablegs", ("normals",), [{}, 3, [2], [torch.zeros(3)]], "vectors of two numbers"),
+        ("stablegs", ("normals",), [{}, 3, [2], [torch.zeros(3)]], "'normals.* expected"),
     ],
 )
 def test_what_no_method_can_have_saved_is_refused_in_a_sentence(tmp_path, saved, name, place, values, words):
@@ -124,7 +124,7 @@ def test_normals_of_other_views_are_refused_before_the_first_step(tmp_path, save
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(saved["stablegs"])
     training = load_checkpoint(path).training
-    training.regularizer.restore(training.regularizer.state() | {"normals": [torch.zeros(2)]})
+    training.method.restore(training.method.state() | {"normals": [torch.zeros(2)]})
     with pytest.raises(ValueError, match="normal for each of 3 training views, found 1"):
         next(train(training, views()))
 

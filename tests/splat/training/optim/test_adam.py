@@ -7,7 +7,7 @@ from splat.training.state import LearningRates, learning_rates
 from tests.splat.tiny import tiny_gaussians
 
 
-def test_one_adam_over_the_flat_vector_is_torch_adam_with_a_rate_per_attribute_and_band():
+def test_one_flat_adam_is_torch_adam_with_a_rate_per_attribute_and_band():
     gaussians = tiny_gaussians(sh_degree=2, dtype=torch.float64)
     rates = LearningRates()
     attributes = {name: value.clone() for name, value in gaussians.attributes.items()}
@@ -68,7 +68,7 @@ def test_forgetting_an_attribute_leaves_the_others():
     assert adam.first.means.all() and adam.second.sh.all()
 
 
-def test_moments_of_gaussians_no_longer_seen_never_become_subnormal_numbers():
+def test_moments_of_unseen_gaussians_never_become_subnormal_numbers():
     gaussians = tiny_gaussians(n=3)
     adam = Adam.zero(gaussians)
     zero, rates = torch.zeros_like(gaussians.flat), torch.zeros_like(gaussians.flat)

@@ -40,7 +40,7 @@ def masked_view() -> View:
     return replace(view, mask=mask)
 
 
-def test_inside_a_mask_psnr_is_that_of_its_pixels_and_ssim_that_of_images_white_outside():
+def test_inside_a_mask_psnr_is_of_its_pixels_and_ssim_of_white_outside():
     view, image = masked_view(), torch.rand(3, 14, 20, generator=torch.Generator().manual_seed(2)) * 1.4 - 0.2
     assert view.mask is not None
     errors = [

@@ -92,7 +92,7 @@ def test_rho_is_c_over_the_root_of_the_mean_curvature():
         assert magnitude.trace == TRACES[name] and not magnitude.capped and not magnitude.negative
 
 
-def test_the_papers_dimension_makes_rho_smaller_by_the_root_of_the_number_of_gaussians():
+def test_the_papers_dimension_makes_rho_smaller_by_the_root_of_n():
     wide = ProbeSettings(caps=UNCAPPED, eps=1e-300, dimension="active")
     ours = magnitudes(TRACES, 100, 2, EXTENT, wide)
     papers = magnitudes(TRACES, 100, 2, EXTENT, replace(wide, dimension="attribute"))
@@ -119,7 +119,7 @@ def test_the_position_probe_scales_with_the_world():
         assert there.rho == pytest.approx(u * here.rho, rel=1e-12)
 
 
-def test_attributes_left_out_or_without_a_weight_have_no_magnitude_and_need_no_trace():
+def test_attributes_left_out_or_without_a_weight_need_no_trace():
     settings = ProbeSettings(attributes=("quats", "sh"), c=Constants(sh=0))
     assert settings.on == ("quats",)
     assert list(magnitudes({"quats": 1.0}, 6, 1, EXTENT, settings)) == ["quats"]
@@ -168,7 +168,7 @@ def test_quaternions_turn_by_the_exponential_map_of_rotations():
     )
 
 
-def test_the_product_of_quaternions_is_hamiltons_and_turns_in_the_gaussians_own_frame():
+def test_the_product_of_quaternions_is_hamiltons_in_the_gaussians_frame():
     p, q = random_like((50, 4), 0), random_like((50, 4), 1)
     product = hamilton(p, q)
     # entries up to 20
@@ -177,7 +177,7 @@ def test_the_product_of_quaternions_is_hamiltons_and_turns_in_the_gaussians_own_
     assert torch.allclose(rotation_matrices(product), both, rtol=0, atol=ROUND_OFF)
 
 
-def test_quaternions_are_turned_about_the_gaussians_axes_and_keep_their_length():
+def test_quaternions_turn_about_the_gaussians_axes_and_keep_their_length():
     gaussians, gradient = scene()
     moved = probe(gaussians, gradient)
     omega = kornia.geometry.quaternion_to_axis_angle(moved.turns)
@@ -217,7 +217,7 @@ def _pinhole() -> tuple[tuple[float, float, float, float], tuple[float, float]]:
     return (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), clamp
 
 
-def test_random_probes_are_normal_with_the_standard_deviation_of_their_band():
+def test_random_probes_are_normal_with_the_deviation_of_their_band():
     """Kolmogorov and Smirnov's test at a level of 1e-3 for each of 5 samples; seeds are fixed."""
     gaussians, gradient = scene(2000, sh_degree=2)
     moved = probe(gaussians, gradient)
@@ -260,7 +260,7 @@ def test_opacities_step_uphill_by_rho_and_stay_where_the_gradient_is_zero():
     assert g[5:].all() and not step[:5].any()
 
 
-def test_what_the_sampled_view_does_not_show_keeps_its_place_turn_and_opacity_alone():
+def test_what_the_view_does_not_show_keeps_its_place_turn_and_opacity():
     gaussians, gradient = scene()
     moved = probe(gaussians, gradient)
     unseen = moved.gaussians.select(torch.arange(5))
@@ -280,7 +280,7 @@ def test_an_axis_alone_is_probed_as_among_all_and_leaves_the_others(name):
     assert not torch.equal(alone.attributes[name], gaussians.attributes[name])
 
 
-def test_same_seed_same_step_and_the_generator_goes_on_alike_whatever_is_probed():
+def test_the_generator_goes_on_alike_whatever_is_probed():
     gaussians, gradient = scene()
     assert torch.equal(
         step_of(probe(gaussians, gradient, seed=1), gaussians).flat,
@@ -298,7 +298,7 @@ def test_same_seed_same_step_and_the_generator_goes_on_alike_whatever_is_probed(
     assert torch.equal(*after)
 
 
-def test_the_gradient_is_pulled_back_as_autograd_does_through_the_probed_copy():
+def test_the_gradient_is_pulled_back_as_autograd_does():
     gaussians, gradient = scene()
     moved, weights = probe(gaussians, gradient), random_like(gaussians.flat.shape, 2)
     flat = gaussians.flat.clone().requires_grad_()
@@ -329,21 +329,7 @@ def test_single_precision_in_single_precision_out():
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (lambda: ProbeSettings(attributes=("means", "means")), "each once"),
-        (
-            lambda: ProbeSettings(attributes=("colour",)),  # pyright: ignore
-            "expected attributes among",
-        ),
-        (
-            lambda: ProbeSettings(dimension="all"),  # pyright: ignore
-            "'active' or 'attribute'",
-        ),
-        (lambda: ProbeSettings(eps=0.0), "eps above 0"),
-        (lambda: ProbeSettings(gamma=1.1), r"gamma in \[0, 1\]"),
-        (lambda: ProbeSettings(kappa_full=0.0), "kappa_full above 0"),
-        (lambda: Constants(means=-1.0), "constants of at least 0"),
-        (lambda: Caps(quats=0.0), "caps above 0"),
-        (lambda: Caps(quats=nan), "caps above 0"),
+        (lambda: ProbeSettings(attributes=("means", "means")), "each of the attributes once"),
         (lambda: magnitudes(TRACES, 0, 1, EXTENT), "at least 1 active"),
         (lambda: magnitudes(TRACES, 1, 1, inf), "finite extent"),
         (lambda: magnitudes({**TRACES, "sh": nan}, 1, 1, EXTENT), "finite trace of sh, got nan"),

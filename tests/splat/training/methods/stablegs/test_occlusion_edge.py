@@ -36,7 +36,7 @@ def test_the_normal_of_a_depth_step_is_across_it(degrees: float) -> None:
     assert coherence > 1 - 1e-3
 
 
-def test_the_normal_is_the_first_eigenvector_of_the_structure_tensor_of_the_strongest_edges() -> None:
+def test_the_normal_is_the_first_eigenvector_of_the_structure_tensor() -> None:
     depth = 5 + torch.rand(40, 50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     depth[:, 20:] += 3
     gradient = kornia.filters.spatial_gradient(depth[None, None])[0, 0, :, 1:-1, 1:-1].reshape(2, -1).numpy()
@@ -75,7 +75,7 @@ def test_the_mean_depth_counts_and_not_how_much_covers_it() -> None:
     assert given[1] == pytest.approx(expected[1], rel=1e-9)
 
 
-def test_the_outline_against_nothing_is_no_edge_and_faint_pixels_say_nothing() -> None:
+def test_the_outline_against_nothing_and_faint_pixels_are_no_edges() -> None:
     x, y = grid()
     disc = x * x + y * y < 20**2
     alpha = torch.where(disc, 1.0, 0.01 * torch.rand(x.shape, generator=torch.Generator().manual_seed(0)).double())

@@ -1,18 +1,22 @@
 """StableGS on the loop: its gradient against one autograd expression, what it leaves out, and resuming."""
 
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 import pytest
 import torch
 
-from splat.losses.cpu.loss import ViewLoss
+from landscape.errors import InputError
+from splat.curvature.traces import exact_traces
+from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings
 from splat.training.loop import train
+from splat.training.methods import agreement
 from splat.training.methods.stablegs import stablegs
 from splat.training.methods.stablegs.attribute_probe import Caps, Constants, ProbeSettings
 from splat.training.methods.stablegs.stablegs import StableGS
@@ -30,9 +34,9 @@ def first_step(settings: StableGS, **others) -> Step:
     gaussians = tiny_gaussians(sh_degree=1, dtype=torch.float64)
     config = TrainConfig(5, method=settings, **others)
     training = Training.start(gaussians, EXTENT, config)
-    training.regularizer.begin(training, views)
+    training.method.on_start(training, views)
     background = config.background_colour(torch.float64)
-    loss = ViewLoss.of(views[1].image, config.loss, torch.float64)
+    loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
     return Step(settings.warm_up + 1, training, training.gaussians, views, 1, background, loss)
 
 
@@ -41,13 +45,13 @@ def base_of(step: Step):
 
 
 @pytest.mark.parametrize("viewpoints", ["one", "all"])
-def test_the_gradient_is_that_of_the_total_loss_with_the_probes_held_constant(monkeypatch, viewpoints):
+def test_the_gradient_is_that_of_the_total_loss_with_constant_probes(monkeypatch, viewpoints):
     settings = StableGS(warm_up=0, asp_weight=0.7, vsp_weight=0.3, viewpoints=viewpoints, probe=PROBE)
     step, probes, poses = first_step(settings, background=(0.2, 0.4, 0.1)), [], []
     probing, posing = stablegs.probe_attributes, stablegs.composite_pose
     monkeypatch.setattr(stablegs, "probe_attributes", lambda *a: probes.append(probing(*a)) or probes[-1])
     monkeypatch.setattr(stablegs, "composite_pose", lambda *a, **k: poses.append(posing(*a, **k)) or poses[-1])
-    gradient = step.training.regularizer.gradient(step, base_of(step))
+    gradient = step.training.method.gradient(step, base_of(step)).gradient
     assert len(probes) == 1 and len(poses) == {"one": 1, "all": 3}[viewpoints]
 
     flat = step.gaussians.flat.detach().requires_grad_()
@@ -75,7 +79,7 @@ def test_nothing_is_probed_before_the_warm_up_is_over():
         training = Training.start(tiny_gaussians(), EXTENT, config)
         runs[name] = [training.gaussians.flat.clone() for _ in train(training, tiny_views())]
         if name == "stablegs":
-            assert sorted({row["step"] for row in training.regularizer.history}) == [7, 10]
+            assert sorted({row["step"] for row in training.method.history}) == [7, 10]
     same = [torch.equal(*pair) for pair in zip(runs["3dgs"], runs["stablegs"], strict=True)]
     assert same == [True] * 6 + [False] * 6
 
@@ -84,12 +88,12 @@ def test_a_probe_of_no_attribute_weighs_the_photometric_gradient_alone(monkeypat
     def never(*_, **__):
         raise AssertionError("was worked out for nothing")
 
-    for name in ("loss_and_gradient", "exact_traces", "render"):
-        monkeypatch.setattr(stablegs, name, never)
+    for module, name in ((stablegs, "loss_and_gradient"), (stablegs, "exact_traces"), (agreement, "render")):
+        monkeypatch.setattr(module, name, never)
     settings = StableGS(warm_up=0, probe=ProbeSettings(attributes=()), viewpoint=ViewpointSettings(edge_rotation=False))
     step = first_step(settings)
     base = base_of(step)
-    torch.testing.assert_close(step.training.regularizer.gradient(step, base), 2 * base.gradient, rtol=0, atol=0)
+    torch.testing.assert_close(step.training.method.gradient(step, base).gradient, 2 * base.gradient, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -105,13 +109,13 @@ def test_a_loss_of_weight_0_is_not_rendered(monkeypatch, weights, renders):
 
         return call
 
-    for name in calls:
-        monkeypatch.setattr(stablegs, name, counted(name, getattr(stablegs, name)))
+    for module, name in ((stablegs, "loss_and_gradient"), (agreement, "render")):
+        monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
     asp, vsp = weights
     viewpoint = ViewpointSettings(edge_rotation=False)
     step = first_step(StableGS(warm_up=0, asp_weight=asp, vsp_weight=vsp, probe=PROBE, viewpoint=viewpoint))
     base = base_of(step)
-    gradient = step.training.regularizer.gradient(step, base)
+    gradient = step.training.method.gradient(step, base).gradient
     assert tuple(calls.values()) == renders
     assert torch.equal(gradient, base.gradient) == (weights == (0.0, 0.0))
 
@@ -120,12 +124,12 @@ def test_a_viewpoint_that_sees_nothing_adds_nothing(monkeypatch):
     step = first_step(StableGS(warm_up=0, asp_weight=0.0, probe=PROBE))
     away = replace(step.camera, centre=torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64))
     monkeypatch.setattr(stablegs, "composite_pose", lambda *_, **__: away)
-    monkeypatch.setattr(stablegs, "consistency_loss", None)
+    monkeypatch.setattr(agreement, "consistency_loss", None)
     base = base_of(step)
-    assert torch.equal(step.training.regularizer.gradient(step, base), base.gradient)
+    assert torch.equal(step.training.method.gradient(step, base).gradient, base.gradient)
 
 
-def test_a_viewpoint_that_sees_nothing_is_counted_in_the_history_until_the_next_diagnosis(monkeypatch):
+def test_viewpoints_that_see_nothing_are_counted_for_each_diagnosis(monkeypatch):
     config = replace(tiny_config(), method=StableGS(warm_up=3, every=4, probe=PROBE))
     posing = stablegs.composite_pose
 
@@ -137,7 +141,7 @@ def test_a_viewpoint_that_sees_nothing_is_counted_in_the_history_until_the_next_
     training = Training.start(tiny_gaussians(), EXTENT, config)
     for _ in train(training, tiny_views()):
         pass
-    notes = [row for row in training.regularizer.history if "note" in row]
+    notes = [row for row in training.method.history if "note" in row]
     # two of three views, at the steps 4 to 7, 8 to 11, and 12
     note = "probed viewpoints without a Gaussian in sight, until the next diagnosis"
     assert notes == [{"step": step, "note": note, "count": count} for step, count in ((4, 8), (8, 8), (12, 2))]
@@ -148,28 +152,28 @@ def looking_away(gaussians):
     gaussians.means[:, 2] *= -1
 
 
-def test_a_diagnosis_without_a_gaussian_in_sight_keeps_the_magnitudes_and_says_so():
+def test_without_a_gaussian_in_sight_a_diagnosis_keeps_the_magnitudes():
     method = StableGS(warm_up=2, every=2, probe=PROBE)
     config = replace(tiny_config(iterations=8), method=method, densify=DensifySettings(enabled=False))
     training = Training.start(tiny_gaussians(), EXTENT, config)
-    regularizer, kept = training.regularizer, []
-    assert isinstance(regularizer, stablegs.StableRegularizer)
+    method, kept = training.method, []
+    assert isinstance(method, stablegs.StableGSMethod)
     looking_away(training.gaussians)
     for done in train(training, tiny_views()):
-        kept.append(dict(regularizer.magnitudes))
+        kept.append(dict(method.magnitudes))
         if done.step in (4, 6):  # in sight for the steps 5 and 6, with the diagnosis of step 5
             looking_away(training.gaussians)
     assert not any(kept[:4]) and kept[4] and all(magnitudes == kept[4] for magnitudes in kept[4:])
-    found = {row["step"]: row.get("note", "") for row in regularizer.history if "count" not in row}
+    found = {row["step"]: row.get("note", "") for row in method.history if "count" not in row}
     assert found == {step: "" if step == 5 else "no Gaussian in sight: magnitudes kept" for step in (3, 5, 7)}
 
 
 def test_the_history_says_what_was_negative_and_what_was_capped():
     constants = Constants(means=1e-9, opacity_logits=0.0)
     step = first_step(StableGS(warm_up=0, probe=ProbeSettings(c=constants)))
-    regularizer = step.training.regularizer
-    regularizer.gradient(step, base_of(step))
-    rows = {row["attribute"]: row for row in regularizer.history}
+    method = step.training.method
+    method.gradient(step, base_of(step))
+    rows = {row["attribute"]: row for row in method.history}
     assert set(rows) == {"means", "log_scales", "quats", "sh"}
     for row in rows.values():
         assert row["step"] == 1 and row["standard_error"] > 0
@@ -182,8 +186,8 @@ def test_the_papers_samples_and_the_exact_traces_estimate_the_same():
     values = {}
     for traces in ("exact", "paper"):
         step = first_step(StableGS(warm_up=0, traces=traces))
-        step.training.regularizer.gradient(step, base_of(step))
-        values[traces] = {row["attribute"]: row for row in step.training.regularizer.history}
+        step.training.method.gradient(step, base_of(step))
+        values[traces] = {row["attribute"]: row for row in step.training.method.history}
     for name, exact in values["exact"].items():
         paper = values["paper"][name]
         assert paper["trace"] != exact["trace"]
@@ -206,20 +210,94 @@ def test_a_stablegs_run_continues_from_a_checkpoint_to_the_same_bits(tmp_path: P
     for _ in train(resumed, tiny_views()):
         pass
     assert torch.equal(resumed.gaussians.flat, whole.gaussians.flat)
-    assert resumed.regularizer.history == whole.regularizer.history
+    assert resumed.method.history == whole.method.history
+
+
+def rounds(config: TrainConfig) -> list[int]:
+    """The steps that clone, split and prune."""
+    schedule = config.method.density_control(config)
+    return [step for step in range(1, config.iterations + 1) if schedule.densifies(step, config.iterations)]
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("iterations", "met", "made"), [(1000, 7, 8), (2000, 7, 8), (5000, 19, 22), (10_000, 39, 44), (30_000, 119, 134)]
+)
+def test_scaled_to_any_length_probing_meets_densification_as_in_the_paper(iterations, met, made):
+    config = TrainConfig(iterations, method=StableGS())
+    config = config.method.scaled(config)
+    assert isinstance(config.method, StableGS) and config.method.warm_up == iterations // 10
+    assert (sum(step > config.method.warm_up for step in rounds(config)), len(rounds(config))) == (met, made)
+    if iterations == 10_000:
+        assert config == TrainConfig(iterations, method=StableGS())
+
+
+def test_what_is_set_by_hand_is_not_scaled():
+    given = TrainConfig(2000, method=StableGS(warm_up=700), densify=DensifySettings(start=50))
+    scaled = given.method.scaled(given, keep=("warm_up", "densify.start"))
+    assert scaled == replace(given, densify=replace(given.densify, stop=3000, reset_every=600))
+    shortest = TrainConfig(1, method=StableGS())
+    scaled = shortest.method.scaled(shortest)
+    assert scaled.method == StableGS(warm_up=0) and scaled.densify.reset_every == 1
+
+
+def test_densification_can_wait_for_the_end_of_the_warm_up(monkeypatch):
+    config = TrainConfig(10_000, method=StableGS())
+    after = replace(config, method=StableGS(densify_after_warm_up=True))
+    assert rounds(after) == [step for step in rounds(config) if step > 1000]
+    short = replace(tiny_config(), method=StableGS(warm_up=5, every=4, probe=PROBE, densify_after_warm_up=True))
+    training, made = Training.start(tiny_gaussians(), EXTENT, short), []
+    monkeypatch.setattr(training.method, "on_densify", lambda change: made.append(training.step + 1))
+    for _ in train(training, tiny_views()):
+        pass
+    assert made == rounds(short) == [6, 8]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
     [
-        ({"warm_up": -1}, "warm_up >= 0"),
-        ({"every": 0}, "every >= 1"),
-        ({"asp_weight": -1.0}, "weights of at least 0"),
-        ({"vsp_weight": float("nan")}, "weights of at least 0"),
-        ({"traces": "guess"}, "'exact' or 'paper'"),
-        ({"viewpoints": "some"}, "'all' or 'one'"),
+        (StableGS(warm_up=12), r"warm_up = 12"),
+        (StableGS(warm_up=0, asp_weight=0.0, vsp_weight=0.0), "all of it is switched off"),
+        (StableGS(warm_up=0, probe=ProbeSettings(attributes=())), "all of it is switched off"),
     ],
 )
-def test_settings_of_stablegs_that_make_no_sense_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        StableGS(**settings)
+def test_a_training_in_which_it_never_acts_is_refused(settings, words):
+    training = Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=settings))
+    with pytest.raises(InputError, match=rf"got stablegs which never does in 12 steps \({words}\); take more steps"):
+        next(train(training, tiny_views()))
+    assert training.step == 0
+
+
+def test_rho_is_as_accurate_as_was_asked_for():
+    config = TrainConfig(5, method=StableGS(warm_up=0))
+    objective = config.objective(tiny_gaussians(seed=1), tiny_views())
+    truth = exact_traces(objective, torch.Generator().manual_seed(99), samples=1000)
+    errors = []
+    for seed in range(20):
+        method = config.method.create(seed)
+        assert isinstance(method, stablegs.StableGSMethod)
+        for name, trace in method.traces(objective).items():
+            assert trace.reason == "tolerance" and 8 <= trace.probes <= 64
+            errors.append(abs((truth[name].value / trace.value) ** 0.5 - 1))
+    assert sum(error > 0.05 for error in errors) <= 0.05 * len(errors)
+
+
+def test_a_trace_that_is_surely_negative_needs_no_more_samples():
+    config = TrainConfig(5, method=StableGS(warm_up=0))
+    objective = config.objective(tiny_gaussians(seed=0), tiny_views())
+    method = config.method.create(0)
+    assert isinstance(method, stablegs.StableGSMethod)
+    traces = method.traces(objective)
+    assert traces["quats"].high < 0 and traces["quats"].probes == 8 < traces["log_scales"].probes
+
+
+def test_checkpoints_from_before_accuracy_keep_their_four_samples(tmp_path):
+    path, method = tmp_path / "checkpoint.pt", StableGS(warm_up=0)
+    save_checkpoint(path, Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=method)), REFERENCE)
+    content = torch.load(path, weights_only=True)
+    del content["config"]["method"]["accuracy"], content["config"]["method"]["densify_after_warm_up"]
+    torch.save(content, path)
+    training = load_checkpoint(path).training
+    assert training.config.method == StableGS(warm_up=0, accuracy=inf)
+    assert isinstance(training.method, stablegs.StableGSMethod)
+    objective = training.config.objective(training.gaussians, tiny_views())
+    assert {trace.probes for trace in training.method.traces(objective).values()} == {4}

@@ -1,0 +1,60 @@
+"""What a command says of an error, and its exit code.
+
+    0    done
+    1    a self-check failed under --strict, a bound of `bench stress` was exceeded, or a cell of a sweep failed
+    2    bad input: one sentence that says what was expected, what came and what to do
+    70   a fault of the program: its traceback, and how to report it
+    71   memory ran out
+    74   the disk is full
+    130  interrupted
+
+A file or folder that cannot be opened is bad input.  Numbers as in `sysexits.h`, and 128 + 2 for the signal SIGINT.
+"""
+
+import shlex
+import sys
+import traceback
+from collections.abc import Sequence
+
+from landscape.errors import InputError, lacks_memory, lacks_space
+
+BAD_INPUT, BUG, NO_MEMORY, FULL_DISK, INTERRUPTED = 2, 70, 71, 74, 130
+
+
+def describe(error: BaseException) -> tuple[int, str]:
+    """The exit code and the sentence for an error.
+
+    >>> describe(InputError("expected a scene, got a teapot"))
+    (2, 'expected a scene, got a teapot')
+    >>> describe(PermissionError(13, "Permission denied", "scene/images"))
+    (2, 'cannot use scene/images: Permission denied')
+    >>> describe(MemoryError())[0], describe(OSError(28, "No space left on device"))[0], describe(KeyboardInterrupt())[0]
+    (71, 74, 130)
+    >>> describe(ZeroDivisionError())[0]
+    70
+    """
+    text = " ".join(str(error).split())
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED, "interrupted"
+    if lacks_memory(error):
+        return NO_MEMORY, f"memory ran out; take fewer Gaussians or smaller images, or end other programs ({text})"
+    if isinstance(error, OSError):
+        named = error.filename is not None and error.strerror is not None
+        if lacks_space(error):
+            return FULL_DISK, f"the disk is full{f' ({error.filename})' if named else ''}; free space and run it again"
+        if named:
+            return BAD_INPUT, f"cannot use {error.filename}: {error.strerror}"
+    if isinstance(error, InputError) or (isinstance(error, OSError) and error.errno is None):  # in the program's words
+        return BAD_INPUT, text
+    return BUG, "this is a fault of the program; please report it with all of the above and what the command read"
+
+
+def report(error: BaseException, command: Sequence[str], debug: bool = False) -> int:
+    """Say what went wrong on stderr; returns the exit code.  debug: with the traceback, whatever the error is."""
+    code, sentence = describe(error)
+    if debug or code == BUG:
+        traceback.print_exception(error)
+    if code == BUG:
+        print(f"command: {shlex.join(command)}", file=sys.stderr)
+    print(f"landscape: {sentence}", file=sys.stderr)
+    return code

@@ -1,0 +1,59 @@
+"""Options of `landscape probe`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from analysis.console.options import DeviceName, Unset
+
+
+@dataclass(frozen=True)
+class ProbeOptions:
+    """Measure the loss landscape at a checkpoint: traces, extreme eigenvalues, anisotropy, a slice."""
+
+    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
+    """RUN/checkpoint.pt, as written by landscape train."""
+    scene: Unset[Path] = None
+    """Folder of the scene, where it has moved since the training."""
+    out: Unset[Path] = None
+    """Folder of the results.  Default: probe, beside the checkpoint."""
+    seed: int = 0
+    """Seed of the random vectors."""
+    device: DeviceName = "auto"
+    """Where to work.  auto: on the GPU where there is one that can be used, else on the CPU."""
+    strict: FlagCreatePairsOff[bool] = False
+    """Exit with 1 if a self-check fails; the record is written all the same."""
+    quick: FlagCreatePairsOff[bool] = False
+    """Numbers to 10% instead of 1%, in a quarter of the time.
+    Without power iteration, the spectral density and the indices that need it, the finite probe, the comparison of depth with
+    lateral directions, and surface.png."""
+    seconds: Unset[float] = None
+    """Time for the estimators together, in seconds; what a stage did not reach in its share is said.  inf: no limit.
+    Default: 45, with --quick 12; under torchrun inf, and nothing else."""
+    slice_points: Unset[int] = None
+    """Points along each side of the slice, odd, 5 or more.  Default: 41."""
+    slice_rise: float = 0.001
+    """What a curvature unit is: the step within which the curvature alone changes the loss by this share of it.
+    The slice reaches 3 units each way."""
+    families: FlagCreatePairsOff[bool] = False
+    """Also the anisotropy indices of all attributes together and of each, for the Hessian and for Gauss-Newton.
+    Takes about four times as many products as the rest.  Not under torchrun."""
+    split_control: FlagCreatePairsOff[bool] = False
+    """The families, and the same of the scene with every Gaussian split in two: what their number alone does to the indices.
+    Takes about 2.5 times as long as the families alone."""
+    metric: Literal["parameters", "scene", "optimiser"] = "parameters"
+    """Units in which the families compare curvature.
+    parameters: as stored.
+    scene: positions in units of the scene's size (the median depth where all views face one way, else the cameras' mean
+    distance from their centre), the rest as stored.
+    optimiser: each parameter in units of its learning rate at the first step.
+    Any but parameters measures the families, as --families does."""
+    family_seconds: float = 1800.0
+    """Time for the families together, in seconds, beside that of --seconds.  inf: no limit."""
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """What `figures.make_all` is told, beside the folder."""
+        return ("--without", "surface") if self.quick else ()

@@ -1,0 +1,326 @@
+"""The sections of a record, as typed structures: what each key means, its type, and how it is written and read (`msgspec`).
+
+The whole files `probe.json` and `slice.json` are `ProbeRecord` and `SliceRecord` in `analysis.records.records`.  Losses are
+dimensionless; curvatures are loss per squared parameter unit, with respect to the stored parameters.
+
+null (None)   not determined; the `note` beside it says why
+UNSET         the key is absent: not every file has it.  UNSET is false, as None is
+not finite    a float; in the file, which is strict JSON, the text "NaN", "Infinity" or "-Infinity"
+
+Within a version of a format keys are added, never renamed or removed.  Fields with a default are those that older files may
+lack; keys of a file that are no fields are ignored.
+"""
+
+from collections.abc import Iterator
+from typing import Annotated, Generic, Literal, TypeVar
+
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+T = TypeVar("T")
+Maybe = T | UnsetType  # a key that may be absent
+Number = float | None
+Count = Annotated[int, Meta(ge=0)]
+Sign = Literal["positive", "negative", "zero", "undetermined"]
+Operator = Literal["hessian", "gauss-newton"]
+IndexName = Literal["literal", "saddle", "share", "effective_rank", "mass_quantile"]
+
+
+def _require_error(name: str, value: Number) -> None:
+    if value is not None and value < 0:
+        raise ValueError(f"Expected `{name}` of at least 0, got {value}")
+
+
+class Named(Struct, Generic[T]):
+    """Entries of one kind under names, of which some may be absent."""
+
+    def items(self) -> Iterator[tuple[str, T]]:
+        """Those that there are, by name."""
+        return ((name, getattr(self, name)) for name in self.__struct_fields__ if getattr(self, name))
+
+
+class Objective(Struct, kw_only=True):
+    """The function whose curvature is measured, beside the training views.
+
+    loss: its formula in words.  sizes: (width, height) of each view, px.  value: L at the checkpoint.
+    gradient_norm: |dL/dTheta|.
+    """
+
+    loss: str | None = None
+    sizes: list[tuple[int, int]] | None = None
+    background: tuple[float, float, float] | None = None
+    operator: Operator | None = None
+    value: Number = None
+    gradient_norm: Number = None
+
+
+class TraceOf(Struct, kw_only=True):
+    """The estimate of a trace.
+
+    standard_error: of value; 0 where the method is exact.  low, high: ends of the interval at `confidence`, e.g. 0.95.
+    sign: "undetermined" where the interval does not decide it.  dim: parameters of the block.  probes: random vectors; 0 where
+    exact.  matvecs: products H v.  reason: why it stopped, one of `landscape.results.StopReason`.
+    method: "exact", or "exact, the coupling of pixels sampled with random signs".  note: why value is null, ...
+    """
+
+    value: Number
+    standard_error: Number
+    low: Number = None
+    high: Number = None
+    confidence: Number = None
+    sign: Sign
+    dim: Count
+    probes: Count
+    matvecs: Count = 0
+    reason: str = ""
+    method: str
+    note: Maybe[str] = UNSET
+
+    def __post_init__(self) -> None:
+        _require_error("standard_error", self.standard_error)
+
+
+class Trace(TraceOf, kw_only=True):
+    """Of one attribute's diagonal block over its active parameters.  tau: sqrt(max(value, 0) / dim), its curvature scale."""
+
+    tau: Number
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_error("tau", self.tau)
+
+
+class LivesOn(Struct, kw_only=True):
+    """Where an eigenvector lives (`analysis.measures.localization`).
+
+    attributes: its shares of the squared mass.  participation: over how many Gaussians it is spread.  needles, needles_bare:
+    share of the mass on Gaussians with a condition number above 100, with and without the blur of 0.3 px^2; needle_count,
+    needle_bare_count: how many those are.  heaviest: (index, share) of single Gaussians, the largest share first.
+    """
+
+    attributes: dict[str, float] = {}
+    participation: Number
+    needles: float
+    needles_bare: Number = None
+    needle_count: Count
+    needle_bare_count: Count = 0
+    heaviest: list[tuple[int, float]] = []
+
+
+class End(Struct, kw_only=True):
+    """A Ritz value of an operator, signed, and its unit vector v.
+
+    residual: |H v - value v|: a true eigenvalue lies within it.  vector_error: about the sine of the angle between v and the
+    true eigenvector.  reason, note: as for `TraceOf`.
+    """
+
+    value: Number
+    residual: Number
+    vector_error: Number = None
+    reason: str | None = None
+    note: Maybe[str] = UNSET
+
+    def __post_init__(self) -> None:
+        _require_error("residual", self.residual)
+
+
+class Eigenvalue(End, kw_only=True):
+    """Of the active operator.  matvecs: products H v of the search for it.  shares: attribute -> share of v's squared mass."""
+
+    matvecs: Count | None = None
+    method: str = ""
+    shares: dict[str, float] = {}
+    lives_on: Maybe[LivesOn] = UNSET
+
+
+class Eigenvalues(Named[Eigenvalue], kw_only=True):
+    """The two largest and the smallest, and both ends by the paper's power iteration."""
+
+    max: Eigenvalue
+    second: Maybe[Eigenvalue] = UNSET
+    min: Eigenvalue
+    power_max: Maybe[Eigenvalue] = UNSET
+    power_min: Maybe[Eigenvalue] = UNSET
+
+
+class Index(Struct, kw_only=True):
+    """A number derived from others, and its bracket.  value: None where undefined; low, high: None where unbounded."""
+
+    value: Number
+    low: Number
+    high: Number
+    note: str
+
+
+class Anisotropy(Named[Index], kw_only=True):
+    """The indices of `landscape.spectrum.anisotropy`."""
+
+    literal: Maybe[Index] = UNSET
+    saddle: Maybe[Index] = UNSET
+    share: Maybe[Index] = UNSET
+    effective_rank: Maybe[Index] = UNSET
+    mass_quantile: Maybe[Index] = UNSET
+
+
+INDICES = Anisotropy.__struct_fields__
+
+
+class FiniteProbe(Struct, kw_only=True):
+    """The second difference (L(+d v) + L(-d v) - 2 L) / d^2 along a direction v, for all steps d of it.
+
+    round_off, truncation: bounds of its errors.  crossed: at which steps the order of the splats or the set of visible ones
+    changed; None where that is not known.  infinitesimal: v.H v.  center_loss, noise: L and the standard deviation of one
+    evaluation's error.  best: index of the step with the least error of those that cross nothing; None without any.
+    evaluations: renders of all views.
+    """
+
+    direction: Maybe[str] = UNSET
+    steps: Annotated[list[float], Meta(min_length=1)]
+    curvatures: list[Number]
+    round_off: list[Number]
+    truncation: list[Number]
+    crossed: list[bool] | None
+    infinitesimal: Number
+    center_loss: Number = None
+    noise: Number = None
+    best: Count | None
+    evaluations: Count = 0
+
+    def __post_init__(self) -> None:
+        columns = [self.curvatures, self.round_off, self.truncation, *([self.crossed] if self.crossed else [])]
+        if {len(column) for column in columns} != {len(self.steps)}:
+            raise ValueError("Expected one curvature, round_off, truncation and crossed for each step, got others")
+        if self.best is not None and self.best >= len(self.steps):
+            raise ValueError(f"Expected `best` below {len(self.steps)}, the number of steps, got {self.best}")
+
+
+class Rise(Struct, kw_only=True):
+    """Rises of the loss by finite steps along and across the rays, and depth over lateral, with standard errors.
+
+    pixels: the length of the steps, as what they move a splat by where they are across the ray.  _crossed: the share of the
+    renders with another order of the splats or set of visible ones.
+    """
+
+    pixels: float
+    ratio: Number
+    ratio_error: Number
+    depth: Number
+    depth_error: Number
+    depth_crossed: float
+    lateral: Number
+    lateral_error: Number
+    lateral_crossed: float
+
+
+class DepthTraces(Struct, kw_only=True):
+    """Of the curvature of the positions, along the rays and across them."""
+
+    depth: TraceOf
+    lateral: TraceOf
+
+
+class Depth(Struct, kw_only=True):
+    """The positions along the rays against one direction across them (`analysis.measures.depth`).
+
+    gradient_ratio: of the root mean square gradients.  gradient_median: of the gradients' ratios over `pairs` of a Gaussian
+    and a view.  curvature: the traces.  curvature_ratio: of the mean curvatures.  rises: one for each length of steps.
+    """
+
+    gradient_ratio: Number
+    gradient_median: Number
+    pairs: Count
+    curvature: DepthTraces
+    curvature_ratio: Index
+    rises: list[Rise]
+
+
+class Family(Struct, kw_only=True):
+    """The anisotropy of one diagonal block of one operator (`analysis.measures.families`).
+
+    metric, unit: in which units curvature is compared, and these in words.  block: "all" or an attribute.  split: whether of
+    the split scene.  dim: rows of the block; rank: those without the exact null space.  beyond: how far outside an end that
+    ran out of its budget may lie (`landscape.eigen.pairs.EigenEnds`).  starts, steps: of the density.
+    """
+
+    metric: str
+    unit: str
+    operator: Operator
+    block: str
+    split: bool
+    gaussians: Count
+    dim: Count
+    rank: Count
+    lambda_max: End
+    lambda_min: End
+    beyond: Number = None
+    indices: Anisotropy
+    starts: Count = 0
+    steps: Count = 0
+    matvecs: Count = 0
+
+
+class Effect(Struct, kw_only=True):
+    """An index of the split scene over that of the trained one: value, low, high, note as for `Index`."""
+
+    operator: Operator
+    block: str
+    index: IndexName
+    value: Number
+    low: Number
+    high: Number
+    note: str
+
+
+class SplitControl(Struct, kw_only=True):
+    """What splitting every Gaussian in two does (`analysis.measures.split_control`).
+
+    gaussians: after it.  rms, largest, psnr (dB): of the images' change; psnr is None where nothing changed.
+    """
+
+    gaussians: Count
+    rms: float
+    largest: float
+    psnr: Number
+    effects: list[Effect]
+
+
+class Direction(Struct, kw_only=True):
+    """One axis of a slice: a vector, of unit length in a probe.
+
+    kind: "eigenvectors", "random", "gradient" or "line".  slope, curvature: of the loss along it.  residual: of an
+    eigenvector, else None.  unit: sqrt(2 loss_scale / |curvature|), the step within which the curvature alone changes the loss
+    by loss_scale; infinite without curvature.  length: of the vector, in parameter units.  scale: what a step of 1 is.
+    """
+
+    name: str
+    kind: Maybe[str] = UNSET
+    slope: Maybe[Number] = UNSET
+    curvature: Number
+    residual: Number = None
+    unit: Number
+    length: Maybe[Number] = UNSET
+    scale: Maybe[str] = UNSET
+
+
+class Slice(Struct, kw_only=True):
+    """The loss along a line or over a plane through the checkpoint.
+
+    cosine: of the angle between the two directions before the second was put at a right angle.  center_loss: L at the centre,
+    a render of the slice's own.  points, evaluated_points, crossed_points: of the grid, see ARRAYS; evaluations: renders of
+    all views.  interpolation_error: the largest error of predictions at `holdout_points` random points, as a share of the
+    range of the evaluated losses; 0 where all points are evaluated, None where a prediction met a loss that is not finite.
+    share_beyond: with 95% confidence at most this share of the interpolated points is off by more.  reason: as for `Trace`.
+    """
+
+    directions: Annotated[list[Direction], Meta(min_length=1, max_length=2)]
+    loss_scale: float
+    cosine: Maybe[Number] = UNSET
+    points: Count = 0
+    evaluated_points: Count | None = None
+    crossed_points: Count = 0
+    evaluations: Count = 0
+    center_loss: float
+    interpolation_error: Number = 0.0
+    holdout_points: Count = 0
+    share_beyond: Number = None
+    reason: str = ""
+    note: Maybe[str] = UNSET

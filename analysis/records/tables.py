@@ -1,0 +1,218 @@
+"""A record as tables: of a probe, for the terminal, and of its anisotropy families, for the terminal and the report."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from analysis.records.findings import attribute_name
+from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
+from analysis.records.records import Check, ProbeRecord
+from analysis.records.schema import INDICES, Depth, Effect, End, Family, Index, Number
+
+ENDS = {
+    "max": "largest eigenvalue",
+    "second": "second largest",
+    "min": "smallest eigenvalue",
+    "power_max": "power iteration, max",
+    "power_min": "power iteration, min",
+}
+NEEDS_DENSITY = "needs the spectral density, which was left out"  # said of an index
+OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
+ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
+CAPTION = "≥: λ min was not reached, or cannot be told from 0"
+OUTCOMES = {True: "[green]passed[/]", False: "[red]FAILED[/]", None: "[yellow]could not run[/]"}
+WIDTH = 15  # of a column of the families' table, with which it fits into 80
+NARROW = 0.1  # of the value: a bracket that is written as an error
+
+
+def probe_table(data: ProbeRecord) -> Table:
+    """Traces, eigenvalues, anisotropy, counts and checks."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=ERRORS, caption_justify="left")
+    table.add_column("", no_wrap=True)
+    table.add_column("value ± error", justify="right", no_wrap=True)
+    table.add_column("τ", justify="right", no_wrap=True)
+    table.add_column("")
+    for name, trace in data.traces.items():
+        about = f"{trace.sign}, dim {trace.dim:,}, {trace.matvecs} products{_reason(trace.reason)}"
+        value = measured(trace.value, trace.standard_error)
+        table.add_row(f"trace of {attribute_name(name)}", value, quantity(trace.tau), about)
+    table.add_section()
+    for name, end in data.eigenvalues.items():
+        main, share = max(end.shares.items(), key=lambda item: item[1], default=("no attribute", 0.0))
+        about = f"{share:.0%} {attribute_name(main)}, {end.matvecs} products{_reason(end.reason)}"
+        table.add_row(ENDS[name], measured(end.value, end.residual), "", about)
+    table.add_section()
+    for name, index in data.anisotropy.items():
+        if index.note != NEEDS_DENSITY:  # the record's notes say that these were left out
+            table.add_row(name.replace("_", " "), *_index(index))
+    table.add_section()
+    for row in _depth_rows(data.depth):
+        table.add_row(*row)
+    table.add_section()
+    counts = data.counts
+    table.add_row("Gaussians in sight", f"{counts.visible_gaussians:,}", "", f"of {counts.gaussians:,}")
+    table.add_row("active parameters", f"{counts.active_parameters:,}", "", f"of {counts.parameters:,}")
+    table.add_row("SH degree in use", f"{counts.sh_degree_active}", "", f"of {counts.sh_degree_stored}")
+    table.add_section()
+    for name, check in data.checks.items():
+        table.add_row(f"check: {name.replace('_', ' ')}", quantity(check.value), "", _outcome(check))
+    return table
+
+
+def _reason(reason: str | None) -> str:
+    """Why it stopped, where that was not because the error asked for was reached."""
+    return "" if reason in ("tolerance", "exact") else f", {reason}"
+
+
+def _outcome(check: Check) -> str:
+    return f"{OUTCOMES[check.passed]}, at most {quantity(check.bound)}{f' ({check.note})' if check.note else ''}"
+
+
+def _depth_rows(depth: Depth | None) -> Iterator[tuple[str, str, str, str]]:
+    """Of positions: along the rays, over a direction across them."""
+    if depth is None:
+        return
+    median = f"median {quantity(depth.gradient_median)}, {depth.pairs:,} pairs of Gaussian and view"
+    yield "depth gradient / lateral", quantity(depth.gradient_ratio), "", median
+    yield "depth curvature / lateral", *_index(depth.curvature_ratio)
+    for row in depth.rises:
+        rises = f"{measured(row.depth, row.depth_error)} over {measured(row.lateral, row.lateral_error)}"
+        yield f"depth / lateral rise, {row.pixels:g} px", measured(row.ratio, row.ratio_error), "", rises
+
+
+def _index(index: Index) -> tuple[str, str, str]:
+    """Value, nothing, bracket and note; a narrow bracket is written as an error."""
+    value, low, high, note = index.value, index.low, index.high, index.note
+    if low is None and high is None:
+        return quantity(value), "", note
+    if low is None or high is None:
+        bracket = " to ".join("unbounded" if end is None else quantity(end) for end in (low, high))
+    elif high - low < NARROW * abs(high + low) / 2:
+        if value is not None and low <= value <= high:
+            return measured(value, max(high - value, value - low)), "", note
+        bracket = measured((low + high) / 2, (high - low) / 2)
+    else:
+        bracket = " to ".join(limits(low, high))
+    return quantity(value), "", f"{bracket} ({note})" if note else bracket
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number as text, what its bracket leaves open, and a note."""
+
+    value: str
+    bracket: str = ""
+    note: str = ""
+
+
+BLANK = (Cell(""), Cell(""))
+
+
+@dataclass(frozen=True)
+class Line:
+    """One family, or what the split does to it: ends, two cells, and indices, one of each in INDICES."""
+
+    operator: str
+    block: str
+    scene: str
+    gaussians: str
+    directions: str
+    ends: tuple[Cell, ...]
+    indices: tuple[Cell, ...]
+
+
+def family_lines(data: ProbeRecord) -> list[Line]:
+    """Of every operator and block: the families, that of the split scene beneath the other, and what the split changes."""
+    rows, control = data.families or [], data.split_control
+    lines = []
+    for row in (row for row in rows if not row.split):
+        lines += [_line(each, bool(control)) for each in rows if _key(each) == _key(row)]
+        if control:
+            effects = {effect.index: effect for effect in control.effects if _key(effect) == _key(row)}
+            factors = tuple(factor(effects.get(name)) for name in INDICES)
+            lines.append(
+                replace(lines[-1], scene="changes by", gaussians="", directions="", ends=BLANK, indices=factors)
+            )
+    return lines
+
+
+def family_table(data: ProbeRecord) -> Table:
+    """The indices of the lines, brackets beneath the values, within 80 columns: without saddle, which is -literal."""
+    title = f"Anisotropy by attribute ({data.families[0].unit})" if data.families else None
+    look: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False, "show_edge": False}
+    table = Table(title=title, caption=CAPTION, **look)
+    table.add_column("", no_wrap=True)
+    shown = [i for i, name in enumerate(INDICES) if name != "saddle"]
+    for i in shown:
+        table.add_column(INDICES[i].replace("_", " "), justify="right", no_wrap=True)
+    operator = ""
+    for line in family_lines(data):
+        if line.operator != operator:
+            table.add_section()
+            table.add_row(operator := line.operator, style="bold")
+        label = line.block if line.scene in ("", "trained") else f"  {line.scene}"
+        cells = [line.indices[i] for i in shown]
+        table.add_row(label, *("\n".join(_folded(text) for text in (c.value, c.bracket) if text) for c in cells))
+    return table
+
+
+def _folded(text: str) -> str:
+    """In two lines where it is too wide for a column.
+
+    >>> _folded("7.45 × 10⁻⁴ … 1.02 × 10⁴"), _folded("34.1 … 120")
+    ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
+    """
+    return text if len(text) <= WIDTH else text.replace(" ± ", "\n± ").replace(" … ", " …\n")
+
+
+def bracketed(index: Index | Effect | None) -> Cell:
+    """An index as text: a narrow bracket as an error, and one without upper end as the bound that it is.
+
+    >>> bracketed(Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")).value
+    '≥ 34.2'
+    >>> bracketed(Index(value=2.0, low=1.95, high=2.04, note="")).value
+    '2.000 ± 0.050'
+    """
+    if index is None:
+        return Cell(UNDETERMINED)
+    value, low, high, note = index.value, index.low, index.high, index.note
+    if (low is None and high is None) or (high is None and low == 0):
+        return Cell(UNDETERMINED, "", note)
+    if high is None or low is None:
+        return Cell(f"≥ {quantity(low)}" if high is None else f"≤ {quantity(high)}", "", note)
+    if value is not None and low <= value <= high and high - low < NARROW * abs(value):
+        return Cell(measured(value, max(high - value, value - low)), "", note)
+    return Cell(quantity(value), " … ".join(limits(low, high)), note)
+
+
+def factor(effect: Effect | None) -> Cell:
+    """What the split multiplies an index by."""
+    cell = bracketed(effect)
+    return cell if cell.value == UNDETERMINED else replace(cell, value=f"× {cell.value}")
+
+
+def _line(row: Family, several: bool) -> Line:
+    ends = _end(row.lambda_max, row.beyond, 1), _end(row.lambda_min, row.beyond, -1)
+    indices = tuple(bracketed(getattr(row.indices, name) or None) for name in INDICES)
+    scene = "" if not several else "split" if row.split else "trained"
+    operator, block = OPERATOR_NAMES[row.operator], attribute_name(row.block)
+    return Line(operator, block, scene, f"{row.gaussians:,}", f"{row.rank:,}", ends, indices)
+
+
+def _end(end: End, beyond: Number, outwards: int) -> Cell:
+    """An end of the spectrum; of one that the budget did not reach, between what it lies.  outwards: 1 for the largest."""
+    value, residual, reason = end.value, end.residual, end.reason or ""
+    if not reason.endswith("budget") or value is None or residual is None:
+        return Cell(measured(value, residual), "", reason)
+    inner = quantity(value - outwards * residual)
+    if beyond is None:
+        return Cell("not reached", f"{'≥' if outwards > 0 else '≤'} {inner}", reason)
+    outer = quantity(value + outwards * (residual + beyond))
+    return Cell("not reached", " … ".join((inner, outer)[::outwards]), reason)
+
+
+def _key(row: Family | Effect) -> tuple[str, str]:
+    return row.operator, row.block

@@ -1,0 +1,50 @@
+"""Options of the commands on several runs: `landscape sweep`, `trajectory` and `compare`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from analysis.console.options import DeviceName, Unset
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Train every method with every seed on every scene, and give mean and standard deviation over the seeds.
+
+    What is done already is kept: a sweep that was stopped or killed continues when it is run again.
+    """
+
+    file: Annotated[Positional[Path], arg(metavar="SWEEP.toml")]
+    """The methods, seeds, scenes and settings; an example is in the README."""
+    out: Unset[Path] = None
+    """Folder of the runs and tables.  Default: the file's."""
+    jobs: int = 1
+    """Runs at once, each on its share of the processors."""
+    probe: FlagCreatePairsOff[bool] = False
+    """Also probe every run after its training; split_control = true in the file adds the split control."""
+
+
+@dataclass(frozen=True)
+class TrajectoryOptions:
+    """Plot the landscape along trainings that were made with --probe-every, several in one picture."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
+    """Folders that landscape train --probe-every wrote."""
+    out: Unset[Path] = None
+    """Folder of the table and the picture.  Default: trajectory, in the folder that holds all runs."""
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """Compare probed runs in one table and on one page: scores, traces, spectra, anisotropy, slices."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
+    """Two or more folders that landscape train wrote, of the same views and loss, each probed."""
+    out: Unset[Path] = None
+    """Folder of the page, the table and the pictures.  Default: compare, in the folder that holds all runs."""
+    probe: FlagCreatePairsOff[bool] = False
+    """Probe the runs that have no record of their checkpoint yet."""
+    device: DeviceName = "auto"
+    """Where to probe.  auto: on the GPU where there is one that can be used, else on the CPU."""

@@ -1,0 +1,69 @@
+"""Options of `landscape train`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+from analysis.console.options import DeviceName, Unset
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Train 3D Gaussian Splatting on a few views of a scene and score it on the views held out."""
+
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder of the scene: COLMAP, LLFF, Blender, instant-ngp, nerfstudio or DTU."""
+    out: Unset[Path] = None
+    """Folder of the run, which must not exist yet.  Default: runs/NAME, NAME that of the scene's folder."""
+    views: Unset[int | Literal["all"]] = None
+    """Number of training views, chosen by the scene's protocol (see the README).
+    all: every view that is not held out; of DTU the protocol's 9.
+    Default: 8 for Blender, else 3."""
+    iterations: int = 2000
+    """Steps of the training, each on one view."""
+    seed: int = 0
+    """Seed of everything random: the same seed gives the same checkpoint, bit for bit."""
+    images: Unset[str] = None
+    """Folder of images within the scene.  Default: images, else the largest images_K."""
+    downscale: float = 1.0
+    """Divide width and height of the images by this factor, 1 or more, by averaging."""
+    start: Literal["scene", "points", "triangulated", "random"] = "scene"
+    """What the Gaussians start from.
+    scene: points where there are any, else random.
+    points: the points of the scene's files that at least two training views see.
+    triangulated: points found in the training views alone, given their poses.
+    random: random points in the volume that the training views have in common."""
+    masks: Unset[Path] = None
+    """Folder of object masks, named after the images; the scores are taken inside them.
+    Default: mask or masks in the scene, or what its files name."""
+    depths: Unset[Path] = None
+    """Folder of relative depth maps for the training views, NAME.npy or 16-bit NAME.png, for methods that use depth."""
+    method: str = "3dgs"
+    """What is trained: 3dgs, stablegs, sam, dropgaussian, dropoutgs, cor-gs, fsgs or dngaussian."""
+    set: UseAppendAction[tuple[str, ...]] = ()
+    """KEY=VALUE changes a setting of the method or of the training, as in vsp_weight=0; may be repeated.
+    An unknown KEY is answered with the names of all."""
+    device: DeviceName = "auto"
+    """Where to train.  auto: on the GPU where there is one that can be used, else on the CPU."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue the run in OUT; the other options must be those that it was started with."""
+    sh_degree: int = 3
+    """Highest degree of spherical harmonics, 0 to 3; the training starts with degree 0, and one joins every 1000 steps."""
+    background: Literal["scene", "black", "white", "random"] = "scene"
+    """Colour behind the Gaussians.  scene: white where the images are transparent, else black.
+    random: another one at every step."""
+    densify: bool = True
+    """Whether to clone, split and prune Gaussians and reset opacities, as 3DGS does."""
+    pixel_loss: Literal["l1", "charbonnier", "l2"] = "l1"
+    """Loss of a pixel, to which 1 - SSIM is added; charbonnier is a smooth l1."""
+    ssim_weight: float = 0.2
+    """Weight of 1 - SSIM, 0 to 1; the pixel loss has the rest."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints: what a killed run loses at most."""
+    probe_every: Unset[int] = None
+    """Steps between records of traces, both ends of the spectrum and anisotropy in OUT/trajectory.csv.  Default: none."""
+    probe_share: float = 0.1
+    """Time that these records may take together, as a share of the time of the steps; one that would not fit is skipped.
+    inf: no limit."""

@@ -1,0 +1,35 @@
+"""Errors whose cause lies outside of the program: bad input, and a machine that lacks memory or disk space.
+
+Raise `InputError` for what whoever gave the arguments, files or settings can mend, with one sentence: what was expected, what
+came, what to do.  Anything else that is raised is a fault of the program, for which its traceback is needed.
+"""
+
+import errno
+
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
+OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")  # torch's words in a RuntimeError
+
+
+class InputError(ValueError):
+    """Input, settings, a file, a scene, a checkpoint or an operator that cannot be used as given."""
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Whether memory, the machine's or a GPU's, ran out.
+
+    >>> lacks_memory(MemoryError()), lacks_memory(RuntimeError("CUDA out of memory")), lacks_memory(ValueError("memory"))
+    (True, True, False)
+    """
+    words = str(error).lower()
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and any(text in words for text in OUT_OF_MEMORY)
+    )
+
+
+def lacks_space(error: BaseException) -> bool:
+    """Whether the disk, or the user's share of it, is full.
+
+    >>> lacks_space(OSError(errno.ENOSPC, "No space left on device")), lacks_space(FileNotFoundError())
+    (True, False)
+    """
+    return isinstance(error, OSError) and error.errno in FULL_DISK

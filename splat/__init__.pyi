@@ -1,0 +1,20 @@
+# The public names, for type checkers and for `__init__.py`, which imports a module when its first name is used.
+from .curvature.hessian import SceneHessian as SceneHessian
+from .curvature.objective import SceneObjective as SceneObjective
+from .curvature.traces import exact_traces as exact_traces
+from .losses.reference import LossSettings as LossSettings
+from .model.camera import Camera as Camera
+from .model.gaussians import Gaussians as Gaussians
+from .model.settings import RenderSettings as RenderSettings
+from .scenes.scene import load_scene as load_scene
+from .scenes.splits import split_scene as split_scene
+from .scenes.synthetic import SyntheticSettings as SyntheticSettings
+from .scenes.synthetic import synthetic_scene as synthetic_scene
+from .scenes.view import View as View
+from .training.checkpoint import load_checkpoint as load_checkpoint
+from .training.loop import train as train
+from .training.methods.methods import METHODS as METHODS
+from .training.score.evaluate import evaluate as evaluate
+from .training.start import initial_gaussians as initial_gaussians
+from .training.state import TrainConfig as TrainConfig
+from .training.state import Training as Training

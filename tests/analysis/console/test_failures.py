@@ -1,0 +1,73 @@
+"""What a command says of an error and its exit code, through the command's own `main`."""
+
+import errno
+
+import numpy as np
+import pytest
+import torch
+
+from analysis.commands import cli
+from landscape.errors import InputError
+from splat.training.checkpoint import load_checkpoint
+
+TRACEBACK = "Traceback (most recent call last)"
+
+
+def ended(monkeypatch, capsys, error: BaseException, *more: str) -> tuple[int, str]:
+    """The exit code and what is on stderr, of a command that this error ends."""
+
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(cli, "run", fail)
+    code = cli.main([*more, "demo"])
+    return code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (InputError("expected a scene,\ngot none"), 2, "expected a scene, got none"),
+        (FileNotFoundError("expected a scene folder, x does not exist"), 2, "expected a scene folder"),
+        (IsADirectoryError(errno.EISDIR, "Is a directory", "a/b"), 2, "cannot use a/b: Is a directory"),
+        (MemoryError(), 71, "memory ran out"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"), 71, "memory ran"),
+        (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"), 71, "memory ran out"),
+        (np._core._exceptions._ArrayMemoryError((9,), np.dtype("f8")), 71, "memory ran out"),  # pyright: ignore[reportAttributeAccessIssue]
+        (OSError(errno.ENOSPC, "No space left on device", "run/metrics.json"), 74, "disk is full (run/metrics.json)"),
+        (OSError(errno.EDQUOT, "Disk quota exceeded"), 74, "the disk is full"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_one_sentence_for_what_is_no_fault_of_the_program(monkeypatch, capsys, error, code, words):
+    found, said = ended(monkeypatch, capsys, error)
+    assert found == code and words in said
+    assert said.startswith("landscape: ") and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("error", [ValueError("shapes"), KeyError("x"), AssertionError(), OSError(errno.EIO, "I/O")])
+def test_a_fault_shows_its_traceback_and_how_to_report_it(monkeypatch, capsys, error):
+    code, said = ended(monkeypatch, capsys, error)
+    assert code == 70 and said.startswith(TRACEBACK)
+    assert said.splitlines()[-2] == "command: landscape demo" and "please report it" in said.splitlines()[-1]
+
+
+def test_debug_shows_the_traceback_before_and_after_the_subcommand(monkeypatch, capsys):
+    code, said = ended(monkeypatch, capsys, InputError("expected less"), "--debug")
+    assert code == 2 and said.startswith(TRACEBACK) and said.splitlines()[-1] == "landscape: expected less"
+    monkeypatch.undo()
+    assert cli.main(["train", "no/such/scene", "--debug"]) == 2
+    assert capsys.readouterr().err.startswith(TRACEBACK)
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError(errno.EIO, "I/O error"), RuntimeError("out of memory")])
+def test_what_the_machine_lacks_is_not_called_damage_to_a_file(monkeypatch, tmp_path, error):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr("zipfile.ZipFile", fail)
+    (tmp_path / "checkpoint.pt").write_bytes(b"")
+    with pytest.raises(type(error)) as caught:
+        load_checkpoint(tmp_path / "checkpoint.pt")
+    assert caught.value is error
