@@ -31,6 +31,7 @@ both while the first runs are under way.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isnan
+from statistics import NormalDist
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -42,7 +43,7 @@ from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.linalg import gram, norm
 from landscape.operators.operator import ProjectedOperator, SymmetricOperator
-from landscape.results import Progress, t_quantile
+from landscape.results import Progress
 from landscape.spectrum.absolute_sum import absolute_integral
 from landscape.spectrum.rules import SpectralDensity
 
@@ -50,7 +51,7 @@ UNEVEN = 0.1  # spread of the squares of a start vector's entries about 1
 SETTLED = 1e-4  # the error of an eigenvector that runs find
 FOUND, CLOSE = 1e-2, 0.1  # of one that was found before, and its residual, as a share of the eigenvalue
 SAME = 1e-6  # by which the squared cosine between two of them may miss 1
-# where their number is free: Student's interval of three is half as long again, and kernels like blocks of four
+# where their number is free: Student's interval of three is half as long again (`quantiles`), and kernels like blocks of four
 FEWEST_STARTS = 4
 FIRST_LOOK, GROWTH = 12, 4 / 3  # steps
 CONFIDENCE = 0.95  # of the interval that is to be short
@@ -156,7 +157,7 @@ class Lengths:
             squares -= float((w * x * x.abs()).sum()) ** 2 / squares
         # the variance over random signs is 2 sum f(lambda)^2 at most
         spread = unit * (2 * rest * max(squares, 0.0) / starts) ** 0.5
-        return t_quantile(starts - 1, CONFIDENCE) * spread + rest * (high - low) / 2
+        return NormalDist().inv_cdf((1 + CONFIDENCE) / 2) * spread + rest * (high - low) / 2
 
 
 class _Runs:
