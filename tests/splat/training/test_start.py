@@ -162,7 +162,8 @@ def test_the_generator_decides_the_points() -> None:
 
 def test_a_box_of_random_points_begins_at_the_twentieth_coordinate(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("splat.training.start.BOX_DENSITY", 1000)
-    scene = Scene("a", Path("a"), [], points=some_points(), background=torch.zeros(3))
+    frames = tuple(Frame(v.name, v.camera, lambda v=v: v) for v in views())
+    scene = Scene("s", Path("s"), "synthetic", frames, some_points(), torch.zeros(3))
     generator = torch.Generator().manual_seed(0)
     gaussians = initial_gaussians(scene, views(), 0, generator=generator, source="box")
     assert scene.points is not None
