@@ -15,7 +15,7 @@ from analysis.bench.options import BenchOptions
 from analysis.commands.options import DemoOptions, SfmOptions
 from analysis.console.failures import report
 from analysis.probe.options import ProbeOptions
-from analysis.runs.options import CompareOptions, SweepOptions, TrajectoryOptions
+from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, TrajectoryOptions
 from analysis.slice.options import SliceOptions
 from analysis.train.options import TrainOptions
 
@@ -27,6 +27,7 @@ Options = (
     | Annotated[ProbeOptions, tyro.conf.subcommand("probe")]
     | Annotated[SliceOptions, tyro.conf.subcommand("slice")]
     | Annotated[CompareOptions, tyro.conf.subcommand("compare")]
+    | Annotated[ClaimsOptions, tyro.conf.subcommand("claims")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
     | Annotated[TrajectoryOptions, tyro.conf.subcommand("trajectory")]
     | Annotated[BenchOptions, tyro.conf.subcommand("bench")]
@@ -96,6 +97,10 @@ def run(options: Options, arguments: Sequence[str]) -> int:
             from analysis.runs.compare import run_compare
 
             return run_compare(options)
+        case ClaimsOptions():
+            from analysis.runs.claims.command import run_claims
+
+            return run_claims(options)
         case DemoOptions():
             from analysis.commands.demo import run_demo
 

@@ -1,4 +1,4 @@
-"""Options of the commands on several runs: `landscape sweep`, `trajectory` and `compare`."""
+"""Options of the commands on several runs: `landscape sweep`, `trajectory`, `compare` and `claims`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,3 +48,14 @@ class CompareOptions:
     """Probe the runs that have no record of their checkpoint yet."""
     device: DeviceName = "auto"
     """Where to probe.  auto: on the GPU where there is one that can be used, else on the CPU."""
+
+
+@dataclass(frozen=True)
+class ClaimsOptions:
+    """Test the paper's nine statements on the trainings of a study, each with its interval over the seeds."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
+    """Folders that hold runs, such as that of a sweep, or the study.csv of an earlier call.
+    3dgs and stablegs decide most statements; the parts of stablegs and three seeds of each the others."""
+    out: Unset[Path] = None
+    """Folder of the page, the tables and the pictures.  Default: claims, in the first folder."""

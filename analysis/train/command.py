@@ -39,6 +39,7 @@ from analysis.records.json_files import plain
 from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
 from analysis.train.options import TrainOptions
+from analysis.train.remarks import remarks
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
 from landscape.errors import InputError
@@ -109,9 +110,9 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         f"{scene.name}: {len(views)} views to train on, {len(held_out)} held out, {camera.width} x {camera.height} px, "
         f"{len(training.gaussians)} Gaussians"
     )
-    for words in (_scaled(_asked(options, scene), config), _not_reached(config)):
-        if words:
-            console.print(words, **WARNING)
+    begun = None if options.resume else (reference.start, len(training.gaussians))
+    for remark in remarks(scene, _asked(options, scene), config, begun):
+        console.print(remark, **WARNING)
     trajectory = None if along is None else Trajectory(out, training, views, along)
     if trajectory and (hopeless := trajectory.hopeless):
         console.print(hopeless, **WARNING)
@@ -125,36 +126,13 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     return 0
 
 
-def _scaled(asked: TrainConfig, config: TrainConfig) -> str:
-    """Which settings of a published schedule were scaled to the length of the training, in words; none: empty."""
-    before, after = (leaves(asdict(settings)) for settings in (asked, config))
-    changes = [
-        f"{key.removeprefix('method.')} {before[key]} to {after[key]}" for key in after if before[key] != after[key]
-    ]
-    if not changes:
-        return ""
-    return (
-        f"{config.method.name}: its published schedule is scaled to {config.iterations} steps: {', '.join(changes)}; "
-        "--set KEY=VALUE gives one of them another value"
-    )
-
-
-def _not_reached(config: TrainConfig) -> str:
-    """Which parts of a method a run does not reach, in words; none: empty."""
-    parts = config.method.parts(config)
-    late = [f"{name} = {begins}" for name, begins in parts.items() if begins >= config.iterations]
-    if not late:
-        return ""
-    return (
-        f"{config.method.name}: what begins after step {' and '.join(late)} is not reached in {config.iterations} steps; take "
-        f"more --iterations, or --set {late[0].split()[0]}={config.iterations // 2}"
-    )
-
-
 def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig, SceneReference]:
     """What the options stand for, before any image is read.  ValueError or FileNotFoundError where they are wrong."""
     colour, preset = COLOURS.get(options.background or "scene"), presets(options.method, options.protocol)
-    scene = load_scene(options.scene, options.images, options.downscale, colour, options.masks, options.depths)
+    scene = load_scene(
+        options.scene, options.images, options.downscale, colour, options.masks, options.depths,
+        strict_frames=options.strict_frames,
+    )  # fmt: skip
     views = usual_views(scene) if options.views is None else options.views
     split = split_scene(scene, None if views == "all" else views)
     start = typed(Source, options.start or preset.get("start", "scene"), "start")

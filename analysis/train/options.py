@@ -29,6 +29,8 @@ class TrainOptions:
     """Folder of images within the scene.  Default: images, else the largest images_K."""
     downscale: float = 1.0
     """Divide width and height of the images by this factor, 1 or more, by averaging."""
+    strict_frames: FlagCreatePairsOff[bool] = False
+    """Refuse a transforms.json that lists frames without an image, instead of skipping these."""
     start: Unset[Literal["scene", "points", "triangulated", "random", "box"]] = None
     """What the Gaussians start from.  Default: scene, or that of the --protocol.
     scene: points where there are any, else random.

@@ -70,7 +70,7 @@ def image_folder(root: Path, images: str | None = None) -> Path:
     if images is None and not found:
         raise FileNotFoundError(
             f"expected a folder images or images_K (K = 2, 4, 8 ...) in {root}, found neither; "
-            "name the folder of the photographs with images=..."
+            "name the folder of the photographs with --images"
         )
     return found[0] if images is None else root / images
 
@@ -80,13 +80,13 @@ def image_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
 
 
-def require_files(paths: Sequence[Path]) -> None:
-    """Raise FileNotFoundError that counts the missing image files and names the first."""
+def require_files(paths: Sequence[Path], advice: str = "or name another folder of images with --images") -> None:
+    """Raise FileNotFoundError that counts the missing image files, names the first, and says what to do."""
     missing = [path for path in paths if not path.is_file()]
     if missing:
         raise FileNotFoundError(
             f"expected {len(paths)} image files, {len(missing)} are missing, the first is {missing[0]}; "
-            "restore them, or choose another image folder with images=..."
+            f"restore them, {advice}"
         )
 
 

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -35,7 +35,10 @@ Kind = Literal["colmap", "llff", "blender", "transforms", "dtu", "synthetic"]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Frames sorted by name (Blender: in the order of its files), points if any, and the background colour."""
+    """Frames sorted by name (Blender: in the order of its files), points if any, and the background colour.
+
+    skipped: names of frames that the scene's file lists without an image.
+    """
 
     name: str
     root: Path
@@ -43,6 +46,7 @@ class Scene:
     frames: tuple[Frame, ...]
     points: Points | None
     background: Float[Tensor, "3"]
+    skipped: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -91,6 +95,7 @@ def load_scene(
     masks: Path | None = None,
     depths: Path | None = None,
     points: bool = True,
+    strict_frames: bool = False,
 ) -> Scene:
     """Recognise and load the scene in a folder; pixels are read later.
 
@@ -101,6 +106,7 @@ def load_scene(
     masks, depths: folders of `splat/scenes/layers.py`, which need not have a file for every image.  Masks by default:
         those that the scene's files name, else a folder mask or masks in the scene, else those that DTU provides.
     points: whether to read a COLMAP model's points, which take longest.
+    strict_frames: whether to refuse a transforms file that lists frames without an image, instead of skipping these.
 
     Raises FileNotFoundError for a missing file and InputError for one that cannot be used, in one sentence.
 
@@ -122,17 +128,17 @@ def load_scene(
         )
     if not 1 <= downscale < float("inf"):
         raise InputError(f"expected downscale of at least 1, got {downscale}")
-    kind, photos, found, own_background = _read(root, images, points)
-    photos = _with_layers(root, photos, masks, depths)
+    found = _read(root, images, points, strict_frames)
+    photos = _with_layers(root, found.photos, masks, depths)
     require_files([photo.path for photo in photos] + [photo.mask for photo in photos if photo.mask])
     _require_distinct(photos, root)
     if background is None:
-        background = own_background
+        background = found.background
     if background is None:
         background = (1.0,) * 3 if image_header(photos[0].path)[1] else (0.0,) * 3
     colour = _colour(background)
     frames = tuple(frame(photo, downscale, colour) for photo in photos)
-    return Scene(root.resolve().name, root.resolve(), kind, frames, found, colour)
+    return Scene(root.resolve().name, root.resolve(), found.kind, frames, found.points, colour, tuple(found.skipped))
 
 
 def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
@@ -142,21 +148,32 @@ def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
     return torch.tensor(values, dtype=torch.float32)
 
 
-def _read(root: Path, images: str | None, points: bool) -> tuple[Kind, list[Photo], Points | None, list[float] | None]:
+class _Found(NamedTuple):
+    """What the files of a scene say."""
+
+    kind: Kind
+    photos: list[Photo]
+    points: Points | None = None
+    background: list[float] | None = None
+    skipped: Sequence[str] = ()
+
+
+def _read(root: Path, images: str | None, points: bool, strict: bool) -> _Found:
     model = find_model(root)
     if model is not None:
-        return "colmap", *read_colmap(root, model, images, points=points), None
+        return _Found("colmap", *read_colmap(root, model, images, points=points))
     if (root / POSES).is_file():
-        return "llff", read_llff(root, images), None, None
+        return _Found("llff", read_llff(root, images))
     if all((root / name).is_file() for _, name in BLENDER_FILES):
         if images is not None:
             raise InputError(f"expected no image folder for {root}, whose transforms files name theirs, got {images!r}")
-        return "blender", read_blender(root), None, None
+        photos, skipped = read_blender(root, strict)
+        return _Found("blender", photos, skipped=skipped)
     for name in (SINGLE_FILE, BLENDER_FILES[0][1]):
         if (root / name).is_file():
-            return "transforms", *read_transforms(root, root / name, images)
+            return _Found("transforms", *read_transforms(root, root / name, images, strict))
     if is_dtu(root):
-        return "dtu", read_dtu(root), None, None
+        return _Found("dtu", read_dtu(root))
     found = sorted(path.name for path in root.iterdir())
     raise FileNotFoundError(
         f"expected a scene with camera poses in {root}: looked for a COLMAP model (cameras, images and points3D, .bin "

@@ -12,7 +12,8 @@ points      points: the scene's, from structure from motion, those seen by at le
                 1.3 (max - min), BOX_DENSITY of them per world unit of the longest side, grey.  The box begins at the
                 BOX_RANK-th smallest coordinate, so that it is not centred on the points
             scene: points where the scene has any, else random
-means       the points                          quats   the identity
+means       the points; those at one place (exactly, as triangulation leaves them) are one, of their mean colour
+quats       the identity
 log_scales  isotropic: log of the root mean square distance to the three nearest neighbours (3DGS)
 opacity     0.1                                 sh      band 0 gives the point's colour, the others 0
 """
@@ -28,6 +29,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.linalg import group_sums
 from splat.model.camera import Camera
 from splat.model.capture import common_target
 from splat.model.gaussians import Gaussians
@@ -39,7 +41,7 @@ from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinat
 Source = Literal["scene", "points", "triangulated", "random", "box"]
 OPACITY = 0.1
 NEIGHBOURS = 3
-SMALLEST_SCALE = sqrt(1e-7)  # of the median scale: for points that coincide with three others
+SMALLEST_SCALE = sqrt(1e-7)  # of the median scale: for points that all but coincide with three others
 NEAR, FAR = 0.5, 1.5  # of the distance to the cameras' common target; Blender's 4 gives its usual 2 and 6
 MAX_DRAWS = 200  # per random point wanted
 SEEN_BY = 2  # views at least, or all if they are fewer
@@ -82,15 +84,16 @@ def gaussians_from_points(
     """float32 Gaussians at the points that so many of the views see."""
     needed = min(seen_by, len(views))
     seen = points.sightings(views) >= needed
-    kept, n = points.xyz[seen], int(seen.sum())
+    kept, colours = _merged(points.xyz[seen], points.rgb[seen])
+    n = len(kept)
     if n <= NEIGHBOURS:
         raise InputError(
-            f"expected more than {NEIGHBOURS} points seen by at least {needed} of the {len(views)} training views, "
-            f"got {n} of {len(points)}; choose views that overlap more, or more of them"
+            f"expected more than {NEIGHBOURS} points at different places seen by at least {needed} of the {len(views)} "
+            f"training views, got {n} of {len(points)}; choose views that overlap more, or more of them"
         )
     scales = _neighbour_distances(kept)
     sh = torch.zeros(n, (sh_degree + 1) ** 2, 3, dtype=torch.float64)
-    sh[:, 0] = (points.rgb[seen].double() - 0.5) / Y00
+    sh[:, 0] = (colours - 0.5) / Y00
     attributes = {
         "means": kept,
         "log_scales": scales.log()[:, None].expand(n, 3),
@@ -101,14 +104,20 @@ def gaussians_from_points(
     return Gaussians.pack(attributes).to(torch.float32)
 
 
+def _merged(xyz: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    """The points that differ in float32, in the order of the first at each place, and the mean colours there."""
+    _, first, place = np.unique(xyz.float().numpy() + 0.0, axis=0, return_index=True, return_inverse=True)  # no -0
+    order = np.argsort(first)
+    index = torch.from_numpy(np.argsort(order)[place.ravel()])
+    sums = group_sums(rgb.double(), index, len(order))
+    return xyz[first[order]], sums / torch.bincount(index, minlength=len(order))[:, None]
+
+
 def _neighbour_distances(xyz: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Root mean square distance to the three nearest other points."""
     distances, _ = scipy.spatial.KDTree(xyz.numpy()).query(xyz.numpy(), k=NEIGHBOURS + 1)
     scales = torch.from_numpy(np.sqrt(np.square(distances[:, 1:]).mean(axis=1)))
-    median = float(scales.median())
-    if not median > 0:
-        raise InputError(f"expected distinct points, got {len(xyz)} of which most coincide with {NEIGHBOURS} others")
-    return scales.clamp_min(SMALLEST_SCALE * median)
+    return scales.clamp_min(SMALLEST_SCALE * float(scales.median()))
 
 
 def points_in_box(points: Points, generator: torch.Generator) -> Points:

@@ -50,7 +50,7 @@ def results(cells: Sequence[Cell], statuses: Mapping[str, str]) -> pd.DataFrame:
     """A row for each cell, in their order."""
     rows = [
         {"scene": cell.scene, "method": cell.method, "seed": cell.seed, "status": statuses[cell.name]}
-        | (_metrics(cell.out) | _probe(cell.out) if statuses[cell.name] == "done" else {})
+        | (metrics_of(cell.out) | probe_of(cell.out) if statuses[cell.name] == "done" else {})
         for cell in cells
     ]
     return with_ratios(pd.DataFrame(rows))
@@ -90,7 +90,8 @@ def summarize(rows: pd.DataFrame) -> pd.DataFrame:
     return grouped.reset_index()
 
 
-def _metrics(run: Path) -> dict[str, float]:
+def metrics_of(run: Path) -> dict[str, float]:
+    """Scores, seconds and the number of Gaussians of a run."""
     found = read_scores(run)
     row: dict[str, float] = {}
     for part, prefix in ((found.test, ""), (found.train, "train_")):
@@ -108,7 +109,7 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def _probe(run: Path) -> dict[str, float | str | None]:
+def probe_of(run: Path) -> dict[str, float | str | None]:
     """Traces, ends and indices of the run's record; nothing without one."""
     if not (run / PROBE).is_dir():
         return {}

@@ -33,7 +33,7 @@ def read_llff(root: Path, images: str | None = None) -> list[Photo]:
     if len(files) != len(rows):
         raise InputError(
             f"expected one image for each of the {len(rows)} poses in {path}, got {len(files)} in {folder}; "
-            "restore the images that the poses were computed from, or choose their folder with images=..."
+            "restore the images that the poses were computed from, or name their folder with --images"
         )
     for file, (near, far) in zip(files, rows[:, 15:]):
         if not 0 < near < far:

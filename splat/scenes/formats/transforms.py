@@ -12,13 +12,12 @@ to camera rotation here is diag(1, -1, -1) R^T.  Intrinsics stand at the top or 
     background                   (this project) the colour that the pictures were composited over
 
 Blender scenes have two files, `transforms_train.json` and `transforms_test.json`; the frames keep their order in the
-files, because the sparse-view protocols count them.  Frames of a single file are sorted by name.
+files, because the sparse-view protocols count them.  Frames of a single file are sorted by name.  Frames without an image,
+which captures often list, are skipped.
 """
 
 import json
-import re
 from collections.abc import Mapping
-from io import BytesIO
 from math import isfinite, pi, tan
 from pathlib import Path
 from typing import Any
@@ -26,10 +25,10 @@ from typing import Any
 import numpy as np
 import pycolmap
 import torch
-from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from landscape.errors import InputError
+from splat.model.files.ply import read_header, read_rows
 from splat.scenes.images import (
     PINHOLE_MODELS,
     UNDISTORTED_HERE,
@@ -47,31 +46,33 @@ REFUSED_TERMS = ("k4", "k5", "k6")
 NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "k1", "k2", "k3", "p1", "p2", *REFUSED_TERMS)
 
 
-def read_blender(root: Path) -> list[Photo]:
-    """Training photographs, then test photographs, named by their path (`train/r_26`)."""
-    photos = []
+def read_blender(root: Path, strict: bool = False) -> tuple[list[Photo], list[str]]:
+    """Training photographs, then test photographs, named by their path (`train/r_26`); and the frames skipped."""
+    photos, skipped = [], []
     for subset, name in BLENDER_FILES:
         data = _load(root / name)
         paths = [_image_path(root, frame["file_path"]) for frame in data["frames"]]
-        photos += _photos(root / name, data, paths, subset)
-    return photos
+        found, missing = _photos(root / name, data, paths, subset, strict)
+        photos, skipped = photos + found, skipped + missing
+    return photos, skipped
 
 
 def read_transforms(
-    root: Path, path: Path, images: str | None = None
-) -> tuple[list[Photo], Points | None, list[float] | None]:
-    """Photographs sorted by name, the points of `ply_file_path`, and the background, where the file has them."""
+    root: Path, path: Path, images: str | None = None, strict: bool = False
+) -> tuple[list[Photo], Points | None, list[float] | None, list[str]]:
+    """Photographs sorted by name, the points of `ply_file_path` and the background, where the file has them; and the
+    frames skipped."""
     data = _load(path)
     data["frames"].sort(key=lambda frame: frame["file_path"])
     paths = [_image_path(root, frame["file_path"]) for frame in data["frames"]]
     if images is not None or (not any(p.is_file() for p in paths) and not (root / "images").exists()):
         folder = image_folder(root, images)
         paths = [_image_path(folder, Path(frame["file_path"]).name) for frame in data["frames"]]
-    photos = _photos(path, data, paths, None)
+    photos, skipped = _photos(path, data, paths, None, strict)
     points = None
     if cloud := _file(data, "ply_file_path", path):
-        points = read_points(root / cloud, tuple(photo.name for photo in photos))
-    return photos, points, data.get("background")
+        points = read_points(root / cloud, tuple(_name(frame) for frame in data["frames"]))
+    return photos, points, data.get("background"), skipped
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -95,17 +96,30 @@ def _image_path(folder: Path, file_path: str) -> Path:
     return next((candidate for candidate in candidates if candidate.is_file()), path)
 
 
-def _photos(path: Path, data: dict[str, Any], paths: list[Path], subset: Subset | None) -> list[Photo]:
-    require_files(paths)  # before their headers are read, which say the size of a Blender scene's images
+def _name(frame: Mapping[str, Any]) -> str:
+    return Path(frame["file_path"]).as_posix()
+
+
+def _photos(
+    path: Path, data: dict[str, Any], paths: list[Path], subset: Subset | None, strict: bool
+) -> tuple[list[Photo], list[str]]:
+    """The frames that have an image, and the names of the others; strict, or where none has one: refuses."""
+    if not any(image.is_file() for image in paths):
+        require_files(paths, f"where {path} says" if subset else "or name another folder of images with --images")
+    if strict:
+        require_files(paths, "or leave out --strict-frames")
     shared = {key: value for key, value in data.items() if key != "frames"}
-    photos = []
+    photos, skipped = [], []
     for frame, image in zip(data["frames"], paths):
-        name = Path(frame["file_path"]).as_posix()
+        name = _name(frame)
+        if not image.is_file():
+            skipped.append(name)
+            continue
         rotation, centre = _pose(frame["transform_matrix"], name, path)
         lens = _lens({**shared, **frame}, image_header(image)[0], name, path)
         mask = _file(frame, "mask_path", path)
         photos.append(Photo(name, image, lens, rotation, centre, subset, mask=path.parent / mask if mask else None))
-    return photos
+    return photos, skipped
 
 
 def _file(values: Mapping[str, Any], key: str, path: Path) -> str | None:
@@ -170,20 +184,20 @@ def _focal(values: Mapping[str, Any], width: int, name: str, path: Path) -> floa
 def read_points(path: Path, names: tuple[str, ...]) -> Points:
     """Points of a PLY file: x y z, red green blue (0 to 255; grey where there are none), and `views` if it is there."""
     try:
-        promised = re.search(rb"^element vertex (\d+)", content := path.read_bytes(), re.M)
-        if promised and int(promised[1]) > len(content):  # memory for so many would be asked for
-            raise ValueError(f"it promises {int(promised[1])} points in {len(content)} bytes")
-        vertex = PlyData.read(BytesIO(content))["vertex"]
-        present = {prop.name for prop in vertex.properties}
-        xyz = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+        content = path.read_bytes()
+        vertex = read_rows(content, read_header(content))
+        if missing := {*"xyz"} - {*vertex.names}:
+            raise InputError(f"its points have no {', '.join(sorted(missing))}")
+        if "views" in vertex.names:
+            raise InputError("its property 'views' is a single number, not a list")
+        xyz = np.stack([vertex.numbers[axis].astype(np.float64) for axis in "xyz"], axis=1)
         rgb = np.full(xyz.shape, 0.5, dtype=np.float32)
-        if {"red", "green", "blue"} <= present:
-            rgb = np.stack([np.asarray(vertex[c], dtype=np.float32) for c in ("red", "green", "blue")], axis=1) / 255
+        if {"red", "green", "blue"} <= {*vertex.names}:
+            rgb = np.stack([vertex.numbers[c].astype(np.float32) for c in ("red", "green", "blue")], axis=1) / 255
         observations = None
-        if "views" in present:
-            seen = [np.asarray(views, dtype=np.int64) for views in vertex["views"]]
+        if seen := vertex.lists.get("views"):
             point = np.repeat(np.arange(len(seen)), [len(views) for views in seen])
-            observations = torch.from_numpy(np.stack([point, np.concatenate(seen)], axis=1)) if seen else None
-    except (OSError, PlyParseError, KeyError, ValueError, TypeError) as error:
+            observations = torch.from_numpy(np.stack([point, np.concatenate(seen).astype(np.int64)], axis=1))
+    except (OSError, InputError) as error:
         raise InputError(f"expected a PLY file of points, cannot read {path}: {error}; restore or remove it") from error
     return Points(torch.from_numpy(xyz), torch.from_numpy(rgb), observations, names)

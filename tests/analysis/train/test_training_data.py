@@ -1,6 +1,7 @@
 """What `landscape train` takes beside the photographs: masks, depth maps, where to start; and LPIPS."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -12,8 +13,9 @@ from PIL import Image
 from torch import Tensor
 
 from analysis.commands.cli import main
-from analysis.train.command import _not_reached, planned
+from analysis.train.command import planned
 from analysis.train.options import TrainOptions
+from analysis.train.remarks import _not_reached
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -68,6 +70,22 @@ def test_the_number_of_training_views_is_the_protocols_where_nobody_says_one(
     monkeypatch.setattr("analysis.train.command.usual_views", lambda scene: 2)
     _, split, *_ = planned(TrainOptions(original, views=views), tmp_path / "run")
     assert len(split.train) == number
+
+
+def test_frames_without_an_image_and_a_poor_start_are_said(original, tmp_path, capsys):
+    scene = tmp_path / "scene"
+    shutil.copytree(original, scene)
+    images(scene)[1].unlink()
+    assert train(scene, tmp_path / "strict", "--strict-frames") == 2
+    assert "leave out --strict-frames" in capsys.readouterr().err
+    assert train(scene, tmp_path / "run") == 0
+    said = capsys.readouterr().err
+    assert "1 of 5 frames that the scene lists were skipped" in said and "images/view_001.png" in said
+    assert "points only, and may leave places empty; take more --views" in said
+    assert train(scene, tmp_path / "random", "--start", "random") == 0
+    assert "random points, of which most lie on no surface" in capsys.readouterr().err
+    assert train(scene, tmp_path / "run", "--iterations", "2", "--resume") == 2  # the same scene, but other settings
+    assert "iterations = 1" in capsys.readouterr().err
 
 
 def test_without_lpips_the_metric_is_left_out_in_one_sentence_and_null_in_the_record(

@@ -93,23 +93,39 @@ def test_scales_follow_the_units_of_the_world() -> None:
         torch.testing.assert_close(change, torch.full_like(change, log(unit)), atol=1e-5, rtol=0)
 
 
-def test_coincident_points_get_a_small_scale_and_a_heap_is_refused() -> None:
+def test_points_at_one_place_become_one_gaussian_of_their_mean_colour() -> None:
     points = some_points()
     everyone = torch.cartesian_prod(torch.arange(60), torch.arange(3))
+    xyz, rgb = points.xyz.clone(), points.rgb
+    xyz[[2, 30]], xyz[3] = xyz[10].clone(), torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64)
+    xyz[40] = torch.tensor([-0.0, 1.0, 2.0 + 1e-12])  # the same number in float32
+    gaussians = gaussians_from_points(Points(xyz, rgb, everyone, NAMES), views())
+    kept = [i for i in range(60) if i not in (10, 30, 40)]
+    torch.testing.assert_close(gaussians.means, xyz[kept].float(), atol=0, rtol=0)
+    wanted = rgb[kept].clone()
+    wanted[2], wanted[3] = rgb[[2, 10, 30]].mean(dim=0), rgb[[3, 40]].mean(dim=0)
+    torch.testing.assert_close(0.5 + Y00 * gaussians.sh[:, 0], wanted)
+    with pytest.raises(ValueError, match=r"more than 3 points at different places .*, got 1 of 60"):
+        gaussians_from_points(Points(torch.zeros_like(xyz), rgb, everyone, NAMES), views())
+
+
+def test_points_that_all_but_coincide_get_a_small_scale() -> None:
+    points = some_points()
     xyz = points.xyz.clone()
-    xyz[:5] = xyz[0]
+    xyz[:5] = xyz[0] + 1e-6 * torch.arange(5, dtype=torch.float64)[:, None]
+    everyone = torch.cartesian_prod(torch.arange(60), torch.arange(3))
     gaussians = gaussians_from_points(Points(xyz, points.rgb, everyone, NAMES), views())
-    gaussians.require_finite()
-    assert gaussians.log_scales[0, 0] < gaussians.log_scales[5:].min()
-    with pytest.raises(ValueError, match="expected distinct points, got 60"):
-        gaussians_from_points(Points(torch.zeros_like(xyz), points.rgb, everyone, NAMES), views())
+    scales = gaussians.log_scales[:, 0].exp()
+    torch.testing.assert_close(scales[:5], torch.full((5,), 10**-3.5) * scales.median())
 
 
 def test_too_few_points_are_refused_with_their_number() -> None:
     few = Points(
         torch.randn(5, 3, dtype=torch.float64), torch.zeros(5, 3), torch.tensor([[0, 0], [0, 1], [1, 1]]), NAMES
     )
-    with pytest.raises(ValueError, match="more than 3 points seen by at least 2 of the 3 training views, got 1 of 5"):
+    with pytest.raises(
+        ValueError, match=r"more than 3 points .* seen by at least 2 of the 3 training views, got 1 of 5"
+    ):
         gaussians_from_points(few, views())
 
 

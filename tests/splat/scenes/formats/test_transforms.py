@@ -64,8 +64,8 @@ def test_lenses_that_a_pinhole_cannot_stand_for_are_refused(
             "4 x 4 transform_matrix for 'images/b.png'",
         ),
         (
-            lambda c: c["frames"][1].update(file_path="images/z.png"),
-            "3 image files, 1 are missing, the first is .*z.png",
+            lambda c: [frame.update(file_path=f"images/{i}.png") for i, frame in enumerate(c["frames"])],
+            "3 image files, 3 are missing, the first is .*0.png.*--images",
         ),
         (lambda c: c["frames"][1].update(file_path="images/a.png"), "'images/a.png' more than once"),
         (lambda c: c.update(ply_file_path="none.ply"), "cannot read .*none.ply"),
@@ -100,6 +100,35 @@ def test_bad_transforms_are_refused_in_one_sentence(
     with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
         load_scene(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_frames_without_an_image_are_skipped_and_counted(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path, ply_file_path="points.ply")
+    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+    lists = "property list uchar int views\nend_header\n0 0 0 2 0 1\n1 1 1 2 1 2\n"  # of the frames that are listed
+    (tmp_path / "points.ply").write_text(header + lists)
+    (tmp_path / "images" / NAMES[0]).unlink()
+    scene = load_scene(tmp_path)
+    assert scene.names == tuple(f"images/{name}" for name in NAMES[1:])
+    assert scene.skipped == (f"images/{NAMES[0]}",)
+    assert scene.points is not None and scene.points.sightings(scene.frames).tolist() == [1, 2]
+    with pytest.raises(
+        FileNotFoundError, match=r"3 image files, 1 are missing, the first is .*leave out --strict-frames"
+    ):
+        load_scene(tmp_path, strict_frames=True)
+
+
+def test_a_blender_scene_skips_frames_of_both_files(tmp_path: Path) -> None:
+    folders.write_blender(tmp_path, train=(2, 26), test=(0, 8))
+    for name in ("train/r_2.png", "test/r_8.png"):
+        (tmp_path / name).unlink()
+    scene = load_scene(tmp_path)
+    assert (scene.names, scene.skipped) == (("train/r_26", "test/r_0"), ("train/r_2", "test/r_8"))
+    (tmp_path / "test/r_0.png").unlink()
+    with pytest.raises(
+        FileNotFoundError, match=r"2 image files, 2 are missing, the first is .*transforms_test.json says"
+    ):
+        load_scene(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["{", 100_000 * "["])

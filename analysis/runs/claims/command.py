@@ -1,0 +1,76 @@
+"""`landscape claims`: the paper's statements against the runs of a study.
+
+OUT/study.csv        the runs (`analysis.runs.claims.study`); the command takes this file instead of the runs, too
+OUT/claims.csv       the effects behind each verdict (`analysis.runs.claims.statements`)
+OUT/predictors.csv   which quantity goes with the score (`analysis.runs.claims.predictors`)
+OUT/claims.json      the nine judgements
+OUT/claims.png, predictors.png   drawn by `figures.claims`
+OUT/claims.html      all of it on a page that needs no network
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import pandas as pd
+from rich.console import Console
+from rich.markup import escape
+
+from analysis.console.drawing import draw
+from analysis.records.json_files import json_text, plain
+from analysis.records.report import pictures_in, template_environment
+from analysis.runs.claims.predictors import predictors
+from analysis.runs.claims.statements import LEAST, Judgement, effect_table, judgements
+from analysis.runs.claims.study import FILE, study
+from analysis.runs.options import ClaimsOptions
+from splat.training.checkpoint import write_atomically
+
+STYLES = {"holds": "green", "holds in part": "yellow", "does not hold": "red", "cannot be tested here": "dim"}
+PICTURES = {
+    "claims": "Each effect with its 95% interval over the seeds. Grey: no effect; diamond: the size that the paper states.",
+    "predictors": "Rank correlation of each measured quantity with PSNR on held-out views, with its 95% interval.",
+}
+
+
+def run_claims(options: ClaimsOptions) -> int:
+    """Judge, print, write; returns the exit code."""
+    rows, console = study(options.runs), Console()
+    found, related = judgements(rows), predictors(rows)
+    out = options.out or (options.runs[0] if options.runs[0].is_dir() else options.runs[0].parent) / "claims"
+    out.mkdir(parents=True, exist_ok=True)
+    for name, table in {FILE: rows, "claims.csv": effect_table(found), "predictors.csv": related}.items():
+        write_atomically(out / name, table.to_csv(index=False).encode())
+    write_atomically(out / "claims.json", json_text(plain([asdict(each) for each in found])).encode())
+    try:
+        draw("claims", out)
+    except RuntimeError as error:  # the verdicts stand without pictures
+        console.print(" ".join(str(error).split()), style="yellow", highlight=False, markup=False, soft_wrap=True)
+    write_atomically(out / "claims.html", render_page(rows, found, out).encode())
+    _print(rows, found, console)
+    console.print(
+        f"open {escape(str(out / 'claims.html'))}; numbers: {FILE}, claims.csv, predictors.csv", soft_wrap=True
+    )
+    return 0
+
+
+def runs_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """How many seeds of each method there are, by scene, steps and views."""
+    counts = rows.groupby(["scene", "views", "steps", "method"], sort=False)["seed"].count()
+    return pd.DataFrame(counts).reset_index().rename(columns={"seed": "seeds"})
+
+
+def _print(rows: pd.DataFrame, found: Sequence[Judgement], console: Console) -> None:
+    few = runs_of(rows).query("seeds < @LEAST")
+    if len(few):
+        names = ", ".join(f"{row['method']} ({row['seeds']})" for row in few.to_dict("records"))
+        console.print(f"fewer than {LEAST} seeds, which decide nothing: {names}", markup=False, highlight=False)
+    for each in found:
+        style = STYLES[each.verdict]
+        console.print(f"\n[bold]{each.number}.[/] {escape(each.statement)} ({each.source})", highlight=False)
+        console.print(f"   [{style}]{each.verdict}[/]: {escape(each.finding)}", highlight=False)
+
+
+def render_page(rows: pd.DataFrame, found: Sequence[Judgement], out: Path) -> str:
+    """The page as text, with the pictures that lie in the folder."""
+    template = template_environment().get_template("claims.html.jinja")
+    return template.render(judgements=found, runs=runs_of(rows).to_dict("records"), pictures=pictures_in(out, PICTURES))

@@ -1,0 +1,63 @@
+"""Which measured quantity goes with the score on held-out views, over all trainings of a study.
+
+    rho         Spearman's rank correlation with PSNR
+    all         over the runs of each scene, ranked within it
+    within      after each method's mean rank was taken away: what the seeds of one method say
+    between     of the methods' means
+
+Each with a 95% interval from a bootstrap, which draws runs (between: methods) with replacement.  Correlation is not cause: the
+runs differ in method, and so in everything at once.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+
+from analysis.records.findings import ATTRIBUTES
+from analysis.records.schema import INDICES
+from analysis.runs.claims.effects import SCORE
+
+QUANTITIES = (
+    "train_psnr", "gaussians", *(f"trace_{name}" for name in ATTRIBUTES), "lambda_max", "lambda_second", "lambda_min", *INDICES,
+    "depth_gradient", "needles",
+)  # fmt: skip
+DRAWS, LIMITS, LEAST = 2000, (0.025, 0.975), 5
+
+
+def predictors(rows: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
+    """A row for each quantity and kind: quantity, kind, rho, low, high, n.  Fewer than LEAST runs or methods give none."""
+    rng = np.random.default_rng(seed)
+
+    def lines() -> Iterator[dict]:
+        for name in QUANTITIES:
+            if name not in rows:
+                continue
+            known = pd.DataFrame(rows[["scene", "method", name, SCORE]].dropna())
+            for kind, pairs in _pairs(known, name).items():
+                if len(pairs) >= LEAST and (np.ptp(pairs, axis=0) > 0).all():
+                    low, high = _bootstrap(pairs, rng)
+                    rho = float(np.corrcoef(pairs.T)[0, 1])
+                    yield {"quantity": name, "kind": kind, "rho": rho, "low": low, "high": high, "n": len(pairs)}
+
+    return pd.DataFrame(lines(), columns=["quantity", "kind", "rho", "low", "high", "n"])
+
+
+def _pairs(known: pd.DataFrame, name: str) -> dict[str, np.ndarray]:
+    """(n, 2) ranks of the quantity and of the score, by kind."""
+    columns, groups = [name, SCORE], [known["scene"], known["method"]]
+    ranks = pd.DataFrame(known.groupby("scene")[columns].rank(pct=True))
+    means = pd.DataFrame(known.groupby(["scene", "method"])[columns].mean())
+    between = pd.DataFrame(means.groupby("scene").rank(pct=True))
+    within = ranks - pd.DataFrame(ranks.groupby(groups).transform("mean"))
+    several = pd.Series(known.groupby(["scene", "method"])[name].transform("size")).to_numpy() > 1
+    return {"all": ranks.to_numpy(), "within": within.to_numpy()[several], "between": between.to_numpy()}
+
+
+def _bootstrap(pairs: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:
+    drawn = pairs[rng.integers(len(pairs), size=(DRAWS, len(pairs)))]
+    centred = drawn - drawn.mean(axis=1, keepdims=True)
+    spread = np.sqrt((centred**2).sum(axis=1)).prod(axis=1)
+    found = (centred.prod(axis=2).sum(axis=1) / np.where(spread > 0, spread, np.nan))[spread > 0]
+    low, high = np.quantile(found, LIMITS)
+    return float(low), float(high)

@@ -1,0 +1,240 @@
+"""The paper's nine statements, each judged by the effects that decide it (`analysis.runs.claims.effects`).
+
+Sizes are the paper's, at 10,000 steps.  Of several effects the first decides, but where a statement says otherwise.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from analysis.records.findings import ATTRIBUTES, attribute_name
+from analysis.records.schema import INDICES
+from analysis.runs.claims.effects import (
+    BASE,
+    LEAST,
+    SCORE,
+    STABLE,
+    Effect,
+    Interval,
+    Verdict,
+    decide,
+    gains,
+    log_ratios,
+    numbers,
+    ratio_effect,
+)  # fmt: skip
+
+ATTRIBUTES_ALONE, VIEWPOINTS_ALONE = "stablegs vsp_weight=0", "stablegs asp_weight=0"
+AXIS = ATTRIBUTES_ALONE + " probe.attributes={}"
+TIME = 1.45
+SUFFICIENT = 0.1  # relative standard error of a trace: rho, its root, is then known to 5%
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """statement: the paper's, with its place.  finding: what was measured, in a sentence.  effects: the first decides."""
+
+    number: int
+    statement: str
+    source: str
+    verdict: Verdict
+    finding: str
+    effects: tuple[Effect, ...] = ()
+
+
+def anisotropy(rows: pd.DataFrame) -> Judgement:
+    effects = []
+    for name in INDICES:
+        sign = -1 if name == "effective_rank" else 1  # the more directions, the less anisotropic
+        effects.append(ratio_effect(name.replace("_", " "), sign * log_ratios(rows, name), 0.26))
+    verdicts: list[Verdict] = [decide(effect) for effect in effects]
+    verdict = verdicts[0]
+    against = [
+        effect.name for effect, found in zip(effects, verdicts) if found == "does not hold" or effect.interval.low > 1
+    ]
+    if verdict == "holds" and against:
+        verdict = "holds in part"
+    finding = f"StableGS multiplies the literal index by {effects[0].interval.text()}; 74% less would be 0.26."
+    if against:
+        finding += f" Not lowered, or by far less: {', '.join(against)}."
+    return Judgement(
+        1, "Geometric probes cut the anisotropy index by 74%.", "Fig. 7, Sec. 4.2", verdict, finding, tuple(effects)
+    )
+
+
+def depth(rows: pd.DataFrame) -> Judgement:
+    ratios = pd.Series(np.log(numbers(rows, "depth_gradient")))
+    effect = ratio_effect("depth / lateral gradient", ratios, 100.0)
+    finding = f"Along the rays the positions' gradient is {effect.interval.text()} times that across them, over all trainings."
+    return Judgement(
+        2,
+        "The gradient along the depth is typically 100 times the lateral one.",
+        "Sec. 3.2",
+        decide(effect),
+        finding,
+        (effect,),
+    )
+
+
+def needles(rows: pd.DataFrame) -> Judgement:
+    share, number = (Interval.of(numbers(rows, name, BASE)) for name in ("needles", "needle_count"))
+    effect = Effect(
+        "share of the steepest eigenvector on needles", share, max(number.value, 0.0) if number.n else 0.0, 0.5
+    )
+    finding = f"Of the steepest eigenvector's mass {share.text()} is on Gaussians with a condition number above 100, which are "
+    finding += f"{number.text()} of those in sight. More than half counts as dominant; measured on the whole Hessian."
+    return Judgement(
+        3, "Gaussians with a condition number above 100 dominate the high curvature of rotation and scale.", "Sec. 3.2",
+        decide(effect), finding, (effect,),
+    )  # fmt: skip
+
+
+def position(rows: pd.DataFrame) -> Judgement:
+    axes = {name: gains(rows, AXIS.format(name)) for name in ATTRIBUTES}
+    whole = gains(rows, ATTRIBUTES_ALONE)
+    share = Effect(
+        "gain of positions alone - half of all attributes'",
+        Interval.of((axes["means"] - whole / 2).dropna()),
+        0.0,
+        None,
+        "dB",
+    )
+    gain = Effect("gain of positions alone", Interval.of(axes["means"]), 0.0, 2.46, "dB")
+    verdict = decide(gain) if gain.interval.n < LEAST or decide(gain) == "does not hold" else decide(share)
+    known = {name: Interval.of(found) for name, found in axes.items() if len(found)}
+    finding = (
+        f"Probing positions alone gains {gain.interval.text(' dB')}, all attributes {Interval.of(whole).text(' dB')}."
+    )
+    if len(known) > 1:
+        best = max(known, key=lambda name: known[name].value)
+        finding += f" The largest gain of one attribute is that of {attribute_name(best)}."
+    return Judgement(
+        4, "Position is the dominant axis: probing it alone recovers 84% of the gain of all attributes.", "Table 2", verdict,
+        finding, (gain, share),
+    )  # fmt: skip
+
+
+def opacity(rows: pd.DataFrame) -> Judgement:
+    effect = Effect("rank correlation", Interval.of(numbers(rows, "opacity_one_view")), 0.0, None)
+    finding = (
+        f"Rank correlation of a Gaussian's curvature in opacity with the share of its weight that one view alone sees: "
+        f"{effect.interval.text()}."
+    )
+    return Judgement(
+        5,
+        "High curvature in opacity goes with view-specific opacities.",
+        "Sec. 3.2",
+        decide(effect),
+        finding,
+        (effect,),
+    )
+
+
+def samples(rows: pd.DataFrame) -> Judgement:
+    effects = [
+        Effect(
+            f"{attribute_name(each)}, least relative error of the trace",
+            Interval.of(numbers(rows, name)),
+            SUFFICIENT,
+            0.0,
+        )
+        for each in ATTRIBUTES
+        if (name := f"hutchinson_{each}") in rows
+    ]
+    effects.sort(key=lambda effect: -effect.interval.value)
+    if not effects:
+        return Judgement(
+            6, "Ten random probes suffice for the traces.", "Eq. (6)", "cannot be tested here",
+            "No run has the anisotropy of its attributes; probe with --families.",
+        )  # fmt: skip
+    worst = effects[0]
+    verdict: Verdict = "holds" if worst.interval.high <= SUFFICIENT else "does not hold"
+    if worst.interval.n < LEAST or worst.interval.low <= SUFFICIENT < worst.interval.high:
+        verdict = "cannot be tested here"
+    finding = f"With ten Gaussian samples the relative standard error of a trace is at least {worst.interval.text()} "
+    finding += f"({worst.name.split(',')[0]}); {SUFFICIENT:.0%} counts as sufficient."
+    return Judgement(6, "Ten random probes suffice for the traces.", "Eq. (6)", verdict, finding, tuple(effects))
+
+
+def basin(rows: pd.DataFrame) -> Judgement:
+    steep, second = (-log_ratios(rows, name) for name in ("lambda_max", "lambda_second"))
+    flat = ratio_effect("largest eigenvalue, 3DGS / StableGS", steep, None)
+    round_ = ratio_effect("λ1 / λ2, 3DGS / StableGS", (steep - second).dropna(), None)
+    found = {decide(flat), decide(round_)}
+    verdict: Verdict = found.pop() if len(found) == 1 else "holds in part" if "holds" in found else "does not hold"
+    finding = (
+        f"The largest eigenvalue of 3DGS is {flat.interval.text()} times that of StableGS, its ratio to the second one "
+    )
+    finding += f"{round_.interval.text()} times; a flat basin against an elongated valley makes both larger than 1."
+    return Judgement(
+        7, "The final surface of StableGS is a flat basin, that of 3DGS an elongated valley.", "Fig. 7", verdict, finding,
+        (flat, round_),
+    )  # fmt: skip
+
+
+def cost(rows: pd.DataFrame) -> Judgement:
+    names = {STABLE: "a viewpoint for each view", f"{STABLE} viewpoints=one": "one viewpoint"}
+    effects = [
+        ratio_effect(f"time, {words}", log_ratios(rows, "cpu_seconds", name), None) for name, words in names.items()
+    ]
+    every, one = (_within(effect.interval) for effect in effects)
+    verdict: Verdict = "holds" if every else "holds in part" if one else "cannot be tested here"
+    if every is False and not one:
+        verdict = "does not hold"
+    size = ratio_effect("Gaussians, StableGS / 3DGS", log_ratios(rows, "gaussians"), None)
+    finding = (
+        f"Processor time over that of 3DGS: {effects[0].interval.text()} with a probed viewpoint for each view, the paper's "
+        f"way, {effects[1].interval.text()} with one. Rendering costs by the number of Gaussians: {size.interval.text()}."
+    )
+    return Judgement(
+        8, "Training takes 1.3 times as long as 3DGS; rendering costs nothing more.", "Sec. 4.3", verdict, finding,
+        (*effects, size),
+    )  # fmt: skip
+
+
+def _within(time: Interval) -> bool | None:
+    """Whether it is at most TIME, some ten percent more than the paper's 1.3; None: not decided."""
+    return None if time.n < LEAST or time.low <= TIME < time.high else time.high <= TIME
+
+
+def scores(rows: pd.DataFrame) -> Judgement:
+    claims = {STABLE: 4.73, ATTRIBUTES_ALONE: 2.92, VIEWPOINTS_ALONE: 2.29}
+    effects = [
+        Effect(f"{name} over 3DGS", Interval.of(gains(rows, name)), 0.0, claim, "dB") for name, claim in claims.items()
+    ]
+    finding = (
+        f"3DGS scores {Interval.of(numbers(rows, SCORE, BASE)).text(' dB')} on held-out views. Gains: "
+        + "; ".join(f"{effect.name.removesuffix(' over 3DGS')} {effect.interval.text(' dB')}" for effect in effects)
+    )
+    return Judgement(
+        9, "StableGS gains 4.73 dB over 3DGS on LLFF with 3 views; its parts alone 2.92 and 2.29 dB.", "Table 6",
+        decide(effects[0]), finding + ".", tuple(effects),
+    )  # fmt: skip
+
+
+STATEMENTS: tuple[Callable[[pd.DataFrame], Judgement], ...] = (
+    anisotropy, depth, needles, position, opacity, samples, basin, cost, scores,
+)  # fmt: skip
+
+
+def judgements(rows: pd.DataFrame) -> list[Judgement]:
+    """All nine, over the rows of a study (`analysis.runs.claims.study`)."""
+    return [statement(rows) for statement in STATEMENTS]
+
+
+def effect_table(found: Sequence[Judgement]) -> pd.DataFrame:
+    """A row for each effect: statement, verdict, effect, unit, value, low, high, n, null, claimed."""
+
+    def lines() -> Iterator[dict]:
+        for judgement in found:
+            for effect in judgement.effects:
+                interval = effect.interval
+                yield {
+                    "statement": judgement.number, "verdict": judgement.verdict, "effect": effect.name, "unit": effect.unit,
+                    "value": interval.value, "low": interval.low, "high": interval.high, "n": interval.n,
+                    "null": effect.null, "claimed": effect.claimed,
+                }  # fmt: skip
+
+    return pd.DataFrame(lines())

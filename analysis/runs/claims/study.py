@@ -1,0 +1,123 @@
+"""The runs of a study as a table: a row for each, which `landscape claims` reads and keeps as OUT/study.csv.
+
+    scene, method, seed         where the row belongs; method: its name and the settings that were changed, as in
+                                "stablegs vsp_weight=0"
+    steps, views                of the training; how many views it was trained on
+    psnr, ssim, ...             as in a sweep's results.csv (`analysis.runs.sweep.sweep_results`): scores, Gaussians, seconds,
+                                threads, traces, ends of the spectrum and indices, those of the probe where the run has one
+    lambda_second               the second largest eigenvalue
+    depth_gradient              the root mean square gradient of the positions along the rays, over that across them
+    needles, needle_count       share of the steepest eigenvector's squared mass on Gaussians with kappa above 100, and share of
+                                the visible Gaussians that these are
+    hutchinson_ATTRIBUTE        the least relative standard error that ten Gaussian samples of the block's trace can have,
+                                sqrt(2 / (10 r)), r the upper end of the block's effective rank; where families were measured
+
+A number that a run does not have is empty.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from math import nan, sqrt
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from analysis.records.findings import ATTRIBUTES
+from analysis.records.records import ProbeRecord, read_record
+from analysis.records.run_files import CHECKPOINT
+from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
+from landscape.errors import InputError
+from splat.model.typed import leaves
+from splat.training.checkpoint import load_checkpoint
+from splat.training.state import MethodSettings, TrainConfig
+
+FILE = "study.csv"
+KEYS = ("scene", "method", "seed", "steps", "views")
+SAMPLES = 10  # the paper's B
+
+
+def study(paths: Sequence[Path]) -> pd.DataFrame:
+    """The rows of all paths: folders that hold runs at any depth, and tables that were written as FILE.
+
+    InputError where there is no run, or one twice.
+    """
+    tables = [pd.read_csv(path) if path.is_file() else pd.DataFrame(map(row_of, _runs(path))) for path in paths]
+    for path, table in zip(paths, tables, strict=True):
+        if missing := [key for key in KEYS if key not in table]:
+            raise InputError(f"expected the table of a study in {path}, got one without the column {missing[0]}")
+    rows = pd.concat(tables, ignore_index=True)
+    if rows.duplicated(list(KEYS)).any():
+        twice = rows[rows.duplicated(list(KEYS))].iloc[0]
+        raise InputError(
+            f"expected every run once, got {twice['method']} with seed {twice['seed']} of {twice['scene']} twice"
+        )
+    return rows
+
+
+def _runs(path: Path) -> Iterator[Path]:
+    found = sorted(checkpoint.parent for checkpoint in path.rglob(CHECKPOINT))
+    if not found:
+        raise InputError(f"expected a run, a folder of runs or the table {FILE} of a study, got {path} with none")
+    return iter(found)
+
+
+def row_of(run: Path) -> dict[str, Any]:
+    """The row of one run; its probe must be of its checkpoint, else it counts as not probed."""
+    checkpoint = load_checkpoint(run / CHECKPOINT)
+    config, row = checkpoint.training.config, {}
+    row |= {
+        "scene": Path(checkpoint.scene.absolute).name,
+        "method": method_name(config.method, config),
+        "seed": config.seed,
+    }
+    row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train)} | metrics_of(run)
+    if not (run / PROBE / ProbeRecord.FILE).is_file():
+        return row
+    data = read_record(run / PROBE, ProbeRecord).data
+    return row | probe_of(run) | _more(data) if data.provenance.iteration == checkpoint.training.step else row
+
+
+def method_name(method: MethodSettings, config: TrainConfig) -> str:
+    """The method and what was changed of it; what it scales to the length of the training is not changed.
+
+    >>> from splat.training.methods.stablegs.stablegs import StableGS
+    >>> config = TrainConfig(iterations=500)
+    >>> method_name(StableGS(vsp_weight=0.0, warm_up=50), config), method_name(StableGS(warm_up=3), config)
+    ('stablegs vsp_weight=0', 'stablegs warm_up=3')
+    """
+    published = leaves(asdict(type(method)().scaled(config).method))
+    changed = [f"{name}={_text(value)}" for name, value in leaves(asdict(method)).items() if value != published[name]]
+    return " ".join([method.name, *changed])
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ",".join(map(_text, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _more(data: ProbeRecord) -> dict[str, float]:
+    """What the statements need beside the columns of a sweep."""
+    second, lives = data.eigenvalues.second, data.eigenvalues.max.lives_on
+    row = {"lambda_second": _number(second and second.value)}
+    if data.depth:
+        row["depth_gradient"] = _number(data.depth.gradient_ratio)
+    if lives:
+        row |= {"needles": lives.needles, "needle_count": lives.needle_count / max(data.counts.visible_gaussians, 1)}
+    return row | _hutchinson(data)
+
+
+def _hutchinson(data: ProbeRecord) -> dict[str, float]:
+    """Relative variance of the mean of B samples: 2 |H|_F^2 / (B tr^2) >= 2 / (B r), r = (sum |lambda|)^2 / sum lambda^2."""
+    blocks = {
+        row.block: row.indices.effective_rank
+        for row in data.families or ()
+        if row.operator == "hessian" and not row.split
+    }
+    ranks: Mapping[str, float] = {name: index.high for name, index in blocks.items() if index and index.high}
+    return {f"hutchinson_{name}": sqrt(2 / (SAMPLES * ranks[name])) for name in ATTRIBUTES if name in ranks}
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else nan

@@ -1,0 +1,71 @@
+"""Remarks of `landscape train` before its first step: what was skipped or scaled or is not reached, and a poor start."""
+
+from dataclasses import asdict
+
+from splat.model.typed import leaves
+from splat.scenes.scene import Scene
+from splat.training.start import Source
+from splat.training.state import TrainConfig
+
+FEW = 500  # Gaussians at the start; density control adds others near those that are there, so that places without stay empty
+HOW_TO_START = {
+    "random": "`landscape sfm PHOTOS` makes a scene with points, and --start triangulated finds some in the training views",
+    "triangulated": "take more --views or larger images, or --start random",
+    "points": "take more --views, or --start triangulated or random",
+}
+
+
+def remarks(scene: Scene, asked: TrainConfig, config: TrainConfig, begun: tuple[Source, int] | None) -> list[str]:
+    """asked, config: the settings, not scaled and scaled; begun: the start and its Gaussians, None where resumed."""
+    found = [_skipped(scene), begun and poor_start(scene, *begun), _scaled(asked, config), _not_reached(config)]
+    return [words for words in found if words]
+
+
+def poor_start(scene: Scene, source: Source, gaussians: int) -> str:
+    """That a training starts at random or from few points, and what to do, in words; else empty.
+
+    >>> from splat import SyntheticSettings, synthetic_scene
+    >>> scene = synthetic_scene(SyntheticSettings(gaussians=50, views=3, width=16, height=12)).scene
+    >>> poor_start(scene, "triangulated", 41)
+    'it starts from 41 points only, and may leave places empty; take more --views or larger images, or --start random'
+    """
+    kind = source if source != "scene" else "random" if scene.points is None else "points"
+    if kind == "random":
+        return f"it starts from {gaussians:,} random points, of which most lie on no surface; {HOW_TO_START[kind]}"
+    few = f"it starts from {gaussians:,} points only, and may leave places empty; {HOW_TO_START[kind]}"
+    return few if gaussians < FEW else ""
+
+
+def _skipped(scene: Scene) -> str:
+    """How many frames of the scene have no image, in words; none: empty."""
+    count, listed = len(scene.skipped), len(scene.skipped) + len(scene.frames)
+    if not count:
+        return ""
+    words = "frames that the scene lists were skipped, because their images are missing; the first is"
+    return f"{count} of {listed} {words} {scene.skipped[0]} (--strict-frames refuses such a scene)"
+
+
+def _scaled(asked: TrainConfig, config: TrainConfig) -> str:
+    """Which settings of a published schedule were scaled to the length of the training, in words; none: empty."""
+    before, after = (leaves(asdict(settings)) for settings in (asked, config))
+    changes = [
+        f"{key.removeprefix('method.')} {before[key]} to {after[key]}" for key in after if before[key] != after[key]
+    ]
+    if not changes:
+        return ""
+    return (
+        f"{config.method.name}: its published schedule is scaled to {config.iterations} steps: {', '.join(changes)}; "
+        "--set KEY=VALUE gives one of them another value"
+    )
+
+
+def _not_reached(config: TrainConfig) -> str:
+    """Which parts of a method a run does not reach, in words; none: empty."""
+    parts = config.method.parts(config)
+    late = [f"{name} = {begins}" for name, begins in parts.items() if begins >= config.iterations]
+    if not late:
+        return ""
+    return (
+        f"{config.method.name}: what begins after step {' and '.join(late)} is not reached in {config.iterations} steps; take "
+        f"more --iterations, or --set {late[0].split()[0]}={config.iterations // 2}"
+    )
