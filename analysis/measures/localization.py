@@ -2,7 +2,7 @@
 
 mass           of Gaussian i in a vector v: m_i = sum of v^2 over its parameters; shares are of sum_i m_i = |v|^2
 participation  (sum_i m_i)^2 / sum_i m_i^2: over how many Gaussians the mass is spread, 1 to n
-condition      kappa of a splat's 2-D covariance Sigma' = r r^T + blur 1 (`projection/reference.py`), lambda_max / lambda_min: the largest
+condition      kappa of a splat's 2-D covariance Sigma' = r r^T + blur 1, lambda_max / lambda_min: the largest
                over the views on whose image its 3-sigma box lies; `rendered` with the blur, `bare` without
 needle         a Gaussian with kappa > 100
 """
