@@ -141,7 +141,7 @@ def folder_script(
     parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png")
     arguments = vars(parser.parse_args())
     folder, suffix = arguments.pop("folder"), arguments.pop("format")
-    folder = sys.stdin.readline().rstrip("\n") if folder == "-" else folder
+    folder = sys.stdin.read() if folder == "-" else folder  # a name may hold a line break
     if not folder:  # who was to name it has ended
         return
     try:

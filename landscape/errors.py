@@ -6,8 +6,10 @@ came, what to do.  Anything else that is raised is a fault of the program, for w
 
 import errno
 
-FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
-OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")  # torch's words in a RuntimeError
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the last: a limit on the size of files
+OUT_OF_MEMORY = (  # words of torch, of Python's threads and of C++
+    "allocate memory", "not enough memory", "out of memory", "can't start new thread", "bad_alloc",
+)  # fmt: skip
 
 
 class InputError(ValueError):
@@ -21,8 +23,10 @@ def lacks_memory(error: BaseException) -> bool:
     (True, True, False)
     """
     words = str(error).lower()
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and any(text in words for text in OUT_OF_MEMORY)
+        isinstance(error, RuntimeError | ImportError) and any(text in words for text in OUT_OF_MEMORY)
     )
 
 

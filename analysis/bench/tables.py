@@ -35,4 +35,4 @@ def write_table(table: pd.DataFrame, path: Path, console: Console | None = None)
     """Write a CSV file, and say where on the console."""
     write_atomically(path, table.to_csv(index=False).encode())
     if console is not None:
-        console.print(str(path), soft_wrap=True, highlight=False)
+        console.print(str(path), soft_wrap=True, highlight=False, markup=False)

@@ -5,15 +5,19 @@ Every subcommand imports what it needs when it runs, so that `landscape --help` 
 """
 
 import gc
+import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated, NoReturn
+from io import TextIOWrapper
+from typing import IO, Annotated, NoReturn
 
 import tyro
+from rich.console import Console
 
 from analysis.bench.options import BenchOptions
 from analysis.commands.options import DemoOptions, SfmOptions
 from analysis.console.failures import report
+from analysis.console.interruption import ignored, raising
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, TrajectoryOptions
 from analysis.slice.options import SliceOptions
@@ -40,16 +44,57 @@ def command() -> NoReturn:
     The libraries' objects live as long as the process, so Python is told not to look for garbage among them.
     """
     gc.set_threshold(100_000)
+    _open_streams()
+    Console.on_broken_pipe = _say_no_more
     code = main()
-    gc.freeze()
-    sys.exit(code)
+    with ignored():  # the work is done
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:
+            _drop(sys.stdout)
+        gc.freeze()
+        sys.exit(code)
+
+
+def _open_streams() -> None:
+    """Open the standard streams that were closed: no file gets their number, and what is said is dropped."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)  # the least free number: this one
+            setattr(sys, name, os.fdopen(opened, "w" if number else "r"))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files may be no text
+
+
+def _say_no_more(console: Console) -> None:
+    """In place of rich's, which ends the process, and the work with it."""
+    console.quiet = True
+    _drop(console.file)
+
+
+def _drop(stream: IO[str]) -> None:
+    """Send what is written to a stream nowhere."""
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; arguments: those of the command line where None.  Returns the exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug, arguments = DEBUG in arguments, [word for word in arguments if word != DEBUG]
-    options = tyro.cli(
+    try:
+        with raising():
+            return run(_parsed(arguments), arguments)
+    except (Exception, KeyboardInterrupt) as error:
+        return report(error, ["landscape", *arguments], debug)
+
+
+def _parsed(arguments: Sequence[str]) -> Options:
+    """The options of a subcommand.  SystemExit for help, and where they cannot be parsed."""
+    return tyro.cli(
         Options,  # pyright: ignore[reportArgumentType]
         prog="landscape",
         description=f"See the loss landscape of a 3D Gaussian Splatting scene.\n{DEBUG}, before or after the subcommand, shows "
@@ -57,10 +102,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args=arguments,
         config=(tyro.conf.DisallowNone,),
     )
-    try:
-        return run(options, arguments)
-    except (Exception, KeyboardInterrupt) as error:
-        return report(error, ["landscape", *arguments], debug)
 
 
 def run(options: Options, arguments: Sequence[str]) -> int:

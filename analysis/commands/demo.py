@@ -27,7 +27,7 @@ def run_demo(options: DemoOptions) -> int:
     """Make, train, probe; returns the exit code."""
     out, console = free_folder(options.out), Console()
     if out != options.out:
-        console.print(f"{options.out} exists, so this run goes to {out}", highlight=False, soft_wrap=True)
+        console.print(f"{options.out} exists, so this run goes to {out}", highlight=False, soft_wrap=True, markup=False)
     console.print("the first run compiles the kernels, which takes about a minute; later runs find them in a cache")
     with Console(stderr=True).status("making a synthetic scene"):
         write_transforms_scene(synthetic_scene(SCENE).scene, out / "scene")
@@ -45,7 +45,9 @@ def run_demo(options: DemoOptions) -> int:
 
 def _announce(console: Console, arguments: list[str]) -> None:
     """The command that does the same."""
-    console.print(f"\n$ {shlex.join(['landscape', *arguments])}", style="bold", highlight=False, soft_wrap=True)
+    console.print(
+        f"\n$ {shlex.join(['landscape', *arguments])}", style="bold", highlight=False, soft_wrap=True, markup=False
+    )
 
 
 def free_folder(wanted: Path) -> Path:

@@ -20,16 +20,16 @@ Draw = Callable[[Path], list[str]]
 @contextmanager
 def drawing(module: str, *options: str) -> Iterator[Draw]:
     """`python -m figures.MODULE OPTIONS` of a folder that is named later: the process loads its libraries meanwhile."""
-    command = [sys.executable, "-m", f"figures.{module}", *options]
-    with _group([*command, "-"]) as process:  # without a folder there is nothing to draw
-        yield lambda target: _said(process, [*command, str(target)], str(target))
+    command = [sys.executable, "-m", f"figures.{module}", *options, "-"]  # without a folder there is nothing to draw
+    with _group(command) as process:
+        yield lambda target: _said(process, str(target))
 
 
 def draw(module: str, target: Path, *options: str) -> list[str]:
     """Run `python -m figures.MODULE OPTIONS TARGET`, a folder or a file; as `Draw` does."""
     command = [sys.executable, "-m", f"figures.{module}", *options, str(target)]
     with _group(command) as process:
-        return _said(process, command)
+        return _said(process)
 
 
 @contextmanager
@@ -52,11 +52,11 @@ def _group(command: list[str]) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-def _said(process: subprocess.Popen[str], command: list[str], told: str = "") -> list[str]:
-    """Warnings of the process, once it is told this and has ended.  command: does the same by hand."""
+def _said(process: subprocess.Popen[str], told: str = "") -> list[str]:
+    """Warnings of the process, once it is told this and has ended."""
     lines = [line for line in process.communicate(told)[1].splitlines() if line.strip()]
     if process.returncode:
-        raise RuntimeError(f"drawing failed; draw again with: {' '.join(command)}\n" + "\n".join(lines))
+        raise RuntimeError("drawing failed: " + "\n".join(lines))
     return [line.split("Warning: ", 1)[1] for line in lines if "Warning: " in line]
 
 

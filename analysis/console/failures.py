@@ -5,20 +5,25 @@
     2    bad input: one sentence that says what was expected, what came and what to do
     70   a fault of the program: its traceback, and how to report it
     71   memory ran out
-    74   the disk is full
-    130  interrupted
+    74   the disk is full, or a limit on the size of files is reached
+    130  interrupted by Ctrl-C; 143 by SIGTERM, 129 by a terminal that closed
+    141  nobody reads the help any more, as after `| head -1`
 
-A file or folder that cannot be opened is bad input.  Numbers as in `sysexits.h`, and 128 + 2 for the signal SIGINT.
+Where nobody reads what a command says any more, it works on quietly.  A file or folder that cannot be opened is bad input.
+Numbers as in `sysexits.h`, and 128 + the number of the signal.
 """
 
 import shlex
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
 
+from analysis.console.interruption import Interrupted
 from landscape.errors import InputError, lacks_memory, lacks_space
 
-BAD_INPUT, BUG, NO_MEMORY, FULL_DISK, INTERRUPTED = 2, 70, 71, 74, 130
+LONGEST = 1000  # characters of a sentence
+BAD_INPUT, BUG, NO_MEMORY, FULL_DISK, INTERRUPTED, NO_READER = 2, 70, 71, 74, 130, 141
 
 
 def describe(error: BaseException) -> tuple[int, str]:
@@ -34,8 +39,14 @@ def describe(error: BaseException) -> tuple[int, str]:
     70
     """
     text = " ".join(str(error).split())
+    if len(text) > LONGEST:  # a damaged file's own words may be megabytes
+        text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 4 :]}"
+    if isinstance(error, Interrupted):
+        return error.exit_code, f"interrupted by {signal.Signals(error.number).name}"
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED, "interrupted"
+    if isinstance(error, BrokenPipeError):
+        return NO_READER, ""
     if lacks_memory(error):
         return NO_MEMORY, f"memory ran out; take fewer Gaussians or smaller images, or end other programs ({text})"
     if isinstance(error, OSError):
@@ -56,5 +67,6 @@ def report(error: BaseException, command: Sequence[str], debug: bool = False) ->
         traceback.print_exception(error)
     if code == BUG:
         print(f"command: {shlex.join(command)}", file=sys.stderr)
-    print(f"landscape: {sentence}", file=sys.stderr)
+    if sentence:
+        print(f"landscape: {sentence}", file=sys.stderr)
     return code

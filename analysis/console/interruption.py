@@ -1,31 +1,78 @@
-"""Ctrl-C, or a scheduler's SIGTERM, in long work that can save first."""
+"""Ctrl-C, a scheduler's SIGTERM, a terminal that closes: what is under way is left in order, the exit code names the signal."""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from threading import Event
+from threading import Event, current_thread, main_thread
+from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal that interrupted what was under way."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+    @property
+    def exit_code(self) -> int:
+        """128 + its number, as shells have it."""
+        return 128 + self.number
+
+
+class Interruption(Event):
+    """Set by the first signal.  exit_code: for a command that it ended."""
+
+    exit_code = 0
 
 
 @contextmanager
-def interruption() -> Iterator[Event]:
-    """The first signal only sets the event, so that what is under way ends; a second one interrupts at once."""
-    event = Event()
-    # None: a handler that is none of Python's, such as a library's that prints a stack trace
-    before = {each: signal.getsignal(each) or signal.SIG_DFL for each in SIGNALS}
+def raising() -> Iterator[None]:
+    """Signals raise `Interrupted` wherever the main thread is, so that what it has begun is cleaned up."""
 
-    def restore() -> None:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+    def interrupt(number: int, _: FrameType | None) -> None:
+        raise Interrupted(number)
 
-    def first(*_: object) -> None:
+    with _handled(interrupt):
+        yield
+
+
+@contextmanager
+def ignored() -> Iterator[None]:
+    """Signals change nothing any more."""
+    with _handled(lambda *_: None):
+        yield
+
+
+@contextmanager
+def interruption() -> Iterator[Interruption]:
+    """The first signal only sets the event, so that what is under way ends; a second one does what it did before."""
+    event = Interruption()
+
+    def first(number: int, _: FrameType | None) -> None:
+        event.exit_code = Interrupted(number).exit_code
         event.set()
         restore()
 
-    for each in SIGNALS:
-        signal.signal(each, first)
-    try:
+    with _handled(first) as restore:
         yield event
+
+
+@contextmanager
+def _handled(handler: Callable[[int, FrameType | None], None]) -> Iterator[Callable[[], None]]:
+    """Handle the signals in the block, but for those that are ignored, as under nohup; gives what ends it earlier."""
+    before = {each: signal.getsignal(each) for each in SIGNALS} if current_thread() is main_thread() else {}
+
+    def restore() -> None:
+        for each, old in before.items():
+            signal.signal(each, signal.SIG_DFL if old is None else old)  # None: a handler that is none of Python's
+
+    for each, old in before.items():
+        if old is not signal.SIG_IGN:
+            signal.signal(each, handler)
+    try:
+        yield restore
     finally:
         restore()

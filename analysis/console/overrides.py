@@ -106,7 +106,7 @@ def read_value(value: Any, hint: Any, key: str) -> Any:
     _require(not isinstance(value, bool), None, hint, value, key)
     try:
         read = hint(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         read = None
     # int(0.5) is 0, which nobody asked for
     return _require(read is not None and (isinstance(value, str) or read == value), read, hint, value, key)

@@ -3,13 +3,15 @@
 The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.
 """
 
+import shlex
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from math import inf, isfinite
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rich.console import Console
@@ -23,7 +25,7 @@ from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.views import write_views
 from analysis.records.findings import findings
 from analysis.records.provenance import require_seed
-from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
+from analysis.records.records import Arrays, ProbeRecord, Record, record_folder
 from analysis.records.tables import family_table, probe_table
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from analysis.measures.families import FamilyOptions
 
 CHECK_FAILED = 1
+SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 WITHOUT_SURFACE = "the picture of the slice as a surface was left out; python -m figures.surface {} draws it"
 
 
@@ -54,14 +57,34 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | 
 def _run(
     options: ProbeOptions, command: Sequence[str], drawn: Draw | None, device: torch.device, ranks: Ranks | None
 ) -> int:
-    out = options.out or options.checkpoint.parent / "probe"
+    out = _out(options)
     settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
     if ranks is not None and family_options is not None:
         raise InputError(
             "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
         )
     writes = ranks is None or ranks.rank == 0
-    require_replaceable(out)
+    # a folder that cannot be written, or that another command is writing, is noticed before hours are spent
+    with record_folder(out) if writes else nullcontext(out) as folder:
+        data = _measured(options, command, drawn, device, ranks, settings, family_options, folder)
+    if writes:
+        _conclude(data, out)
+    failed = any(check.passed is False for check in data.checks.values())
+    return CHECK_FAILED if options.strict and failed else 0
+
+
+def _measured(
+    options: ProbeOptions,
+    command: Sequence[str],
+    drawn: Draw | None,
+    device: torch.device,
+    ranks: Ranks | None,
+    settings: ProbeSettings,
+    family_options: "FamilyOptions | None",
+    folder: Path,
+) -> ProbeRecord:
+    """Measure, and write the record, its pictures and its page into the folder."""
+    writes = ranks is None or ranks.rank == 0
     console, start = Console(stderr=True, quiet=not writes), perf_counter()
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
@@ -69,7 +92,7 @@ def _run(
         checkpoint.training.move(device)
         scene = checkpoint.load_scene(options.checkpoint, options.scene)
         objective = scene_objective(checkpoint, scene, ranks)
-    console.print(_introduction(scene, checkpoint, objective), highlight=False)
+    console.print(_introduction(scene, checkpoint, objective), highlight=False, markup=False)
     with stages:
         generator = torch.Generator(device).manual_seed(options.seed)
         found = measure(objective, settings, generator, stages.stage)
@@ -85,17 +108,18 @@ def _run(
             data, arrays["families"] = families.added_to(data), families.arrays()
             data.provenance.families = asdict(family_options)
         if options.quick:
-            data.notes.append(WITHOUT_SURFACE.format(out))
+            data.notes.append(WITHOUT_SURFACE.format(shlex.quote(str(_out(options)))))
         if writes:
-            _write(out, data, arrays, objective, stages, start, drawn, options.pictures)
-    if writes:
-        _conclude(data, out)
-    failed = any(check.passed is False for check in data.checks.values())
-    return CHECK_FAILED if options.strict and failed else 0
+            _write(folder, data, arrays, objective, stages, start, drawn, options.pictures)
+    return data
+
+
+def _out(options: ProbeOptions) -> Path:
+    return options.out or options.checkpoint.parent / "probe"
 
 
 def _write(
-    out: Path,
+    folder: Path,
     data: ProbeRecord,
     arrays: Arrays,
     objective: SceneObjective,
@@ -104,8 +128,8 @@ def _write(
     drawn: Draw | None,
     pictures: Sequence[str],
 ) -> None:
-    """The record, its pictures and its page, all at once."""
-    with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
+    """The record, its pictures and its page."""
+    with ThreadPoolExecutor(1) as pool:
         write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
         write_with_pictures(folder, data, arrays, stages, start, drawn, pictures)
@@ -170,7 +194,7 @@ def _conclude(data: ProbeRecord, out: Path) -> None:
         console.print(family_table(data))
     for line in findings(data):
         if line.level != "fact":
-            console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False)
+            console.print(line.text, style="red" if line.level == "failure" else "yellow", **SAID)
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-    console.print(f"{data.timing['total']:.1f} s; open {out / REPORT}", soft_wrap=True, highlight=False)
-    console.print(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", soft_wrap=True, highlight=False)
+    console.print(f"{data.timing['total']:.1f} s; open {out / REPORT}", **SAID)
+    console.print(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", **SAID)

@@ -100,8 +100,10 @@ def json_text(data: Any) -> str:
 
 
 def encoded(value: Any) -> Any:
-    """Plain types with floats that are not finite as text."""
+    """Plain types with floats that are not finite as text, and of names of files what is no text spelt out."""
     match value:
+        case str():
+            return value.encode("utf-8", "backslashreplace").decode()
         case float() if not math.isfinite(value):
             return "NaN" if math.isnan(value) else f"{'-' * (value < 0)}Infinity"
         case dict():

@@ -8,15 +8,15 @@
 `record_folder` makes the whole folder appear at once.  Needs no torch.
 """
 
+import glob
 import os
-import secrets
 import shutil
-import time
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar, cast
+from typing import Any, BinaryIO, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
 from msgspec import UNSET, Struct, field
@@ -26,6 +26,7 @@ from analysis.records.json_files import decoded, encoded, fitted, json_text, pla
 from analysis.records.provenance import Provenance
 from analysis.records.schema import Count, Maybe, Number
 from landscape.errors import InputError
+from splat.model.untrusted import beside, locked, require_modest
 
 ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
@@ -155,7 +156,6 @@ class SliceRecord(Struct, kw_only=True):
 
 Data = TypeVar("Data", bound=ProbeRecord | SliceRecord)
 Arrays = dict[str, dict[str, np.ndarray]]
-_ABANDONED_AFTER = 3600.0  # seconds; filling a folder takes seconds: an older partial one is a killed process's
 
 
 @dataclass(frozen=True)
@@ -174,27 +174,30 @@ def record_folder(folder: str | Path, kind: type[ProbeRecord | SliceRecord] = Pr
     An old record at `folder` is replaced.  Killed at any point, `folder` is the old record, the new one, or (between
     two renames) absent with the old record complete in `.NAME.previous` beside it, from where the next use restores it.
     """
-    folder = Path(folder).absolute()
+    folder = Path(folder).resolve()  # a link stays one
     require_replaceable(folder, kind)
     folder.parent.mkdir(parents=True, exist_ok=True)
     previous = folder.with_name(f".{folder.name}.previous")
-    _clean_up_after_kills(folder, previous)
-    partial = folder.with_name(f".{folder.name}.partial-{secrets.token_hex(4)}")
-    partial.mkdir()
-    try:
-        yield partial
-        for file in (path for path in partial.rglob("*") if path.is_file()):
-            with file.open("rb") as stream:
-                os.fsync(stream.fileno())
-        if folder.exists():
-            folder.rename(previous)
-        partial.rename(folder)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        if previous.exists() and not folder.exists():
-            previous.rename(folder)
-        raise
-    shutil.rmtree(previous, ignore_errors=True)
+    with locked(beside(folder), f"no other command that writes {folder}"):
+        _clean_up_after_kills(folder, previous)
+        partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
+        partial.mkdir()
+        try:
+            yield partial
+            for file in (path for path in partial.rglob("*") if path.is_file()):
+                with file.open("rb") as stream:
+                    os.fsync(stream.fileno())
+            if folder.exists():
+                folder.rename(previous)
+            partial.rename(folder)
+        except BaseException as error:
+            _remove(partial)
+            if previous.exists() and not folder.exists():
+                previous.rename(folder)
+            if isinstance(error, OSError) and error.errno and error.filename is None:
+                error.filename = str(folder)  # a full disk's error has none
+            raise
+        _remove(previous)
 
 
 def write_record(folder: str | Path, data: ProbeRecord | SliceRecord, arrays: Mapping[str, Mapping[str, Any]]) -> Path:
@@ -262,17 +265,21 @@ def _read_arrays(folder: Path, group: str, shapes: Mapping[str, list[int]], agai
     shapes = {name: shape for name, shape in shapes.items() if name in ARRAYS[group] or "*" in ARRAYS[group]}
     if not path.is_file():
         raise FileNotFoundError(f"expected the arrays of the record in {path}, got no such file; {again}")
-    with (
-        path.open("rb") as stream,
-        refusing_damage("arrays", path, again),
-        np.load(stream, allow_pickle=False) as archive,
-    ):
+    with path.open("rb") as stream, refusing_damage("arrays", path, again), _archive(stream) as archive:
         arrays = {name: archive[name] for name in shapes if name in archive.files}
     try:
         _require_arrays(group, arrays, shapes)
     except ValueError as error:
         raise InputError(f"expected the arrays of the record in {path}, got {error}; {again}") from None
     return arrays
+
+
+def _archive(stream: BinaryIO) -> Any:
+    """The arrays of an .npz, read when they are asked for."""
+    with zipfile.ZipFile(stream) as archive:
+        require_modest(archive)
+    stream.seek(0)
+    return np.load(stream, allow_pickle=False)
 
 
 @contextmanager
@@ -293,6 +300,8 @@ def _require_arrays(group: str, arrays: Mapping[str, np.ndarray], shapes: Mappin
         if name not in arrays:
             raise ValueError(f"no {name}")
         array, kind = arrays[name], "boolean" if name in BOOLEAN else "floating"
+        if not isinstance(array, np.ndarray):  # numpy gives the bytes of what is none
+            raise ValueError(f"no array as {name}")
         if array.shape != tuple(shape):
             raise ValueError(f"{name} of shape {list(array.shape)} instead of {shape}")
         if not np.issubdtype(array.dtype, np.bool_ if name in BOOLEAN else np.floating):
@@ -331,8 +340,15 @@ def require_replaceable(folder: Path, kind: type[ProbeRecord | SliceRecord] = Pr
 
 
 def _clean_up_after_kills(folder: Path, previous: Path) -> None:
+    """The lock is ours: what is partial is nobody's."""
     if folder.exists():  # else `previous` is the only record there is
-        shutil.rmtree(previous, ignore_errors=True)
-    for partial in folder.parent.glob(f".{folder.name}.partial-*"):
-        if time.time() - partial.stat().st_mtime > _ABANDONED_AFTER:
-            shutil.rmtree(partial, ignore_errors=True)
+        _remove(previous)
+    for partial in folder.parent.glob(f".{glob.escape(folder.name)}.partial-*"):
+        _remove(partial)
+
+
+def _remove(folder: Path) -> None:
+    if folder.is_symlink():
+        folder.unlink()
+    else:
+        shutil.rmtree(folder, ignore_errors=True)

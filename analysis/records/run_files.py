@@ -8,6 +8,7 @@
 What is damaged is refused by the name of the file, with what to do.  Needs no torch.
 """
 
+import reprlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,9 @@ NO_TIME = "no time"  # how the note of a record of a trajectory begins that was 
 STATES = ("whole", "cut", "skipped")  # of a record of a trajectory
 TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
-ALWAYS = ("step", "gaussians", "seconds")  # columns of a trajectory
+WHOLE = ("step", "gaussians")  # columns of a trajectory
+ALWAYS = (*WHOLE, "seconds")
+LARGEST = 2**53  # that a table holds exactly
 NUMBERS = (  # more of them, empty where not determined; others may be there too
     *(f"trace_{name}{part}" for name in ATTRIBUTES for part in ("", "_error", "_low", "_high")),
     *(f"{name}{part}" for name in ENDS for part in ("", "_error")),
@@ -108,8 +111,12 @@ def read_trajectory(path: Path) -> "pd.DataFrame":
         else:
             numbers = pd.Series(pd.to_numeric(column, errors="coerce"))
             wrong, what = numbers.isna() & (column.notna() | (name in ALWAYS)), "a number"
+            if name in WHOLE and not wrong.any():
+                wrong, what = (numbers % 1 != 0) | ~numbers.between(0, LARGEST), "a whole number of at least 0"
             table[name] = numbers
         if wrong.any():
             row = int(wrong.to_numpy().argmax())
-            raise InputError(f"expected {what} as {name} in {path}, got {column.iloc[row]!r} in row {row + 1}")
+            raise InputError(
+                f"expected {what} as {name} in {path}, got {reprlib.repr(column.iloc[row])} in row {row + 1}"
+            )
     return table

@@ -10,6 +10,7 @@ must be kept in mind beside that is said: other starts, steps, budgets, checks t
 """
 
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def run_compare(options: CompareOptions) -> int:
     require_same(labels, checkpoints)
     missing = [path for path, checkpoint in zip(options.runs, checkpoints) if not probed(path, checkpoint)]
     if missing and not options.probe:
-        again = "; ".join(f"landscape probe {path / CHECKPOINT}" for path in missing)
+        again = "; ".join(f"landscape probe {shlex.quote(str(path / CHECKPOINT))}" for path in missing)
         raise InputError(
             f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
         )
@@ -143,7 +144,9 @@ def cautions(runs: Sequence[Run]) -> list[str]:
     if without := [run for run in runs if not run.data.split_control]:
         lines.append(
             "Anisotropy depends on the number of Gaussians; how much, the split control says, which is missing: "
-            + "; ".join(f"landscape probe {run.folder / CHECKPOINT} --split-control" for run in without)
+            + "; ".join(
+                f"landscape probe {shlex.quote(str(run.folder / CHECKPOINT))} --split-control" for run in without
+            )
         )
     return lines
 
@@ -169,18 +172,18 @@ def _write(runs: Sequence[Run], out: Path) -> None:
     console, labels = Console(), [run.label for run in runs]
     rows, notes = comparison(runs), cautions(runs)
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode())
+    write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode(errors="backslashreplace"))
     index = Comparison(runs={run.label: str((run.folder / PROBE).resolve()) for run in runs})
     write_atomically(out / COMPARISON, json_text(plain(index)).encode())
     try:
         draw("compare", out)
     except RuntimeError as error:  # the numbers stand without pictures
         notes.append(" ".join(str(error).split()))
-    write_atomically(out / PAGE, render_page(runs, rows, notes, out).encode())
+    write_atomically(out / PAGE, render_page(runs, rows, notes, out).encode(errors="backslashreplace"))
     console.print(compare_table(rows, labels))
     for note in notes:
         console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
-    console.print(f"open {out / PAGE}; numbers: {out / TABLE}", highlight=False, soft_wrap=True)
+    console.print(f"open {out / PAGE}; numbers: {out / TABLE}", highlight=False, soft_wrap=True, markup=False)
 
 
 def render_page(runs: Sequence[Run], rows: Sequence[Any], notes: Sequence[str], out: Path) -> str:

@@ -5,6 +5,7 @@ OUT/trajectories.png    drawn by `figures/trajectory.py`, which also draws PDF
 """
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,16 +38,16 @@ def run_trajectory(options: TrajectoryOptions) -> int:
     out.mkdir(parents=True, exist_ok=True)
     path, console = out / TABLE, Console()
     temporary = path.with_suffix(".csv.partial")
-    table.to_csv(temporary, index=False)
+    table.to_csv(temporary, index=False, errors="backslashreplace")
     temporary.replace(path)
     console.print(first_and_last(table))
     try:
         draw("trajectory", path)
         drawn = f"picture: {out / PICTURE}; "
     except RuntimeError as error:  # the numbers stand without the picture
-        console.print(" ".join(str(error).split()), style="yellow", highlight=False, soft_wrap=True)
+        console.print(" ".join(str(error).split()), style="yellow", highlight=False, soft_wrap=True, markup=False)
         drawn = ""
-    console.print(f"{drawn}numbers: {path}", soft_wrap=True, highlight=False)
+    console.print(f"{drawn}numbers: {path}", soft_wrap=True, highlight=False, markup=False)
     return 0
 
 
@@ -76,7 +77,7 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
         if not path.is_file():
             raise FileNotFoundError(
                 f"expected {RECORDS} in the run {run}, found none; train with --probe-every, as in "
-                f"landscape train SCENE --out {run} --probe-every 500"
+                f"landscape train SCENE --out {shlex.quote(str(run))} --probe-every 500"
             )
         table = read_trajectory(path)
         name = folder.name if folder == common else folder.relative_to(common).as_posix()

@@ -35,7 +35,7 @@ from analysis.probe.record import loss_name, provenance_of
 from analysis.records.findings import of_slice, resolved
 from analysis.records.provenance import require_seed
 from analysis.records.quantities import measured, quantity
-from analysis.records.records import SliceRecord, record_folder, refusing_damage, require_replaceable
+from analysis.records.records import SliceRecord, record_folder, refusing_damage
 from analysis.records.schema import FiniteProbe
 from analysis.slice.directions import (
     RISE,
@@ -71,9 +71,29 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     device = device_named(options.device)
     settings = _settings(options, shape, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
-    require_replaceable(out, SliceRecord)
-    unfinished = out.with_name(f".{out.name}.unfinished")
-    console, start = Console(stderr=True), perf_counter()
+    # a folder that cannot be written, or that another command is writing, is noticed before anything is rendered
+    with record_folder(out, SliceRecord) as folder:
+        data = _sliced(options, command, shape, device, settings, out, folder)
+    shutil.rmtree(_unfinished(out), ignore_errors=True)
+    _conclude(data, out)
+    return 0
+
+
+def _unfinished(out: Path) -> Path:
+    return out.with_name(f".{out.name}.unfinished")
+
+
+def _sliced(
+    options: SliceOptions,
+    command: Sequence[str],
+    shape: Shape,
+    device: torch.device,
+    settings: SliceSettings,
+    out: Path,
+    folder: Path,
+) -> SliceRecord:
+    """Slice, and write the record with its pictures into the folder."""
+    unfinished, console, start = _unfinished(out), Console(stderr=True), perf_counter()
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint = load_checkpoint(options.checkpoint)
@@ -93,11 +113,8 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         made.other = None if options.other is None else str(options.other)
         data = slice_record(found, objective, notes + slice_notes(found.slice), made)
-        with record_folder(out, SliceRecord) as folder:
-            write_with_pictures(folder, data, slice_arrays(found), stages, start)
-    shutil.rmtree(unfinished, ignore_errors=True)
-    _conclude(data, out)
-    return 0
+        write_with_pictures(folder, data, slice_arrays(found), stages, start)
+    return data
 
 
 def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:

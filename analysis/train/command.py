@@ -14,13 +14,13 @@ RUN/metrics.json    {"step", "method", "protocol", "gaussians", "train": scores,
 """
 
 import io
-import json
 import math
 import os
 import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ import pandas as pd
 import torch
 from PIL import Image
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
@@ -35,7 +36,7 @@ from torch import Tensor
 
 from analysis.console.interruption import interruption
 from analysis.console.overrides import assignments, overridden
-from analysis.records.json_files import plain
+from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
 from analysis.train.options import TrainOptions
@@ -46,6 +47,7 @@ from landscape.errors import InputError
 from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
 from splat.model.typed import leaves, typed
+from splat.model.untrusted import beside, locked
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
@@ -75,7 +77,8 @@ OPTIONS = {  # settings of the training that have an option of their own
     "densify.enabled": "densify",
 }
 AGAIN = "repeat its command with --resume, or choose another --out"
-WARNING: dict[str, Any] = {"style": "yellow", "soft_wrap": True, "highlight": False, "markup": False}
+PLAIN: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}  # paths and names may hold brackets
+WARNING = PLAIN | {"style": "yellow"}
 SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
 
 
@@ -101,14 +104,33 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         training = Training.start(start, scene.extent(split.train), config)
     training.move(device)
     prepare(training, views)  # refuses what cannot be trained before there is a folder
-    if not options.resume:
-        _create_run(out, training, reference, keep_start=along is not None)
+    if not out.parent.exists():
+        out.parent.mkdir(parents=True, exist_ok=True)
+    with locked(beside(out), f"no other training in {out}"):
+        if not options.resume:
+            _require_run(out, resume=False)  # another may have been faster
+            _create_run(out, training, reference, keep_start=along is not None)
+        return _run(options, command, training, scene, views, held_out, reference, out, along)
 
-    console = Console(stderr=True)
+
+def _run(
+    options: TrainOptions,
+    command: Sequence[str],
+    training: Training,
+    scene: Scene,
+    views: list[View],
+    held_out: list[View],
+    reference: SceneReference,
+    out: Path,
+    along: TrajectorySettings | None,
+) -> int:
+    """Train to the end and score, in a folder that exists; as `run_training`."""
+    config, console = training.config, Console(stderr=True)
     camera = views[0].camera
     console.print(
         f"{scene.name}: {len(views)} views to train on, {len(held_out)} held out, {camera.width} x {camera.height} px, "
-        f"{len(training.gaussians)} Gaussians"
+        f"{len(training.gaussians)} Gaussians",
+        markup=False,
     )
     begun = None if options.resume else (reference.start, len(training.gaussians))
     for remark in remarks(scene, _asked(options, scene), config, begun):
@@ -116,10 +138,10 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     trajectory = None if along is None else Trajectory(out, training, views, along)
     if trajectory and (hopeless := trajectory.hopeless):
         console.print(hopeless, **WARNING)
-    if not _follow(training, views, out / CHECKPOINT, reference, options.checkpoint_every, trajectory, console):
+    if code := _follow(training, views, out / CHECKPOINT, reference, options.checkpoint_every, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])
-        console.print(f"stopped after step {training.step}; to continue: {again}", soft_wrap=True, highlight=False)
-        return 130
+        console.print(f"stopped after step {training.step}; to continue: {again}", **PLAIN)
+        return code
     _report(training, views, held_out, out)
     if trajectory and (skipped := trajectory.skipped):
         console.print(skipped, **WARNING)
@@ -190,8 +212,8 @@ def _require_run(out: Path, resume: bool) -> None:
 def _create_run(out: Path, training: Training, reference: SceneReference, *, keep_start: bool) -> None:
     """Make the folder with its first checkpoint appear at once.  keep_start: with a copy that stays."""
     partial = out.absolute().with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed: the lock is ours
+    partial.mkdir()
     try:
         save_checkpoint(partial / CHECKPOINT, training, reference)
         if keep_start:
@@ -230,16 +252,16 @@ def _follow(
     every: int,
     trajectory: Trajectory | None,
     console: Console,
-) -> bool:
-    """Train to the end with a progress bar and checkpoints; False where a signal ended it, after a checkpoint."""
+) -> int:
+    """Train to the end with a progress bar and checkpoints; the exit code where a signal ended it, after a checkpoint."""
     total, spent = training.config.iterations, TrainingTime.read(path.parent)
     warned = (trajectory.skipped or trajectory.hopeless) if trajectory else ""
     with interruption() as interrupted, _progress(console) as progress:
-        bar = progress.add_task("training", total=total, completed=training.step, loss=math.nan, gaussians=0)
+        bar = progress.add_task("training", total=total, completed=training.step, state="")
         loss = math.nan
         for done in spent.timed(train(training, views)):
             loss = done.loss if math.isnan(loss) else loss + SMOOTHING * (done.loss - loss)
-            progress.update(bar, completed=done.step, loss=loss, gaussians=done.gaussians)
+            progress.update(bar, completed=done.step, state=f"loss {loss:.4f} {done.gaussians} Gaussians")
             if trajectory:
                 trajectory.after_step(spent.wall)
                 if not warned and (warned := trajectory.skipped):
@@ -250,8 +272,8 @@ def _follow(
                 spent.write(path.parent)
                 _write_history(training, path.with_name(HISTORY))
             if stop:
-                return done.step == total
-    return True
+                return interrupted.exit_code if done.step < total else 0
+    return 0
 
 
 def _write_history(training: Training, path: Path) -> None:
@@ -270,8 +292,7 @@ def _progress(console: Console) -> Progress:
         BarColumn(),
         MofNCompleteColumn(),
         _Rate(),
-        TextColumn("loss {task.fields[loss]:.4f}"),
-        TextColumn("{task.fields[gaussians]} Gaussians"),
+        TextColumn("{task.fields[state]}"),
         TimeRemainingColumn(),
         console=console,
         refresh_per_second=4,
@@ -282,17 +303,17 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
     """Score the views, write renders and metrics, print the table."""
     config = training.config
     background = config.background_colour(training.gaussians.flat.dtype)
-    renders = out / RENDERS
+    renders, names = out / RENDERS, render_names([view.name for view in held_out])
 
     def keep(name: str, image: Tensor) -> None:
-        write_atomically(renders / render_name(name), _png(image))
+        write_atomically(renders / names[name], _png(image))
 
     console = Console()
     try:
         lpips = load_lpips()
     except MissingPerceptual as error:
         lpips = None
-        console.print(str(error), soft_wrap=True, highlight=False, markup=False)
+        console.print(str(error), **PLAIN)
     seen = evaluate(training.gaussians, views, background, config.render, lpips=lpips)
     tested = None
     if held_out:
@@ -308,19 +329,36 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
         "seconds": asdict(TrainingTime.read(out)),
         "provenance": plain(provenance(config.seed, checkpoint=str(out / CHECKPOINT))),
     }
-    write_atomically(out / METRICS, (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
+    write_atomically(out / METRICS, json_text(metrics).encode())
     console.print(_table(seen, tested))
     rendered = (
         f"renders of the held-out views: {renders}; " if tested else "no view was held out, so nothing was tested; "
     )
     for line in (f"{rendered}scores: {out / METRICS}", f"next: landscape probe {shlex.quote(str(out / CHECKPOINT))}"):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+        console.print(line, **PLAIN)
 
 
 def render_name(view: str) -> str:
     """File name of a view's render: `train/r_3` becomes `train_r_3.png`, `IMG_1.JPG` becomes `IMG_1.png`."""
     flat = Path(view.replace("/", "_"))
     return f"{flat.stem if flat.suffix.lower() in IMAGE_SUFFIXES else flat.name}.png"
+
+
+def render_names(views: Sequence[str]) -> dict[str, str]:
+    """`render_name` of each view; those that would be one file, in any case of letters, are told apart by a number.
+
+    >>> render_names(["a/b.png", "a_b.png", "c"])
+    {'a/b.png': 'a_b.png', 'a_b.png': 'a_b-2.png', 'c': 'c.png'}
+    """
+    names: dict[str, str] = {}
+    for view in views:
+        name, taken = render_name(view), {each.lower() for each in names.values()}
+        stem = name.removesuffix(".png")
+        numbered = (f"{stem}-{number}.png" for number in count(2))
+        names[view] = (
+            name if name.lower() not in taken else next(each for each in numbered if each.lower() not in taken)
+        )
+    return names
 
 
 def _png(image: Tensor) -> bytes:
@@ -331,11 +369,8 @@ def _png(image: Tensor) -> bytes:
 
 
 def _scores(evaluation: Evaluation) -> dict[str, Any]:
-    def number(value: float) -> float | str:
-        return "Infinity" if value == math.inf else value
-
     def of(scores: ViewScore | Evaluation) -> dict[str, Any]:
-        return {"psnr": number(scores.psnr), "ssim": scores.ssim, "lpips": scores.lpips}
+        return {"psnr": scores.psnr, "ssim": scores.ssim, "lpips": scores.lpips}
 
     return {**of(evaluation), "masked": evaluation.masked, "views": {view.name: of(view) for view in evaluation.views}}
 
@@ -351,7 +386,7 @@ def _table(seen: Evaluation, tested: Evaluation | None) -> Table:
     def row(name: str, scores: ViewScore | Evaluation, style: str | None = None) -> None:
         values = [getattr(scores, key) for key in columns.values()]
         cells = ["" if v is None else f"{v:.{2 if key == 'psnr' else 4}f}" for v, key in zip(values, columns.values())]
-        table.add_row(name, *cells, style=style)
+        table.add_row(escape(name), *cells, style=style)
 
     if tested:
         for view in tested.views:

@@ -256,7 +256,7 @@ def _read_rows(path: Path, step: int) -> list[Row]:
     with path.open(encoding="utf-8", newline="") as stream:
         # as text, which is written back to the same bits
         rows: list[Row] = [dict(row) for row in csv.DictReader(stream)]
-    return [row | {"seconds": float(row["seconds"])} for row in rows if int(row["step"]) <= step]
+    return [row | {"seconds": float(row["seconds"])} for row in rows if float(row["step"]) <= step]
 
 
 def _compile(training: Training, views: Sequence[View]) -> None:

@@ -2,20 +2,9 @@
 
 from collections.abc import Callable, Iterator
 
-import psutil
-import torch
-
 from splat.curvature.linearize import LinearizedView
 
 VECTORS = 8  # at a time in a product: a wider block gains nothing more, because it leaves the second-level cache
-
-
-def free_memory(device: torch.device) -> int:
-    """Free bytes on a device; on a GPU with those that torch keeps for future tensors."""
-    if device.type != "cuda":
-        return psutil.virtual_memory().available
-    cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return torch.cuda.mem_get_info(device)[0] + cached
 
 
 class KeptViews:

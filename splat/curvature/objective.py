@@ -26,8 +26,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from landscape.operators.distributed import ALONE, Ranks
+from splat.backend.memory import free_memory
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
-from splat.curvature.kept_views import KeptViews, free_memory
+from splat.curvature.kept_views import KeptViews
 from splat.curvature.linearize import LinearizedView
 from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings

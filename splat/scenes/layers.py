@@ -21,6 +21,7 @@ from PIL import Image
 from torch import Tensor
 
 from landscape.errors import InputError
+from splat.model.untrusted import read_array
 from splat.scenes.view import View
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -30,14 +31,20 @@ SIXTEEN_BITS = ("I;16", "I;16B", "I")
 # Pillow recognises a file by its content, whatever its name, and would start Ghostscript for PostScript
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 # raised by Pillow for damaged files
+MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
 UNREADABLE = (OSError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError)
 
 
 @contextmanager
 def opened_image(path: Path, kind: str = "an image") -> Iterator[Image.Image]:
-    """An image file, open.  ValueError that says which kind was expected, where it cannot be read."""
+    """An image file, open.  InputError that says which kind was expected, where it cannot be read or is too large."""
     try:
         with Image.open(path, formats=FORMATS) as file:
+            if file.width * file.height > MOST_PIXELS:
+                raise InputError(
+                    f"expected {kind} of at most {MOST_PIXELS:,} pixels, got {file.width} x {file.height} px in {path}; "
+                    "reduce it"
+                )
             yield file
     except UNREADABLE as error:
         raise InputError(f"expected {kind}, cannot read {path}: {error}; replace the file") from error
@@ -90,7 +97,8 @@ def read_depth(path: Path) -> Float[Tensor, "1 h w"]:
     """The numbers of the file, checked."""
     if path.suffix == ".npy":
         try:
-            values = read_array(path)
+            with path.open("rb") as stream:
+                values = read_array(stream)
         except (OSError, ValueError) as error:
             raise InputError(f"expected a depth map, cannot read {path}: {error}; write it again") from error
     else:
@@ -112,15 +120,3 @@ def read_depth(path: Path) -> Float[Tensor, "1 h w"]:
     if values.min() == values.max():
         raise InputError(f"expected depths that vary, got {values.min()} everywhere in {path}; write it again")
     return torch.from_numpy(values)[None]
-
-
-def read_array(path: Path) -> np.ndarray:
-    """Real numbers that `numpy.save` wrote.  ValueError or OSError where the file has others or none."""
-    with path.open("rb") as file:
-        try:
-            values = np.lib.format.read_array(file, allow_pickle=False)
-        except Exception as error:  # NumPy has Python read the header, whose errors are of many kinds
-            raise InputError(f"no array of numbers ({error})") from error
-    if values.dtype.kind not in "fiu":
-        raise InputError(f"an array of {values.dtype}, not of real numbers")
-    return values

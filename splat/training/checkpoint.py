@@ -23,6 +23,7 @@ from landscape.errors import InputError, lacks_memory
 from splat.model.gaussians import Gaussians
 from splat.model.settings import current_settings
 from splat.model.typed import Count, leaves, typed
+from splat.model.untrusted import require_modest
 from splat.scenes.scene import Scene
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
@@ -153,7 +154,7 @@ def _interned(content: Any) -> Any:
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Put content at path, so that a reader or a crash sees either what was there before or all of it."""
-    partial = path.with_name(f".{path.name}.partial")
+    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")  # another program may write there too
     try:
         with partial.open("wb") as file:
             file.write(content)
@@ -193,6 +194,7 @@ def _read(file: BinaryIO, path: Path) -> Any:
     """The content that torch saved, after its checksums were found to be right."""
     try:
         with zipfile.ZipFile(file) as archive:
+            require_modest(archive)
             if wrong := archive.testzip():
                 raise zipfile.BadZipFile(f"the checksum of {wrong} is wrong")
         file.seek(0)
@@ -291,6 +293,8 @@ def _generator(state: Tensor) -> torch.Generator:
 
 def _numbers(key: str, value: Tensor, count: int, dtype: torch.dtype, least: float | None = None) -> Tensor:
     """The tensor, if it holds so many numbers of this type in memory, one by one; least: also finite, and not below this."""
+    if value.is_nested or value.layout != torch.strided or value.requires_grad:
+        raise InputError(f"'{key}' is a tensor of another kind than numbers in a row")
     kind = f"{value.dtype} of shape {tuple(value.shape)}"
     if tuple(value.shape) != (count,) or value.dtype != dtype or dtype not in (torch.float32, torch.float64):
         raise InputError(f"'{key}' is {kind}, expected {dtype} {(count,)}")

@@ -54,7 +54,7 @@ def run_sweep(options: SweepOptions) -> int:
     with locked(sweep.out) as lock, interruption() as interrupted:
         cells = _Cells(sweep, to_do, options.jobs, interrupted, lock)
         cells.run()
-    return _conclude(cells, stopped=interrupted.is_set())
+    return _conclude(cells, interrupted.exit_code)
 
 
 def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
@@ -203,7 +203,7 @@ def _environment(jobs: int) -> dict[str, str]:
     return environment
 
 
-def _conclude(cells: _Cells, stopped: bool) -> int:
+def _conclude(cells: _Cells, stopped: int) -> int:
     """The tables, and what did not go well; returns the exit code."""
     sweep, console = cells.sweep, Console()
     rows = write_results(sweep, cells.statuses)
@@ -214,7 +214,9 @@ def _conclude(cells: _Cells, stopped: bool) -> int:
     for line in cells.failed.values():
         console.print(line, style="red", soft_wrap=True, highlight=False, markup=False)
     done = sum(status == "done" for status in cells.statuses.values())
-    console.print(f"{done} of {len(sweep.cells)} cells done; tables: {sweep.out}", soft_wrap=True, highlight=False)
+    console.print(
+        f"{done} of {len(sweep.cells)} cells done; tables: {sweep.out}", soft_wrap=True, highlight=False, markup=False
+    )
     if done < len(sweep.cells):
         console.print("the same command continues", highlight=False)
-    return 130 if stopped else CELL_FAILED if cells.failed else 0
+    return stopped or (CELL_FAILED if cells.failed else 0)

@@ -101,7 +101,7 @@ def read_sweep(file: Path, out: Path | None = None, probe: bool = False) -> Swee
         raise FileNotFoundError(f"expected a sweep in TOML at {file}, found no such file; the README has an example")
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"expected a sweep in TOML in {file}, got a file that is none: {error}") from None
     try:
         return _sweep(content, file, out, probe)

@@ -10,8 +10,13 @@ import os
 import re
 from hashlib import sha256
 from pathlib import Path
+from tempfile import gettempdir
+from typing import Any
+from uuid import uuid4
 
-from numba.core import config
+from numba.core import caching, config
+
+from landscape.errors import InputError
 
 PACKAGE = Path(__file__).resolve().parents[2]
 KERNEL = re.compile(r"^@(kernel|formula|intrinsic|overload)\b", re.MULTILINE)
@@ -19,17 +24,37 @@ IMPORT = re.compile(r"^from (splat[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 
 
 def kernel_folder(register_bits: int) -> Path:
-    """The folder for this code and this width: in NUMBA_CACHE_DIR, else beside the code, else in the user's cache."""
+    """The folder for this code and this width: in the first place of `_places` where it can be written."""
     digest = sha256()
     for source in _sources():
         digest.update(source.relative_to(PACKAGE).as_posix().encode() + b"\0" + source.read_bytes())
+    for base in _places():
+        folder = base / f"kernels-{register_bits}-{digest.hexdigest()[:16]}"
+        if _is_ours(folder):
+            return folder
+    raise InputError(
+        f"expected a folder for compiled kernels that can be written and is nobody else's, found none among "
+        f"{', '.join(map(str, _places()))}; name one with NUMBA_CACHE_DIR"
+    )
+
+
+def _places() -> list[Path]:
+    """NUMBA_CACHE_DIR alone, where it is set; else beside the code, the user's cache, and one for temporary files."""
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        base = Path(chosen)
-    elif os.access(PACKAGE, os.W_OK):
-        base = PACKAGE / "__pycache__"
-    else:
-        base = Path.home() / ".cache" / "splat-landscape"
-    return base / f"kernels-{register_bits}-{digest.hexdigest()[:16]}"
+        return [Path(chosen)]
+    home = Path(os.path.expanduser("~"))  # remains as it is where there is none
+    caches = [home / ".cache" / "splat-landscape"] if home.is_dir() else []
+    return [PACKAGE / "__pycache__", *caches, Path(gettempdir()) / f"splat-landscape-{os.getuid()}"]
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether a folder can be written, made if it must be, and belongs to this user: what lies in it is run."""
+    try:
+        folder.mkdir(mode=0o755, parents=True, exist_ok=True)
+        owners = {folder.stat().st_uid, folder.parent.stat().st_uid}
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK) and owners <= {os.getuid(), 0}
 
 
 def _sources() -> list[Path]:
@@ -51,3 +76,31 @@ def _sources() -> list[Path]:
 def keep_kernels(register_bits: int) -> None:
     """Tell Numba; to be called before the first kernel is defined."""
     config.CACHE_DIR = str(kernel_folder(register_bits))  # pyright: ignore[reportAttributeAccessIssue]
+    caching.IndexDataCacheFile = _CacheFile  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class _CacheFile(caching.IndexDataCacheFile):
+    """Numba's, but for three things.
+
+    A damaged file, such as one that a full disk cut, counts as missing: its kernel is compiled anew.  Files have names of their
+    own, as two processes that compile at a time would give one name to two kernels.  Dates of sources do not count: the folder
+    is named after their content.
+    """
+
+    def __init__(self, cache_path: str, filename_base: str, source_stamp: object) -> None:
+        super().__init__(cache_path, filename_base, None)
+
+    def _data_name(self, number: int) -> str:
+        return f"{super()._data_name(number).removesuffix('.nbc')}.{uuid4().hex[:8]}.nbc"
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()
+        except Exception:  # unpickling raises nearly anything
+            return {}
+
+    def _load_data(self, name: str) -> Any:
+        try:
+            return super()._load_data(name)
+        except Exception as error:
+            raise FileNotFoundError(name) from error  # which Numba expects of a file

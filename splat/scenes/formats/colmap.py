@@ -6,6 +6,7 @@ COLMAP's conventions are those of this package: world to camera, +x right, +y do
 
 import re
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
@@ -36,7 +37,7 @@ def read_colmap(
     """Photographs sorted by name, and the model's points with their tracks unless points is False."""
     _require_plausible_counts(model)
     try:
-        reconstruction = pycolmap.Reconstruction(model)
+        reconstruction = _reconstruction(model)
         registered = (reconstruction.images[i] for i in reconstruction.reg_image_ids())
         posed = sorted(registered, key=lambda image: image.name)  # which may be no text
     except (ValueError, RuntimeError, IndexError) as error:
@@ -57,6 +58,19 @@ def read_colmap(
         centre = torch.from_numpy(image.projection_center().copy())
         photos.append(Photo(image.name, path, reconstruction.cameras[image.camera_id], rotation, centre))
     return photos, points_of(reconstruction, posed) if points else None
+
+
+def _reconstruction(model: Path) -> pycolmap.Reconstruction:
+    """The model of its three files.
+
+    Rigs and frames, which newer versions of COLMAP write beside them, say nothing more: every image has its pose.  COLMAP
+    believes the counts in these files.
+    """
+    with TemporaryDirectory() as alone:
+        for file in (model / (name + suffix) for name in MODEL_FILES for suffix in (".bin", ".txt")):
+            if file.is_file():
+                (Path(alone) / file.name).symlink_to(file.resolve())
+        return pycolmap.Reconstruction(alone)
 
 
 def _require_plausible_counts(model: Path) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from landscape.errors import InputError
+from splat.model.untrusted import read_array
 from splat.scenes.images import Photo, checked_lens, image_files, image_folder
-from splat.scenes.layers import read_array
 
 POSES = "poses_bounds.npy"
 
@@ -21,7 +21,8 @@ def read_llff(root: Path, images: str | None = None) -> list[Photo]:
     """Photographs sorted by name, with the depth range of each."""
     path = root / POSES
     try:
-        rows = read_array(path).astype(np.float64)
+        with path.open("rb") as stream:
+            rows = read_array(stream).astype(np.float64)
     except (ValueError, OSError) as error:
         raise InputError(
             f"expected an array in {path}, cannot read it: {error}; make it again with LLFF's imgs2poses"

@@ -182,7 +182,7 @@ def _focal(values: Mapping[str, Any], width: int, name: str, path: Path) -> floa
 
 
 def read_points(path: Path, names: tuple[str, ...]) -> Points:
-    """Points of a PLY file: x y z, red green blue (0 to 255; grey where there are none), and `views` if it is there."""
+    """Points of a PLY file: x y z, red green blue (grey where there are none), and `views` if it is there."""
     try:
         content = path.read_bytes()
         vertex = read_rows(content, read_header(content))
@@ -193,7 +193,7 @@ def read_points(path: Path, names: tuple[str, ...]) -> Points:
         xyz = np.stack([vertex.numbers[axis].astype(np.float64) for axis in "xyz"], axis=1)
         rgb = np.full(xyz.shape, 0.5, dtype=np.float32)
         if {"red", "green", "blue"} <= {*vertex.names}:
-            rgb = np.stack([vertex.numbers[c].astype(np.float32) for c in ("red", "green", "blue")], axis=1) / 255
+            rgb = _colours(np.stack([vertex.numbers[c] for c in ("red", "green", "blue")], axis=1))
         observations = None
         if seen := vertex.lists.get("views"):
             point = np.repeat(np.arange(len(seen)), [len(views) for views in seen])
@@ -201,3 +201,11 @@ def read_points(path: Path, names: tuple[str, ...]) -> Points:
     except (OSError, InputError) as error:
         raise InputError(f"expected a PLY file of points, cannot read {path}: {error}; restore or remove it") from error
     return Points(torch.from_numpy(xyz), torch.from_numpy(rgb), observations, names)
+
+
+def _colours(values: np.ndarray) -> np.ndarray:
+    """In [0, 1]: real numbers of which none exceeds 1 are so already, others and whole numbers count to 255."""
+    if not ((values >= 0) & (values <= 255)).all():
+        raise InputError("its colours are not between 0 and 255")
+    shares = values.dtype.kind == "f" and (values <= 1).all()
+    return values.astype(np.float32) / np.float32(1 if shares else 255)

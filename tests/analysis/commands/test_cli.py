@@ -153,7 +153,7 @@ def test_a_signal_saves_a_checkpoint_and_says_how_to_continue(finished, original
     before = [signal.getsignal(each) or signal.SIG_DFL for each in (signal.SIGINT, signal.SIGTERM)]
     with monkeypatch.context() as patch:
         patch.setattr("splat.render.loss_and_gradient.render", press)
-        assert main(command) == 130
+        assert main(command) == 128 + kind
     assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
     said = " ".join(capsys.readouterr().err.split())
     assert f"stopped after step 4; to continue: landscape {shlex.join(command)} --resume" in said

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from landscape.operators.checks import check_operator
+from splat.backend.memory import free_memory
 from splat.curvature.hessian import SceneHessian, ViewSum
-from splat.curvature.kept_views import free_memory
 from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.losses.cpu.loss import CpuViewLoss

@@ -1,0 +1,85 @@
+"""Files that anyone may have written, and files that two programs may want to write at a time.
+
+A file from outside is read only where what it promises fits its size on disk: what it would take in memory is known before any
+of it is read.
+"""
+
+import fcntl
+import os
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import prod
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from landscape.errors import InputError
+
+EXPANSION = 32  # times its size on disk that an archive may hold; what this program writes is not compressed
+SLACK = 2**20  # bytes that any archive may hold
+TAKEN = "expected {what}, got another at work, which holds {path}; wait until it ends, or choose another --out"
+
+
+def require_modest(archive: zipfile.ZipFile) -> None:
+    """InputError where the members of an archive, some of which may share their bytes, are far larger than the file."""
+    assert archive.fp is not None
+    size, held = archive.fp.seek(0, os.SEEK_END), sum(member.file_size for member in archive.infolist())
+    if held > EXPANSION * size + SLACK:
+        raise InputError(f"it promises {held:,} bytes in a file of {size:,}")
+
+
+def read_array(file: BinaryIO) -> np.ndarray:
+    """Real numbers that `numpy.save` wrote.  InputError where the file has others, none, or fewer than it promises."""
+    size = os.fstat(file.fileno()).st_size
+    try:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, kind = read(file)
+        if min(shape, default=0) < 0 or prod(shape) * kind.itemsize > size:
+            raise ValueError(f"it promises {kind} of shape {shape} in {size:,} bytes")
+        if kind.kind not in "fiu":
+            raise InputError(f"an array of {kind}, not of real numbers")
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # NumPy has Python read the header, whose errors are of many kinds
+        raise InputError(f"no array of numbers ({error})") from error
+
+
+@contextmanager
+def locked(path: Path, what: str) -> Iterator[int]:
+    """Hold the file at `path`, made for this and removed in the end; gives its descriptor, with which a child holds it too.
+
+    The system lets go of it when the last process that has it ends, however that comes.  A file system without locks holds
+    nothing.  what: which is expected to be alone.  InputError where another process holds it.
+    """
+    while True:
+        with path.open("a") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(TAKEN.format(what=what, path=path)) from None
+            except OSError:  # such as Lustre, mounted without them
+                pass
+            if not _is_at(file.fileno(), path):  # the one who held it has just removed it
+                continue
+            try:
+                yield file.fileno()
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
+def beside(folder: Path) -> Path:
+    """Where the lock of a folder lies, which may not exist yet."""
+    return folder.absolute().with_name(f".{folder.name}.lock")
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,176 @@
+"""Broken files by the thousand: `python -m tests.hostile.fuzz [--cases 10000] [--seed 0] [FORMAT ...]`.
+
+Every case is made from the format's name, the seed and its number alone.  It runs in a process that may take so many bytes more
+than at its start, and that is ended where a case takes too long.  Outcomes:
+
+    clean       refused in one sentence            harmless    accepted, and what follows from it is made
+    traceback   any other error                    wrong       accepted, and other than what was written or than can be
+    memory      more than MOST_BYTES               hang        longer than SECONDS
+    crash       the process ended
+"""
+
+import argparse
+import json
+import os
+import random
+import resource
+import select
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+SECONDS, MOST_BYTES = 5.0, 2**30  # of a processor; beyond what the process holds at its start
+GOOD = ("clean", "harmless")
+PATIENCE = 120.0  # seconds by the clock without a word, on a machine that does other work too
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass
+class Found:
+    """Outcomes of a format's cases; failures: what to say of those that are not good."""
+
+    outcomes: Counter[str] = field(default_factory=Counter)
+    failures: list[str] = field(default_factory=list)
+
+    def add(self, case: int, outcome: str, said: str) -> None:
+        self.outcomes[outcome] += 1
+        if outcome not in GOOD:
+            self.failures.append(f"case {case}, {outcome}: {said}")
+
+
+def fuzzed(name: str, cases: int, seed: int = 0) -> Found:
+    """What comes of so many cases of a format."""
+    found, first = Found(), 0
+    while first < cases:
+        first = _watched(name, first, cases, seed, found)
+    return found
+
+
+def _watched(name: str, first: int, cases: int, seed: int, found: Found) -> int:
+    """Run cases from `first` on in a process, until it ends; returns the next case."""
+    words = [
+        sys.executable,
+        "-m",
+        "tests.hostile.fuzz",
+        "--work",
+        str(first),
+        "--cases",
+        str(cases),
+        "--seed",
+        str(seed),
+        name,
+    ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    with (
+        tempfile.TemporaryFile() as errors,
+        subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, env=environment) as process,
+    ):
+        assert process.stdout is not None
+        case, waiting = first - 1, b""
+        while True:
+            ready, _, _ = select.select([process.stdout], [], [], PATIENCE)
+            if not ready:
+                process.kill()
+                found.add(case + 1, "hang", f"longer than {PATIENCE:g} s")
+                return case + 2
+            content = os.read(process.stdout.fileno(), 1 << 16)
+            if not content:
+                break
+            *lines, waiting = (waiting + content).split(b"\n")
+            for line in lines:
+                case, outcome, said = json.loads(line)
+                if outcome != "begun":
+                    found.add(case, outcome, said)
+        process.wait()
+        if case + 1 < cases:
+            errors.seek(0)
+            found.add(
+                case + 1, "crash", f"exit code {process.returncode}: {errors.read().decode(errors='replace')[-300:]}"
+            )
+            return case + 2
+    return cases
+
+
+def work(name: str, first: int, cases: int, seed: int) -> None:
+    """Run cases, a line of JSON each on standard output."""
+    from tests.hostile.formats import FORMATS
+
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory() as folder, os.fdopen(os.dup(1), "w") as out:
+        os.dup2(2, 1)  # what libraries print
+        example = FORMATS[name](Path(folder))
+        _limit_memory()
+        print(json.dumps([first - 1, "begun", ""]), file=out, flush=True)
+        for case in range(first, cases):
+            start = time.process_time()
+            outcome, said = _outcome(example, random.Random(f"{name} {seed} {case}"))
+            if (spent := time.process_time() - start) > SECONDS:
+                outcome, said = "hang", f"{spent:.1f} s, {outcome} {said}"
+            print(json.dumps([case, outcome, said]), file=out, flush=True)
+
+
+def _limit_memory() -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * os.sysconf("SC_PAGE_SIZE") + MOST_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+def _outcome(example: object, chance: random.Random) -> tuple[str, str]:
+    from analysis.console.failures import BAD_INPUT, NO_MEMORY, describe
+
+    try:
+        example.case(chance)  # pyright: ignore[reportAttributeAccessIssue]
+    except AssertionError as error:
+        if (
+            "tests/hostile" in traceback.extract_tb(error.__traceback__)[-1].filename
+            or "not equal" in str(error).lower()
+        ):
+            return "wrong", str(error).strip()[:200]
+        return "traceback", _where(error)
+    except Exception as error:
+        code, _ = describe(error)
+        if code == NO_MEMORY:
+            return "memory", _where(error)
+        return ("clean", "") if code == BAD_INPUT else ("traceback", _where(error))
+    return "harmless", ""
+
+
+def _where(error: BaseException) -> str:
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if str(ROOT) in frame.filename]
+    place = f"{Path(frames[-1].filename).relative_to(ROOT)}:{frames[-1].lineno}" if frames else ""
+    return f"{type(error).__name__} at {place}: {' '.join(str(error).split())[:200]}"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("formats", nargs="*")
+    parser.add_argument("--cases", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--work", type=int)
+    options = parser.parse_args()
+    if options.work is not None:
+        work(options.formats[0], options.work, options.cases, options.seed)
+        return 0
+    from tests.hostile.formats import FORMATS
+
+    bad = 0
+    for name in options.formats or FORMATS:
+        start = time.monotonic()
+        found = fuzzed(name, options.cases, options.seed)
+        counts = ", ".join(f"{count} {outcome}" for outcome, count in sorted(found.outcomes.items()))
+        print(f"{name}: {counts}; {time.monotonic() - start:.0f} s", flush=True)
+        kinds = Counter(failure.partition(", ")[2] for failure in found.failures)
+        for kind, count in kinds.most_common(12):
+            print(f"    {count} x {kind}")
+        bad += len(found.failures)
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,193 @@
+"""Commands as processes: signals, full disks, folders that cannot be written, no home, two at work on one folder."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from analysis.commands.cli import main
+from analysis.console.interruption import raising
+from landscape.errors import InputError
+from splat.model.untrusted import beside, locked
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint
+
+ROOT = Path(__file__).parents[2]
+COMMAND = [sys.executable, "-m", "analysis.commands.cli"]
+LONG = ["--iterations", "100000", "--checkpoint-every", "1000000"]
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "still [v2]"
+    write_transforms_scene(synthetic_scene(SyntheticSettings(gaussians=60, views=5, width=24, height=18)).scene, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def run(scene) -> Path:
+    out = scene.with_name("run")
+    assert main(["train", str(scene), "--out", str(out), "--iterations", "6"]) == 0
+    return out
+
+
+def started(words: list[str], **settings) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*COMMAND, *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **settings
+    )
+
+
+def waits_for(process: subprocess.Popen[str], ready: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 300
+    while not ready():
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.01)
+
+
+def hidden(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_training_that_a_signal_ends_saves_and_says_how_to_continue(scene, tmp_path, kind):
+    out = tmp_path / "x[v2]"
+    process = started(["train", str(scene), "--out", str(out), *LONG])
+    waits_for(process, (out / "checkpoint.pt").exists)
+    time.sleep(1)
+    process.send_signal(kind)
+    said = process.communicate()[1]
+    assert process.returncode == 128 + kind, said
+    assert f"'{out}'" in said and "Aborted at" not in said and "Traceback" not in said
+    assert load_checkpoint(out / "checkpoint.pt").training.step > 0 and hidden(tmp_path) == hidden(out) == []
+
+
+@pytest.mark.parametrize("ready", ["lock", "partial"])
+def test_a_probe_that_a_signal_ends_leaves_nothing_and_names_the_signal(run, tmp_path, ready):
+    out = tmp_path / "probe"
+    process = started(["probe", str(run / "checkpoint.pt"), "--out", str(out)])
+    waits_for(process, beside(out).exists if ready == "lock" else lambda: bool(list(tmp_path.glob(".probe.partial-*"))))
+    time.sleep(0.0 if ready == "lock" else 2.0)
+    process.terminate()
+    said = process.communicate()[1]
+    assert process.returncode == 143 and said.endswith("landscape: interrupted by SIGTERM\n"), said
+    assert "Aborted at" not in said and list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_raises_while_pycolmap_is_imported(tmp_path):
+    program = (
+        "import os, signal\nfrom analysis.console.interruption import Interrupted, raising\n"
+        "with raising():\n    import splat.scenes.scene\n    try:\n        os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    except Interrupted as error:\n        print(error.exit_code)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("143\n", "")
+
+
+def test_signals_that_are_ignored_stay_so():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup leaves it
+    try:
+        with raising():
+            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_second_command_on_a_folder_is_refused_and_a_killed_one_holds_nothing(tmp_path):
+    path = beside(tmp_path / "run")
+    program = "import sys, time\nfrom pathlib import Path\nfrom splat.model.untrusted import locked\n"
+    program += "with locked(Path(sys.argv[1]), 'no other'):\n    print('held', flush=True)\n    time.sleep(100)"
+    with subprocess.Popen([sys.executable, "-c", program, str(path)], cwd=ROOT, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"held\n"
+        with (
+            pytest.raises(InputError, match="expected no other command, got another at work"),
+            locked(path, "no other command"),
+        ):
+            pass
+        assert path.exists()
+        other.kill()
+    with locked(path, "no other command"):
+        assert path.exists()
+    assert not path.exists()
+
+
+def test_of_two_trainings_in_one_folder_one_is_refused_in_a_sentence(scene, tmp_path):
+    out = tmp_path / "run"
+    first = started(["train", str(scene), "--out", str(out), *LONG])
+    waits_for(first, (out / "checkpoint.pt").exists)
+    second = started(["train", str(scene), "--out", str(out), *LONG, "--resume"])
+    said = second.communicate()[1]
+    assert second.returncode == 2 and "no other training" in said and said.count("landscape:") == 1
+    first.terminate()
+    first.communicate()
+    assert first.returncode == 143 and load_checkpoint(out / "checkpoint.pt").training.step > 0
+
+
+def limited(size: int) -> Callable[[], None]:
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_path):
+    done = started(["train", str(scene), "--out", str(tmp_path / "new")], preexec_fn=limited(4096))
+    said = done.communicate()[1]
+    assert done.returncode == 74 and str(tmp_path) in said and "Traceback" not in said, said
+    done = started(
+        ["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"], preexec_fn=limited(8192)
+    )
+    said = done.communicate()[1]
+    assert done.returncode == 74 and str(tmp_path / "probe") in said and "Traceback" not in said, said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_home_or_a_folder_beside_the_code_kernels_are_kept_with_temporary_files(tmp_path, monkeypatch):
+    from splat.backend.cpu import kernel_cache
+
+    monkeypatch.setattr(kernel_cache, "PACKAGE", kernel_cache.PACKAGE)
+    for home in (None, str(tmp_path / "none")):
+        monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+        monkeypatch.delenv("HOME", raising=False) if home is None else monkeypatch.setenv("HOME", home)
+        monkeypatch.setattr(kernel_cache, "gettempdir", lambda: str(tmp_path))
+        assert kernel_cache._places()[-1] == tmp_path / f"splat-landscape-{os.getuid()}"
+    file = tmp_path / "file"
+    file.write_text("")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(file))
+    with pytest.raises(InputError, match="name one with NUMBA_CACHE_DIR"):
+        kernel_cache.kernel_folder(256)
+
+
+def test_a_cut_file_of_a_kernel_is_compiled_anew(tmp_path):
+    (tmp_path / "small.py").write_text(
+        "from splat.backend.cpu import simd\nfrom splat.backend.cpu.jit import kernel\n"
+        "@kernel\ndef twice(x):\n    return 2 * x\nprint(twice(4.0))\n"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
+
+    def ran() -> str:
+        return subprocess.run(
+            [sys.executable, str(tmp_path / "small.py")],
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+
+    assert ran() == "8.0\n"
+    for suffix in ("nbi", "nbc"):
+        (file,) = (tmp_path / "cache").rglob(f"small.twice-*.{suffix}")
+        file.write_bytes(file.read_bytes()[:40])
+        assert ran() == "8.0\n"
+
+
+@pytest.mark.parametrize("words", [["train", "--help"], ["train", "nowhere"]])
+def test_output_that_nobody_reads_is_no_error(words):
+    command = " ".join([sys.executable, "-m", "analysis.commands.cli", *words])
+    for pipe in ("| true; exit ${PIPESTATUS[0]}", ">&-"):
+        done = subprocess.run(["bash", "-c", f"{command} {pipe}"], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode in ((0, 141) if words[1] == "--help" else (2,)) and "Traceback" not in done.stderr
