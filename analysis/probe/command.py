@@ -20,6 +20,7 @@ from analysis.console.stages import Stages
 from analysis.probe.measurement import ProbeSettings, measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
+from analysis.probe.views import write_views
 from analysis.records.findings import findings
 from analysis.records.provenance import require_seed
 from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
@@ -83,16 +84,25 @@ def _run(
             data, arrays["families"] = families.added_to(data), families.arrays()
             data.provenance.families = asdict(family_options)
         if writes:
-            _write(out, data, arrays, stages, start, drawn)
+            _write(out, data, arrays, objective, stages, start, drawn)
     if writes:
         _conclude(data, out)
     failed = any(check.passed is False for check in data.checks.values())
     return CHECK_FAILED if options.strict and failed else 0
 
 
-def _write(out: Path, data: ProbeRecord, arrays: Arrays, stages: Stages, start: float, drawn: Draw | None) -> None:
+def _write(
+    out: Path,
+    data: ProbeRecord,
+    arrays: Arrays,
+    objective: SceneObjective,
+    stages: Stages,
+    start: float,
+    drawn: Draw | None,
+) -> None:
     """The record, its pictures and its page, all at once."""
     with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
+        write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
         write_with_pictures(folder, data, arrays, stages, start, drawn)
         from analysis.records.report import write_report
