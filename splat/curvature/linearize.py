@@ -159,7 +159,7 @@ class LinearizedView:
             )
         found = []
         for gauss_newton in parts:
-            blocks = raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton) + coupled
+            blocks = self._raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton) + coupled
             found.append(PerGaussianBlocks(*self._projection.blocks(blocks, not gauss_newton)))
         return found
 

@@ -161,7 +161,7 @@ class CpuRaster:
             first = splat_start[splats[done]]
             stop = max(int(np.searchsorted(ends, layout.place[first] + together, side="right")), done + 1)
             last = splat_start[splats[stop - 1] + 1]
-            found = aligned(((layout.place[last] - layout.place[first]) * row,), self.dtype)
+            found = aligned((int(layout.place[last] - layout.place[first]) * row,), self.dtype)
             view, size = (self.params, lists, self.frame, self.pixels, layout), (self.height, self.width)
             over_tiles(footprints.find_footprints, *view, first, last, found)
             heaviest = done + np.argsort(np.diff(layout.place[splat_start])[splats[done:stop]])[::-1]

@@ -63,7 +63,8 @@ def dense(operator: SceneHessian) -> Tensor:
 def geometry_rows(objective: SceneObjective) -> Tensor:
     """Where each Gaussian's geometry and opacity lie among all parameters, (n, 11)."""
     each = [
-        torch.arange(rows.stop)[rows].view(len(objective.active), -1) for rows in map(objective.blocks.get, GEOMETRY)
+        torch.arange(rows.stop)[rows].view(len(objective.active), -1)
+        for rows in (objective.blocks[name] for name in GEOMETRY)
     ]
     return torch.cat(each, dim=1)
 
@@ -97,8 +98,8 @@ def test_own_blocks_with_ssim_are_differences_of_gradients() -> None:
             for sign in (1, -1):
                 moved = flat.clone()
                 moved[row] += sign * step
-                views = (objective.linearize(index, objective.active.with_flat(moved)) for index in range(2))
-                ends.append(sum(view.gradient for view in views)[rows] / 2)
+                views = [objective.linearize(index, objective.active.with_flat(moved)) for index in range(2)]
+                ends.append((views[0].gradient + views[1].gradient)[rows] / 2)
             columns.append((ends[0] - ends[1]) / (2 * step))
         # the truncation is step^2 / 6 times a third derivative: one more factor of some 1 / (a splat's size) each
         assert float((torch.stack(columns) - own[gaussian]).abs().max() / own[gaussian].abs().max()) < 1e-6
