@@ -3,7 +3,6 @@
 The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.
 """
 
-import shlex
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
 
 CHECK_FAILED = 1
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
-WITHOUT_SURFACE = "the picture of the slice as a surface was left out; python -m figures.surface {} draws it"
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
@@ -57,7 +55,7 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | 
 def _run(
     options: ProbeOptions, command: Sequence[str], drawn: Draw | None, device: torch.device, ranks: Ranks | None
 ) -> int:
-    out = _out(options)
+    out = options.out or options.checkpoint.parent / "probe"
     settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
     if ranks is not None and family_options is not None:
         raise InputError(
@@ -107,15 +105,9 @@ def _measured(
             )
             data, arrays["families"] = families.added_to(data), families.arrays()
             data.provenance.families = asdict(family_options)
-        if options.quick:
-            data.notes.append(WITHOUT_SURFACE.format(shlex.quote(str(_out(options)))))
         if writes:
-            _write(folder, data, arrays, objective, stages, start, drawn, options.pictures)
+            _write(folder, data, arrays, objective, stages, start, drawn)
     return data
-
-
-def _out(options: ProbeOptions) -> Path:
-    return options.out or options.checkpoint.parent / "probe"
 
 
 def _write(
@@ -126,13 +118,12 @@ def _write(
     stages: Stages,
     start: float,
     drawn: Draw | None,
-    pictures: Sequence[str],
 ) -> None:
     """The record, its pictures and its page."""
     with ThreadPoolExecutor(1) as pool:
         write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
-        write_with_pictures(folder, data, arrays, stages, start, drawn, pictures)
+        write_with_pictures(folder, data, arrays, stages, start, drawn)
         from analysis.records.report import write_report
 
         write_report(folder, surface.result())
