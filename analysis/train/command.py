@@ -54,7 +54,7 @@ from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_at
 from splat.training.densify import DensifySettings
 from splat.training.loop import prepare, train
 from splat.training.methods.methods import METHODS
-from splat.training.scene_reference import SceneReference
+from splat.training.origin.scene_reference import SceneReference
 from splat.training.score.evaluate import Evaluation, ViewScore, evaluate, have_masks
 from splat.training.score.perceptual import MissingPerceptual, load_lpips
 from splat.training.start import initial_gaussians
