@@ -21,6 +21,7 @@ from analysis.console.stages import Stages
 from analysis.probe.measurement import ProbeSettings, measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
+from analysis.probe.views import write_views
 from analysis.records.findings import findings
 from analysis.records.provenance import require_seed
 from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
@@ -88,7 +89,7 @@ def _run(
         if options.quick:
             data.notes.append(WITHOUT_SURFACE.format(out))
         if writes:
-            _write(out, data, arrays, stages, start, drawn, options.pictures)
+            _write(out, data, arrays, objective, stages, start, drawn, options.pictures)
     if writes:
         _conclude(data, out)
     failed = any(check.passed is False for check in data.checks.values())
@@ -99,6 +100,7 @@ def _write(
     out: Path,
     data: ProbeRecord,
     arrays: Arrays,
+    objective: SceneObjective,
     stages: Stages,
     start: float,
     drawn: Draw | None,
@@ -106,6 +108,7 @@ def _write(
 ) -> None:
     """The record, its pictures and its page, all at once."""
     with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
+        write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
         write_with_pictures(folder, data, arrays, stages, start, drawn, pictures)
         from analysis.records.report import write_report
