@@ -60,3 +60,25 @@ def test_a_ply_is_probed_and_its_record_says_what_was_assumed(folder):
     record = read_record(folder / "probe").data
     assert record.provenance.origin["trained_by"] == "splat-landscape" and len(record.provenance.views) == 2
     assert any("trained by splat-landscape (the file)" in note for note in record.notes)
+
+
+def test_a_training_starts_from_another_tools_gaussians_with_its_renderer(folder):
+    out, source = folder / "run", folder / "in.ply"
+    common = [
+        "train",
+        str(folder / "scene"),
+        "--from",
+        str(source),
+        "--no-densify",
+        "--iterations",
+        "2",
+        "--views",
+        "2",
+    ]
+    assert main([*common, "--trained-by", "gsplat-raw", "--out", str(out)]) == 0
+    training = load_checkpoint(out / "checkpoint.pt").training
+    assert (training.config.render.alpha_max, training.step) == (0.999, 2)
+    assert len(training.gaussians) == len(MADE.truth)
+    moved = (training.gaussians.means - MADE.truth.means).abs().max()
+    assert 0 < moved < 0.01 * training.extent
+    assert main([*common, "--set", "render.near=0.1", "--out", str(folder / "other")]) == 2
