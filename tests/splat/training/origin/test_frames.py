@@ -77,6 +77,8 @@ def test_gsplats_worlds_have_the_axes_and_the_size_that_define_them(scene):
     focus = np.median(centres - (centres * axes).sum(axis=1, keepdims=True) * axes, axis=0)
     size = np.median(np.linalg.norm(centres - focus, axis=1))
     assert np.cbrt(np.linalg.det(frames[0][:, :3])) * size == pytest.approx(1, rel=1e-9)
+    middle = np.median(scene.points.xyz.numpy() @ turn.T, axis=0) @ turn
+    np.testing.assert_allclose([frame @ [*middle, 1] for frame in frames], 0, atol=1e-9)
 
 
 @pytest.mark.parametrize("variant", range(4))
