@@ -178,7 +178,7 @@ def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
         gradient, value, render = _linearised(objective, report)
-        blocks = objective.gaussian_blocks
+        blocks = objective.approximate_blocks
     with stage("checks") as report:
         operator_check = check_operator(operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(hessian, spawn(generator), report, settings.checked_views)
