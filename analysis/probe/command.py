@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from analysis.measures.families import FamilyOptions
 
 CHECK_FAILED = 1
-WITHOUT_SURFACE = "the picture of the slice as a surface was left out; python -m figures.surface {} draws it"
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
@@ -85,10 +84,8 @@ def _run(
             )
             data, arrays["families"] = families.added_to(data), families.arrays()
             data.provenance.families = asdict(family_options)
-        if options.quick:
-            data.notes.append(WITHOUT_SURFACE.format(out))
         if writes:
-            _write(out, data, arrays, objective, stages, start, drawn, options.pictures)
+            _write(out, data, arrays, objective, stages, start, drawn)
     if writes:
         _conclude(data, out)
     failed = any(check.passed is False for check in data.checks.values())
@@ -103,13 +100,12 @@ def _write(
     stages: Stages,
     start: float,
     drawn: Draw | None,
-    pictures: Sequence[str],
 ) -> None:
     """The record, its pictures and its page, all at once."""
     with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
         write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
-        write_with_pictures(folder, data, arrays, stages, start, drawn, pictures)
+        write_with_pictures(folder, data, arrays, stages, start, drawn)
         from analysis.records.report import write_report
 
         write_report(folder, surface.result())

@@ -31,12 +31,12 @@ class ProbeOptions:
     quick: FlagCreatePairsOff[bool] = False
     """Numbers to 10% instead of 1%, in a quarter of the time.
     Without power iteration, the spectral density and the indices that need it, the finite probe, the comparison of depth with
-    lateral directions, and surface.png."""
+    lateral directions, and the slice's plane between its two axes."""
     seconds: Unset[float] = None
     """Time for the estimators together, in seconds; what a stage did not reach in its share is said.  inf: no limit.
     Default: 45, with --quick 12; under torchrun inf, and nothing else."""
     slice_points: Unset[int] = None
-    """Points along each side of the slice, odd, 5 or more.  Default: 41."""
+    """Points along each side of the slice, odd, 5 or more.  Default: 41, with --quick 21."""
     slice_rise: float = 0.001
     """What a curvature unit is: the step within which the curvature alone changes the loss by this share of it.
     The slice reaches 3 units each way."""
@@ -55,8 +55,3 @@ class ProbeOptions:
     Any but parameters measures the families, as --families does."""
     family_seconds: float = 1800.0
     """Time for the families together, in seconds, beside that of --seconds.  inf: no limit."""
-
-    @property
-    def pictures(self) -> tuple[str, ...]:
-        """What `figures.make_all` is told, beside the folder."""
-        return ("--without", "surface") if self.quick else ()
