@@ -6,8 +6,8 @@ OUT/compare.json    {"runs": {LABEL: folder of its record}}, from which `figures
 OUT/*.png           traces, densities of the spectrum and slices in common limits
 
 What must be the same for curvatures to be comparable at all is demanded: the loss that was probed, the training views and their
-sizes.  Runs that were trained with other losses are probed with that of 3DGS (`landscape probe --loss 3dgs`).  What must be kept
-in mind beside that is said: other starts, steps, losses of training, budgets, checks that failed, numbers of Gaussians.
+sizes.  Runs that were trained with other losses are probed with that of 3DGS (`landscape probe --loss 3dgs`).  What must be
+kept in mind beside that is said: other starts, steps, losses of training, budgets, failed checks, numbers of Gaussians.
 """
 
 import os
