@@ -7,6 +7,9 @@ Every subcommand imports what it needs when it runs, so that `landscape --help` 
 import gc
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, NoReturn
 
 import tyro
@@ -19,7 +22,7 @@ from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, T
 from analysis.slice.options import SliceOptions
 from analysis.train.options import TrainOptions
 
-DEBUG = "--debug"
+DEBUG, CHECKPOINT = "--debug", "checkpoint.pt"
 Options = (
     Annotated[SfmOptions, tyro.conf.subcommand("sfm")]
     | Annotated[TrainOptions, tyro.conf.subcommand("train")]
@@ -48,19 +51,34 @@ def command() -> NoReturn:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; arguments: those of the command line where None.  Returns the exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments[:1] == ["--version"]:
+        print(f"splat-landscape {version('splat-landscape')}")
+        return 0
     debug, arguments = DEBUG in arguments, [word for word in arguments if word != DEBUG]
     options = tyro.cli(
         Options,  # pyright: ignore[reportArgumentType]
         prog="landscape",
         description=f"See the loss landscape of a 3D Gaussian Splatting scene.\n{DEBUG}, before or after the subcommand, shows "
-        "where in the program an error came up.",
+        "where in the program an error came up.  --version alone shows the version.",
         args=arguments,
         config=(tyro.conf.DisallowNone,),
     )
     try:
-        return run(options, arguments)
+        return run(at_files(options), arguments)
     except (Exception, KeyboardInterrupt) as error:
         return report(error, ["landscape", *arguments], debug)
+
+
+def at_files(options: Options) -> Options:
+    """A run folder stands for its checkpoint where one is asked for, and a checkpoint for its run."""
+    changes: dict[str, object] = {}
+    for name in ("checkpoint", "other", "subject"):
+        path = getattr(options, name, None)
+        if isinstance(path, Path) and (path / CHECKPOINT).is_file():
+            changes[name] = path / CHECKPOINT
+    if runs := getattr(options, "runs", ()):
+        changes["runs"] = tuple(run.parent if run.name == CHECKPOINT else run for run in runs)
+    return replace(options, **changes) if changes else options
 
 
 def run(options: Options, arguments: Sequence[str]) -> int:

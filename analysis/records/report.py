@@ -15,7 +15,7 @@ import plotly.graph_objects as go
 import plotly.io
 from plotly.offline import get_plotlyjs
 
-from analysis.records.findings import attribute_name, findings
+from analysis.records.findings import attribute_name, findings, is_open
 from analysis.records.json_files import plain
 from analysis.records.quantities import limits, measured, quantity
 from analysis.records.records import ProbeRecord, Record, read_record
@@ -65,6 +65,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "measured": measured,
         "attribute": attribute_name,
         "cell": _cell,
+        "open_ended": is_open,
     }
     surface = embedded_surface(record) if surface is None else surface
     return environment.get_template("report.html.jinja").render(
