@@ -25,11 +25,12 @@ OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
 ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
 HARD_SPACE = "\u00a0"
+GAPS, REMARK = 7, 18  # between columns of the probe's table; its last one's least width
 WIDTH = 15  # of a column of the families' table, with which it fits into 80
 NARROW = 0.1  # of the value: a bracket that is written as an error
 
 
-def probe_table(data: ProbeRecord, width: int) -> Table:
+def probe_table(data: ProbeRecord, width: int = 80) -> Table:
     """Traces, eigenvalues, anisotropy, counts and checks, in a width where words wrap and numbers do not."""
     rows = [
         *_trace_rows(data),
@@ -44,14 +45,14 @@ def probe_table(data: ProbeRecord, width: int) -> Table:
         None,
         *_check_rows(data.checks),
     ]
-    taken = [max(len(row[i]) for row in rows if row) for i in (0, 1)]
+    name, value = (max(len(row[i]) for row in rows if row) for i in (0, 1))
+    name = min(name, max(width - value - GAPS - REMARK, REMARK))
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=ERRORS, caption_justify="left")
-    table.add_column("", no_wrap=True)
-    table.add_column("value ± error", justify="right", no_wrap=True)
-    table.add_column("", no_wrap=True)
+    for heading, justify in (("", "left"), ("value ± error", "right"), ("", "left")):
+        table.add_column(heading, justify=justify, no_wrap=True)
     for row in rows:
         if row:
-            table.add_row(*row[:2], wrapped(row[2], width - sum(taken) - 7))
+            table.add_row(wrapped(row[0], name), row[1], wrapped(row[2], width - name - value - GAPS))
         else:
             table.add_section()
     return table
@@ -68,7 +69,7 @@ def wrapped(text: str, width: int) -> str:
     over
     (1.37 ± 0.10) × 10⁻⁴
     """
-    for sign in " ± ", " × ":
+    for sign in " ± ", " × ", " px":
         text = text.replace(sign, sign.replace(" ", HARD_SPACE))
     return textwrap.fill(text, max(width, 12), break_long_words=False, break_on_hyphens=False)
 
