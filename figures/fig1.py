@@ -22,7 +22,7 @@ WIDTH = 4.8  # inches
 
 
 def draw(runs: Sequence[Path]) -> Figure:
-    """Of two runs.  ValueError names every record that is missing, each with the command that makes it."""
+    """Fig. 1 of two runs.  ValueError names every record that is missing, each with the command that makes it."""
     names = names_of(runs)
     found = read_all(*(partial(landscape_of, run) for run in runs), *(partial(_views, run) for run in runs))
     landscapes = found[:2]

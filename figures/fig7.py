@@ -28,7 +28,7 @@ BAR: dict[str, Any] = {"shrink": 0.6, "aspect": 14}  # without a name: the title
 
 
 def draw(runs: Sequence[Path]) -> Figure:
-    """Of two runs.  ValueError names every record that is missing, each with the command that makes it."""
+    """Fig. 7 of two runs.  ValueError names every record that is missing, each with the command that makes it."""
     names = names_of(runs)
     *found, start = read_all(
         *(partial(_measured, run, name) for run, name in zip(runs, names, strict=True)),
@@ -66,7 +66,7 @@ def draw(runs: Sequence[Path]) -> Figure:
 
 
 def names_of(runs: Sequence[Path]) -> list[str]:
-    """Of the folders; the parents' where the folders' own are the same, as with a sweep's METHOD/SEED."""
+    """Names of the folders; those of their parents where the folders have the same name, as with a sweep's METHOD/SEED."""
     if len(runs) != 2:
         raise ValueError(f"expected two runs, of 3DGS and of StableGS, got {len(runs)}")
     first, second = (run.resolve() for run in runs)
@@ -78,7 +78,7 @@ def names_of(runs: Sequence[Path]) -> list[str]:
 
 
 def read_all(*reads: Callable[[], Any]) -> list[Any]:
-    """What each of them gives.  ValueError with what all of them say is missing or wrong, so that one look is enough."""
+    """Results of all readers.  ValueError with everything that is missing or wrong at once."""
     found, missing = [], []
     for read in reads:
         try:

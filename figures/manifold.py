@@ -37,7 +37,7 @@ FUNCTION = {"views": "training views", "sizes": "sizes of the views", "loss": "l
 
 @dataclass(frozen=True)
 class Scale:
-    """What landscapes have in common: steps to +-reach, changes of the loss from low to high."""
+    """Limits that landscapes share: steps to +-reach, changes of the loss from low to high."""
 
     reach: float
     low: float
@@ -66,11 +66,11 @@ class Scale:
         return f"step along {name}{unit_suffix(self.steps)}"
 
     def flat_label(self, name: str) -> str:
-        """Of a horizontal axis, which has the room for the unit below."""
+        """Label of a horizontal axis, which has the room for the unit below."""
         return f"{self.step_label(name)}\n(param. units)"
 
     def holding(self, other: Plane) -> "Scale":
-        """The same steps, and the changes of another landscape's sections within them too."""
+        """Limits with the same steps that hold another landscape's sections too."""
         lines = [through_centre(other, axis) for axis in (0, 1)]
         near = np.ma.concatenate([change[np.abs(steps) <= self.reach] for steps, change in lines])
         return replace(self, low=min(self.low, float(near.min())), high=max(self.high, float(near.max())))
@@ -130,7 +130,7 @@ def _record_of(run: Path) -> Record:
 
 
 def start_of(run: Path) -> Plane:
-    """The same of where a run began."""
+    """Landscape of where a run began."""
     if not (run / START / CHECKPOINT).is_file():
         raise FileNotFoundError(
             f"expected the start of the run in {run / START / CHECKPOINT}, found none; train anew with --probe-every, "
@@ -180,7 +180,7 @@ def _inner_ticks(reach: float) -> list[float]:
 
 
 def contours(axes: Axes, landscape: Plane, scale: Scale) -> QuadContourSet:
-    """The same from above, at levels that all landscapes have in common."""
+    """Landscape from above, at levels that all landscapes share."""
     steps, loss = 10.0**scale.steps, 10.0**scale.loss
     levels = np.asarray(MaxNLocator(LEVELS).tick_values(scale.low / loss, scale.high / loss))
     x, y, change = landscape.x.steps / steps, landscape.y.steps / steps, change_of(landscape).T / loss

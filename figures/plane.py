@@ -71,7 +71,7 @@ class Plane:
 
     @property
     def crossed_share(self) -> float | None:
-        """Of the evaluated points."""
+        """Share of the evaluated points."""
         return None if self.crossed is None else float(self.crossed.sum() / self.evaluated.sum())
 
 

@@ -108,7 +108,7 @@ def _draw_curvatures(axes: Axes, along: Direction, probe: FiniteProbe) -> None:
 
 
 def _limits(exact: float, values: np.ndarray, bounds: np.ndarray) -> tuple[float, float]:
-    """Of the values with the shorter bars, with a margin: a value that is hardly known does not flatten those that are."""
+    """Limits of the values with the shorter bars, with a margin: a value that is hardly known does not flatten the others."""
     short = bounds <= SHORT * np.maximum(np.abs(values), abs(exact))
     if short.any():
         values, bounds = values[short], bounds[short]

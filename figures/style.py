@@ -106,7 +106,7 @@ def exponent_of(*values: np.ndarray | float) -> int:
 
 
 def unit_suffix(exponent: int) -> str:
-    """What an axis label says about a power that was taken out.
+    """Suffix of an axis label for a power that was taken out.
 
     >>> unit_suffix(-6), unit_suffix(0)
     (' (×10⁻⁶)', '')

@@ -96,7 +96,7 @@ def _rendered(heights: np.ndarray, levels: np.ndarray) -> np.ndarray:
 
 
 def _drawn_by_matplotlib(heights: np.ndarray) -> np.ndarray:
-    """The same box and view as the renderer's, painted back to front."""
+    """Surface in the renderer's box and view, painted back to front."""
     figure = Figure(figsize=(3, 3), dpi=300)
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(0, 1), ylim=(0, 1))

@@ -108,7 +108,7 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
 
 
 def marker_words(measured: pd.DataFrame, *names: str) -> list[Line2D]:
-    """What hollow markers and triangles mean, for a legend, where one of the indices has any."""
+    """Legend of hollow markers and triangles, where one of the indices has any."""
     values = measured[list(names)].to_numpy(float)
     ends = np.stack([measured[[f"{name}{end}" for name in names]].to_numpy(float) for end in ("_low", "_high")])
     bounds = np.isfinite(values) & ~np.isfinite(ends).all(axis=0)

@@ -199,7 +199,7 @@ def _scaling(workload: Workload, repetitions: int, meter: Meter) -> list[dict]:
 
 
 def _roofline(bench: ViewBench, times: dict[str, Timing], peak: float, bandwidth: float) -> Table:
-    """How many pairs a second the passes evaluate, and which shares their arithmetic and bytes are of the ceilings."""
+    """Table of the pairs a second that the passes evaluate, and of their arithmetic and bytes as shares of the ceilings."""
     pairs = bench.pairs
     table = pd.DataFrame(
         {
@@ -217,7 +217,7 @@ def _roofline(bench: ViewBench, times: dict[str, Timing], peak: float, bandwidth
 def _bounds(
     workload: Workload, bench: ViewBench, times: dict[str, Timing], reference: ReferenceCost | None, meter: Meter
 ) -> pd.DataFrame:
-    """What is asked for as ratios: of times, and of bytes over what the view's size allows."""
+    """Ratios that the project promises: of times, and of bytes over what the view's size allows."""
     view, lines = bench.linearized, ratios(times, by_triton(workload.gaussians.flat))
     kept, sizes = bench.kept(), (view.touched, workload.pixels, view.intersections)
     allowed = sum(each * size for each, size in zip(KEPT, sizes, strict=True))
@@ -237,7 +237,7 @@ def _bounds(
 
 
 def ratios(times: dict[str, Timing], on_gpu: bool) -> list[dict]:
-    """Those of times; nan where there was nothing to compare with."""
+    """Ratios of times; nan where there was nothing to compare with."""
     each = per_vector(times)
     nothing, lines = Timing((np.nan,)), []
     for stage, unit, bound in (*(ON_GPU if on_gpu else ON_CPU), *ON_BOTH):

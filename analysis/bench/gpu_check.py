@@ -239,7 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def in_turn(commands: Mapping[str, tuple[float, list[str]]], out: Path, console: Console) -> dict[str, list[Check]]:
-    """What each part finds, by name; each has a limit in seconds and a command, which takes --into FILE."""
+    """Checks of each part, by name; commands: a limit in seconds and a command that takes --into FILE."""
     found: dict[str, list[Check]] = {}
     for name, (limit, command) in commands.items():
         console.rule(name)

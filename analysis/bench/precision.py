@@ -1,4 +1,4 @@
-"""What single precision costs: one view's derivatives in float32 against float64, at the same stored parameters.
+"""Round-off of single precision: one view's derivatives in float32 against float64, at the same stored parameters.
 
 Rounding also changes decisions: which of two splats at nearly one depth is in front, which pixels a splat's contour holds,
 where a pixel stops, which sign a residual has.  To see rounding alone, decisions are held equal: alpha_min and

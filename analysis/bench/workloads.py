@@ -1,4 +1,4 @@
-"""What a bench measures: Gaussians with the views that they are compared with, of a scene, a checkpoint or made up."""
+"""Workloads of a bench: Gaussians with the views that they are compared with, of a scene, a checkpoint or synthetic."""
 
 import re
 from dataclasses import dataclass, replace
@@ -59,7 +59,7 @@ class Workload:
 
     @property
     def pixels(self) -> int:
-        """Of one view."""
+        """Number of pixels of one view."""
         return self.views[0].camera.width * self.views[0].camera.height
 
     def to(self, device: torch.device) -> "Workload":

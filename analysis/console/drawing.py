@@ -53,7 +53,7 @@ def _group(command: list[str]) -> Iterator[subprocess.Popen[str]]:
 
 
 def _said(process: subprocess.Popen[str], command: list[str], told: str = "") -> list[str]:
-    """What the process warned of, once it is told this and has ended.  command: does the same by hand."""
+    """Warnings of the process, once it is told this and has ended.  command: does the same by hand."""
     lines = [line for line in process.communicate(told)[1].splitlines() if line.strip()]
     if process.returncode:
         raise RuntimeError(f"drawing failed; draw again with: {' '.join(command)}\n" + "\n".join(lines))
@@ -61,5 +61,5 @@ def _said(process: subprocess.Popen[str], command: list[str], told: str = "") ->
 
 
 def module_environment() -> dict[str, str]:
-    """In which `python -m` finds the modules of this repository, and all that this process finds."""
+    """Environment in which `python -m` finds this repository's modules, and all that this process finds."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}

@@ -1,4 +1,4 @@
-"""What the options of several commands share.
+"""Types that the options of several commands share.
 
 Each command's options are a plain dataclass beside the command, in an `options.py` that imports nothing heavy: help is quick.
 The help keeps the line breaks of their docstrings: a line is a sentence.

@@ -29,11 +29,11 @@ class Timing:
         return median(self.seconds)
 
     def __add__(self, other: "Timing") -> "Timing":
-        """Of both calls, one after the other: round by round."""
+        """Time of both calls, one after the other: round by round."""
         return Timing(tuple(a + b for a, b in zip(self.seconds, other.seconds, strict=True)))
 
     def __truediv__(self, count: float) -> "Timing":
-        """Of one of `count` equal parts."""
+        """Time of one of `count` equal parts."""
         return Timing(tuple(second / count for second in self.seconds))
 
 

@@ -57,7 +57,7 @@ class DepthSplit:
 
     @cached_property
     def gradient_ratio(self) -> float:
-        """Of the root mean squares; nan without a lateral gradient."""
+        """Ratio of the root mean squares; nan without a lateral gradient."""
         depth, lateral = self.components.square().sum(dim=0).tolist()
         return (LATERAL_DIRECTIONS * depth / lateral) ** 0.5 if lateral > 0 else nan
 
@@ -69,7 +69,7 @@ class DepthSplit:
 
     @cached_property
     def curvature_ratio(self) -> Bracket:
-        """Of the mean curvatures, with the intervals of both traces; undefined where the lateral one may be 0 or less."""
+        """Ratio of the mean curvatures, with the intervals of both traces; undefined where the lateral one may be 0 or less."""
         depth, lateral = self.depth, self.lateral
         if lateral.low <= 0:
             return Bracket(None, -inf, inf, "the lateral curvature is negative or its sign undetermined")
@@ -97,7 +97,7 @@ class DepthRises:
         return depth / lateral, (depth / lateral).abs() * relative.square().sum(dim=1).sqrt()
 
     def rows(self) -> list[Rise]:
-        """As a record has them; what is not finite is None."""
+        """Rises as a record has them; what is not finite is None."""
         columns: dict[str, Sequence[float]] = dict(zip(("ratio", "ratio_error"), (x.tolist() for x in self.ratios)))
         for kind, name in enumerate(KINDS):
             for suffix, table in (("", self.values), ("_error", self.errors), ("_crossed", self.discontinuous)):
@@ -164,7 +164,7 @@ def depth_rises(
     draws: int = DRAWS,
     progress: Progress | None = None,
 ) -> DepthRises:
-    """What steps along and across the rays do to the loss.  steps: px; draws: of all directions and signs, 2 or more."""
+    """Rises of the loss by steps along and across the rays.  steps: px; draws: of all directions and signs, 2 or more."""
     if draws < 2:
         raise InputError(f"expected at least 2 draws, got {draws}")
     seeds = torch.randint(2**62, (draws,), generator=generator, device=generator.device).tolist()
@@ -207,7 +207,7 @@ def _across(vectors: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float[
 
 
 def _split_traces(blocks: Float[Tensor, "n 3 3"], rays: Float[Tensor, "n 3"]) -> Float64[Tensor, "2"]:
-    """Of both KINDS, summed."""
+    """Traces of both KINDS, summed."""
     H, v = blocks.double(), rays.double()
     depth = (v[:, None, :] @ H @ v[:, :, None]).sum()
     return torch.stack([depth, H.diagonal(dim1=1, dim2=2).sum() - depth])

@@ -56,7 +56,7 @@ DENSITY_SHARE = 0.45  # of a family's time: 48 of 108 products by default
 
 @dataclass(frozen=True)
 class FamilyOptions:
-    """In which metric, whether the split control too, and how much work.
+    """Metric, split control and budget of the families.
 
     family: budget of each; seconds: for all of them together; memory: GiB for the vectors of a basis.
     """
@@ -181,7 +181,7 @@ def measure_families(
 
 
 def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:
-    """The same loss over the same views of the split Gaussians."""
+    """Objective of the split Gaussians: the same loss over the same views."""
     settings = objective.loss_settings, objective.background, objective.settings
     return SceneObjective(control.gaussians, objective.views, *settings)
 

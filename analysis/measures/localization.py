@@ -1,8 +1,8 @@
-"""Where a vector over a scene's parameters lives: on which attributes, how many Gaussians, and which kind of Gaussians.
+"""Localization of a vector over a scene's parameters: its attributes, how many Gaussians, and which kind of Gaussians.
 
 mass           of Gaussian i in a vector v: m_i = sum of v^2 over its parameters; shares are of sum_i m_i = |v|^2
 participation  (sum_i m_i)^2 / sum_i m_i^2: over how many Gaussians the mass is spread, 1 to n
-condition      kappa of a splat's 2-D covariance Sigma' = r r^T + blur 1 (`projection.py`), lambda_max / lambda_min: the largest
+condition      kappa of a splat's 2-D covariance Sigma' = r r^T + blur 1, lambda_max / lambda_min: the largest
                over the views on whose image its 3-sigma box lies; `rendered` with the blur, `bare` without
 needle         a Gaussian with kappa > 100
 """
@@ -75,7 +75,7 @@ def conditions(
 
 
 def localize(vector: Float[Tensor, " p"], gaussians: Gaussians, conditions: Conditions, heaviest: int = 10) -> LivesOn:
-    """Where a vector laid out like `gaussians.flat` lives; conditions: of the same Gaussians."""
+    """Localization of a vector laid out like `gaussians.flat`; conditions: of the same Gaussians."""
     mass = masses(vector, gaussians)
     if len(conditions.rendered) != len(gaussians):
         raise ValueError(f"expected conditions of {len(gaussians)} Gaussians, got {len(conditions.rendered)}")

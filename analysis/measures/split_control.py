@@ -43,7 +43,7 @@ class SplitControl:
 
     @property
     def psnr(self) -> float:
-        """Of the split scene's images against the given scene's, dB."""
+        """PSNR of the split scene's images against the given scene's, dB."""
         return -20 * log10(self.rms) if self.rms else inf
 
 

@@ -28,6 +28,7 @@ from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import remarks, summary
+from analysis.probe.views import write_views
 from analysis.records.provenance import require_seed, versions
 from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
@@ -102,7 +103,7 @@ def _run(
         if options.quick:
             data.notes.append(WITHOUT_SURFACE.format(out))
         if writes:
-            _write(out, data, arrays, stages, start, drawn, options.pictures)
+            _write(out, data, arrays, objective, stages, start, drawn, options.pictures)
     if writes:
         if not found.unreached:
             shutil.rmtree(unfinished, ignore_errors=True)
@@ -132,6 +133,7 @@ def _write(
     out: Path,
     data: ProbeRecord,
     arrays: Arrays,
+    objective: SceneObjective,
     stages: Stages,
     start: float,
     drawn: Draw | None,
@@ -139,6 +141,7 @@ def _write(
 ) -> None:
     """The record, its pictures and its page, all at once."""
     with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
+        write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
         write_with_pictures(folder, data, arrays, stages, start, drawn, pictures)
         from analysis.records.report import write_report

@@ -58,6 +58,16 @@ def findings(data: ProbeRecord) -> list[Line]:
     return sorted(lines, key=lambda line: line.level != "failure")
 
 
+def headline(data: ProbeRecord) -> list[Line]:
+    """Three sentences at most: basin or saddle, the attribute that carries the curvature, the steepest direction."""
+    found = [
+        *_of_ends(data.eigenvalues),
+        *_of_traces(data.traces)[:1],
+        *_of_needles(data.eigenvalues.max.lives_on, data.counts),
+    ]
+    return found[:3]
+
+
 def _of_checks(checks: Mapping[str, Check]) -> list[Line]:
     lines = []
     for name, check in checks.items():

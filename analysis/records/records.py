@@ -2,6 +2,7 @@
 
     RUN/probe/probe.json, RUN/slice-.../slice.json    every number: `ProbeRecord`, `SliceRecord`
     GROUP.npz                                         one for each group of arrays: ARRAYS
+    view-NNN-photograph.jpg, view-NNN-render.jpg      training views, by their place among them
     *.png, report.html                                drawn from these
 
 `record_folder` makes the whole folder appear at once.  Needs no torch.
@@ -48,6 +49,7 @@ slice         x, y: increasing steps along the directions; loss: L on the grid, 
 directions    of a `landscape slice`: its directions as columns, of the Gaussians in sight or, for a line, of all
 """
 BOOLEAN = {"evaluated", "crossed"}
+PHOTOGRAPH, RENDER = "view-{:03d}-photograph.jpg", "view-{:03d}-render.jpg"
 
 
 class Format(Struct, frozen=True):

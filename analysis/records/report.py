@@ -1,10 +1,12 @@
-"""A self-contained page about one record: what it says in words, the pictures, an interactive surface, every number.
+"""A self-contained page about one record: the scene, five numbers and three sentences; the pictures; every number, folded.
 
-The page carries its pictures and plotly.js within it, and its content security policy forbids every request
+The page carries its pictures and plotly.js (compressed) within it, and its content security policy forbids every request
 to a network.  Text from the record is escaped.
 """
 
 import base64
+import gzip
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,19 +17,20 @@ import plotly.graph_objects as go
 import plotly.io
 from plotly.offline import get_plotlyjs
 
-from analysis.records.findings import attribute_name, findings, is_open
+from analysis.records.findings import attribute_name, findings, headline, is_open
 from analysis.records.json_files import plain
 from analysis.records.quantities import limits, measured, quantity
-from analysis.records.records import ProbeRecord, Record, read_record
+from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.schema import INDICES
 from analysis.records.tables import family_lines
 
 FILE = "report.html"
 PICTURES = {
-    "traces": "Trace of each attribute's block of the Hessian, and the curvature scale τ that follows from it.",
-    "spectrum": "Ritz values of the active operator. Bars are residuals: a true eigenvalue lies within each.",
-    "slice2d": "The loss on the plane of the two directions. Dots: renders, blue where sorts were crossed; dashed: the model.",
+    "slice2d": "The loss on the plane of the two steepest directions. Dots: renders, blue where the order of the splats or the "
+    "set of visible ones is not the checkpoint's; dashed: the quadratic model.",
     "surface": "The same plane as a surface.",
+    "spectrum": "Curvatures met by the search for the spectrum's ends. Bars: residuals; a true eigenvalue lies within each.",
+    "traces": "Curvature of each attribute, summed over its parameters, and the mean curvature scale τ that follows from it.",
 }
 
 
@@ -72,13 +75,53 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         data=record.data,
         counts=plain(record.data.counts),
         provenance=plain(record.data.provenance),
+        numbers=numbers(record.data),
+        headline=headline(record.data),
         findings=findings(record.data),
+        views=views_in(record),
         pictures=pictures_in(record.folder, PICTURES),
         families=family_lines(record.data),
         indices=INDICES,
         surface=surface,
-        plotly_js=get_plotlyjs() if surface else "",
+        plotly_js=base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode() if surface else "",
     )
+
+
+def numbers(data: ProbeRecord) -> list[dict[str, str]]:
+    """The five numbers at the top: value with its error or bracket, and what it is."""
+    ends, found = data.eigenvalues, []
+    for end, words in ((ends.max, "largest curvature"), (ends.min, "smallest curvature")):
+        found.append({"value": measured(end.value, end.residual), "words": words})
+    traces = {
+        name: trace for name, trace in data.traces.items() if trace.value is not None and math.isfinite(trace.value)
+    }
+    if traces:
+        name, trace = max(traces.items(), key=lambda item: abs(item[1].value or 0.0))
+        words = f"trace of {attribute_name(name)}, the largest of five"
+        found.append({"value": measured(trace.value, trace.standard_error), "words": words})
+    if index := data.anisotropy.literal:
+        bracket = " to ".join(limits(index.low, index.high))
+        known = index.low is not None and index.high is not None
+        found.append({"value": quantity(index.value if known else None), "words": f"largest over smallest ({bracket})"})
+    if lives := ends.max.lives_on:
+        words = f"Gaussians carry the steepest direction, of {data.counts.visible_gaussians:,} in sight"
+        found.append({"value": quantity(lives.participation), "words": words})
+    return found
+
+
+def views_in(record: Record[ProbeRecord]) -> list[dict[str, str]]:
+    """Photograph and render of the training views whose pictures lie in the folder, as data URIs with the view's name."""
+    names, folder = record.data.provenance.views or [], record.folder
+    pairs = [(name, folder / PHOTOGRAPH.format(i), folder / RENDER.format(i)) for i, name in enumerate(names)]
+    return [
+        {"name": name, "photograph": _uri(photograph, "jpeg"), "render": _uri(render, "jpeg")}
+        for name, photograph, render in pairs
+        if photograph.is_file() and render.is_file()
+    ]
+
+
+def _uri(path: Path, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 def interactive_surface(record: Record[ProbeRecord]) -> go.Figure | None:
@@ -133,13 +176,7 @@ def pictures_in(folder: Path, captions: Mapping[str, str]) -> list[dict[str, str
     """The pictures that were drawn, as data URIs with their captions."""
     drawn = [(name, caption, folder / f"{name}.png") for name, caption in captions.items()]
     return [
-        {
-            "name": name,
-            "caption": caption,
-            "uri": f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}",
-        }
-        for name, caption, path in drawn
-        if path.is_file()
+        {"name": name, "caption": caption, "uri": _uri(path, "png")} for name, caption, path in drawn if path.is_file()
     ]
 
 

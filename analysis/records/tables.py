@@ -25,7 +25,7 @@ OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
 ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
 HARD_SPACE = "\u00a0"
-GAPS, REMARK = 7, 18  # between columns of the probe's table; its last one's least width
+GAPS, REMARK = 8, 18  # between columns of the probe's table; its last one's least width
 WIDTH = 15  # of a column of the families' table, with which it fits into 80
 NARROW = 0.1  # of the value: a bracket that is written as an error
 

@@ -1,4 +1,4 @@
-"""How long a training took: the time in its steps alone, over resumes, without loading, saving and scoring.
+"""Time of a training: in its steps alone, over resumes, without loading, saving and scoring.
 
 RUN/seconds.json    {"step", "wall", "cpu", "threads"}, written after every checkpoint: seconds by the clock and of all
                     processors together up to that step, and the threads that a kernel might use; null where a resume

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 from splat.model.camera import Camera
+from splat.model.files.ply import ply_bytes
 from splat.scenes.formats.transforms import SINGLE_FILE
 from splat.scenes.scene import Scene
 from splat.scenes.view import Frame, Points
@@ -80,20 +80,16 @@ def _camera(camera: Camera) -> dict[str, Any]:
 
 def _write_points(points: Points, names: tuple[str, ...], path: Path) -> None:
     """Write x y z, red green blue and, where tracks are known, the list `views` of the frames that see the point."""
-    kinds = [(axis, "f8") for axis in "xyz"] + [(colour, "u1") for colour in COLOURS]
-    if points.observations is not None:
-        kinds.append(("views", "O"))
-    rows = np.empty(len(points), dtype=kinds)
+    rows = np.empty(len(points), [(axis, "f8") for axis in "xyz"] + [(colour, "u1") for colour in COLOURS])
     for i, (axis, colour) in enumerate(zip("xyz", COLOURS)):
         rows[axis] = points.xyz[:, i].numpy()
         rows[colour] = (points.rgb[:, i] * 255).round().to(torch.uint8).numpy()
+    lists = {}
     if points.observations is not None:
         place = {name: i for i, name in enumerate(names)}
         seen: list[list[int]] = [[] for _ in range(len(points))]
         for point, image in points.observations.tolist():
             if points.names[image] in place:
                 seen[point].append(place[points.names[image]])
-        for i, views in enumerate(seen):
-            rows["views"][i] = np.array(sorted(views), dtype=np.int32)
-    element = PlyElement.describe(rows, "vertex", val_types={"views": "i4"}, len_types={"views": "u4"})
-    PlyData([element]).write(path)
+        lists["views"] = [np.array(sorted(views), dtype=np.int32) for views in seen]
+    path.write_bytes(ply_bytes(rows, lists=lists))

@@ -1,4 +1,4 @@
-"""What the accuracy study estimates: operators whose traces, spectrum and diagonal are known, and what their products cost.
+"""Cases of the accuracy study: operators with known traces, spectrum and diagonal, and the cost of their products.
 
     splats      the Hessian of a small synthetic scene, made dense in float64: the truth is its eigendecomposition.  Methods see
                 the same matrix in float32, and every product costs what the scene's own product with as many vectors took.
@@ -36,7 +36,7 @@ SETTINGS = SyntheticSettings(60, 2, 24, 18, sh_degree=0)
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What the estimates are compared with.  diagonal: None where it is not known."""
+    """True values that estimates are compared with.  diagonal: None where it is not known."""
 
     traces: Mapping[str, float]
     scales: Mapping[str, float]
@@ -94,7 +94,7 @@ class Case:
 
     @property
     def round_off(self) -> float:
-        """What the products' rounding may do to an estimate, as a share of its scale: independent roundings of every row."""
+        """Bound of the products' rounding in an estimate, as a share of its scale: independent roundings of every row."""
         return self.operator.dim**0.5 * torch.finfo(self.operator.dtype).eps
 
     @property
@@ -176,7 +176,7 @@ def matrix_cases(seed: int) -> Iterator[Case]:
 
 
 def splat_cases(seed: int, scenes: int = 1) -> dict[str, Callable[[], Case]]:
-    """How to make them, by name: a scene far from its fit and one near it, with SSIM; and one with the pixel loss alone, whose
+    """Makers of the scenes, by name: one far from its fit and one near it, with SSIM; and one with the pixel loss alone, whose
     traces are exact.  Of more scenes the k-th of a kind is another world from another seed, NAME #k."""
     kinds = {
         "far from a fit": (0.2, LossSettings()),

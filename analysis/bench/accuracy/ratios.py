@@ -1,4 +1,4 @@
-"""What an accuracy study's runs mean: a point a setting, and the defaults' work over others' at equal true error.
+"""Summaries of an accuracy study: a point a setting, and the defaults' work over others' at equal true error.
 
 See `analysis.bench.accuracy.command` for the definition; the numbers are those of its table of runs.
 """
@@ -53,7 +53,7 @@ class Curve:
 
 
 def needed(errors: np.ndarray, costs: np.ndarray, goal: float) -> tuple[float, str]:
-    """What a method needs for an error, and whether that is exact (""), an upper (">=" of a ratio) or a lower bound ("<=").
+    """Work that a method needs for an error, and whether it is exact (""), an upper ("≥" of a ratio) or a lower bound ("≤").
 
     It has an error where none of its costlier settings has a larger one: see `analysis.bench.accuracy.command`.
 
@@ -124,7 +124,7 @@ def _together(found: Sequence[tuple[Mapping, np.ndarray]]) -> dict:
 
 
 def _asked(family: str, quantity: str) -> float:
-    """What the ratio may be at most; nan: nothing is asked for."""
+    """Largest ratio that is asked for; nan: none."""
     return MATRICES if family == "matrices" else SCENES.get(quantity, np.nan)
 
 
@@ -152,7 +152,7 @@ def _compared(
 
 
 def _best(found: Mapping[str, tuple[float, str]]) -> str:
-    """Who needs least; those whose settings end before they reach the error only where nobody reaches it."""
+    """Name of the method that needs least; methods whose settings end above the error count only where all do."""
     return min(found, key=lambda name: (found[name][1] == "≤", found[name][0] * (-1 if found[name][1] == "≤" else 1)))
 
 

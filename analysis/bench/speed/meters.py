@@ -1,4 +1,4 @@
-"""What a bench measures with on the device that it runs on: a clock, the memory of a call, and the machine's ceilings.
+"""Meters of a device: a clock, the memory of a call, and the machine's ceilings.
 
 HostMeter   wall clock; memory of NumPy's arrays, by tracemalloc; ceilings of every thread together
 GpuMeter    time between two CUDA events around a call's launches, once the device has nothing else to do; memory of torch's
@@ -34,7 +34,7 @@ class Meter(Protocol):
 
 
 class HostMeter:
-    """Of the CPU."""
+    """Meter of the CPU."""
 
     device = torch.device("cpu")
 
@@ -54,7 +54,7 @@ class HostMeter:
 
 
 class GpuMeter:
-    """Of one GPU."""
+    """Meter of one GPU."""
 
     def __init__(self, device: torch.device):
         self.device = device

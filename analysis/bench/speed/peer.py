@@ -11,7 +11,7 @@ from splat.scenes.view import View
 
 
 class MissingPeer(Exception):
-    """Why there is nothing to compare with."""
+    """There is nothing to compare with, for this reason."""
 
 
 def gsplat_gradient(workload: Workload, view: View, loss: Any) -> Callable[[], object]:

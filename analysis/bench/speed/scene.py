@@ -87,7 +87,7 @@ class ViewBench:
         return self._rasterize().backward(self.cotangent)
 
     def gradient(self) -> torch.Tensor:
-        """Of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
+        """Gradient of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
         splats, depths, drawn = projected(self.workload.gaussians, self.lens)
         camera, settings = self.view.camera, self.workload.settings
         raster = rasterize(splats, depths, drawn, self.background, camera.width, camera.height, settings)
@@ -99,7 +99,7 @@ class ViewBench:
         return projected_vjp(self.workload.gaussians, self.lens, splats, drawn, bar)
 
     def gradient_by_autograd(self, accumulation: Accumulation = "deterministic") -> torch.Tensor:
-        """The same, as a step of a training makes it."""
+        """Gradient as a step of a training computes it, through torch."""
         w, settings = self.workload, replace(self.workload.settings, accumulation=accumulation)
         flat = self.like.clone().requires_grad_()
         image = render(w.gaussians.with_flat(flat), self.view.camera, self.background, settings).image
@@ -125,7 +125,7 @@ class ViewBench:
         }
 
     def wholes(self) -> Calls:
-        """What the ratios are about."""
+        """Calls whose times the ratios compare."""
         products = {f"H v {K}": lambda U=U: self.linearized.hvp(U) for K, U in self.vectors.items()}
         return {
             "rasterizer": self._rasterizer,
@@ -157,7 +157,7 @@ class ViewBench:
         return pairs_of(self.raster)
 
     def bytes_of(self, name: str) -> int:
-        """What a pass reads and writes."""
+        """Bytes that a pass reads and writes."""
         an_entry, a_pixel = BYTES[name]
         return an_entry * self.linearized.intersections + a_pixel * self.workload.pixels
 
@@ -201,7 +201,7 @@ def powers_of_two(most: int) -> list[int]:
 
 
 def scaling(workload: Workload, repetitions: int, meter: Meter) -> Iterator[tuple[str, int, dict[str, Timing]]]:
-    """What grows, to how much, and the times of everything in SCALED: Gaussians, pixels, views and, on the CPU, threads."""
+    """Yield what is scaled, to how much, and the times of everything in SCALED: Gaussians, pixels, views, threads (CPU)."""
     for share in SHARES:
         part = workload.thinned(max(1, round(share * len(workload.gaussians))))
         yield "gaussians", len(part.gaussians), scaled_times(part, repetitions, meter)

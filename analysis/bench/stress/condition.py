@@ -132,7 +132,7 @@ class Condition:
 
 
 def cancellation(case: Case, point: Gaussians) -> float:
-    """What is lost where a block is put together from moments of the offsets d = (x, y), its largest over the splats.
+    """Largest cancellation over the splats where a block is summed from moments of the offsets d = (x, y).
 
     sum w (Q d)^2 is taken from sum w x^2, ..., whose terms are as large as (|Q| |d|)^2, against |Q d|^2 <= |Q| d.Q d: a
     factor of |Q| |d|^2 / d.Q d, at the edge of the splat (its level, 2 ln(o / alpha_min)) and within the image.

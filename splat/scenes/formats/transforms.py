@@ -17,9 +17,7 @@ which captures often list, are skipped.
 """
 
 import json
-import re
 from collections.abc import Mapping
-from io import BytesIO
 from math import isfinite, pi, tan
 from pathlib import Path
 from typing import Any
@@ -27,10 +25,10 @@ from typing import Any
 import numpy as np
 import pycolmap
 import torch
-from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from landscape.errors import InputError
+from splat.model.files.ply import read_header, read_rows
 from splat.scenes.images import (
     PINHOLE_MODELS,
     UNDISTORTED_HERE,
@@ -186,20 +184,20 @@ def _focal(values: Mapping[str, Any], width: int, name: str, path: Path) -> floa
 def read_points(path: Path, names: tuple[str, ...]) -> Points:
     """Points of a PLY file: x y z, red green blue (0 to 255; grey where there are none), and `views` if it is there."""
     try:
-        promised = re.search(rb"^element vertex (\d+)", content := path.read_bytes(), re.M)
-        if promised and int(promised[1]) > len(content):  # memory for so many would be asked for
-            raise ValueError(f"it promises {int(promised[1])} points in {len(content)} bytes")
-        vertex = PlyData.read(BytesIO(content))["vertex"]
-        present = {prop.name for prop in vertex.properties}
-        xyz = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+        content = path.read_bytes()
+        vertex = read_rows(content, read_header(content))
+        if missing := {*"xyz"} - {*vertex.names}:
+            raise InputError(f"its points have no {', '.join(sorted(missing))}")
+        if "views" in vertex.names:
+            raise InputError("its property 'views' is a single number, not a list")
+        xyz = np.stack([vertex.numbers[axis].astype(np.float64) for axis in "xyz"], axis=1)
         rgb = np.full(xyz.shape, 0.5, dtype=np.float32)
-        if {"red", "green", "blue"} <= present:
-            rgb = np.stack([np.asarray(vertex[c], dtype=np.float32) for c in ("red", "green", "blue")], axis=1) / 255
+        if {"red", "green", "blue"} <= {*vertex.names}:
+            rgb = np.stack([vertex.numbers[c].astype(np.float32) for c in ("red", "green", "blue")], axis=1) / 255
         observations = None
-        if "views" in present:
-            seen = [np.asarray(views, dtype=np.int64) for views in vertex["views"]]
+        if seen := vertex.lists.get("views"):
             point = np.repeat(np.arange(len(seen)), [len(views) for views in seen])
-            observations = torch.from_numpy(np.stack([point, np.concatenate(seen)], axis=1)) if seen else None
-    except (OSError, PlyParseError, KeyError, ValueError, TypeError) as error:
+            observations = torch.from_numpy(np.stack([point, np.concatenate(seen).astype(np.int64)], axis=1))
+    except (OSError, InputError) as error:
         raise InputError(f"expected a PLY file of points, cannot read {path}: {error}; restore or remove it") from error
     return Points(torch.from_numpy(xyz), torch.from_numpy(rgb), observations, names)

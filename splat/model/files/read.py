@@ -1,0 +1,111 @@
+"""Read Gaussians from a file of any tool, recognised by what is in it."""
+
+import ast
+import io
+import zipfile
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from landscape.errors import InputError
+from splat.model.files import quantised, tensor_files
+from splat.model.files.ply import MAGIC, read_header
+from splat.model.files.splat_file import SplatFile
+from splat.model.files.splat_ply import read_splat_ply
+
+ZIP_MAGIC, LICHTFELD = b"PK\x03\x04", (b"LFKP", b"PKFL")
+LONGEST_SETTINGS = 1 << 16
+KINDS = "PLY, a checkpoint of graphdeco, gsplat or nerfstudio, .splat, compressed PLY, .spz or .sog"
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether a file is for `read_splats`: recognised, and not of `splat.training.checkpoint`."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        start = file.read(4)
+        if not start.startswith(ZIP_MAGIC):
+            known = (MAGIC, quantised.GZIP_MAGIC, quantised.SPZ_MAGIC, *LICHTFELD)
+            return start.startswith(known) or path.suffix.lower() == ".splat"
+        try:
+            with zipfile.ZipFile(file) as archive:
+                return not tensor_files.is_own(archive) and (
+                    tensor_files.is_tensor_file(archive) or quantised.is_sog(archive)
+                )
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError):
+            return False  # `load_checkpoint` says what is wrong with it
+
+
+def read_splats(path: Path) -> SplatFile:
+    """The Gaussians of a file that `is_foreign`.  InputError that says what is wrong with it.
+
+    >>> read_splats(Path(getfixture("tmp_path") / "none.ply"))
+    Traceback (most recent call last):
+        ...
+    FileNotFoundError: expected a file of Gaussians at ...none.ply, found none
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a file of Gaussians at {path}, found none")
+    try:
+        return _with_settings(_read(path, path.read_bytes()), path)
+    except InputError as error:
+        raise InputError(f"expected Gaussians in {path} ({KINDS}): {error}") from error
+
+
+def _read(path: Path, content: bytes) -> SplatFile:
+    if content.startswith(LICHTFELD):
+        raise InputError("it is LichtFeld's own format, which changes often: export a PLY there")
+    if content.startswith(MAGIC):
+        compressed = quantised.is_compressed(read_header(content))
+        return quantised.read_compressed_ply(content) if compressed else read_splat_ply(content)
+    if content.startswith((quantised.GZIP_MAGIC, quantised.SPZ_MAGIC)):
+        return quantised.read_spz(content)
+    if content.startswith(ZIP_MAGIC):
+        try:
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                sog = quantised.is_sog(archive)
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, RuntimeError) as error:
+            raise InputError(f"it is a damaged zip file ({error})") from error
+        return quantised.read_sog(content) if sog else tensor_files.read_tensor_file(path, content)
+    if path.suffix.lower() == ".splat" and content and len(content) % quantised.SPLAT.itemsize == 0:
+        return quantised.read_dot_splat(content)  # which has no mark of its own
+    raise InputError("it is none of them")
+
+
+def _with_settings(found: SplatFile, path: Path) -> SplatFile:
+    """With what graphdeco's `cfg_args` beside the model says; it is of a training of graphdeco or of a relative of it."""
+    parts = path.resolve().parts
+    model = path.resolve().parents[2] if parts[-3:-2] == ("point_cloud",) else path.resolve().parent
+    settings = read_cfg_args(model / "cfg_args") if found.format in ("PLY", "graphdeco checkpoint") else {}
+    if not settings:
+        return found
+    step = found.step
+    if step is None and parts[-2].removeprefix("iteration_").isdigit():
+        step = int(parts[-2].removeprefix("iteration_")[:9])
+    return replace(
+        found,
+        tool=found.tool or "graphdeco",
+        step=step,
+        antialiased=found.antialiased or settings.get("antialiasing") is True,
+        settings=settings,
+    )
+
+
+def read_cfg_args(path: Path) -> dict[str, Any]:
+    """The keywords of `Namespace(...)` that are literals; empty where there is no such file.  Nothing in it is run."""
+    if not path.is_file() or path.stat().st_size > LONGEST_SETTINGS:
+        return {}
+    try:
+        call = ast.parse(path.read_text(encoding="utf-8").strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return {}
+    if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
+        return {}
+    found = {}
+    for keyword in call.keywords:
+        try:
+            found[keyword.arg] = ast.literal_eval(keyword.value)
+        except (ValueError, TypeError, RecursionError, MemoryError):
+            continue
+    return {name: value for name, value in found.items() if name is not None}
