@@ -8,7 +8,7 @@ from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
 from analysis.records.records import ProbeRecord
 from analysis.records.schema import Index, Trace
 
-SHORT = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "colour"}
+SHORT = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "SH"}
 
 
 def summary(data: ProbeRecord, report: Path) -> list[str]:

@@ -25,7 +25,7 @@ OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
 ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
 HARD_SPACE = "\u00a0"
-GAPS, REMARK = 8, 18  # between columns of the probe's table; its last one's least width
+GAPS, NUMBER, REMARK = 8, 27, 22  # of the probe's table: between columns, widest number in a line, least room for words
 WIDTH = 15  # of a column of the families' table, with which it fits into 80
 NARROW = 0.1  # of the value: a bracket that is written as an error
 
@@ -45,7 +45,8 @@ def probe_table(data: ProbeRecord, width: int = 80) -> Table:
         None,
         *_check_rows(data.checks),
     ]
-    name, value = (max(len(row[i]) for row in rows if row) for i in (0, 1))
+    rows = [row and (row[0], _folded(row[1], NUMBER), row[2]) for row in rows]
+    name, value = (max(len(line) for row in rows if row for line in row[i].splitlines()) for i in (0, 1))
     name = min(name, max(width - value - GAPS - REMARK, REMARK))
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=ERRORS, caption_justify="left")
     for heading, justify in (("", "left"), ("value ± error", "right"), ("", "left")):
@@ -205,13 +206,13 @@ def family_table(data: ProbeRecord) -> Table:
     return table
 
 
-def _folded(text: str) -> str:
+def _folded(text: str, width: int = WIDTH) -> str:
     """In two lines where it is too wide for a column.
 
     >>> _folded("7.45 × 10⁻⁴ … 1.02 × 10⁴"), _folded("34.1 … 120")
     ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
     """
-    return text if len(text) <= WIDTH else text.replace(" ± ", "\n± ").replace(" … ", " …\n")
+    return text if len(text) <= width else text.replace(" ± ", "\n± ").replace(" … ", " …\n")
 
 
 def bracketed(index: Index | Effect | None) -> Cell:
