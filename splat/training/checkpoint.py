@@ -32,6 +32,15 @@ from splat.training.state import Method, ThreeDGS, TrainConfig, Training
 
 FORMAT, VERSION = "splat-landscape checkpoint", 2
 KIND = "expected a checkpoint written by landscape train"
+# settings that older files lack, where the training was the one of their defaults
+LATER = {
+    "protocol",
+    "clamp_image",
+    "rates.position_hold",
+    "densify.split_distance",
+    "densify.grow_opacity",
+    "densify.first_reset",
+}
 REMEDY = "take another copy of the file, or train anew"
 
 
@@ -255,7 +264,7 @@ def _config(content: dict[str, Any]) -> TrainConfig:
     method, render = {**METHODS[name].BEFORE, **method}, current_settings(render)
     content = {**content, "render": render, "method": {}}
     config = replace(typed(TrainConfig, content, "config"), method=typed(METHODS[name], method, "config.method"))
-    if different := leaves({**content, "method": method}).keys() ^ leaves(asdict(config)).keys():
+    if different := (leaves({**content, "method": method}).keys() ^ leaves(asdict(config)).keys()) - LATER:
         raise InputError(f"'config' has missing or unknown keys: {', '.join(sorted(map(str, different)))}")
     return config
 

@@ -16,11 +16,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Column
 
-from analysis.probe.measurement import ProbeSettings
 from analysis.runs.sweep.sweep_file import Cell, Sweep
 from analysis.train.training_time import TrainingTime
 
 Stage = Literal["train", "probe"]
+
+A_PROBE = 45.0  # seconds, before one has been made
 
 
 class SweepProgress:
@@ -40,7 +41,7 @@ class SweepProgress:
             refresh_per_second=2,
             expand=True,
         )
-        self._task = self._bar.add_task("", total=sum(cell.training.iterations for cell in sweep.cells), state="")
+        self._task = self._bar.add_task("", total=sum(cell.steps for cell in sweep.cells), state="")
 
     def __enter__(self) -> "SweepProgress":
         self._bar.start()
@@ -97,12 +98,12 @@ class SweepProgress:
         total = 0.0
         for cell, each in zip(self.sweep.cells, spent, strict=True):
             pace = mean(paces.get((cell.scene, cell.method), [other]))
-            total += pace * (cell.training.iterations - each.step)
+            total += pace * (cell.steps - each.step)
             total += self._probe_seconds() * ("probe" in self.to_do[cell.name])
         return total / self.jobs
 
     def _probe_seconds(self) -> float:
         if self.probes:
             return mean(self.probes)
-        whole = self.sweep.probe_seconds or ProbeSettings().seconds
+        whole = self.sweep.probe_seconds or A_PROBE
         return whole + self.sweep.family_seconds * self.sweep.split_control
