@@ -99,7 +99,7 @@ def run(options: Options, arguments: Sequence[str]) -> int:
         case ProbeOptions():
             from analysis.console.drawing import drawing
 
-            with drawing("make_all", *options.pictures) as drawn:
+            with drawing("make_all") as drawn:
                 from analysis.probe.command import run_probe
 
                 return run_probe(options, ["landscape", *arguments], drawn)

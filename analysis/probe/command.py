@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 CHECK_FAILED = 1
 DRAWING = 8.0  # seconds that a record and its pictures take, on two processors of 2023
-WITHOUT_SURFACE = "the picture of the slice as a surface was left out; python -m figures.surface {} draws it"
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
@@ -100,10 +99,8 @@ def _run(
             )
             data, arrays["families"] = families.added_to(data), families.arrays()
             data.provenance.families = asdict(family_options)
-        if options.quick:
-            data.notes.append(WITHOUT_SURFACE.format(out))
         if writes:
-            _write(out, data, arrays, objective, stages, start, drawn, options.pictures)
+            _write(out, data, arrays, objective, stages, start, drawn)
     if writes:
         if not found.unreached:
             shutil.rmtree(unfinished, ignore_errors=True)
@@ -137,13 +134,12 @@ def _write(
     stages: Stages,
     start: float,
     drawn: Draw | None,
-    pictures: Sequence[str],
 ) -> None:
     """The record, its pictures and its page, all at once."""
     with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
         write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
-        write_with_pictures(folder, data, arrays, stages, start, drawn, pictures)
+        write_with_pictures(folder, data, arrays, stages, start, drawn)
         from analysis.records.report import write_report
 
         write_report(folder, surface.result())

@@ -75,7 +75,7 @@ LEFT_OUT = {
 }
 MOST_AT_ONCE = 4  # start vectors
 # what a stage takes on two real scenes, as products with MOST_AT_ONCE vectors and as renders of all views
-TYPICAL = {"traces": (12, 0), "eigenvalues": (10, 0), "slice": (0, 100), "depth": (2, 50)}
+TYPICAL = {"traces": (12, 0), "eigenvalues": (10, 0), "slice": (0, 180), "depth": (2, 50)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,14 +299,12 @@ def _plane(
     axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
     workers = 1 if at.objective.ranks.size > 1 or by_triton(center) else thread_count()
+    # without a budget for it, the two axes alone
+    most = inf if settings.slice_plane else 1
+    accuracy = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most)
     # Ritz vectors: H between any two of them is their values' diagonal matrix
-    known, accuracy = (
-        curvatures.diag(),
-        SliceSettings(settings.slice_tolerance, settings.slice_holdout, workers=workers),
-    )
-    evaluate = evaluation(at.objective, workers)
+    known, evaluate = curvatures.diag(), evaluation(at.objective, workers)
     plane = evaluate_slice(evaluate, center, vectors, axes, at.gradient, known, accuracy, generator, progress=report)
-    notes.extend(slice_notes(plane))
     return PlaneSlice(plane, loss_scale, (first, second))
 
 
@@ -320,10 +318,3 @@ def evaluation(objective: SceneObjective, workers: int) -> Loss:
             return objective.evaluate(theta)
 
     return alone
-
-
-def slice_notes(found: Slice) -> list[str]:
-    """That a slice is not as good as was asked for."""
-    if found.reason in ("tolerance", "exact"):
-        return []
-    return [f"the slice's interpolation stopped at its {found.reason}, before its error was down to the tolerance"]

@@ -30,7 +30,7 @@ class ProbeOptions:
     quick: FlagCreatePairsOff[bool] = False
     """Numbers to 10% instead of 1%, in a quarter of the time, into a folder of their own (probe-quick).
     Without the spectral density and the indices that need it, power iteration, the finite probe, the comparison of depth with
-    lateral directions, and surface.png."""
+    lateral directions, and the slice's plane between its two axes."""
     seconds: Unset[float] = None
     """Time for the whole command, pictures too; what was not reached is said, and the same command continues.
     Default: no limit: the probe ends at its accuracies.  Not under torchrun."""
@@ -42,7 +42,7 @@ class ProbeOptions:
     end_products: Unset[int] = None
     """Products of the search for both ends of the spectrum, at most.  Default: 3000."""
     slice_points: Unset[int] = None
-    """Points along each side of the slice, odd, 5 or more.  Default: 41."""
+    """Points along each side of the slice, odd, 5 or more.  Default: 41, with --quick 21."""
     slice_rise: float = 0.001
     """What a curvature unit is: the step within which the curvature alone changes the loss by this share of it.
     The slice reaches 3 units each way."""
@@ -61,8 +61,3 @@ class ProbeOptions:
     Any but parameters measures the families, as --families does."""
     family_seconds: float = 1800.0
     """Time for the families together, in seconds, beside that of --seconds.  inf: no limit."""
-
-    @property
-    def pictures(self) -> tuple[str, ...]:
-        """What `figures.make_all` is told, beside the folder."""
-        return ("--without", "surface") if self.quick else ()

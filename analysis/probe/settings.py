@@ -9,7 +9,6 @@ from landscape.slices.finite_probe import NOISE_POINTS, STEPS
 
 FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density's run and along a side of a slice
 FEWEST_PRODUCTS = 16  # of a density
-FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,7 @@ class ProbeSettings:
         density, of which a tenth sees the ends again; 0: it is left out.
     slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
         of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
-        slice_holdout: renders that judge this error.
+        slice_plane: whether to render more than its two axes.
     probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
         noise of a render.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
@@ -41,7 +40,7 @@ class ProbeSettings:
     slice_radius: float = 3.0
     slice_rise: float = 0.001
     slice_tolerance: float = 0.01
-    slice_holdout: int = 30
+    slice_plane: bool = True
     probe_steps: tuple[float, ...] = STEPS
     depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=1024))
     depth_steps: tuple[float, ...] = DEPTH_STEPS
@@ -70,8 +69,8 @@ class ProbeSettings:
             trace_samples=5,
             eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=1000),
             density_matvecs=0,
-            slice_tolerance=0.1,
-            slice_holdout=FEWEST_HELD_OUT,
+            slice_points=21,
+            slice_plane=False,
             probe_steps=(),
             depth=None,
         )

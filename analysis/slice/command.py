@@ -3,7 +3,7 @@
     load            the checkpoint, its scene, the other checkpoint of a line
     linearise       every view held still
     directions      eigenvectors from the probe beside the checkpoint or by Lanczos, and their curvatures
-    slice           renders where needed, in parallel, interpolated elsewhere (`landscape.slices.refinement`)
+    slice           renders in parallel; of a plane where needed, interpolated elsewhere (`landscape.slices.refinement`)
     finite steps    along a line: second differences at steps over four decades, beside the infinitesimal curvature
 
 What is found on the way is kept in `.NAME.unfinished` beside the record, from which the same command continues, whatever
@@ -16,7 +16,7 @@ import shlex
 import shutil
 from collections.abc import Sequence
 from functools import partial
-from math import ceil, inf
+from math import inf
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -30,7 +30,7 @@ from torch import Tensor
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.command import scene_objective
-from analysis.probe.measurement import evaluation, slice_notes
+from analysis.probe.measurement import evaluation
 from analysis.probe.record import loss_name, provenance_of
 from analysis.records.findings import of_slice, resolved
 from analysis.records.provenance import require_seed
@@ -59,7 +59,6 @@ from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
 from splat.training.checkpoint import Checkpoint, load_checkpoint
 
-COARSE = {1: 9, 2: 21}  # points that an adaptive slice begins with, by its dimension
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
@@ -92,7 +91,7 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
             raise
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         made.other = None if options.other is None else str(options.other)
-        data = slice_record(found, objective, notes + slice_notes(found.slice), made)
+        data = slice_record(found, objective, notes, made)
         with record_folder(out, SliceRecord) as folder:
             write_with_pictures(folder, data, slice_arrays(found), stages, start)
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -101,22 +100,21 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
 
 
 def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
-    """As asked for; a line of few points holds an eighth of them out, and a GPU is full with one render."""
+    """As asked for; a GPU is full with one render."""
     most = torch.get_num_threads() if device.type == "cpu" else 1
     workers = most if options.workers is None else options.workers
-    holdout = min(SliceSettings.holdout, ceil(options.points**shape.dimension / 8))
     if options.all_points:
         if options.max_renders is not None:
             raise InputError("expected --all-points or --max-renders, got both; leave one out")
         return SliceSettings(tolerance=None, workers=workers)
-    least = COARSE[shape.dimension] + holdout + 1
+    least = options.points * shape.dimension + 1
     if options.max_renders is not None and options.max_renders < least:
         raise InputError(
-            f"expected --max-renders of at least {least}, with which a slice of dimension {shape.dimension} can begin and be "
-            f"judged, got {options.max_renders}"
+            f"expected --max-renders of at least {least}, the points of the axes, which are all rendered, and the centre, got "
+            f"{options.max_renders}; take fewer --points"
         )
     renders = inf if options.max_renders is None else options.max_renders
-    return SliceSettings(options.tolerance, holdout, workers=workers, max_evaluations=renders)
+    return SliceSettings(options.tolerance, workers=workers, max_evaluations=renders)
 
 
 def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
@@ -228,7 +226,7 @@ def _conclude(data: SliceRecord, out: Path) -> None:
         say(f"{text}; one curvature unit is a step of {quantity(direction.unit)}")
     if data.finite_probe:
         say(_finite_curvature(data.finite_probe))
-    for line in of_slice(data.slice):
+    for line in of_slice(data.slice, data.provenance):
         say(line.text)
     for note in data.notes:
         say(note, style="yellow")

@@ -15,7 +15,8 @@ Along = Literal["eigenvectors", "random", "gradient", "line"]
 class SliceOptions:
     """Slice the training loss through a checkpoint: along a line or over a plane, with the quadratic model beside it.
 
-    Points are rendered where the others do not predict them well.  A slice that was killed continues when it is run again.
+    Of a plane both axes are rendered, and points between them until these predict the others well.  A slice that was killed
+    continues when it is run again.
     """
 
     checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
@@ -39,7 +40,8 @@ class SliceOptions:
     points: int = 41
     """Points along each direction, odd; a line to OTHER may get a few more or less."""
     tolerance: float = 0.01
-    """Largest error of the points that are interpolated instead of rendered, as a share of the range of the loss."""
+    """Error of the points of a plane that are interpolated instead of rendered, as a share of the range of the loss.
+    Both axes are rendered in full; where too few renders are made to reach it, no surface is drawn."""
     all_points: FlagCreatePairsOff[bool] = False
     """Render every point, whatever the tolerance."""
     max_renders: Unset[int] = None

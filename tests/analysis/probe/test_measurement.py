@@ -44,6 +44,8 @@ def test_kernels_are_compiled_before_the_time_is_told_and_blocks_made_once(monke
     assert {"block_diagonal", "evaluate", "check_against_gradient"} <= {*first}
     assert calls.count("block_diagonal") == 1 and calls.count("gauss_newton") == 1
     assert found.value == pytest.approx(objective.loss(objective.active.flat))
+    assert found.plane is not None  # the two axes alone
+    assert int(found.plane.slice.evaluated.sum()) == 9 and not found.plane.slice.resolved
     assert {trace.probes for trace in found.traces.values()} == {settings.trace_samples}
 
 

@@ -90,12 +90,10 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     assert main(["probe", str(run), "--quick", "--verbose"]) == 0
     said = capsys.readouterr()
     data = read_record(run / "probe-quick").data
-    assert data.provenance.dtype == "float32" and data.slice.points == 41 * 41
+    assert data.provenance.dtype == "float32" and data.slice.points == 21 * 21
     assert set(dict(data.eigenvalues.items())) == {"max", "second", "min"} and "power iteration" not in said.out
     # what it left out is said, in the record and aloud
-    assert any("surface was left out" in note for note in data.notes) and "surface was left out" in " ".join(
-        said.out.split()
-    )
+    assert f"no surface is drawn; landscape slice {run / 'checkpoint.pt'} renders more" in " ".join(said.out.split())
     assert data.finite_probe is None and "the finite probe was left out" in data.notes
     assert data.depth is None and "positions along and across the rays were left out" in data.notes
     assert data.anisotropy.share.value is None and "density" not in data.timing
@@ -123,7 +121,7 @@ def test_a_quick_probe_leaves_out_the_same_pictures_however_it_is_started(run, t
         "analysis.console.recording.draw", lambda module, target, *told: drawn.append((module, *told)) or []
     )
     assert run_probe(ProbeOptions(run / "checkpoint.pt", quick=True, out=tmp_path / "function")) == 0
-    assert begun == drawn == [("make_all", "--without", "surface")]
+    assert begun == drawn == [("make_all",)]
 
 
 def test_time_that_ends_is_said_and_the_same_command_continues_to_the_same_numbers(

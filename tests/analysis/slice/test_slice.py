@@ -256,12 +256,20 @@ def test_of_two_kinds_the_second_is_turned_to_a_right_angle(run, objective, tmp_
 
 
 def test_an_adaptive_slice_says_what_it_rendered_and_stays_below_the_most(run, objective, tmp_path, capsys):
-    record = sliced(tmp_path / "slice", run / "double.pt", "--max-renders", "80", "--tolerance", "1e-6")
+    record = sliced(tmp_path / "slice", run / "double.pt", "--max-renders", "200", "--tolerance", "1e-6")
     check_renders(record, objective)
     about = record.data.slice
-    assert about.evaluations <= 80 and about.points == 41 * 41 and about.reason == "evaluation budget"
+    assert (
+        about.evaluations <= 200
+        and not about.resolved
+        and about.points == 41 * 41
+        and about.reason == "evaluation budget"
+    )
     said = capsys.readouterr()
-    assert "evaluation budget" in said.out and f"{about.evaluated_points} are renders" in said.out
+    words = " ".join(said.out.split())
+    assert f"from {about.evaluated_points} of 1,681 renders, and no surface is drawn; leave out --max-renders." in words
+    assert [path.name for path in (tmp_path / "slice").glob("*.png")] == ["slice2d.png"]
+    assert np.isfinite(record.arrays["slice"]["loss"]).sum() == about.evaluated_points
     assert str(tmp_path / "slice") in said.out and "slice.json" in said.out
 
 
@@ -386,7 +394,7 @@ def few(run: Path, tmp_path: Path) -> str:
         (["--radius", "0"], ["radii", "above 0"]),
         (["--radius", "1", "--radius", "1", "--radius", "1"], ["at most 2 radii"]),
         (["--tolerance", "2"], ["tolerance between 0 and 1"]),
-        (["--max-renders", "10"], ["at least 52"]),
+        (["--max-renders", "10"], ["at least 83"]),
         (["--max-renders", "60", "--all-points"], ["leave one out"]),
         (["--workers", "0"], ["workers"]),
         (["--along", "line"], ["no other checkpoint", "name it"]),
