@@ -135,7 +135,7 @@ def measure(
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
         gradient, value, render = _linearised(objective, report)
-        objective.gaussian_blocks  # noqa: B018 (made here, where kernels compile)
+        objective.approximate_blocks  # noqa: B018 (made here, where kernels compile)
     with stages.stage("checks") as report:
         operator_check = check_operator(operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(hessian, spawn(generator), report, settings.checked_views)
@@ -247,7 +247,7 @@ def _ends(at: _Point, seconds: float, generator: torch.Generator, report: Progre
         notes.append(
             f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB"
         )
-    start = BlockEigenvectors(at.objective, *at.objective.gaussian_blocks).warm_start()
+    start = BlockEigenvectors(at.objective, *at.objective.approximate_blocks).warm_start()
     eigen = replace(eigen, max_seconds=seconds, basis=basis)
     return extreme_eigenpairs(at.operator, generator, eigen, start, report)
 
