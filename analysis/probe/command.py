@@ -21,6 +21,7 @@ from rich.console import Console
 
 from analysis.console.drawing import Draw
 from analysis.console.kept import kept_stages
+from analysis.console.options import ForeignOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.measurement import measure
@@ -38,7 +39,8 @@ from landscape.probes import spawn
 from splat.backend.device import device_named
 from splat.curvature.objective import SceneObjective
 from splat.scenes.scene import Scene
-from splat.training.checkpoint import Checkpoint, load_checkpoint
+from splat.training.checkpoint import Checkpoint, open_checkpoint
+from splat.training.origin.foreign import Foreign
 
 if TYPE_CHECKING:
     from analysis.measures.families import FamilyOptions
@@ -76,14 +78,15 @@ def _run(
     console = Console(stderr=True, quiet=not writes)
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
-        checkpoint = load_checkpoint(options.checkpoint)
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
-        scene = checkpoint.load_scene(options.checkpoint, options.scene)
         objective = scene_objective(checkpoint, scene, ranks)
     console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True)
     unfinished = out.with_name(f".{out.name}.unfinished")
     folder = None if ranks else unfinished
-    told = f"{_digest(options.checkpoint)} {scene.root} {settings} {options.seed} {device} {versions()}"
+    told = (
+        f"{_digest(options.checkpoint)} {options.foreign} {scene.root} {settings} {options.seed} {device} {versions()}"
+    )
     deadline = begun + limit - DRAWING
     with stages, _kept(unfinished, command, console):
         generator = torch.Generator(device).manual_seed(options.seed)
@@ -99,6 +102,7 @@ def _run(
             )
             data, arrays["families"] = families.added_to(data), families.arrays()
             data.provenance.families = asdict(family_options)
+        data.notes += checkpoint.assumptions
         if writes:
             _write(out, data, arrays, objective, stages, start, drawn)
     if writes:
@@ -143,6 +147,21 @@ def _write(
         from analysis.records.report import write_report
 
         write_report(folder, surface.result())
+
+
+def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
+    """A checkpoint, our own or another tool's, and its scene.  out: beside which a picture explains a refusal."""
+    listed = None
+    if ask.train_list is not None:
+        try:
+            listed = tuple(ask.train_list.read_text(encoding="utf-8").split("\n"))
+        except UnicodeDecodeError as error:
+            raise InputError(f"expected names of views, one in each line, in {ask.train_list}, got no text") from error
+        listed = tuple(name.strip() for name in listed if name.strip())
+    foreign = Foreign(folder, ask.views, listed, ask.trained_by, ask.images, ask.downscale)
+    checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
+    scene = checkpoint.load_scene(path, folder)
+    return checkpoint.thinned(scene, ask.max_views), scene
 
 
 def scene_objective(
