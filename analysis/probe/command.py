@@ -38,6 +38,7 @@ from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import spawn
 from splat.backend.device import device_named
 from splat.curvature.objective import SceneObjective
+from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint, open_checkpoint
 from splat.training.origin.foreign import Foreign
@@ -80,13 +81,11 @@ def _run(
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
-        objective = scene_objective(checkpoint, scene, ranks)
+        objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True)
     unfinished = out.with_name(f".{out.name}.unfinished")
     folder = None if ranks else unfinished
-    told = (
-        f"{_digest(options.checkpoint)} {options.foreign} {scene.root} {settings} {options.seed} {device} {versions()}"
-    )
+    told = f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {settings} {options.seed} {device} {versions()}"
     deadline = begun + limit - DRAWING
     with stages, _kept(unfinished, command, console):
         generator = torch.Generator(device).manual_seed(options.seed)
@@ -165,12 +164,19 @@ def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> t
 
 
 def scene_objective(
-    checkpoint: Checkpoint, scene: Scene, ranks: Ranks | None = None, *, keep_unseen: bool = False
+    checkpoint: Checkpoint,
+    scene: Scene,
+    ranks: Ranks | None = None,
+    *,
+    keep_unseen: bool = False,
+    loss: LossSettings | None = None,
 ) -> SceneObjective:
-    """The training's loss over its views, at the checkpoint; ranks: share them.  keep_unseen: see `SceneObjective`."""
+    """A loss, by default the training's, over its views, at the checkpoint; ranks: share them.  keep_unseen: see
+    `SceneObjective`."""
     ranks = ranks or ALONE
     training, views = checkpoint.training, scene.load(ranks.share(checkpoint.scene.train, "training view"))
-    return training.config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
+    config = replace(training.config, loss=loss or training.config.loss)
+    return config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
 
 def _settings(options: ProbeOptions) -> ProbeSettings:

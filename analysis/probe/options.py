@@ -23,6 +23,9 @@ class ProbeOptions:
     """Seed of the random vectors."""
     device: DeviceName = "auto"
     """Where to work.  auto: on the GPU where there is one that can be used, else on the CPU."""
+    loss: Literal["training", "3dgs"] = "training"
+    """Whose curvature.  training: the loss that the checkpoint was trained with.
+    3dgs: that of 3DGS, whatever it was trained with, so that trainings with other losses can be compared."""
     strict: FlagCreatePairsOff[bool] = False
     """Exit with 1 if a self-check fails; the record is written all the same."""
     verbose: FlagCreatePairsOff[bool] = False
