@@ -118,7 +118,7 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
 def _legend(field: Plane) -> list[Line2D]:
     handles = [Line2D([], [], color=BLACK, label="loss, true renders")]
     if not field.evaluated.all():
-        size = "unbounded" if field.error is None else f"< {100 * field.error:.2g}%"
+        size = "unbounded" if field.error is None else f"<{100 * field.error:.2g}%"
         label = "loss, renders" if field.unresolved else f"loss, {field.evaluated.mean():.0%} renders (error {size})"
         handles = [Line2D([], [], color=BLACK, marker=".", markersize=4, label=label)]
     if field.model is not None:
