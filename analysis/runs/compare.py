@@ -5,15 +5,16 @@ OUT/compare.csv     every number, see `analysis/runs/compare_table.py`
 OUT/compare.json    {"runs": {LABEL: folder of its record}}, from which `figures/compare.py` draws
 OUT/*.png           traces, densities of the spectrum and slices in common limits
 
-What must be the same for curvatures to be comparable at all is demanded: the loss, the training views and their sizes.  What
-must be kept in mind beside that is said: other starts, steps, budgets, checks that failed, numbers of Gaussians.
+What must be the same for curvatures to be comparable at all is demanded: the loss that was probed, the training views and their
+sizes.  Runs that were trained with other losses are probed with that of 3DGS (`landscape probe --loss 3dgs`).  What must be
+kept in mind beside that is said: other starts, steps, losses of training, budgets, failed checks, numbers of Gaussians.
 """
 
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 
@@ -21,6 +22,7 @@ from analysis.console.drawing import draw
 from analysis.console.options import DeviceName
 from analysis.console.overrides import leaves
 from analysis.probe.options import ProbeOptions
+from analysis.probe.record import loss_name
 from analysis.records.findings import of_budgets, unresolved
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import quantity
@@ -52,19 +54,26 @@ def run_compare(options: CompareOptions) -> int:
     common = common.parent if common in folders else common
     labels = [str(folder.relative_to(common)) for folder in folders]
     checkpoints = [load_checkpoint(folder / CHECKPOINT) for folder in folders]
-    require_same(labels, checkpoints)
+    require_same(labels, checkpoints, trained_alike=False)
+    loss = (
+        "3dgs"
+        if any(c.training.config.loss != checkpoints[0].training.config.loss for c in checkpoints)
+        else "training"
+    )
     missing = [path for path, checkpoint in zip(paths, checkpoints) if not probed(path, checkpoint)]
     if missing and not options.probe:
-        again = "; ".join(f"landscape probe {path / CHECKPOINT}" for path in missing)
+        more = "" if loss == "training" else f" --loss {loss}"
+        again = "; ".join(f"landscape probe {path / CHECKPOINT}{more}" for path in missing)
         raise InputError(
             f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
         )
     for path in missing:
-        _probe(path, options.device)
+        _probe(path, options.device, loss)
     runs = [
         Run(path, label, checkpoint, _scores(path), read_record(path / PROBE, ProbeRecord).data)
         for path, label, checkpoint in zip(paths, labels, checkpoints)
     ]
+    require_same_loss(runs)
     named = [_relative(group, common) for group in groups]
     _write(runs, named, identical(labels, checkpoints), options.out or common / "compare")
     return 0
@@ -83,14 +92,15 @@ def _folders(runs: Sequence[Path]) -> list[Path]:
     return folders
 
 
-def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> None:
-    """ValueError where the runs' curvatures are those of different functions."""
+def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint], *, trained_alike: bool = True) -> None:
+    """InputError where the runs' curvatures are those of different functions; trained_alike: of the loss of training."""
     demanded: dict[str, Callable[[Checkpoint], Any]] = {
         "training views": lambda c: c.scene.train,
         "sizes of the views": lambda c: c.scene.sizes,
-        "loss": lambda c: c.training.config.loss,
         "background": lambda c: c.training.config.background,
     }
+    if trained_alike:
+        demanded["loss"] = lambda c: c.training.config.loss
     for what, of in demanded.items():
         first = of(checkpoints[0])
         for label, checkpoint in zip(labels, checkpoints, strict=True):
@@ -101,6 +111,17 @@ def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> No
                 )
 
 
+def require_same_loss(runs: Sequence[Run]) -> None:
+    """InputError where the records are of different losses; older ones do not name theirs, which is the training's."""
+    losses = [run.data.objective.loss or loss_name(run.checkpoint.training.config.loss) for run in runs]
+    for run, loss in zip(runs, losses, strict=True):
+        if loss != losses[0]:
+            raise InputError(
+                f"expected probes of the same loss, as curvatures are not comparable else, got {losses[0]} in {runs[0].label} "
+                f"and {loss} in {run.label}; probe all of them with --loss 3dgs"
+            )
+
+
 def probed(run: Path, checkpoint: Checkpoint) -> bool:
     """Whether the run has a record of this checkpoint's step."""
     if not (run / PROBE / ProbeRecord.FILE).is_file():
@@ -108,11 +129,12 @@ def probed(run: Path, checkpoint: Checkpoint) -> bool:
     return read_record(run / PROBE, ProbeRecord).data.provenance.iteration == checkpoint.training.step
 
 
-def _probe(run: Path, device: DeviceName) -> None:
+def _probe(run: Path, device: DeviceName, loss: Literal["training", "3dgs"]) -> None:
     from analysis.probe.command import run_probe
 
     path = run / CHECKPOINT
-    run_probe(ProbeOptions(path, device=device), ["landscape", "probe", str(path), "--device", device])
+    command = ["landscape", "probe", str(path), "--device", device, "--loss", loss]
+    run_probe(ProbeOptions(path, device=device, loss=loss), command)
 
 
 def _scores(run: Path) -> Scores | None:
@@ -128,6 +150,8 @@ def cautions(runs: Sequence[Run]) -> list[str]:
         "start": lambda run: getattr(run.checkpoint.scene, "start", None),
         "seed": lambda run: run.checkpoint.training.config.seed,
         "held-out views": lambda run: run.checkpoint.scene.test,
+        "losses of the trainings": lambda run: run.checkpoint.training.config.loss,
+        "protocol": lambda run: run.checkpoint.training.config.protocol,
         "random background": lambda run: run.checkpoint.training.config.random_background,
         "precision": lambda run: run.data.provenance.dtype,
     }

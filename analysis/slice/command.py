@@ -29,7 +29,7 @@ from torch import Tensor
 
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.probe.command import scene_objective
+from analysis.probe.command import opened, scene_objective
 from analysis.probe.measurement import evaluation
 from analysis.probe.record import loss_name, provenance_of
 from analysis.records.findings import of_slice, resolved
@@ -56,6 +56,7 @@ from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
 from splat.backend.device import device_named
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
+from splat.model.files.read import is_foreign, read_splats
 from splat.training.checkpoint import Checkpoint, load_checkpoint
 
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
@@ -74,10 +75,9 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     console, start = Console(stderr=True), perf_counter()
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
-        checkpoint = load_checkpoint(options.checkpoint)
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
         others = [_other_end(checkpoint, path) for path in options.others]
-        scene = checkpoint.load_scene(options.checkpoint, options.scene)
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
     with stages:
         notes: list[str] = []
@@ -90,7 +90,7 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
             raise
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         made.other = ", ".join(map(str, options.others)) or None
-        data = slice_record(found, objective, notes, made)
+        data = slice_record(found, objective, notes + checkpoint.assumptions, made)
         with record_folder(out, SliceRecord) as folder:
             write_with_pictures(folder, data, slice_arrays(found), stages, start)
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -118,7 +118,8 @@ def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> Slic
 
 def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
     """The other checkpoint's parameters, with its quaternions near those here."""
-    here, there = checkpoint.training.gaussians, load_checkpoint(path).training.gaussians
+    here = checkpoint.training.gaussians
+    there = read_splats(path).gaussians if is_foreign(path) else load_checkpoint(path).training.gaussians
     if (len(here), here.sh_degree) != (len(there), there.sh_degree):
         raise InputError(
             f"expected a checkpoint of {len(here):,} Gaussians with SH degree {here.sh_degree} at the other end of the line, "

@@ -1,12 +1,12 @@
 """Options of `landscape slice`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from analysis.console.options import DeviceName, Unset
+from analysis.console.options import DeviceName, ForeignOptions, Unset
 
 Along = Literal["eigenvectors", "random", "gradient", "line"]
 
@@ -20,7 +20,7 @@ class SliceOptions:
     """
 
     checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN/checkpoint.pt, as written by landscape train."""
+    """RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
     others: Annotated[Positional[tuple[Path, ...]], arg(metavar="[OTHER [THIRD]]", help_behavior_hint="")] = ()
     """Where a line leads to: a checkpoint with as many Gaussians and the same SH degree.  Two: the plane through all three."""
     along: UseAppendAction[tuple[Along, ...]] = ()
@@ -53,6 +53,7 @@ class SliceOptions:
     seed: int = 0
     """Seed of random directions, of the start of Lanczos, and of the points that judge the interpolation."""
     scene: Unset[Path] = None
-    """Folder of the scene, where it has moved since the training."""
+    """Folder of the scene: where it has moved since the training, or of another tool's file."""
     out: Unset[Path] = None
     """Folder of the results.  Default: beside the checkpoint, such as slice-eigenvectors-2d or slice-line-1d."""
+    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)

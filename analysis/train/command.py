@@ -40,6 +40,7 @@ from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
 from analysis.train.options import TrainOptions
 from analysis.train.remarks import remarks
+from analysis.train.source import from_checkpoint
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
 from landscape.errors import InputError
@@ -56,7 +57,7 @@ from splat.training.densify import DensifySettings
 from splat.training.loop import prepare, train
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
-from splat.training.scene_reference import SceneReference
+from splat.training.origin.scene_reference import SceneReference
 from splat.training.score.evaluate import Evaluation, ViewScore, evaluate, have_masks
 from splat.training.score.perceptual import MissingPerceptual, load_lpips
 from splat.training.start import Source, initial_gaussians
@@ -86,7 +87,8 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_share)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
-    scene, split, config, reference = planned(options, out)
+    plan, given = from_checkpoint(options, planned(options, out), out)
+    scene, split, config, reference = plan
     device = device_named(options.device)
     views, held_out = scene.load(split.train), scene.load(split.test)
     for together in (views, held_out):
@@ -97,7 +99,9 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         training = resumed(out / CHECKPOINT, config, reference)
     else:
         generator = torch.Generator().manual_seed(config.seed)
-        start = initial_gaussians(scene, views, 0, generator=generator, source=reference.start)
+        start = given
+        if start is None:
+            start = initial_gaussians(scene, views, 0, generator=generator, source=reference.start)
         training = Training.start(start, scene.extent(split.train), config)
     training.move(device)
     prepare(training, views)  # refuses what cannot be trained before there is a folder

@@ -38,6 +38,10 @@ class TrainOptions:
     triangulated: points found in the training views alone, given their poses.
     random: random points in the volume that the training views have in common.
     box: random points in the box of the scene's points."""
+    from_: Annotated[Unset[Path], arg(name="from")] = None
+    """A checkpoint, our own or another tool's, whose Gaussians to start from, with its renderer and in its world."""
+    trained_by: Unset[str] = None
+    """Whose conventions another tool's file of --from follows, see landscape probe.  Default: what the file says."""
     masks: Unset[Path] = None
     """Folder of object masks, named after the images; the scores are taken inside them.
     Default: mask or masks in the scene, or what its files name."""

@@ -12,10 +12,11 @@ from analysis.probe.command import run_probe
 from analysis.probe.measurement import ProbeSettings
 from analysis.probe.options import ProbeOptions
 from analysis.records.json_files import plain
-from analysis.records.records import Record, read_record
+from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.schema import INDICES
 from splat.curvature.hessian import SceneHessian
-from splat.training.checkpoint import load_checkpoint
+from splat.losses.reference import LossSettings
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from tests.analysis.probe.probed import unlimited
 
 
@@ -59,6 +60,30 @@ def test_what_was_skipped_is_counted_and_its_time_said(record, dense, run):
     undone = [skipped[name] for name in ("samples_of_finished_traces", "points_of_the_slice_predicted")]
     assert all((skip.seconds_saved > 0) == (skip.count > 0) for skip in undone)
     assert [skip.seconds_saved for skip in skipped.values()].count(None) == 5
+
+
+def test_a_checkpoint_can_be_probed_with_the_loss_of_3dgs(run, tmp_path, no_pictures):
+    loaded = load_checkpoint(run / "double.pt")
+    other = replace(loaded.training, config=replace(loaded.training.config, loss=LossSettings("l2", literal=True)))
+    for name, training, options in (("plain", loaded.training, []), ("other", other, ["--loss", "3dgs"])):
+        save_checkpoint(run / f"{name}.pt", training, loaded.scene)
+        assert (
+            main(
+                [
+                    "probe",
+                    str(run / f"{name}.pt"),
+                    "--quick",
+                    "--seconds",
+                    "inf",
+                    "--out",
+                    str(tmp_path / name),
+                    *options,
+                ]
+            )
+            == 0
+        )
+    plain, probed = (read_record(tmp_path / name, ProbeRecord).data for name in ("plain", "other"))
+    assert probed.objective == plain.objective and probed.traces == plain.traces
 
 
 def test_the_record_is_strict_json(record):

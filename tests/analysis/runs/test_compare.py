@@ -190,11 +190,7 @@ def test_pictures_are_drawn_from_the_records_and_lie_in_the_page(trained, tmp_pa
 
 
 def test_other_functions_are_not_compared(runs, capsys):
-    changed(runs[1], loss=LossSettings(ssim_weight=0.5))
-    refused(
-        capsys, runs, "expected runs with the same loss", "ssim_weight=0.2", "in plain/0", "ssim_weight=0.5", "in sam/0"
-    )
-    changed(runs[1], loss=LossSettings(), background=(1.0, 1.0, 1.0))
+    changed(runs[1], background=(1.0, 1.0, 1.0))
     refused(capsys, runs, "expected runs with the same background")
     path = Path(runs[0]) / "checkpoint.pt"
     loaded = load_checkpoint(path)
@@ -203,6 +199,33 @@ def test_other_functions_are_not_compared(runs, capsys):
     save_checkpoint(path, loaded.training, replace(loaded.scene, train=loaded.scene.train[::-1]))
     refused(capsys, runs, "expected runs with the same training views")
     assert not (Path(runs[0]).parents[1] / "compare").exists()
+
+
+def test_probes_of_other_losses_are_not_compared(runs, capsys, no_pictures):
+    changed(runs[1], loss=LossSettings(literal=True), protocol="llff")
+    assert main(["compare", *runs]) == 0  # both records are of one loss
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The losses of the trainings are not the same." in said and "The protocol is not the same." in said
+    path = Path(runs[1]) / "probe/probe.json"
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps(data | {"objective": data["objective"] | {"loss": "L1 + 0.2 (1 − SSIM)"}}))
+    refused(capsys, runs, "expected probes of the same loss", "L1 + 0.2 (1 − SSIM) in sam/0", "--loss 3dgs")
+
+
+def test_runs_trained_with_other_losses_are_probed_with_that_of_3dgs(runs, capsys, monkeypatch, no_pictures):
+    changed(runs[1], loss=LossSettings(literal=True))
+    for run in runs:
+        shutil.rmtree(Path(run) / "probe")
+    refused(capsys, runs, "; ".join(f"landscape probe {run}/checkpoint.pt --loss 3dgs" for run in runs))
+    asked = []
+
+    def probe(options, command) -> int:
+        asked.append((options.loss, command[-1]))
+        record(options.checkpoint.parent / "probe", 1.0)
+        return 0
+
+    monkeypatch.setattr("analysis.probe.command.run_probe", probe)
+    assert main(["compare", *runs, "--probe"]) == 0 and asked == [("3dgs", "3dgs")] * 2
 
 
 def test_trajectories_of_other_functions_are_not_drawn_into_one_picture(runs, capsys, monkeypatch):
@@ -229,7 +252,9 @@ def test_a_run_without_a_record_is_refused_with_the_command_or_probed(runs, caps
         return 0
 
     monkeypatch.setattr("analysis.probe.command.run_probe", probe)
-    assert main(["compare", *runs, "--probe"]) == 0 and asked == [f"{command} --device auto" for command in commands]
+    assert main(["compare", *runs, "--probe"]) == 0 and asked == [
+        f"{command} --device auto --loss training" for command in commands
+    ]
     assert (Path(runs[0]).parents[1] / "compare/compare.csv").exists()
 
 
