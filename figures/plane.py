@@ -114,8 +114,8 @@ def plane(record: Record) -> Plane:
         model=masked[1] if len(masked) == 2 else None,
         crossed=arrays.get("crossed"),
         evaluated=arrays.get("evaluated", np.ones(arrays["loss"].shape, bool)),
-        error=about.interpolation_error if about.tolerance is None else about.tolerance,
-        unresolved="" if about.resolved else unresolved(about, record.data.provenance),
+        error=about.tolerance or about.interpolation_error,
+        unresolved="" if about.is_resolved else unresolved(about, record.data.provenance),
         exponent=exponent,
         loss_scale=about.loss_scale,
     )

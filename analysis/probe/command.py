@@ -85,8 +85,10 @@ def _run(
     console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True)
     unfinished = out.with_name(f".{out.name}.unfinished")
     folder = None if ranks else unfinished
-    f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {settings} "
-    f"{options.seed} {device} {versions()}"
+    told = (
+        f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {settings} "
+        f"{options.seed} {device} {versions()}"
+    )
     deadline = begun + limit - DRAWING
     with stages, _kept(unfinished, command, console):
         generator = torch.Generator(device).manual_seed(options.seed)

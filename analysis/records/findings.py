@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from msgspec import UNSET
+
 from analysis.records import schema
 from analysis.records.provenance import Provenance
 from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
@@ -299,14 +301,14 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
         return [Line("No slice of the loss was recorded.", "caution")]
     lines, error, count = [], plane.interpolation_error, plane.holdout_points
     rendered = plane.points if plane.evaluated_points is None else plane.evaluated_points
-    if not plane.resolved:
+    if not plane.is_resolved:
         lines.append(Line(unresolved(plane, made), "caution"))
     elif rendered < plane.points:
         text = f"Of the slice's {plane.points:,} points {rendered:,} are renders, among them all of both axes; the others are "
         text += "interpolated" + (
             f" to {100 * plane.tolerance:.2g}% of the range of the loss" if plane.tolerance else ""
         )
-        seen = plane.error_seen if plane.error_seen is not None else error
+        seen = error if plane.error_seen in (None, UNSET) else plane.error_seen
         size = f"at most {100 * seen:.2g}%" if seen is not None else "without bound"
         text += f" (the error at {count} random point{'' if count == 1 else 's'}: {size}"
         lines.append(Line(f"{text}; the bound for all: {100 * error:.2g}%)." if error is not None else f"{text})."))
@@ -318,7 +320,7 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
 
 def unresolved(plane: schema.Slice, made: Provenance) -> str:
     """Why a plane is not drawn, and the command that resolves it."""
-    asked = "" if plane.tolerance is None else f" to {100 * plane.tolerance:.2g}% of the range of the loss"
+    asked = "" if not plane.tolerance else f" to {100 * plane.tolerance:.2g}% of the range of the loss"
     limited = "--max-renders" in (made.command or "")
     remedy = "leave out --max-renders" if limited else f"landscape slice {made.checkpoint} renders more"
     return (

@@ -49,8 +49,9 @@ def probe_table(data: ProbeRecord, width: int = 80) -> Table:
     name, value = (max(len(line) for row in rows if row for line in row[i].splitlines()) for i in (0, 1))
     name = min(name, max(width - value - GAPS - REMARK, REMARK))
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=ERRORS, caption_justify="left")
-    for heading, justify in (("", "left"), ("value ± error", "right"), ("", "left")):
-        table.add_column(heading, justify=justify, no_wrap=True)
+    table.add_column("", no_wrap=True)
+    table.add_column("value ± error", justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
     for row in rows:
         if row:
             table.add_row(wrapped(row[0], name), row[1], wrapped(row[2], width - name - value - GAPS))

@@ -169,7 +169,7 @@ def cautions(runs: Sequence[Run]) -> list[str]:
         order = ", ".join(run.label for run in runs)
         lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
     for run in runs:
-        if run.data.slice and not run.data.slice.resolved:
+        if run.data.slice and not run.data.slice.is_resolved:
             lines.append(f"{run.label}: {unresolved(run.data.slice, run.data.provenance)}")
         failed = [name.replace("_", " ") for name, check in run.data.checks.items() if check.passed is False]
         lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]
