@@ -179,7 +179,7 @@ def draw_slices(records: Records) -> Figure:
 
 def _has_surface(record: Record[ProbeRecord]) -> bool:
     about = record.data.slice
-    return "slice" in record.arrays and about is not None and about.resolved
+    return "slice" in record.arrays and about is not None and about.is_resolved
 
 
 def _window(field: Plane, x: float, y: float) -> tuple[np.ndarray, np.ndarray, np.ma.MaskedArray, np.ndarray]:

@@ -25,7 +25,7 @@ def recorded_figures(record: Record) -> tuple[str, ...]:
     slice = record.data.slice if "slice" in record.arrays else None
     axes = len(slice.directions) if slice else 0
     known = {"traces": isinstance(record.data, ProbeRecord), "spectrum": "spectrum" in record.arrays}
-    known |= {"slice1d": axes == 1, "slice2d": axes == 2, "surface": axes == 2 and bool(slice and slice.resolved)}
+    known |= {"slice1d": axes == 1, "slice2d": axes == 2, "surface": axes == 2 and bool(slice and slice.is_resolved)}
     return tuple(name for name in FIGURES if known[name])
 
 

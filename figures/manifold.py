@@ -123,7 +123,7 @@ def _record_of(run: Path) -> Record:
                 raise ValueError(
                     f"expected a slice along {' and '.join(NAMES)} in {run / name}, got others; {_slice(run)}"
                 )
-            if found.data.slice is None or found.data.slice.resolved:
+            if found.data.slice is None or found.data.slice.is_resolved:
                 return found
     raise FileNotFoundError(
         f"expected a slice of {run} in {' or '.join(str(run / name) for name, _ in SLICES)}, with a surface, "

@@ -30,6 +30,7 @@ class Direction:
     steps: np.ndarray
     exponent: int
     scale: str = "param. units"
+    kind: str = ""
 
     @property
     def label(self) -> str:
@@ -73,6 +74,12 @@ class Plane:
         return f"change of loss{unit_suffix(self.exponent)}"
 
     @property
+    def others(self) -> list[tuple[float, float]]:
+        """Where other checkpoints lie: at the ends of lines."""
+        lines = [direction.kind == "line" for direction in (self.x, self.y)]
+        return [place for place, line in zip([(1.0, 0.0), (0.0, 1.0)], lines, strict=True) if line]
+
+    @property
     def dots(self) -> np.ndarray:
         """Renders, which pictures mark where there are other points."""
         return self.evaluated & (not self.evaluated.all())
@@ -107,8 +114,8 @@ def plane(record: Record) -> Plane:
         model=masked[1] if len(masked) == 2 else None,
         crossed=arrays.get("crossed"),
         evaluated=arrays.get("evaluated", np.ones(arrays["loss"].shape, bool)),
-        error=about.interpolation_error if about.tolerance is None else about.tolerance,
-        unresolved="" if about.resolved else unresolved(about, record.data.provenance),
+        error=about.tolerance or about.interpolation_error,
+        unresolved="" if about.is_resolved else unresolved(about, record.data.provenance),
         exponent=exponent,
         loss_scale=about.loss_scale,
     )
@@ -117,7 +124,9 @@ def plane(record: Record) -> Plane:
 def direction(about: schema.Direction, steps: np.ndarray, exponent: int) -> Direction:
     """An axis as it was recorded."""
     curvature, unit = (np.nan if number is None else number for number in (about.curvature, about.unit))
-    return Direction(literal(about.name), curvature, unit, steps, exponent, literal(about.scale or Direction.scale))
+    return Direction(
+        literal(about.name), curvature, unit, steps, exponent, literal(about.scale or Direction.scale), about.kind or ""
+    )
 
 
 def _alike(arrays: dict[str, np.ndarray]) -> bool:

@@ -2,10 +2,10 @@
 
 Dots: true renders, among them all of the cross-sections; between them the loss is interpolated.  Blue dots: crossed points,
 where the order of the splats or the set of visible ones is not the centre's.  White dashed lines: the quadratic model at the
-contours' levels.  Grey: no finite loss.  The cross-sections share their vertical axis, so that a steep direction looks steep
-beside a flat one; their upper axes count steps in curvature units, within one of which the curvature alone changes the loss by
-the amount named.  Where too few points are renders to know the others, the cross-sections are drawn alone, and a sentence says
-what resolves the plane.
+contours' levels.  Grey: no finite loss.  Crosses: other checkpoints that the plane leads to.  The cross-sections share their
+vertical axis, so that a steep direction looks steep beside a flat one; their upper axes count steps in curvature units, within
+one of which the curvature alone changes the loss by the amount named.  Where too few points are renders to know the others, the
+cross-sections are drawn alone, and a sentence says what resolves the plane.
 """
 
 import textwrap
@@ -73,6 +73,9 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
         axes.plot(x[rows], y[columns], **CROSSED)
     axes.xaxis.set_major_locator(MaxNLocator(ACROSS))
     axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
+    for place in field.others:
+        ends = place[0] / 10.0**field.x.exponent, place[1] / 10.0**field.y.exponent
+        axes.plot(*ends, "x", color=VERMILION, markersize=5, markeredgewidth=1.2)
     axes.set_xlabel(field.x.label)
     axes.set_ylabel(field.y.label)
     if same := same_scale(np.ptp(field.x.steps), np.ptp(field.y.steps)):
@@ -115,7 +118,7 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
 def _legend(field: Plane) -> list[Line2D]:
     handles = [Line2D([], [], color=BLACK, label="loss, true renders")]
     if not field.evaluated.all():
-        size = "unbounded" if field.error is None else f"< {100 * field.error:.2g}%"
+        size = "unbounded" if field.error is None else f"<{100 * field.error:.2g}%"
         label = "loss, renders" if field.unresolved else f"loss, {field.evaluated.mean():.0%} renders (error {size})"
         handles = [Line2D([], [], color=BLACK, marker=".", markersize=4, label=label)]
     if field.model is not None:

@@ -8,7 +8,10 @@ import gc
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
+from importlib.metadata import version
 from io import TextIOWrapper
+from pathlib import Path
 from typing import IO, Annotated, NoReturn
 
 import tyro
@@ -23,7 +26,7 @@ from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, T
 from analysis.slice.options import SliceOptions
 from analysis.train.options import TrainOptions
 
-DEBUG = "--debug"
+DEBUG, CHECKPOINT = "--debug", "checkpoint.pt"
 Options = (
     Annotated[SfmOptions, tyro.conf.subcommand("sfm")]
     | Annotated[TrainOptions, tyro.conf.subcommand("train")]
@@ -85,10 +88,13 @@ def _drop(stream: IO[str]) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; arguments: those of the command line where None.  Returns the exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments[:1] == ["--version"]:
+        print(f"splat-landscape {version('splat-landscape')}")
+        return 0
     debug, arguments = DEBUG in arguments, [word for word in arguments if word != DEBUG]
     try:
         with raising():
-            return run(_parsed(arguments), arguments)
+            return run(at_files(_parsed(arguments)), arguments)
     except (Exception, KeyboardInterrupt) as error:
         return report(error, ["landscape", *arguments], debug)
 
@@ -99,10 +105,22 @@ def _parsed(arguments: Sequence[str]) -> Options:
         Options,  # pyright: ignore[reportArgumentType]
         prog="landscape",
         description=f"See the loss landscape of a 3D Gaussian Splatting scene.\n{DEBUG}, before or after the subcommand, shows "
-        "where in the program an error came up.",
+        "where in the program an error came up.  --version alone shows the version.",
         args=arguments,
         config=(tyro.conf.DisallowNone,),
     )
+
+
+def at_files(options: Options) -> Options:
+    """A run folder stands for its checkpoint where one is asked for, and a checkpoint for its run."""
+    changes: dict[str, object] = {}
+    for name in ("checkpoint", "other", "subject"):
+        path = getattr(options, name, None)
+        if isinstance(path, Path) and (path / CHECKPOINT).is_file():
+            changes[name] = path / CHECKPOINT
+    if runs := getattr(options, "runs", ()):
+        changes["runs"] = tuple(run.parent if run.name == CHECKPOINT else run for run in runs)
+    return replace(options, **changes) if changes else options
 
 
 def run(options: Options, arguments: Sequence[str]) -> int:

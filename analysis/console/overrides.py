@@ -8,6 +8,7 @@ VALUE   a plain value, or text that is read by the setting's type: a number, tru
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields, is_dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -51,9 +52,20 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
             raise InputError(
                 f"expected a setting of the training ({', '.join(_names(config))}) or of the method {config.method.name} "
                 f"({', '.join(_names(config.method)) or 'which has none'}), got {key!r}"
+                + did_you_mean(key, [*_names(config), *_names(config.method)])
             )
         config = _changed(config, path if path[0] in own else ["method", *path], value, key)
     return config
+
+
+def did_you_mean(name: str, known: Sequence[str]) -> str:
+    """The end of a message about a name that is none of the known ones.
+
+    >>> did_you_mean("warmup", ["warm_up", "gamma"]), did_you_mean("teapot", ["gamma"])
+    ('; did you mean warm_up?', '')
+    """
+    near = get_close_matches(name, known, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _names(settings: TrainConfig | MethodSettings) -> list[str]:
@@ -68,7 +80,8 @@ def _settable(kind: type) -> list[str]:
 def _changed(settings: T, path: list[str], value: Any, key: str) -> T:
     hints, settable = get_type_hints(type(settings)), _settable(type(settings))
     if path[0] not in settable:
-        raise InputError(f"expected a setting among {', '.join(settable)}, got {path[0]!r} in {key!r}")
+        meant = did_you_mean(path[0], settable)
+        raise InputError(f"expected a setting among {', '.join(settable)}, got {path[0]!r} in {key!r}{meant}")
     now = getattr(settings, path[0])
     if is_dataclass(now):
         if not path[1:]:

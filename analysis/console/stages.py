@@ -1,36 +1,47 @@
-"""Long work in named stages: a line for each with the time it took and the time remaining, and how far it is."""
+"""Long work in named stages: a line for each with the time it took, how far it is, at which rate, and the time left for all.
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+Off a terminal there are no bars: a line when a stage ends, and one now and then while it runs.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from time import perf_counter
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
 from landscape.results import Progress as Report
+
+Stage = Callable[[str], AbstractContextManager[Report]]
+NOW_AND_THEN = 15.0  # seconds between lines off a terminal
+STRAYS = 4.0  # by which a plan may be wrong
 
 
 class Stages:
     """A context manager; `stage(name)` is one too, and gives what the estimators call with their progress.
 
-    Without a console nothing is printed; timing: seconds a stage, in the order run.
+    Without a console nothing is printed.  timing: seconds a stage, in the order run; plan: seconds that stages to come are
+    expected to take.
     """
 
     def __init__(self, console: Console | None = None) -> None:
         self.timing: dict[str, float] = {}
+        self.plan: dict[str, float] = {}
+        bars = console is not None and console.is_terminal
+        self._whole, self._console = console, None if bars or console is None or console.quiet else console
+        self._said = perf_counter()
         self._progress = Progress(
             SpinnerColumn(finished_text="✓"),
             TextColumn("{task.description}", table_column=Column(no_wrap=True, min_width=15)),
             BarColumn(bar_width=12, table_column=Column(min_width=12)),
             TimeElapsedColumn(table_column=Column(no_wrap=True, min_width=7)),
-            TimeRemainingColumn(table_column=Column(no_wrap=True, min_width=7)),
             TextColumn(
                 "{task.fields[state]}", style="dim", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)
             ),
             console=console,
-            disable=console is None,
+            disable=not bars,
             refresh_per_second=4,
             expand=True,
         )
@@ -48,12 +59,47 @@ class Stages:
     def stage(self, name: str) -> Iterator[Report]:
         """Time the block; call what it gives with the units done, the most there can be, and a few words."""
         task = self._progress.add_task(name, total=None, state="")
+        start = perf_counter()
 
         def report(done: int, most: int, state: str) -> None:
-            self._progress.update(task, completed=done, total=most, state=f"{done}/{most} {state}")
+            spent = perf_counter() - start
+            rate = f", {done / spent:.2g} a second" if done and spent > 1 else ""
+            words = f"{done} of at most {most}{rate}{self.left(name, spent)}"
+            self._progress.update(task, completed=done, total=most, state=f"{words}; {state}")
+            if perf_counter() - self._said > NOW_AND_THEN:
+                self._say(f"{name}: {words}")
 
-        start = perf_counter()
         yield report
         self.timing[name] = perf_counter() - start
         done = self._progress.tasks[task].completed or 1  # an estimator that is done early has used less than the most
         self._progress.update(task, completed=done, total=done)
+        left = self.left("", 0.0)
+        self._say(f"{name}: {self.timing[name]:.1f} s{left}")
+
+    def known(self, name: str, seconds: float) -> None:
+        """A stage whose result is there from before, when it took so long."""
+        self.timing[name] = seconds
+        self._progress.update(self._progress.add_task(name, total=1, state="kept from before"), completed=1)
+        self._say(f"{name}: kept from before")
+
+    def left(self, name: str, spent: float) -> str:
+        """The time left for all in words, while this stage has taken so many seconds: at the pace of those that are done."""
+        to_come = {each: seconds for each, seconds in self.plan.items() if each not in self.timing}
+        if not to_come:
+            return ""
+        done = {each: seconds for each, seconds in self.plan.items() if each in self.timing}
+        pace = sum(self.timing[each] for each in done) / sum(done.values()) if done else 1.0
+        pace = min(max(pace, 1 / STRAYS), STRAYS)
+        return f", about {max(pace * sum(to_come.values()) - spent, 1.0):.0f} s left"
+
+    def expect(self, plan: Mapping[str, float], because: str) -> None:
+        """Say how long stages to come will take, and why."""
+        self.plan = dict(plan)
+        if self._whole is not None:
+            seconds = sum(plan.values())
+            self._whole.print(f"about {max(seconds, 1.0):.0f} s from here: {because}", highlight=False, soft_wrap=True)
+
+    def _say(self, words: str) -> None:
+        self._said = perf_counter()
+        if self._console is not None:
+            self._console.print(words, highlight=False, markup=False, soft_wrap=True)

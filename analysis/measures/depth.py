@@ -19,10 +19,9 @@ pixels where it is across: px |mean - centre| / f.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from math import inf, nan
-from time import monotonic
 
 import torch
 import torch.nn.functional as F
@@ -30,7 +29,6 @@ from jaxtyping import Float, Float64
 from msgspec import convert
 from torch import Tensor
 
-from analysis.console.budget import Share
 from analysis.records.schema import Depth, Rise
 from landscape.errors import InputError
 from landscape.probes import draw_probes
@@ -111,21 +109,15 @@ class DepthRises:
 
 
 def measure_depth(
-    objective: SceneObjective, traces: TraceSettings, steps: tuple[float, ...], render: float, share: Share
+    objective: SceneObjective,
+    traces: TraceSettings,
+    steps: tuple[float, ...],
+    generator: torch.Generator,
+    report: Progress,
 ) -> Depth:
-    """The stage `depth` of a probe.  steps: px; their rises are left out where time is short.
-
-    render: seconds, of all views.
-    """
-    end = monotonic() + share.seconds
-    found = depth_split(objective, share.generator, replace(traces, max_seconds=share.seconds / 2), share.report)
-    rises = []
-    if (2 * len(KINDS) * DRAWS * len(steps) + 1) * render <= end - monotonic():
-        rises = depth_rises(objective, share.generator, steps, progress=share.report).rows()
-    else:
-        share.notes.append(
-            "finite steps along the rays were left out: their renders would have taken more than their time"
-        )
+    """The stage `depth` of a probe.  steps: px."""
+    found = depth_split(objective, generator, traces, report)
+    rises = depth_rises(objective, generator, steps, progress=report).rows()
     return convert(
         {
             "gradient_ratio": finite_or_none(found.gradient_ratio),

@@ -25,7 +25,7 @@ import torch
 from msgspec import UNSET, convert, structs
 from torch import Tensor
 
-from analysis.console.budget import Stage
+from analysis.console.stages import Stage
 from analysis.measures.memory import basis_within, vectors_within
 from analysis.measures.split_control import SplitControl, split_control
 from analysis.measures.units import Metric, optimiser_units, scene_size, scene_units

@@ -1,31 +1,37 @@
-"""`landscape probe`: one checkpoint in, one record folder out (`analysis.records.records`), a table, and where to look.
+"""`landscape probe`: one checkpoint in, one record folder out (`analysis.records.records`), a summary, and where to look.
 
-The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.
+The operator is the exact Hessian of the training loss over the training views, in the checkpoint's precision.  What finished
+stages found is kept in `.NAME.unfinished` beside the record, from which the same command continues, whatever ended this one.
 """
 
-from collections.abc import Sequence
+import shlex
+import shutil
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict, replace
+from hashlib import file_digest
 from math import inf, isfinite
 from pathlib import Path
-from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from time import monotonic, perf_counter
+from typing import TYPE_CHECKING
 
 import torch
 from rich.console import Console
 
 from analysis.console.drawing import Draw
+from analysis.console.kept import kept_stages
 from analysis.console.options import ForeignOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.probe.measurement import ProbeSettings, measure
+from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
+from analysis.probe.settings import ProbeSettings
+from analysis.probe.summary import remarks, summary
 from analysis.probe.views import write_views
-from analysis.records.findings import findings
-from analysis.records.provenance import require_seed
-from analysis.records.records import Arrays, ProbeRecord, Record, record_folder
+from analysis.records.provenance import require_seed, versions
+from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
@@ -41,7 +47,7 @@ if TYPE_CHECKING:
     from analysis.measures.families import FamilyOptions
 
 CHECK_FAILED = 1
-SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
+DRAWING = 8.0  # seconds that a record and its pictures take, on two processors of 2023
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
@@ -58,44 +64,35 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | 
 def _run(
     options: ProbeOptions, command: Sequence[str], drawn: Draw | None, device: torch.device, ranks: Ranks | None
 ) -> int:
-    out = _out(options)
-    settings, family_options = _settings(options, shared=ranks is not None), _family_options(options)
+    out = options.out or options.checkpoint.parent / ("probe-quick" if options.quick else "probe")
+    start, begun = perf_counter(), monotonic()
+    settings, family_options = _settings(options), _family_options(options)
+    limit = inf if options.seconds is None else options.seconds
+    if ranks is not None and isfinite(limit):  # no process's clock may decide what all measure
+        raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {limit:g}")
     if ranks is not None and family_options is not None:
         raise InputError(
             "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
         )
     writes = ranks is None or ranks.rank == 0
-    # a folder that cannot be written, or that another command is writing, is noticed before hours are spent
-    with record_folder(out) if writes else nullcontext(out) as folder:
-        data = _measured(options, command, drawn, device, ranks, settings, family_options, folder)
-    if writes:
-        _conclude(data, out)
-    failed = any(check.passed is False for check in data.checks.values())
-    return CHECK_FAILED if options.strict and failed else 0
-
-
-def _measured(
-    options: ProbeOptions,
-    command: Sequence[str],
-    drawn: Draw | None,
-    device: torch.device,
-    ranks: Ranks | None,
-    settings: ProbeSettings,
-    family_options: "FamilyOptions | None",
-    folder: Path,
-) -> ProbeRecord:
-    """Measure, and write the record, its pictures and its page into the folder."""
-    writes = ranks is None or ranks.rank == 0
-    console, start = Console(stderr=True, quiet=not writes), perf_counter()
+    require_replaceable(out)
+    console = Console(stderr=True, quiet=not writes)
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, _out(options))
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
-    console.print(_introduction(scene, checkpoint, objective), highlight=False, markup=False)
-    with stages:
+    console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True, markup=False)
+    unfinished = out.with_name(f".{out.name}.unfinished")
+    folder = None if ranks else unfinished
+    told = (
+        f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {settings} "
+        f"{options.seed} {device} {versions()}"
+    )
+    deadline = begun + limit - DRAWING
+    with stages, _kept(unfinished, command, console):
         generator = torch.Generator(device).manual_seed(options.seed)
-        found = measure(objective, settings, generator, stages.stage)
+        found = measure(objective, settings, generator, stages, folder, told, deadline)
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         if family_options is not None:
@@ -109,12 +106,34 @@ def _measured(
             data.provenance.families = asdict(family_options)
         data.notes += checkpoint.assumptions
         if writes:
-            _write(folder, data, arrays, objective, stages, start, drawn)
-    return data
+            _write(out, data, arrays, objective, stages, start, drawn)
+    if writes:
+        if not found.unreached:
+            shutil.rmtree(unfinished, ignore_errors=True)
+        _conclude(data, out, options.verbose)
+    failed = any(check.passed is False for check in data.checks.values())
+    return CHECK_FAILED if options.strict and failed else 0
+
+
+@contextmanager
+def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[None]:
+    """Says of an interrupted probe how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if stages := ", ".join(kept_stages(folder)):
+            words = f"kept: {stages}; the same command continues from there: {shlex.join(command)}"
+            console.print(words, highlight=False, markup=False, soft_wrap=True)
+        raise
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return file_digest(stream, "sha256").hexdigest()
 
 
 def _write(
-    folder: Path,
+    out: Path,
     data: ProbeRecord,
     arrays: Arrays,
     objective: SceneObjective,
@@ -122,18 +141,14 @@ def _write(
     start: float,
     drawn: Draw | None,
 ) -> None:
-    """The record, its pictures and its page."""
-    with ThreadPoolExecutor(1) as pool:
+    """The record, its pictures and its page, all at once."""
+    with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
         write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
         write_with_pictures(folder, data, arrays, stages, start, drawn)
         from analysis.records.report import write_report
 
         write_report(folder, surface.result())
-
-
-def _out(options: ProbeOptions) -> Path:
-    return options.out or options.checkpoint.parent / "probe"
 
 
 def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
@@ -167,16 +182,23 @@ def scene_objective(
     return config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
 
-def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:
-    """shared: by several processes, none of whose clocks may decide what is measured."""
+def _settings(options: ProbeOptions) -> ProbeSettings:
+    if options.seconds is not None and not options.seconds > 0:
+        raise InputError(f"expected --seconds above 0, got {options.seconds:g}")
     settings = ProbeSettings.quick() if options.quick else ProbeSettings()
     points = settings.slice_points if options.slice_points is None else options.slice_points
-    seconds = settings.seconds if options.seconds is None else options.seconds
-    if shared:
-        if options.seconds is not None and isfinite(options.seconds):
-            raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {options.seconds:g}")
-        seconds = inf
-    return replace(settings, slice_points=points, slice_rise=options.slice_rise, seconds=seconds)
+    eigen = (
+        settings.eigen if options.end_products is None else replace(settings.eigen, max_matvecs=options.end_products)
+    )
+    density = settings.density_matvecs if options.density_products is None else options.density_products
+    return replace(
+        settings,
+        slice_points=points,
+        slice_rise=options.slice_rise,
+        eigen=eigen,
+        density_matvecs=density,
+        power_apart=options.power,
+    )
 
 
 def _family_options(options: ProbeOptions) -> "FamilyOptions | None":
@@ -204,17 +226,18 @@ def _embedded_surface(record: Record[ProbeRecord]) -> str:
     return embedded_surface(record)
 
 
-def _conclude(data: ProbeRecord, out: Path) -> None:
-    """The table, what was not reached or failed, and the files to open."""
+def _conclude(data: ProbeRecord, out: Path, verbose: bool) -> None:
+    """The summary, or the table too; what failed or is not known, with what to do."""
     from analysis.records.report import FILE as REPORT
 
     console = Console()
-    console.print(probe_table(data))
+    if verbose:
+        console.print(probe_table(data, console.width))
+        pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
+        console.print(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", soft_wrap=True, highlight=False, markup=False)
     if data.families:
         console.print(family_table(data))
-    for line in findings(data):
-        if line.level != "fact":
-            console.print(line.text, style="red" if line.level == "failure" else "yellow", **SAID)
-    pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-    console.print(f"{data.timing['total']:.1f} s; open {out / REPORT}", **SAID)
-    console.print(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", **SAID)
+    for line in remarks(data, verbose):
+        console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False, markup=False)
+    for text in summary(data, out / REPORT):
+        console.print(text, soft_wrap=True, highlight=False, markup=False)

@@ -4,45 +4,43 @@
     checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
     traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
     eigenvalues         the two largest and the smallest; the search begins at `splat.curvature.block_eigenvectors`
-    power iteration *   both ends as the paper takes them
-    density *           stochastic Lanczos quadrature, for sums and quantiles of |lambda|
+    slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
+    density *           stochastic Lanczos quadrature, for sums and quantiles of |lambda|; its first runs hold the iterates of
+                        the paper's power iteration
+    power iteration     for itself, where that is asked for
     finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
-    slice               the plane of the two largest eigenvalues' vectors: renders along both axes and where needed between them
     depth *             the positions' gradient and curvature along the rays and across them, and what finite steps there do
 
-* not in a quick probe, which has too few products for them.  Every kernel has worked once when the checks are done: what
-follows compiles nothing.  The estimators stop at their tolerance, at their budget of products, or when their share of the time
-is spent; each result says which.  Time that a stage leaves goes to the later ones.  The numbers depend on the seed alone unless
-time ran out.
+* not in a quick probe.  Every kernel has worked once when the checks are done: what follows compiles nothing.  The estimators
+stop at their accuracy or after so many products as settings allow at most; each result says which.  No clock decides but for a
+deadline, which ends what is under way.  The numbers depend on the seed alone, also where stages were kept from a run before.
 """
 
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import inf
+from pathlib import Path
 from time import monotonic
 
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from analysis.console.budget import Budget, Share, Stage
-from analysis.measures.depth import STEPS as DEPTH_STEPS
+from analysis.console.kept import Kept
+from analysis.console.stages import Stages
 from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import check_against_gradient
 from analysis.measures.memory import basis_within, vectors_within
+from analysis.probe.settings import FEWEST_STEPS, ProbeSettings
 from analysis.records.schema import Depth
 from landscape import (
     CountingOperator,
     DerivativeCheck,
     EigenEnds,
-    EigenSettings,
     OperatorCheck,
-    PowerSettings,
     Slice,
     SpectralDensity,
     TraceEstimate,
-    TraceSettings,
     check_operator,
     curvature_reach,
     evaluate_slice,
@@ -51,10 +49,12 @@ from landscape import (
     spectral_density,
     symmetric_axis,
 )
-from landscape.errors import InputError
+from landscape.eigen.lanczos import LanczosFactorization
+from landscape.eigen.power import power_of_runs
+from landscape.operators.operator import finished
 from landscape.probes import spawn
 from landscape.results import Progress
-from landscape.slices.finite_probe import NOISE_POINTS, STEPS, FiniteProbe, finite_probe
+from landscape.slices.finite_probe import FiniteProbe, finite_probe
 from landscape.slices.grid_evaluations import Loss
 from landscape.slices.refinement import SliceSettings
 from landscape.spectrum.density import ActiveSpace
@@ -66,76 +66,16 @@ from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
 
-OPTIONAL = ("power iteration", "density", "finite probe", "depth")  # stages
-FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density and along a side of a slice that are worth their time
-FEWEST_STARTS = 3  # of a density of less than MANY_MATVECS; two have three times the interval
-MANY_MATVECS = 48
+STAGES = ("traces", "eigenvalues", "slice", "density", "power iteration", "finite probe", "depth")
+# what is said of a stage that was not asked for
+LEFT_OUT = {
+    "density": "the spectral density was left out, and the indices that need it",
+    "finite probe": "the finite probe was left out",
+    "depth": "positions along and across the rays were left out",
+}
 MOST_AT_ONCE = 4  # start vectors
-SHORTEST = 1e-9  # seconds
-
-
-@dataclass(frozen=True)
-class ProbeSettings:
-    """How much of everything; the defaults are for numbers to 1%.
-
-    checked_vectors, checked_views: of the self-checks; None: all views.
-    trace_samples: exactly so many for each trace; None: as many as `traces` asks for.
-    power: None: no power iteration.  density_matvecs: products of the spectral density; 0: it is left out.
-    slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
-        of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
-        slice_plane: whether to render more than its two axes.
-    probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
-        noise of a render.
-    depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
-    seconds: for all estimators together.  memory: GiB for the vectors of a basis.
-    """
-
-    checked_vectors: int = 4
-    checked_views: int | None = None
-    traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.01, max_probes=128))
-    trace_samples: int | None = None
-    eigen: EigenSettings = field(default_factory=lambda: EigenSettings(largest=2, smallest=1, max_matvecs=150))
-    power: PowerSettings | None = field(default_factory=lambda: PowerSettings(max_matvecs=40))
-    density_matvecs: int = 96
-    slice_points: int = 41
-    slice_radius: float = 3.0
-    slice_rise: float = 0.001
-    slice_tolerance: float = 0.01
-    slice_plane: bool = True
-    probe_steps: tuple[float, ...] = STEPS
-    depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=64))
-    depth_steps: tuple[float, ...] = DEPTH_STEPS
-    noise_points: int = NOISE_POINTS
-    seconds: float = 45.0
-    memory: float = 2.0
-
-    def __post_init__(self) -> None:
-        if self.slice_points < FEWEST_POINTS or self.slice_points % 2 == 0:
-            raise InputError(
-                f"expected an odd number of at least {FEWEST_POINTS} slice points, got {self.slice_points}"
-            )
-        if not (self.slice_radius > 0 and self.slice_rise > 0):
-            raise InputError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
-        if not (self.seconds > 0 and self.memory > 0):
-            raise InputError(f"expected seconds and memory > 0, got {self.seconds} and {self.memory}")
-
-    @classmethod
-    def quick(cls) -> "ProbeSettings":
-        """Numbers to 10%, in a quarter of the time."""
-        return cls(
-            checked_vectors=2,
-            checked_views=1,
-            traces=TraceSettings(rtol=0.1),
-            trace_samples=5,
-            eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=60),
-            power=None,
-            density_matvecs=0,
-            slice_points=21,
-            slice_plane=False,
-            probe_steps=(),
-            depth=None,
-            seconds=12.0,
-        )
+# what a stage takes on two real scenes, as products with MOST_AT_ONCE vectors and as renders of all views
+TYPICAL = {"traces": (12, 0), "eigenvalues": (10, 0), "slice": (0, 180), "depth": (2, 50)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,11 +88,19 @@ class PlaneSlice:
 
 
 @dataclass(frozen=True, eq=False)
+class Spectrum:
+    """The density, None where there is no memory for it, and the power iteration that its runs hold."""
+
+    density: SpectralDensity | None
+    power: EigenEnds | None
+
+
+@dataclass(frozen=True, eq=False)
 class Measured:
-    """What was measured; density, finite, depth and plane are None where a note says why, power where it was not asked for.
+    """What was measured; density, power, finite, depth and plane are None where a note says why.
 
     matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
-    of the directions that are not exactly flat.
+    of the directions that are not exactly flat; unreached: stages that time did not reach.
     """
 
     value: float
@@ -170,62 +118,87 @@ class Measured:
     spared: int
     rank: int
     notes: tuple[str, ...]
+    unreached: tuple[str, ...] = ()
 
 
-def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch.Generator, stage: Stage) -> Measured:
-    """Run every stage.  stage(name): see `analysis.console.stages`."""
-    with stage("linearise") as report:
+def measure(
+    objective: SceneObjective,
+    settings: ProbeSettings,
+    generator: torch.Generator,
+    stages: Stages,
+    folder: Path | None = None,
+    told: str = "",
+    deadline: float = inf,
+) -> Measured:
+    """Run every stage.  folder, told, deadline: see `Kept`."""
+    with stages.stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
         gradient, value, render = _linearised(objective, report)
-        blocks = objective.approximate_blocks
-    with stage("checks") as report:
+        objective.approximate_blocks  # noqa: B018 (made here, where kernels compile)
+    with stages.stage("checks") as report:
         operator_check = check_operator(operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(hessian, spawn(generator), report, settings.checked_views)
-    wanted = settings.power, settings.density_matvecs, settings.probe_steps, settings.depth
-    unasked = [name for name, each in zip(OPTIONAL, wanted, strict=True) if not each]
-    budget = Budget(settings.seconds, unasked, generator, stage)
-    with budget.stage("traces") as share:
-        allowed = replace(settings.traces, max_seconds=share.seconds)
-        traces = exact_traces(objective, share.generator, allowed, share.report, samples=settings.trace_samples)
-    with budget.stage("eigenvalues") as share:
-        eigen, start = _search(operator, settings, share), BlockEigenvectors(objective, *blocks).warm_start()
-        timed = CountingOperator(operator)
-        ends = extreme_eigenpairs(timed, share.generator, eigen, start, share.report)
-    power = density = finite = depth = None
-    if settings.power is not None:
-        with budget.stage("power iteration") as share:
-            each = replace(settings.power, max_seconds=share.seconds / 2)
-            power = power_ends(operator, share.generator, each, share.report)
+    checks = operator.matvecs, hessian.views.spared
+    product = _seconds_of_product(hessian)
+    words = f"{MOST_AT_ONCE} products at once take {product:.2g} s, a render of all views {render:.2g} s"
+    stages.expect(_plan(settings, product, render), words)
+    kept = Kept(stages, generator, STAGES, lambda: [operator.matvecs, hessian.views.spared], folder, told, deadline)
+    point = _Point(objective, hessian, operator, settings, gradient, value)
+    return _all_stages(point, kept, operator_check, gradient_check, checks)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """What the stages work with."""
+
+    objective: SceneObjective
+    hessian: SceneHessian
+    operator: CountingOperator
+    settings: ProbeSettings
+    gradient: Tensor
+    value: float
+
+
+def _all_stages(
+    at: _Point, kept: Kept, operator_check: OperatorCheck, gradient_check: DerivativeCheck, checks: tuple[int, int]
+) -> Measured:
+    objective, settings = at.objective, at.settings
+    traces = kept.run("traces", dict[str, TraceEstimate], lambda g, report, _: _traces(at, kept.left, g, report), True)
+    ends = kept.run("eigenvalues", EigenEnds, lambda *told: _ends(at, kept.left, *told), True)
+    assert traces is not None and ends is not None  # what time allows of them
+    plane = kept.run("slice", PlaneSlice | None, lambda *told: _plane(at, ends, *told))  # pyright: ignore[reportArgumentType]
+    spectrum = power = finite = depth = None
     if settings.density_matvecs:
-        with budget.stage("density") as share:
-            active, room = ActiveSpace(hessian.project, hessian.rank), vectors_within(operator, settings.memory)
-            run = partial(spectral_density, operator, active=active, ends=ends, trace=total_trace(traces))
-            density = _density(run, room, settings, timed.seconds / timed.matvecs, share)
+        spectrum = kept.run("density", Spectrum, lambda *told: _spectrum(at, ends, traces, *told))
+    if settings.power_apart:
+        power = kept.run(
+            "power iteration", EigenEnds, lambda g, report, _: power_ends(at.operator, g, settings.power, report)
+        )
     if settings.probe_steps:
-        with budget.stage("finite probe") as share:
-            finite = _finite(objective, operator, ends, settings, render, share)
-    with budget.stage("slice") as share:
-        plane = _plane(objective, gradient, value, ends, settings, share)
+        finite = kept.run("finite probe", FiniteProbe, lambda g, report, _: _finite(at, ends, report))
     if settings.depth is not None:
-        with budget.stage("depth") as share:
-            depth = measure_depth(objective, settings.depth, settings.depth_steps, render, share)
+        accuracy, steps = settings.depth, settings.depth_steps
+        depth = kept.run("depth", Depth, lambda g, report, _: measure_depth(objective, accuracy, steps, g, report))
+    matvecs, spared = (first + more for first, more in zip(checks, kept.counts, strict=True))
+    wanted = {"density": settings.density_matvecs, "finite probe": settings.probe_steps, "depth": settings.depth}
     return Measured(
-        value=value,
-        gradient_norm=float(gradient.double().norm()),
+        value=at.value,
+        gradient_norm=float(at.gradient.double().norm()),
         operator_check=operator_check,
         gradient_check=gradient_check,
         traces=traces,
         ends=ends,
-        power=power,
-        density=density,
+        power=power or (spectrum and spectrum.power),
+        density=spectrum and spectrum.density,
         finite=finite,
         depth=depth,
         plane=plane,
-        matvecs=operator.matvecs,
-        spared=hessian.views.spared,
-        rank=hessian.rank,
-        notes=tuple(budget.notes),
+        matvecs=matvecs,
+        spared=spared,
+        rank=at.hessian.rank,
+        notes=(*(LEFT_OUT[name] for name, each in wanted.items() if not each), *kept.notes),
+        unreached=tuple(kept.unreached),
     )
 
 
@@ -239,77 +212,99 @@ def _linearised(objective: SceneObjective, report: Progress) -> tuple[Tensor, fl
     return gradient, objective.loss(center), monotonic() - start
 
 
-def _search(operator: CountingOperator, settings: ProbeSettings, share: Share) -> EigenSettings:
-    """For the ends: in the time of the stage, with a basis that memory has room for."""
-    eigen = settings.eigen
-    basis = basis_within(eigen, vectors_within(operator, settings.memory))
+def _seconds_of_product(hessian: SceneHessian) -> float:
+    """With MOST_AT_ONCE vectors."""
+    V = torch.ones_like(hessian.objective.active.flat)[:, None].expand(-1, MOST_AT_ONCE).contiguous()
+    start = monotonic()
+    finished(hessian.apply(V))
+    return monotonic() - start
+
+
+def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str, float]:
+    """Seconds that every stage is expected to take, from those of a product and of a render."""
+    work = dict(TYPICAL)
+    if settings.density_matvecs:
+        work["density"] = (settings.density_matvecs // MOST_AT_ONCE, 0)
+    if settings.power_apart:
+        work["power iteration"] = (settings.power.max_matvecs, 0)
+    if settings.probe_steps:
+        work["finite probe"] = (0, 2 * len(settings.probe_steps) + settings.noise_points + 1)
+    if settings.depth is None:
+        del work["depth"]
+    return {name: products * product + renders * render for name, (products, renders) in work.items()}
+
+
+def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Progress) -> dict[str, TraceEstimate]:
+    allowed = replace(at.settings.traces, max_seconds=seconds)
+    return exact_traces(at.objective, generator, allowed, report, samples=at.settings.trace_samples)
+
+
+def _ends(at: _Point, seconds: float, generator: torch.Generator, report: Progress, notes: list[str]) -> EigenEnds:
+    """In the time that there is, with a basis that memory has room for."""
+    eigen, memory = at.settings.eigen, at.settings.memory
+    basis = basis_within(eigen, vectors_within(at.operator, memory))
     if basis < eigen.basis:
-        share.notes.append(
-            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {settings.memory:g} GiB"
+        notes.append(
+            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB"
         )
-    return replace(eigen, max_seconds=share.seconds, basis=basis)
+    start = BlockEigenvectors(at.objective, *at.objective.approximate_blocks).warm_start()
+    eigen = replace(eigen, max_seconds=seconds, basis=basis)
+    return extreme_eigenpairs(at.operator, generator, eigen, start, report)
 
 
-def _density(
-    run: Callable[..., SpectralDensity], room: int, settings: ProbeSettings, each: float, share: Share
-) -> SpectralDensity | None:
-    """As many products as time allows at so many seconds each, in runs that memory has room for (of that many vectors); None
-    where they are too few."""
-    matvecs = int(min(settings.density_matvecs, share.seconds / each))
-    starts = FEWEST_STARTS if matvecs < MANY_MATVECS else None
+def _spectrum(
+    at: _Point,
+    ends: EigenEnds,
+    traces: dict[str, TraceEstimate],
+    generator: torch.Generator,
+    report: Progress,
+    notes: list[str],
+) -> Spectrum:
+    """In runs that memory has room for."""
+    settings, iterates = at.settings, []
+    room = vectors_within(at.operator, settings.memory)
     batch = MOST_AT_ONCE if room > FEWEST_STEPS * MOST_AT_ONCE else 1
     longest = room // (batch + 1)
-    if min(matvecs // FEWEST_STARTS, longest) < FEWEST_STEPS:
-        share.notes.append(
-            f"the spectral density was left out: time and memory allowed {matvecs} products in runs of {longest}"
-        )
-        return None
-    if matvecs < settings.density_matvecs:
-        share.notes.append(f"the spectral density took {matvecs} products instead of {settings.density_matvecs}")
-    return run(share.generator, progress=share.report, matvecs=matvecs, starts=starts, longest=longest, batch=batch)
+    if longest < FEWEST_STEPS:
+        notes.append(f"the spectral density was left out: memory allowed runs of {longest} products")
+        return Spectrum(None, None)
+
+    def watch(runs: Sequence[LanczosFactorization]) -> None:
+        iterates.append(power_of_runs(runs, settings.power))
+
+    active = ActiveSpace(at.hessian.project, at.hessian.rank)
+    density = spectral_density(
+        at.operator, generator, settings.density_matvecs, longest=longest, batch=batch, progress=report,
+        active=active, ends=ends, trace=total_trace(traces), watch=watch,
+    )  # fmt: skip
+    return Spectrum(density, iterates[0] if iterates else None)
 
 
-def _finite(
-    objective: SceneObjective,
-    operator: CountingOperator,
-    ends: EigenEnds,
-    settings: ProbeSettings,
-    render: float,
-    share: Share,
-) -> FiniteProbe | None:
-    """Along the first eigenvector; None where its renders, of so many seconds each, would take longer than they may."""
-    if (2 * len(settings.probe_steps) + settings.noise_points + 1) * render > max(share.seconds, SHORTEST):
-        share.notes.append(
-            "the finite probe was left out: its renders would have taken more than its share of the time"
-        )
-        return None
-    center, vector = objective.active.flat, ends.largest.vectors[:, 0]
-    return finite_probe(
-        objective.evaluate, center, vector, operator, settings.probe_steps, share.report, settings.noise_points
-    )
+def _finite(at: _Point, ends: EigenEnds, report: Progress) -> FiniteProbe:
+    """Along the first eigenvector."""
+    center, vector = at.objective.active.flat, ends.largest.vectors[:, 0]
+    steps, points = at.settings.probe_steps, at.settings.noise_points
+    return finite_probe(at.objective.evaluate, center, vector, at.operator, steps, report, points)
 
 
 def _plane(
-    objective: SceneObjective, gradient: Tensor, value: float, ends: EigenEnds, settings: ProbeSettings, share: Share
+    at: _Point, ends: EigenEnds, generator: torch.Generator, report: Progress, notes: list[str]
 ) -> PlaneSlice | None:
-    center, loss_scale = objective.active.flat, settings.slice_rise * value
+    settings, center, loss_scale = at.settings, at.objective.active.flat, at.settings.slice_rise * at.value
     curvatures: Float64[Tensor, 2] = ends.largest.values[:2]
     if loss_scale <= 0 or not curvatures.all():
-        share.notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")
+        notes.append("the slice was left out: the loss or one of the two largest curvatures is exactly 0")
         return None
     first, second = (curvature_reach(float(curvature), loss_scale) for curvature in curvatures)
     axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
-    workers = 1 if objective.ranks.size > 1 or by_triton(center) else thread_count()
+    workers = 1 if at.objective.ranks.size > 1 or by_triton(center) else thread_count()
     # without a budget for it, the two axes alone
-    most, limit = (inf if settings.slice_plane else 1), max(share.seconds, SHORTEST)
-    allowed = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most, max_seconds=limit)
-    evaluate = evaluation(objective, allowed.workers)
+    most = inf if settings.slice_plane else 1
+    accuracy = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most)
     # Ritz vectors: H between any two of them is their values' diagonal matrix
-    known = curvatures.diag()
-    plane = evaluate_slice(
-        evaluate, center, vectors, axes, gradient, known, allowed, share.generator, progress=share.report
-    )
+    known, evaluate = curvatures.diag(), evaluation(at.objective, workers)
+    plane = evaluate_slice(evaluate, center, vectors, axes, at.gradient, known, accuracy, generator, progress=report)
     return PlaneSlice(plane, loss_scale, (first, second))
 
 

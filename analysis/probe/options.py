@@ -14,7 +14,7 @@ class ProbeOptions:
     """Measure the loss landscape at a checkpoint: traces, extreme eigenvalues, anisotropy, a slice."""
 
     checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
     scene: Unset[Path] = None
     """Folder of the scene: where it has moved since the training, or of another tool's file."""
     out: Unset[Path] = None
@@ -28,13 +28,22 @@ class ProbeOptions:
     3dgs: that of 3DGS, whatever it was trained with, so that trainings with other losses can be compared."""
     strict: FlagCreatePairsOff[bool] = False
     """Exit with 1 if a self-check fails; the record is written all the same."""
+    verbose: FlagCreatePairsOff[bool] = False
+    """Print every number, not only a summary."""
     quick: FlagCreatePairsOff[bool] = False
-    """Numbers to 10% instead of 1%, in a quarter of the time.
-    Without power iteration, the spectral density and the indices that need it, the finite probe, the comparison of depth with
+    """Numbers to 10% instead of 1%, in a quarter of the time, into a folder of their own (probe-quick).
+    Without the spectral density and the indices that need it, power iteration, the finite probe, the comparison of depth with
     lateral directions, and the slice's plane between its two axes."""
     seconds: Unset[float] = None
-    """Time for the estimators together, in seconds; what a stage did not reach in its share is said.  inf: no limit.
-    Default: 45, with --quick 12; under torchrun inf, and nothing else."""
+    """Time for the whole command, pictures too; what was not reached is said, and the same command continues.
+    Default: no limit: the probe ends at its accuracies.  Not under torchrun."""
+    power: FlagCreatePairsOff[bool] = False
+    """Power iteration (the paper's way to the ends) with 40 products of its own for each end.
+    Else it is read from the density's Lanczos runs, up to as many steps as they have, without a product."""
+    density_products: Unset[int] = None
+    """Products of the spectral density: more make the brackets of sums and quantiles narrower.  Default: 108."""
+    end_products: Unset[int] = None
+    """Products of the search for both ends of the spectrum, at most.  Default: 3000."""
     slice_points: Unset[int] = None
     """Points along each side of the slice, odd, 5 or more.  Default: 41, with --quick 21."""
     slice_rise: float = 0.001

@@ -53,7 +53,7 @@ def probe_record(
         slice=None if found.plane is None else _slice(found.plane, found.ends.largest),
         counts=_counts(found, objective),
         checks=_checks(found),
-        notes=list(found.notes),
+        notes=[*found.notes, *_unreached(found)],
         skipped=_skipped(found, objective, timing),
         provenance=made,
         timing=dict(timing),
@@ -182,6 +182,12 @@ def literal_index(ends: EigenEnds, power: EigenEnds) -> schema.Index:
     if certain.note not in ("definite", "indefinite"):
         note += f" ({certain.note})"
     return index_of(replace(certain, value=value, note=note))
+
+
+def _unreached(found: Measured) -> list[str]:
+    if not found.unreached:
+        return []
+    return [f"time ended before: {', '.join(found.unreached)}; the same command continues from there"]
 
 
 def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:

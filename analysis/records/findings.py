@@ -4,9 +4,12 @@ Every sentence follows from numbers of the record and their errors alone; where 
 """
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
+
+from msgspec import UNSET
 
 from analysis.records import schema
 from analysis.records.provenance import Provenance
@@ -25,10 +28,11 @@ END_NAMES = {"max": "largest", "min": "smallest"}
 
 @dataclass(frozen=True)
 class Line:
-    """One sentence; a failure is a check that did not hold or a number that is none."""
+    """One sentence; a failure is a check that did not hold or a number that is none; open: a number is not known, and what
+    resolves it."""
 
     text: str
-    level: Literal["fact", "caution", "failure"] = "fact"
+    level: Literal["fact", "caution", "open", "failure"] = "fact"
 
 
 def attribute_name(attribute: str) -> str:
@@ -45,6 +49,7 @@ def findings(data: ProbeRecord) -> list[Line]:
         *_of_ends(ends),
         *of_budgets({"max": ends.max.reason, "min": ends.min.reason}),
         *_of_anisotropy(data.anisotropy),
+        *_of_open(data),
         *_of_needles(ends.max.lives_on, data.counts),
         *_of_finite_probe(data.finite_probe),
         *_of_depth(data.depth),
@@ -156,7 +161,7 @@ def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
 def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
     lines, saddle, share = [], family.saddle, family.share
     steepest = "The steepest direction up is"
-    if saddle and _is_finite(saddle.value):
+    if saddle and _is_finite(saddle.value) and not is_open(saddle):
         text = f"{steepest} {quantity(saddle.value)} times as curved as the steepest down{_bracket(saddle)}."
         lines.append(Line(text))
     elif saddle and saddle.low is not None and 0 < saddle.low < math.inf:
@@ -165,10 +170,50 @@ def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
     elif saddle:
         text = f"The ratio of the two ends of the spectrum is not determined{_in_brackets(saddle.note)}."
         lines.append(Line(text, "caution"))
-    if share and _is_finite(share.value):
+    if share and _is_finite(share.value) and not is_open(share):
         text = f"The steepest direction alone holds {share.value:.2%} of all absolute curvature"
         lines.append(Line(f"{text}{_bracket(share, '{:.2%}'.format)}."))
     return lines
+
+
+def is_open(index: schema.Index) -> bool:
+    """Whether its bracket has no lower or no upper end; False where it is undefined."""
+    return (index.low is None) != (index.high is None) or (
+        index.low is None and index.high is None and index.value is not None
+    )
+
+
+def remedy(data: ProbeRecord, name: str) -> str:
+    """The command that resolves an index, as far as any does."""
+    made, ends = data.provenance, data.eigenvalues
+    command = made.command or f"landscape probe {made.checkpoint or 'CHECKPOINT'}"
+    reasons = {end.reason for end in (ends.max, ends.min)}
+    if "time budget" in reasons:
+        return f"the same command without --seconds resolves it: {_without(command, '--seconds')}"
+    if "matvec budget" in reasons:
+        spent = ends.min.matvecs or 1
+        return f"more products resolve it: {_with(command, '--end-products', 4 * spent)}"
+    if name in ("share", "effective_rank", "mass_quantile"):
+        products = int((made.settings or {}).get("density_matvecs") or 108)
+        return f"a longer density narrows it: {_with(command, '--density-products', 4 * products)}"
+    return "the end is within its error of 0, and no more products resolve it"
+
+
+def _without(command: str, option: str) -> str:
+    return re.sub(rf" {option}[ =]\S+", "", command)
+
+
+def _with(command: str, option: str, value: int) -> str:
+    return f"{_without(_without(command, '--seconds'), option)} {option} {value}"
+
+
+def _of_open(data: ProbeRecord) -> list[Line]:
+    """The indices without a finite bracket: the bracket, and the command that resolves it."""
+    return [
+        Line(f"{name.replace('_', ' ').capitalize()}: {UNDETERMINED}{_bracket(index)}; {remedy(data, name)}.", "open")
+        for name, index in data.anisotropy.items()
+        if is_open(index)
+    ]
 
 
 def _of_needles(where: schema.Maybe[schema.LivesOn], counts: Counts) -> list[Line]:
@@ -256,14 +301,14 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
         return [Line("No slice of the loss was recorded.", "caution")]
     lines, error, count = [], plane.interpolation_error, plane.holdout_points
     rendered = plane.points if plane.evaluated_points is None else plane.evaluated_points
-    if not plane.resolved:
+    if not plane.is_resolved:
         lines.append(Line(unresolved(plane, made), "caution"))
     elif rendered < plane.points:
         text = f"Of the slice's {plane.points:,} points {rendered:,} are renders, among them all of both axes; the others are "
         text += "interpolated" + (
             f" to {100 * plane.tolerance:.2g}% of the range of the loss" if plane.tolerance else ""
         )
-        seen = plane.error_seen if plane.error_seen is not None else error
+        seen = error if plane.error_seen in (None, UNSET) else plane.error_seen
         size = f"at most {100 * seen:.2g}%" if seen is not None else "without bound"
         text += f" (the error at {count} random point{'' if count == 1 else 's'}: {size}"
         lines.append(Line(f"{text}; the bound for all: {100 * error:.2g}%)." if error is not None else f"{text})."))
@@ -275,7 +320,7 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
 
 def unresolved(plane: schema.Slice, made: Provenance) -> str:
     """Why a plane is not drawn, and the command that resolves it."""
-    asked = "" if plane.tolerance is None else f" to {100 * plane.tolerance:.2g}% of the range of the loss"
+    asked = "" if not plane.tolerance else f" to {100 * plane.tolerance:.2g}% of the range of the loss"
     limited = "--max-renders" in (made.command or "")
     remedy = "leave out --max-renders" if limited else f"landscape slice {made.checkpoint} renders more"
     return (

@@ -17,7 +17,7 @@ import plotly.graph_objects as go
 import plotly.io
 from plotly.offline import get_plotlyjs
 
-from analysis.records.findings import attribute_name, findings, headline
+from analysis.records.findings import attribute_name, findings, headline, is_open
 from analysis.records.json_files import plain
 from analysis.records.quantities import limits, measured, quantity
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
@@ -68,6 +68,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "measured": measured,
         "attribute": attribute_name,
         "cell": _cell,
+        "open_ended": is_open,
     }
     surface = embedded_surface(record) if surface is None else surface
     return environment.get_template("report.html.jinja").render(
@@ -126,7 +127,7 @@ def _uri(path: Path, kind: str) -> str:
 def interactive_surface(record: Record[ProbeRecord]) -> go.Figure | None:
     """The recorded slice as a surface to turn and zoom, with the quadratic model where known; None without one."""
     about = record.data.slice
-    if about is None or "slice" not in record.arrays or not about.resolved:
+    if about is None or "slice" not in record.arrays or not about.is_resolved:
         return None
     arrays = record.arrays["slice"]
     layers = [("loss", "loss", "Cividis", 1.0), ("model", "quadratic model", "Greys", 0.45)]

@@ -321,11 +321,16 @@ class Slice(Struct, kw_only=True):
     crossed_points: Count = 0
     evaluations: Count = 0
     center_loss: float
-    tolerance: Number = None
-    resolved: bool = True
+    tolerance: Maybe[Number] = UNSET
+    resolved: Maybe[bool] = UNSET
     interpolation_error: Number = 0.0
-    error_seen: Number = None
+    error_seen: Maybe[Number] = UNSET
     holdout_points: Count = 0
     share_beyond: Number = None
     reason: str = ""
     note: Maybe[str] = UNSET
+
+    @property
+    def is_resolved(self) -> bool:
+        """Whether every point of the grid has a loss; older files do not say so, and have it."""
+        return self.resolved is not False

@@ -1,15 +1,16 @@
 """A record as tables: of a probe, for the terminal, and of its anisotropy families, for the terminal and the report."""
 
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 from rich import box
 from rich.table import Table
 
-from analysis.records.findings import attribute_name
+from analysis.records.findings import attribute_name, is_open
 from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
-from analysis.records.records import Check, ProbeRecord
+from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import INDICES, Depth, Effect, End, Family, Index, Number
 
 ENDS = {
@@ -23,43 +24,94 @@ NEEDS_DENSITY = "needs the spectral density, which was left out"  # said of an i
 OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
 ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
-OUTCOMES = {True: "[green]passed[/]", False: "[red]FAILED[/]", None: "[yellow]could not run[/]"}
+HARD_SPACE = "\u00a0"
+GAPS, NUMBER, REMARK = 8, 27, 22  # of the probe's table: between columns, widest number in a line, least room for words
 WIDTH = 15  # of a column of the families' table, with which it fits into 80
 NARROW = 0.1  # of the value: a bracket that is written as an error
 
 
-def probe_table(data: ProbeRecord) -> Table:
-    """Traces, eigenvalues, anisotropy, counts and checks."""
+def probe_table(data: ProbeRecord, width: int = 80) -> Table:
+    """Traces, eigenvalues, anisotropy, counts and checks, in a width where words wrap and numbers do not."""
+    rows = [
+        *_trace_rows(data),
+        None,
+        *_end_rows(data),
+        None,
+        *((name.replace("_", " "), *_index(index)) for name, index in data.anisotropy.items() if _measured(index)),
+        None,
+        *_depth_rows(data.depth),
+        None,
+        *_count_rows(data.counts),
+        None,
+        *_check_rows(data.checks),
+    ]
+    rows = [row and (row[0], _folded(row[1], NUMBER), row[2]) for row in rows]
+    name, value = (max(len(line) for row in rows if row for line in row[i].splitlines()) for i in (0, 1))
+    name = min(name, max(width - value - GAPS - REMARK, REMARK))
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=ERRORS, caption_justify="left")
     table.add_column("", no_wrap=True)
     table.add_column("value ± error", justify="right", no_wrap=True)
-    table.add_column("τ", justify="right", no_wrap=True)
-    table.add_column("")
+    table.add_column("", no_wrap=True)
+    for row in rows:
+        if row:
+            table.add_row(wrapped(row[0], name), row[1], wrapped(row[2], width - name - value - GAPS))
+        else:
+            table.add_section()
+    return table
+
+
+Row = tuple[str, str, str]
+
+
+def wrapped(text: str, width: int) -> str:
+    """In lines of this width at most; a number with its error stays in one.
+
+    >>> print(wrapped("(8.6 ± 0.6) × 10⁻⁶ over (1.37 ± 0.10) × 10⁻⁴", 22).replace("\u00a0", " "))
+    (8.6 ± 0.6) × 10⁻⁶
+    over
+    (1.37 ± 0.10) × 10⁻⁴
+    """
+    for sign in " ± ", " × ", " px":
+        text = text.replace(sign, sign.replace(" ", HARD_SPACE))
+    return textwrap.fill(text, max(width, 12), break_long_words=False, break_on_hyphens=False)
+
+
+def _trace_rows(data: ProbeRecord) -> Iterator[Row]:
     for name, trace in data.traces.items():
-        about = f"{trace.sign}, dim {trace.dim:,}, {trace.matvecs} products{_reason(trace.reason)}"
-        value = measured(trace.value, trace.standard_error)
-        table.add_row(f"trace of {attribute_name(name)}", value, quantity(trace.tau), about)
-    table.add_section()
+        about = (
+            f"τ {quantity(trace.tau)}, {trace.sign}, dim {trace.dim:,}, {trace.matvecs} products{_reason(trace.reason)}"
+        )
+        yield f"trace of {attribute_name(name)}", measured(trace.value, trace.standard_error), about
+
+
+def _end_rows(data: ProbeRecord) -> Iterator[Row]:
+    """An end that was not reached is no number."""
     for name, end in data.eigenvalues.items():
         main, share = max(end.shares.items(), key=lambda item: item[1], default=("no attribute", 0.0))
+        value = measured(end.value, end.residual)
         about = f"{share:.0%} {attribute_name(main)}, {end.matvecs} products{_reason(end.reason)}"
-        table.add_row(ENDS[name], measured(end.value, end.residual), "", about)
-    table.add_section()
-    for name, index in data.anisotropy.items():
-        if index.note != NEEDS_DENSITY:  # the record's notes say that these were left out
-            table.add_row(name.replace("_", " "), *_index(index))
-    table.add_section()
-    for row in _depth_rows(data.depth):
-        table.add_row(*row)
-    table.add_section()
-    counts = data.counts
-    table.add_row("Gaussians in sight", f"{counts.visible_gaussians:,}", "", f"of {counts.gaussians:,}")
-    table.add_row("active parameters", f"{counts.active_parameters:,}", "", f"of {counts.parameters:,}")
-    table.add_row("SH degree in use", f"{counts.sh_degree_active}", "", f"of {counts.sh_degree_stored}")
-    table.add_section()
-    for name, check in data.checks.items():
-        table.add_row(f"check: {name.replace('_', ' ')}", quantity(check.value), "", _outcome(check))
-    return table
+        if (end.reason or "").endswith("budget"):
+            value, about = UNDETERMINED, f"at {value} so far; {about}"
+        yield ENDS[name], value, about
+
+
+def _count_rows(counts: Counts) -> Iterator[Row]:
+    yield "Gaussians in sight", f"{counts.visible_gaussians:,}", f"of {counts.gaussians:,}"
+    yield "active parameters", f"{counts.active_parameters:,}", f"of {counts.parameters:,}"
+    yield "SH degree in use", f"{counts.sh_degree_active}", f"of {counts.sh_degree_stored}"
+
+
+def _check_rows(checks: Mapping[str, Check]) -> Iterator[Row]:
+    """Those that passed in one row."""
+    if good := [name.replace("_", " ") for name, check in checks.items() if check.passed]:
+        yield "checks passed", f"{len(good)} of {len(checks)}", ", ".join(good)
+    for name, check in checks.items():
+        if not check.passed:
+            yield f"check: {name.replace('_', ' ')}", quantity(check.value), _outcome(check)
+
+
+def _measured(index: Index) -> bool:
+    return index.note != NEEDS_DENSITY  # the record's notes say that these were left out
 
 
 def _reason(reason: str | None) -> str:
@@ -68,35 +120,31 @@ def _reason(reason: str | None) -> str:
 
 
 def _outcome(check: Check) -> str:
-    return f"{OUTCOMES[check.passed]}, at most {quantity(check.bound)}{f' ({check.note})' if check.note else ''}"
+    outcome = "could not run" if check.passed is None else "FAILED"
+    return f"{outcome}, at most {quantity(check.bound)}{f' ({check.note})' if check.note else ''}"
 
 
-def _depth_rows(depth: Depth | None) -> Iterator[tuple[str, str, str, str]]:
+def _depth_rows(depth: Depth | None) -> Iterator[Row]:
     """Of positions: along the rays, over a direction across them."""
     if depth is None:
         return
     median = f"median {quantity(depth.gradient_median)}, {depth.pairs:,} pairs of Gaussian and view"
-    yield "depth gradient / lateral", quantity(depth.gradient_ratio), "", median
+    yield "depth gradient / lateral", quantity(depth.gradient_ratio), median
     yield "depth curvature / lateral", *_index(depth.curvature_ratio)
     for row in depth.rises:
         rises = f"{measured(row.depth, row.depth_error)} over {measured(row.lateral, row.lateral_error)}"
-        yield f"depth / lateral rise, {row.pixels:g} px", measured(row.ratio, row.ratio_error), "", rises
+        yield f"depth / lateral rise, {row.pixels:g} px", measured(row.ratio, row.ratio_error), rises
 
 
-def _index(index: Index) -> tuple[str, str, str]:
-    """Value, nothing, bracket and note; a narrow bracket is written as an error."""
-    value, low, high, note = index.value, index.low, index.high, index.note
-    if low is None and high is None:
-        return quantity(value), "", note
-    if low is None or high is None:
-        bracket = " to ".join("unbounded" if end is None else quantity(end) for end in (low, high))
-    elif high - low < NARROW * abs(high + low) / 2:
-        if value is not None and low <= value <= high:
-            return measured(value, max(high - value, value - low)), "", note
-        bracket = measured((low + high) / 2, (high - low) / 2)
-    else:
-        bracket = " to ".join(limits(low, high))
-    return quantity(value), "", f"{bracket} ({note})" if note else bracket
+def _index(index: Index) -> tuple[str, str]:
+    """Value, and bracket and note; a narrow bracket is written as an error, a value without bracket not at all."""
+    cell = bracketed(index)
+    if index.low is None and index.high is None:
+        return UNDETERMINED, index.note
+    if is_open(index):
+        return UNDETERMINED, f"{cell.value} ({index.note})"
+    bracket = cell.bracket.replace(" … ", " to ")
+    return cell.value, f"{bracket} ({index.note})" if bracket and index.note else bracket or index.note
 
 
 @dataclass(frozen=True)
@@ -159,13 +207,13 @@ def family_table(data: ProbeRecord) -> Table:
     return table
 
 
-def _folded(text: str) -> str:
+def _folded(text: str, width: int = WIDTH) -> str:
     """In two lines where it is too wide for a column.
 
     >>> _folded("7.45 × 10⁻⁴ … 1.02 × 10⁴"), _folded("34.1 … 120")
     ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
     """
-    return text if len(text) <= WIDTH else text.replace(" ± ", "\n± ").replace(" … ", " …\n")
+    return text if len(text) <= width else text.replace(" ± ", "\n± ").replace(" … ", " …\n")
 
 
 def bracketed(index: Index | Effect | None) -> Cell:

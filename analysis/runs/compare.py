@@ -13,6 +13,7 @@ kept in mind beside that is said: other starts, steps, losses of training, budge
 import os
 import shlex
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,14 +24,15 @@ from analysis.console.options import DeviceName
 from analysis.console.overrides import leaves
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import loss_name
-from analysis.records.findings import of_budgets
+from analysis.records.findings import of_budgets, unresolved
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.report import pictures_in, template_environment
 from analysis.records.run_files import CHECKPOINT, COMPARISON, METRICS, Comparison, Scores, read_scores
-from analysis.runs.compare_table import Run, compare_table, comparison, frame
+from analysis.runs.compare_table import Row, Run, compare_table, comparison, frame
 from analysis.runs.options import CompareOptions
+from analysis.runs.seeds import Group, grouped, groups_of, identical, sayings
 from landscape.errors import InputError
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
@@ -46,7 +48,9 @@ PICTURES = {
 
 def run_compare(options: CompareOptions) -> int:
     """Read, probe where asked to, compare; returns the exit code."""
-    folders = _folders(options.runs)
+    groups = groups_of(options.runs, options.group)
+    paths = [folder for group in groups for folder in group.folders]
+    folders = _folders(paths)
     common = Path(os.path.commonpath(folders))
     common = common.parent if common in folders else common
     labels = [str(folder.relative_to(common)) for folder in folders]
@@ -57,7 +61,7 @@ def run_compare(options: CompareOptions) -> int:
         if any(c.training.config.loss != checkpoints[0].training.config.loss for c in checkpoints)
         else "training"
     )
-    missing = [path for path, checkpoint in zip(options.runs, checkpoints) if not probed(path, checkpoint)]
+    missing = [path for path, checkpoint in zip(paths, checkpoints) if not probed(path, checkpoint)]
     if missing and not options.probe:
         more = "" if loss == "training" else f" --loss {loss}"
         again = "; ".join(f"landscape probe {shlex.quote(str(path / CHECKPOINT))}{more}" for path in missing)
@@ -68,12 +72,18 @@ def run_compare(options: CompareOptions) -> int:
         _probe(path, options.device, loss)
     runs = [
         Run(path, label, checkpoint, _scores(path), read_record(path / PROBE, ProbeRecord).data)
-        for path, label, checkpoint in zip(options.runs, labels, checkpoints)
+        for path, label, checkpoint in zip(paths, labels, checkpoints)
     ]
     require_same_loss(runs)
-    out = options.out or common / "compare"
-    _write(runs, out)
+    named = [_relative(group, common) for group in groups]
+    _write(runs, named, identical(labels, checkpoints), options.out or common / "compare")
     return 0
+
+
+def _relative(group: Group, common: Path) -> Group:
+    """The group with its label as those of runs are, where it is a folder."""
+    path = Path(group.label).resolve()
+    return replace(group, label=str(path.relative_to(common))) if path.is_relative_to(common) else group
 
 
 def _folders(runs: Sequence[Path]) -> list[Path]:
@@ -160,6 +170,8 @@ def cautions(runs: Sequence[Run]) -> list[str]:
         order = ", ".join(run.label for run in runs)
         lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
     for run in runs:
+        if run.data.slice and not run.data.slice.is_resolved:
+            lines.append(f"{run.label}: {unresolved(run.data.slice, run.data.provenance)}")
         failed = [name.replace("_", " ") for name, check in run.data.checks.items() if check.passed is False]
         lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]
         ends = {"max": run.data.eigenvalues.max.reason, "min": run.data.eigenvalues.min.reason}
@@ -191,33 +203,50 @@ def split_controls(runs: Sequence[Run]) -> list[str]:
     return lines
 
 
-def _write(runs: Sequence[Run], out: Path) -> None:
-    """Table, pictures, page; and the table and the cautions once more for the terminal."""
+def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], out: Path) -> None:
+    """Table, pictures, page; and what it says, the table and the cautions once more for the terminal."""
     console, labels = Console(), [run.label for run in runs]
     rows, notes = comparison(runs), cautions(runs)
+    shown = grouped(rows, groups)
+    says = [*same, *sayings(shown, groups)]
+    shown_runs = {folder: group.label for group in groups for folder in group.folders[:1]}
+    if len(shown_runs) < len(runs):
+        notes.append(f"The pictures show the first run of each group: {', '.join(map(str, shown_runs))}.")
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode(errors="backslashreplace"))
-    index = Comparison(runs={run.label: str((run.folder / PROBE).resolve()) for run in runs})
+    index = Comparison(runs={label: str((folder / PROBE).resolve()) for folder, label in shown_runs.items()})
     write_atomically(out / COMPARISON, json_text(plain(index)).encode())
     try:
         draw("compare", out)
     except RuntimeError as error:  # the numbers stand without pictures
         notes.append(" ".join(str(error).split()))
-    write_atomically(out / PAGE, render_page(runs, rows, notes, out).encode(errors="backslashreplace"))
-    console.print(compare_table(rows, labels))
+    names = [group.label for group in groups]
+    write_atomically(out / PAGE, render_page(runs, names, shown, says, notes, out).encode(errors="backslashreplace"))
+    for line in says:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    console.print(compare_table(shown, names))
     for note in notes:
         console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
     console.print(f"open {out / PAGE}; numbers: {out / TABLE}", highlight=False, soft_wrap=True, markup=False)
 
 
-def render_page(runs: Sequence[Run], rows: Sequence[Any], notes: Sequence[str], out: Path) -> str:
-    """The page as text, with the pictures that lie in the folder."""
+def render_page(
+    runs: Sequence[Run],
+    groups: Sequence[str],
+    rows: Sequence[Row],
+    says: Sequence[str],
+    notes: Sequence[str],
+    out: Path,
+) -> str:
+    """The page as text, with the pictures that lie in the folder.  groups: names of the rows' columns."""
     environment = template_environment()
     sections = {
         name: [row for row in rows if row.section == name] for name in dict.fromkeys(row.section for row in rows)
     }
     return environment.get_template("compare.html.jinja").render(
         runs=runs,
+        groups=groups,
+        says=says,
         sections=sections,
         notes=notes,
         controls=split_controls(runs),

@@ -1,6 +1,6 @@
 """`landscape slice`: one checkpoint in, its loss along a line or over a plane out, as a record with pictures.
 
-    load            the checkpoint, its scene, the other checkpoint of a line
+    load            the checkpoint, its scene, the other checkpoints of a line or a plane
     linearise       every view held still
     directions      eigenvectors from the probe beside the checkpoint or by Lanczos, and their curvatures
     slice           renders in parallel; of a plane where needed, interpolated elsewhere (`landscape.slices.refinement`)
@@ -57,7 +57,6 @@ from splat.backend.device import device_named
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
-from splat.model.gaussians import Gaussians
 from splat.training.checkpoint import Checkpoint, load_checkpoint
 
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
@@ -67,7 +66,7 @@ DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     """Slice the checkpoint's loss; returns the exit code.  command: as typed, for the record."""
     require_seed(options.seed)
-    shape = Shape.of(options.along, options.dimension, options.radius, options.points, options.other is not None)
+    shape = Shape.of(options.along, options.dimension, options.radius, options.points, len(options.others))
     device = device_named(options.device)
     settings = _settings(options, shape, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
@@ -98,19 +97,19 @@ def _sliced(
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
-        other = None if options.other is None else _other_end(checkpoint, options.other)
-        objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
+        others = [_other_end(checkpoint, path) for path in options.others]
+        objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
     with stages:
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:
-            found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
+            found = _measure(objective, shape, others, known, settings, options, unfinished, stages)
         except BaseException:
             if unfinished.is_dir():
                 console.print(f"what was rendered is kept; to continue: {shlex.join(command)}", **SAID)
             raise
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
-        made.other = None if options.other is None else str(options.other)
+        made.other = ", ".join(map(str, options.others)) or None
         data = slice_record(found, objective, notes + checkpoint.assumptions, made)
         write_with_pictures(folder, data, slice_arrays(found), stages, start)
     return data
@@ -135,7 +134,7 @@ def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> Slic
 
 
 def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
-    """The other checkpoint's parameters, quaternions as unit ones on the near side."""
+    """The other checkpoint's parameters, with its quaternions near those here."""
     here = checkpoint.training.gaussians
     there = read_splats(path).gaussians if is_foreign(path) else load_checkpoint(path).training.gaussians
     if (len(here), here.sh_degree) != (len(there), there.sh_degree):
@@ -143,11 +142,7 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
             f"expected a checkpoint of {len(here):,} Gaussians with SH degree {here.sh_degree} at the other end of the line, "
             f"got {len(there):,} with {there.sh_degree} in {path}; take two of one training after densification has ended"
         )
-    there = Gaussians(there.flat.to(here.flat, copy=True), there.sh_degree)
-    quats = there.quats
-    quats /= quats.norm(dim=1, keepdim=True)
-    quats *= torch.where((quats * here.quats).sum(dim=1, keepdim=True) < 0, -1.0, 1.0).to(quats)
-    return there.flat
+    return there.with_flat(there.flat.to(here.flat)).aligned_to(here).flat
 
 
 def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list[str]) -> list[Tensor]:
@@ -167,7 +162,7 @@ def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list
 def _measure(
     objective: SceneObjective,
     shape: Shape,
-    other: Float[Tensor, " n"] | None,
+    others: list[Float[Tensor, " n"]],
     known: list[Tensor],
     settings: SliceSettings,
     options: SliceOptions,
@@ -184,7 +179,7 @@ def _measure(
     operator = CountingOperator(SceneHessian(objective))
     true = CountingOperator(SceneHessian(objective, keep_null=True))  # H itself: a line may lead anywhere
     with stages.stage("directions") as report:
-        exact = find_directions(shape, objective, operator, other, known, generators, report)
+        exact = find_directions(shape, objective, operator, others, known, generators, report)
         _keep_eigenvectors(exact, unfinished)
         directions = at_right_angles(exact)
         vectors = torch.stack([direction.vector for direction in directions], dim=1)

@@ -21,8 +21,8 @@ class SliceOptions:
 
     checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
     """RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
-    other: Annotated[Positional[Path | None], arg(metavar="[OTHER]", help_behavior_hint="")] = None
-    """Where a line leads to: a checkpoint with as many Gaussians and the same SH degree."""
+    others: Annotated[Positional[tuple[Path, ...]], arg(metavar="[OTHER [THIRD]]", help_behavior_hint="")] = ()
+    """Where a line leads to: a checkpoint with as many Gaussians and the same SH degree.  Two: the plane through all three."""
     along: UseAppendAction[tuple[Along, ...]] = ()
     """Directions; given twice, the plane of the first direction of each.  Default: eigenvectors, or line where OTHER is given.
     eigenvectors: of the two largest eigenvalues, from RUN/probe or else computed.
@@ -30,7 +30,7 @@ class SliceOptions:
     gradient: the steepest ascent.
     line: to OTHER."""
     dimension: Unset[Literal[1, 2]] = None
-    """1: a line; 2: a plane.  Default: 2 for eigenvectors and random, 1 for gradient and line."""
+    """1: a line; 2: a plane.  Default: 2 for eigenvectors, random and two OTHER checkpoints, 1 for gradient and line."""
     radius: UseAppendAction[tuple[float, ...]] = ()
     """How far to look each way; given twice, one for each direction.
     eigenvectors: in curvature units: the step within which the curvature alone changes the loss by 0.1%.  Default: 3.

@@ -28,6 +28,10 @@ class Eigenpairs:
     def __len__(self) -> int:
         return self.values.numel()
 
+    def __repr__(self) -> str:
+        pairs = zip(self.values.tolist(), self.residuals.tolist(), strict=True)
+        return f"{', '.join(f'{value:.6g} ± {residual:.1g}' for value, residual in pairs) or 'none'} ({self.reason})"
+
     def interval(self, index: int = 0) -> tuple[float, float]:
         """[value - residual, value + residual] of the pair at this index.  It contains an eigenvalue of H."""
         value, residual = float(self.values[index]), float(self.residuals[index])
@@ -61,6 +65,9 @@ class EigenEnds:
     beyond: float
     noise: float
     ritz: Float64[Tensor, "2 m"] | None = None
+
+    def __repr__(self) -> str:
+        return f"largest   {self.largest!r}\nsmallest  {self.smallest!r}\n  by {self.method}, {self.matvecs} products"
 
     def record(self) -> dict[str, object]:
         ends = {"max": self.largest, "min": self.smallest}

@@ -47,6 +47,15 @@ class Slice:
         """Whether every point is evaluated, or known to within the tolerance."""
         return self.reason in ("exact", "tolerance")
 
+    def __repr__(self) -> str:
+        shape, rendered = " x ".join(map(str, self.loss.shape)), int(self.evaluated.sum())
+        return (
+            f"slice of {shape} points around {self.center_loss:.6g}, values over a range of {self.range:.4g}\n"
+            f"  {rendered:,} evaluated; error of the others {self.interpolation_error:.2g} of the range, "
+            f"at {self.holdout.numel()} points\n"
+            f"  {self.evaluations:,} evaluations; ended: {self.reason}"
+        )
+
     @property
     def difference(self) -> Float64[Tensor, "..."] | None:
         """Loss minus quadratic model."""

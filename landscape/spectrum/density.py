@@ -41,8 +41,8 @@ from landscape.eigen.krylov import MARGIN
 from landscape.eigen.lanczos import LanczosFactorization, lanczos
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
-from landscape.linalg import gram, norm
-from landscape.operators.operator import ProjectedOperator, SymmetricOperator
+from landscape.linalg import gram, norm, orthogonalise
+from landscape.operators.operator import DenseOperator, ProjectedOperator, SymmetricOperator
 from landscape.results import Progress
 from landscape.spectrum.absolute_sum import absolute_integral
 from landscape.spectrum.rules import SpectralDensity
@@ -80,6 +80,7 @@ def spectral_density(
     active: ActiveSpace | None = None,
     ends: EigenEnds | None = None,
     trace: tuple[float, float] | None = None,
+    watch: Callable[[Sequence[LanczosFactorization]], object] | None = None,
 ) -> SpectralDensity:
     """Gauss rules of random start vectors, one Lanczos run each.
 
@@ -91,6 +92,7 @@ def spectral_density(
     active: leaves the eigenvalues of a known null space out; `dim` of the result is then the rank.
     ends: eigenpairs found before by `extreme_eigenpairs`; those that are accurate enough are `known` from the beginning.
     trace: of the operator, with its standard error, where it is known better than from so few start vectors.
+    watch: is given the first runs, H's own, before `ends` are taken out of them.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> H = DenseOperator(torch.diag(torch.tensor([5.0, -1.0, *[2.0] * 98], dtype=torch.float64)))
@@ -103,7 +105,9 @@ def spectral_density(
         raise InputError(
             f"expected starts >= 2, matvecs >= 2 a start vector and batch >= 1, got {least}, {matvecs} and {batch}"
         )
-    found = _Runs(operator, generator, active, ends, lambda done, state: progress and progress(done, matvecs, state))
+    found = _Runs(
+        operator, generator, active, ends, lambda done, state: progress and progress(done, matvecs, state), watch
+    )
     most = min(matvecs // least, found.rank, longest or found.rank)
     steps, count = most, least
     if starts is None:
@@ -170,10 +174,13 @@ class _Runs:
         active: ActiveSpace | None,
         ends: EigenEnds | None,
         progress: Callable[[int, str], object],
+        watch: Callable[[Sequence[LanczosFactorization]], object] | None,
     ) -> None:
+        self.watch, self.whole = watch, operator
         self.generator, self.active, self.progress = generator, active, progress
         self.rank = operator.dim if active is None else active.rank
-        self.known, self.residuals, V = found_before(ends, operator, generator.device)
+        self.known, self.residuals, V, self.error = found_before(ends, operator, generator.device)
+        self.values = self.known  # of V's columns
         self.operator = ProjectedOperator(operator, lambda X: X - V @ (V.T @ X)) if V.shape[1] else operator
         self.V, self.matvecs = V, 0
         self.noise = 0.0 if ends is None or isnan(ends.noise) else ends.noise  # of a product
@@ -187,14 +194,19 @@ class _Runs:
         Z = draw_starts(self.operator.dim, count, self.generator, self.operator.dtype)
         if self.active is not None:
             Z = self.active.project(Z)
-        Z = Z - self.V @ (self.V.T @ Z)
+        watch = None if self.rules else self.watch
+        if watch is None:
+            Z = Z - self.V @ (self.V.T @ Z)
         before, size = self.matvecs, float(self.known.abs().max()) if len(self.known) else 0.0
 
         def report(done: int, _: int, state: str) -> None:
             self.progress(before + done, f"density: {state}")
 
-        runs = lanczos(self.operator, Z, steps, report, size, enough)
+        runs = lanczos(self.operator if watch is None else self.whole, Z, steps, report, size, enough)
         self.matvecs += sum(len(run.T) for run in runs)
+        if watch is not None:
+            watch(runs)
+            runs = [without(run, self.V, self.values, self.error) for run in runs]
         spectra = [torch.linalg.eigh(run.T) for run in runs]
         others = [torch.ones_like(values, dtype=torch.bool) for values, _ in spectra]
         if not self.rules and count > 1:
@@ -231,18 +243,42 @@ def draw_starts(n: int, count: int, generator: torch.Generator, dtype: torch.dty
 
 def found_before(
     ends: EigenEnds | None, operator: SymmetricOperator, device: torch.device
-) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Float[Tensor, "n k"]]:
-    """Eigenvalues, residuals and orthonormal vectors of the pairs that are good."""
+) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Float[Tensor, "n k"], float]:
+    """Eigenvalues, residuals, orthonormal vectors and the largest vector error of the pairs that are good."""
     if ends is None:
         none = torch.zeros(0, dtype=torch.float64)
-        return none, none, torch.zeros(operator.dim, 0, dtype=operator.dtype, device=device)
+        return none, none, torch.zeros(operator.dim, 0, dtype=operator.dtype, device=device), 0.0
     pairs = (ends.largest,) if ends.smallest is ends.largest else (ends.largest, ends.smallest)
     values, residuals, errors = (
         torch.cat([getattr(pair, name) for pair in pairs]) for name in ("values", "residuals", "vector_errors")
     )
     good = (errors < FOUND) & (residuals <= CLOSE * values.abs())
     vectors = torch.cat([pair.vectors for pair in pairs], dim=1)[:, good.to(ends.largest.vectors.device)]
-    return values[good], residuals[good], torch.linalg.qr(vectors).Q
+    return values[good], residuals[good], torch.linalg.qr(vectors).Q, float(errors[good].max()) if good.any() else 0.0
+
+
+def without(
+    run: LanczosFactorization, V: Float[Tensor, "n k"], values: Float64[Tensor, " k"], error: float
+) -> LanczosFactorization:
+    """The run that P H P, P = 1 - V V^T, would have made from P z, for eigenvectors V of H, off by `error`: P and H commute.
+
+    Its space is that of P Q, where P H P is T - C diag(values) C^T and the Gram matrix 1 - C C^T, C = Q^T V.  Directions of Q
+    that lie in V, as far as round-off and the error tell, are left out.
+    """
+    if not len(values):
+        return run
+    C, steps = gram(run.Q, V).cpu(), len(run.T)
+    size, U = torch.linalg.eigh(torch.eye(steps, dtype=torch.float64) - C @ C.T)
+    kept = size > max(torch.finfo(run.Q.dtype).eps ** 0.5, (10 * error) ** 2)
+    roots, U = size[kept].sqrt(), U[:, kept]
+    B = U / roots
+    H = B.T @ (run.T - C @ torch.diag(values) @ C.T) @ B
+    (small,) = lanczos(DenseOperator((H + H.T) / 2), (roots * U[0])[:, None], len(roots))
+    B = B @ small.Q
+    Q = run.Q @ B.to(run.Q) - V @ (C.T @ B).to(V)
+    r = run.r[None].clone()
+    orthogonalise(r, torch.cat([V, Q], dim=1).T)
+    return LanczosFactorization(Q, small.T, r[0] * float(B[-1, -1]))
 
 
 def missed(values: Float64[Tensor, " k"], residuals: Float64[Tensor, " k"]) -> Float64[Tensor, " k"]:

@@ -60,6 +60,16 @@ class SpectralDensity:
     trace: tuple[float, float] | None = None
     missed: Float64[Tensor, " k"] | None = None
 
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{value:.4g}" for value in self.known.tolist())
+        reach = self.nodes[self.weights > 0]
+        ends = f"[{float(reach.min()):.4g}, {float(reach.max()):.4g}]" if reach.numel() else "nothing"
+        return (
+            f"spectral density of {self.dim:,} eigenvalues, nodes over {ends}\n"
+            f"  {len(self.nodes)} start vectors of {self.nodes.shape[1]} Lanczos steps at most, {self.matvecs} products\n"
+            f"  known one by one: {shown or 'none'}"
+        )
+
     @property
     def rest(self) -> int:
         """How many eigenvalues are not known."""

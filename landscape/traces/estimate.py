@@ -39,6 +39,13 @@ class TraceEstimate:
         none = torch.zeros(0, dtype=torch.float64)
         return cls(block, dim, value, 0.0, value, value, confidence, 0, matvecs, "exact", none, "exact")
 
+    def __repr__(self) -> str:
+        return (
+            f"trace of {self.block} ({self.dim:,} rows): {self.value:.6g} ± {self.standard_error:.2g}, {self.sign}\n"
+            f"  {self.confidence:.0%} in [{self.low:.6g}, {self.high:.6g}]\n"
+            f"  {self.method}, {self.probes} vectors, {self.matvecs} products; ended: {self.reason}"
+        )
+
     @property
     def half_width(self) -> float:
         """Half the length of the interval."""

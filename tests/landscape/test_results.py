@@ -8,10 +8,12 @@ from landscape.eigen.eigen import extreme_eigenpairs
 from landscape.eigen.power import power_ends
 from landscape.operators.checks import check_operator
 from landscape.results import Bracket, standard_deviation
+from landscape.slices.refinement import SliceSettings
+from landscape.slices.slices import evaluate_slice
 from landscape.spectrum.anisotropy import anisotropy
 from landscape.spectrum.density import spectral_density
 from landscape.traces.trace import estimate_traces
-from tests.landscape.spectra import generator, operator
+from tests.landscape.spectra import N, generator, operator
 
 
 @pytest.mark.parametrize("size", [1.0, 2.0**600, 2.0**-600])
@@ -43,3 +45,22 @@ def test_a_bracket_reads_as_a_sentence():
     assert str(Bracket(None, 5.0, inf, "why")) == ">= 5: why"
     assert str(Bracket(None, 0.0, 5.0, "why")) == "in [0, 5]: why"
     assert str(Bracket(None, inf, inf, "why")) == "undefined: why"
+
+
+def test_results_are_shown_in_three_lines():
+    H = operator("both tails")
+    ends = extreme_eigenpairs(H, generator())
+    density = spectral_density(H, generator(), 24, ends=ends)
+    (trace,) = estimate_traces(H, generator()).values()
+    x = torch.linspace(-1, 1, 5, dtype=torch.float64)
+    plane = evaluate_slice(
+        lambda v: (v @ v, None), torch.zeros(3), torch.eye(3)[:, :2], [x, x], settings=SliceSettings(None)
+    )
+    for result, words in (
+        (ends, f"largest   {float(ends.largest.values):.6g} ±"),
+        (density, f"of {N} eigenvalues"),
+        (trace, f"({N} rows)"),
+        (plane, "5 x 5"),
+    ):
+        lines = repr(result).splitlines()
+        assert len(lines) == 3 and max(map(len, lines)) <= 120 and words in lines[0]

@@ -16,11 +16,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Column
 
-from analysis.probe.measurement import ProbeSettings
 from analysis.runs.sweep.sweep_file import Cell, Sweep
 from analysis.train.training_time import TrainingTime
 
 Stage = Literal["train", "probe"]
+
+A_PROBE = 45.0  # seconds, before one has been made
 
 
 class SweepProgress:
@@ -104,5 +105,5 @@ class SweepProgress:
     def _probe_seconds(self) -> float:
         if self.probes:
             return mean(self.probes)
-        whole = self.sweep.probe_seconds or ProbeSettings().seconds
+        whole = self.sweep.probe_seconds or A_PROBE
         return whole + self.sweep.family_seconds * self.sweep.split_control

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -17,7 +18,11 @@ import pytest
 import torch
 from PIL import Image
 
-from analysis.commands.cli import main
+from analysis.bench.options import BenchOptions
+from analysis.commands.cli import at_files, main
+from analysis.probe.options import ProbeOptions
+from analysis.runs.options import CompareOptions
+from analysis.slice.options import SliceOptions
 from analysis.train.command import planned, render_name
 from analysis.train.options import TrainOptions
 from splat.losses.reference import psnr
@@ -395,3 +400,24 @@ def test_a_method_and_its_settings_are_named_on_the_command_line(original, tmp_p
     assert main(arguments(original, tmp_path / "other", "--method", "magic")) == 2
     assert "expected a method among 3dgs, stablegs" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
+
+
+def test_a_run_stands_for_its_checkpoint_and_a_checkpoint_for_its_run(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    named = (
+        ProbeOptions(run),
+        SliceOptions(tmp_path / "none", run),
+        BenchOptions(run),
+        CompareOptions((run, run / "checkpoint.pt")),
+    )
+    assert [at_files(options) for options in named] == [*named[:3], CompareOptions((run, run))]
+    (run / "checkpoint.pt").touch()
+    probe, line, bench, _ = (at_files(options) for options in named)
+    assert probe == ProbeOptions(run / "checkpoint.pt") and bench == BenchOptions(run / "checkpoint.pt")
+    assert line == SliceOptions(tmp_path / "none", run / "checkpoint.pt")
+
+
+def test_the_version_is_said(capsys):
+    assert main(["--version"]) == 0
+    assert re.fullmatch(r"splat-landscape \d+\.\S+\n", capsys.readouterr().out)

@@ -41,8 +41,12 @@ def test_each_type_is_read_from_text_and_from_a_plain_value():
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("warmup", "1", "of the training .*iterations.* or of the method stablegs .*warm_up.*, got 'warmup'"),
-        ("probe.gama", "1", "expected a setting among .*gamma.*, got 'gama' in 'probe.gama'"),
+        (
+            "warmup",
+            "1",
+            "of the training .* or of the method stablegs .*warm_up.*, got 'warmup'; did you mean warm_up.$",
+        ),
+        ("probe.gama", "1", "expected a setting among .*gamma.*, got 'gama' in 'probe.gama'; did you mean gamma"),
         ("name", "sam", "expected a setting of the training"),
         ("densify", "1", "name of a single setting, as in densify.enabled"),
         ("seed.x", "1", "'seed' to be the last name"),

@@ -143,8 +143,8 @@ def test_positions_are_split_along_and_across_the_rays(record, dense):
         assert row.ratio == pytest.approx(row.depth / row.lateral, rel=1e-12)
         assert min(row.depth_error, row.lateral_error, row.ratio_error) > 0
         assert 0 <= row.depth_crossed <= 1
-    console = Console(width=140, record=True, file=StringIO())
-    console.print(probe_table(record.data))
+    console = Console(width=200, record=True, file=StringIO())
+    console.print(probe_table(record.data, 200))
     table = console.export_text()
     assert "depth gradient / lateral" in table and "depth curvature / lateral" in table
     assert all(f"depth / lateral rise, {step:g} px" in table for step in STEPS)

@@ -3,17 +3,23 @@
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from io import StringIO
+from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from analysis.commands.cli import main
-from analysis.console.budget import SHARES
 from analysis.probe.command import run_probe
-from analysis.probe.measurement import ProbeSettings
+from analysis.probe.measurement import STAGES
 from analysis.probe.options import ProbeOptions
+from analysis.probe.settings import ProbeSettings
+from analysis.probe.summary import summary
 from analysis.records.json_files import plain
+from analysis.records.quantities import measured, quantity
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.schema import INDICES
+from analysis.records.tables import HARD_SPACE, probe_table
 from splat.curvature.hessian import SceneHessian
 from splat.losses.reference import LossSettings
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
@@ -33,7 +39,7 @@ def test_the_record_has_counts_checks_stages_and_provenance(record, dense, run):
     assert set(data.checks) == {"symmetry", "round_off", "finiteness", "finite_difference"}
     assert data.objective.value == pytest.approx(value, rel=1e-12)
     assert data.objective.gradient_norm == pytest.approx(float(gradient.norm()), rel=1e-9)
-    stages = ["load", "linearise", "checks", *SHARES, "pictures"]
+    stages = ["load", "linearise", "checks", *(name for name in STAGES if name != "power iteration"), "pictures"]
     assert list(data.timing) == [*stages, "total"]
     assert sum(data.timing[stage] for stage in stages) <= data.timing["total"]
     provenance = data.provenance
@@ -48,13 +54,14 @@ def test_what_was_skipped_is_counted_and_its_time_said(record, dense, run):
     objective, _, _, _ = dense
     skipped, gaussians = record.data.skipped, load_checkpoint(run / "double.pt").training.gaussians
     views = list(objective.linearized)
+    most = max(trace.probes for trace in record.data.traces.values())
     assert {name: skip.count for name, skip in skipped.items()} == {
         "gaussians_out_of_sight": len(gaussians) - len(objective.active),
         "sh_bands_not_in_use": 0,
         "entries_behind_opaque_fronts": sum(view.intersections_behind for view in views),
         "tiles_of_zero_cotangent": sum(view.dark_tiles for view in views),
         "products_of_views_not_concerned": 0,
-        "samples_of_finished_traces": sum(128 - trace.probes for trace in record.data.traces.values()),
+        "samples_of_finished_traces": sum(most - trace.probes for trace in record.data.traces.values()),
         "points_of_the_slice_predicted": int((~record.arrays["slice"]["evaluated"]).sum()),
     }
     undone = [skipped[name] for name in ("samples_of_finished_traces", "points_of_the_slice_predicted")]
@@ -105,9 +112,9 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_does_not(run, rec
 
 def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_pictures, monkeypatch):
     monkeypatch.setenv("COLUMNS", "140")
-    assert main(["probe", str(run / "checkpoint.pt"), "--quick"]) == 0
+    assert main(["probe", str(run), "--quick", "--verbose"]) == 0
     said = capsys.readouterr()
-    data = read_record(run / "probe").data
+    data = read_record(run / "probe-quick").data
     assert data.provenance.dtype == "float32" and data.slice.points == 21 * 21
     assert set(dict(data.eigenvalues.items())) == {"max", "second", "min"} and "power iteration" not in said.out
     # what it left out is said, in the record and aloud
@@ -121,10 +128,10 @@ def test_the_table_shows_every_attribute_and_the_files_to_open(run, capsys, no_p
     assert skips["gaussians_out_of_sight"].count == data.counts.skipped_gaussians
     for label in ("position", "log scale", "rotation", "opacity", "colour (SH)"):
         assert f"trace of {label}" in said.out
-    for label in ("largest eigenvalue", "smallest eigenvalue", "literal", "saddle", "check: symmetry"):
+    for label in ("largest eigenvalue", "smallest eigenvalue", "literal", "saddle", "checks passed"):
         assert label in said.out
-    assert "effective rank" not in said.out and "not necessarily the end" in said.out
-    assert str(run / "probe" / "report.html") in said.out and "probe.json" in said.out
+    assert "effective rank" not in said.out and "not necessarily the end" in " ".join(said.out.split())
+    assert str(run / "probe-quick" / "report.html") in said.out and "probe.json" in said.out
     for stage in ("traces", "eigenvalues", "slice"):
         assert stage in said.err
 
@@ -142,16 +149,44 @@ def test_a_quick_probe_leaves_out_the_same_pictures_however_it_is_started(run, t
     assert begun == drawn == [("make_all",)]
 
 
-def test_a_budget_that_ends_is_said_and_what_was_reached_is_recorded(run, tmp_path, capsys, no_pictures):
+def test_time_that_ends_is_said_and_the_same_command_continues_to_the_same_numbers(
+    run, record, tmp_path, capsys, no_pictures
+):
     out = tmp_path / "short"
-    assert main(["probe", str(run / "checkpoint.pt"), "--out", str(out), "--seconds", "1e-6"]) == 0
-    data = read_record(out).data
-    assert data.eigenvalues.max.reason == "time budget"
-    assert (data.slice.points, data.slice.evaluated_points, data.slice.resolved) == (41 * 41, 81, False)
+    words = ["probe", str(run / "double.pt"), "--out", str(out), "--slice-points", "5"]
+    assert main([*words, "--seconds", "1e-6"]) == 0
+    data, said = read_record(out).data, " ".join(capsys.readouterr().out.split())
+    assert data.eigenvalues.max.reason == "time budget" and data.slice is None and data.depth is None
+    assert any("time ended before: slice, density, finite probe, depth" in note for note in data.notes)
     assert data.anisotropy.share.value is None
-    assert any("density was left out" in note for note in data.notes)
-    assert data.depth.rises == [] and any("steps along the rays were left out" in note for note in data.notes)
-    assert "density was left out" in " ".join(capsys.readouterr().out.split())
+    # what is not known is no number, and the command that resolves it is named
+    assert "curvature from – (not reached) to – (not reached)" in said and "λ max / λ min = –" in said
+    assert f"landscape probe {run / 'double.pt'} --out {out} --slice-points 5" in said
+    assert main(words) == 0
+    again, whole = numbers(read_record(out)), numbers(record)
+    assert again[1] == whole[1] and again[0]["eigenvalues"] == whole[0]["eigenvalues"]
+    assert not list(tmp_path.glob(".short.unfinished"))
+
+
+def test_the_summary_takes_six_short_lines(record):
+    lines = summary(record.data, Path("run/probe/report.html"))
+    assert len(lines) == 6 and all(len(line) <= 90 for line in lines)
+    ranked = [quantity(trace.value) for trace in sorted(record.data.traces.values(), key=lambda t: -abs(t.value))]
+    places = [lines[2].index(text) for text in ranked]
+    assert places == sorted(places) and "all 4 passed" in lines[4] and "±" in lines[3]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_table_wraps_no_number(record, width):
+    console = Console(width=width, file=StringIO())
+    console.print(probe_table(record.data, width))
+    text = console.file.getvalue().replace(HARD_SPACE, " ")  # pyright: ignore[reportAttributeAccessIssue]
+    assert "…" not in text and max(map(len, text.splitlines())) <= width
+    data = record.data
+    for value, error in [(t.value, t.standard_error) for t in data.traces.values()] + [
+        (row.depth, row.depth_error) for row in data.depth.rises
+    ]:
+        assert measured(value, error) in text
 
 
 def skewed():
@@ -177,6 +212,12 @@ def test_a_failed_check_is_an_error_only_when_strict_and_is_recorded(run, tmp_pa
 
 
 def test_settings_out_of_range_are_refused():
-    for wrong in ({"slice_points": 3}, {"slice_points": 6}, {"slice_rise": 0.0}, {"seconds": 0.0}, {"memory": -1.0}):
+    for wrong in (
+        {"slice_points": 3},
+        {"slice_points": 6},
+        {"slice_rise": 0.0},
+        {"density_matvecs": 5},
+        {"memory": -1.0},
+    ):
         with pytest.raises(ValueError, match="expected"):
             replace(ProbeSettings(), **wrong)

@@ -85,13 +85,21 @@ def test_a_probe_that_is_killed_leaves_the_old_record_whole(run, record, tmp_pat
     assert (out / "probe.json").read_bytes() == before and read_record(out).data.provenance.dtype == "float64"
 
 
-def test_an_interrupted_probe_writes_nothing(run, tmp_path, monkeypatch):
+def test_an_interrupted_probe_keeps_its_stages_and_says_how_to_go_on(run, tmp_path, monkeypatch, capsys):
     def interrupt(target):
         raise KeyboardInterrupt
 
+    words = ["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]
     monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(interrupt))
-    assert main(["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"]) == 130
-    assert list(tmp_path.iterdir()) == []
+    assert main(words) == 130
+    assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]
+    said = capsys.readouterr().err
+    assert "kept: eigenvalues, slice, traces; the same command continues" in said and " ".join(words) in said
+    monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(lambda target: []))
+    monkeypatch.setattr("analysis.probe.measurement.extreme_eigenpairs", None)  # it is not searched for again
+    assert main([*words, "--strict"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["probe"]
+    assert read_record(tmp_path / "probe").data.eigenvalues.max.reason == "tolerance"
 
 
 def test_numbers_are_kept_where_the_pictures_fail(run, tmp_path, monkeypatch):

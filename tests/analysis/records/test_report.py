@@ -3,15 +3,18 @@ import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from io import StringIO
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from analysis.records.findings import findings
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
 from analysis.records.report import interactive_surface, numbers, write_report
+from analysis.records.tables import probe_table
 from tests.recorded import depth_section, probe_of, synthetic, written
 
 UNPACKS = 'new DecompressionStream("gzip")'  # plotly.js
@@ -333,3 +336,34 @@ def test_needles_are_counted_and_notes_are_sentences():
         data
     )
     assert "The slice was left out." in said
+
+
+@pytest.mark.parametrize(
+    ("index", "settings", "reason", "command"),
+    [
+        (
+            "mass_quantile",
+            {"density_matvecs": 108},
+            "tolerance",
+            "landscape probe run --out there --density-products 432",
+        ),
+        ("literal", {}, "time budget", "landscape probe run --out there"),
+        ("literal", {}, "matvec budget", "landscape probe run --out there --end-products 60"),
+        ("literal", {}, "noise floor", None),
+    ],
+)
+def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_resolves_it(
+    tmp_path, index, settings, reason, command
+):
+    data, arrays = synthetic()
+    data["anisotropy"][index] = {"value": -361.25, "low": 0.5, "high": None, "note": "open"}
+    data["eigenvalues"]["min"] |= {"reason": reason, "matvecs": 15}
+    data["provenance"] |= {"settings": settings, "command": "landscape probe run --seconds 45 --out there"}
+    (line,) = (line for line in findings(probe_of(data)) if line.level == "open")
+    assert line.text.startswith(f"{index.replace('_', ' ').capitalize()}: – (between 0.500 and –); ")
+    assert line.text.endswith(f"{command}." if command else "no more products resolve it.")
+    text = Page(page(tmp_path / "probe", data, arrays)).text
+    assert "361" not in text and "0.500" in text
+    console = Console(width=120, file=StringIO())
+    console.print(probe_table(probe_of(data), 120))
+    assert "361" not in console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]

@@ -16,6 +16,7 @@ from splat.losses.reference import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.methods.sam import SAM
 from tests.figures.test_trajectory_figure import rows
 from tests.recorded import depth_section, synthetic, written
 
@@ -146,6 +147,39 @@ def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(train
             f"by {quantity(0.01 * scale)} (root mean square; {quantity(40 / scale)} dB), and 182 of the halves" in page
         )
         assert bracketed(Index(value=7 * scale, low=6 * scale, high=9 * scale, note="")).bracket in page
+
+
+def test_runs_with_the_same_parameters_are_said_to_be_the_same(runs, capsys, no_pictures):
+    shutil.copy(Path(runs[0]) / "checkpoint.pt", Path(runs[1]) / "checkpoint.pt")
+    assert main(["compare", *runs]) == 0
+    assert capsys.readouterr().out.startswith("sam/0: parameters are identical to plain/0.")
+    changed(runs[1], method=SAM())
+    assert main(["compare", *runs]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("sam/0: the method never acted: parameters are identical to plain/0.")
+    page = (Path(runs[0]).parents[1] / "compare/compare.html").read_text()
+    assert page.index("never acted") < page.index("<h2>Pictures") < page.index("<h2>Numbers")
+
+
+def test_seeds_are_compared_by_mean_and_spread(runs, capsys, no_pictures, tmp_path):
+    folders = [Path(run).parent for run in runs]
+    for folder, scale in zip(folders, (1.0, 0.5), strict=True):
+        shutil.copytree(folder / "0", folder / "1")
+        shutil.rmtree(folder / "1/probe")
+        record(folder / "1/probe", 1.1 * scale)
+    assert main(["compare", *map(str, folders), "--out", str(tmp_path / "cells")]) == 0
+    said, page = capsys.readouterr().out, (tmp_path / "cells/compare.html").read_text()
+    assert "sam and plain differ by more than the spread of their seeds in" in said and "trace of position" in said
+    trace = synthetic(1.0)[0]["traces"]["means"]["value"]
+    cell = measured(1.05 * trace, 0.1 * trace / 2**0.5)
+    assert cell in said and cell in page and "The pictures show the first run of each group" in said
+    table = pd.read_csv(tmp_path / "cells/compare.csv")
+    assert set(table["run"]) == {"plain/0", "plain/1", "sam/0", "sam/1"}
+    assert json.loads((tmp_path / "cells/compare.json").read_text())["runs"].keys() == {"plain", "sam"}
+    named = ["--group", f"A={folders[0]}/0,{folders[0]}/1", "--group", f"B={folders[1]}/0,{folders[1]}/1"]
+    assert main(["compare", *named, "--out", str(tmp_path / "named")]) == 0
+    assert "B and A differ by more than the spread of their seeds in" in capsys.readouterr().out
+    refused(capsys, ["--group", "A"], "--group LABEL=RUN,RUN")
 
 
 def test_pictures_are_drawn_from_the_records_and_lie_in_the_page(trained, tmp_path):

@@ -3,9 +3,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from landscape.eigen.power import PowerSettings, power_ends, power_iteration
+from landscape.eigen.lanczos import lanczos
+from landscape.eigen.power import PowerSettings, power_ends, power_iteration, power_of_runs
 from landscape.operators.operator import CountingOperator, DenseOperator
-from tests.landscape.spectra import Broken, eigenvalues, generator, operator
+from tests.landscape.spectra import Broken, N, eigenvalues, generator, operator
 
 
 @pytest.mark.parametrize("name", ["power law", "both tails", "clustered", "negative", "multiple"])
@@ -40,8 +41,36 @@ def test_power_iteration_says_when_its_budget_ends_it():
     H = CountingOperator(operator("indefinite"))
     ends = power_ends(H, generator(), PowerSettings(rtol=1e-12, max_matvecs=15))
     assert ends.largest.reason == "matvec budget" and H.matvecs == ends.matvecs == 30
-    late, steps = power_iteration(operator("indefinite"), generator(), PowerSettings(rtol=1e-12, max_seconds=0.0))
-    assert (late.reason, steps) == ("time budget", 1)
+
+
+@pytest.mark.parametrize("name", ["power law", "both tails", "clustered", "negative", "indefinite"])
+@pytest.mark.parametrize("steps", [1, 2, 9, 25])
+def test_lanczos_runs_hold_the_iterates_of_power_iteration(name, steps):
+    H, Z = operator(name), torch.randn(N, 2, generator=generator(), dtype=torch.float64)
+    settings = PowerSettings(rtol=0.0, max_matvecs=steps)
+    ends = power_of_runs(lanczos(H, Z, max(steps, 12)), settings)
+    first, _ = power_iteration(H, generator(), settings, start=Z[:, 0])
+    other, _ = power_iteration(H, generator(), settings, shift=float(first.values), start=Z[:, 1])
+    size = float(eigenvalues(H).abs().max())
+    for found, true in zip(
+        (ends.smallest, ends.largest), sorted((first, other), key=lambda pair: float(pair.values)), strict=True
+    ):
+        assert abs(float(found.values - true.values)) < 1e-10 * size
+        assert abs(float(found.residuals - true.residuals)) < 1e-10 * size
+        assert float((found.vectors - true.vectors).norm()) < 1e-10
+        assert found.reason == "matvec budget"
+    assert ends.matvecs == 0
+
+
+def test_iterates_end_where_the_lanczos_run_does_unless_it_found_all_there_is():
+    H, Z = operator("both tails"), torch.randn(N, 1, generator=generator(), dtype=torch.float64)
+    settings = PowerSettings(rtol=0.0, max_matvecs=3000)
+    short, _ = power_iteration(H, generator(), replace(settings, max_matvecs=7), start=Z[:, 0])
+    assert float(power_of_runs(lanczos(H, Z, 7), settings).largest.residuals) == pytest.approx(float(short.residuals))
+    whole = DenseOperator(torch.diag(torch.tensor([3.0, 2.0, -1.0], dtype=torch.float64)))
+    ends = power_of_runs(lanczos(whole, torch.ones(3, 1, dtype=torch.float64), 3), settings)
+    assert float(ends.largest.values) == pytest.approx(3) and float(ends.smallest.values) == pytest.approx(-1)
+    assert ends.smallest.reason == "noise floor"
 
 
 def test_power_iteration_of_zero_is_zero():
@@ -59,7 +88,7 @@ def test_products_that_are_not_finite_are_an_error():
         power_iteration(Broken(torch.eye(5)), generator())
 
 
-@pytest.mark.parametrize("wrong", ["rtol", "atol", "max_seconds"])
+@pytest.mark.parametrize("wrong", ["rtol", "atol"])
 def test_a_power_setting_that_is_no_number_is_refused(wrong):
     with pytest.raises(ValueError, match=r"got .*nan"):
         replace(PowerSettings(), **{wrong: float("nan")})

@@ -8,9 +8,9 @@ import torch
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from landscape.eigen.lanczos import lanczos
 from landscape.linalg import norm
-from landscape.operators.operator import DenseOperator
+from landscape.operators.operator import DenseOperator, ProjectedOperator
 from landscape.spectrum.absolute_sum import absolute_integral, absolute_sum
-from landscape.spectrum.density import FIRST_LOOK, Lengths, spectral_density
+from landscape.spectrum.density import FIRST_LOOK, Lengths, spectral_density, without
 from landscape.spectrum.quantiles import absolute_quantile
 from landscape.spectrum.rules import SpectralDensity
 from landscape.traces.estimate import TraceEstimate
@@ -37,6 +37,37 @@ def errors(H, f, **given):
     found = [spectral_density(H, generator(seed), 48, 4, **given).integral(f).value for seed in range(RUNS)]
     off = torch.tensor(found, dtype=torch.float64) / truth - 1
     return float(off.square().mean().sqrt()), float(off.mean())
+
+
+@pytest.mark.parametrize("steps", [5, 12, 40])
+@pytest.mark.parametrize("name", ["power law", "both tails", "indefinite"])
+def test_eigenvectors_taken_out_of_a_run_leave_that_of_the_others(name, steps):
+    H = operator(name)
+    values, vectors = torch.linalg.eigh(H.matrix)
+    known, size = torch.tensor([0, N - 2, N - 1]), float(values.abs().max())
+    V, z = vectors[:, known], torch.randn(N, 1, generator=generator(), dtype=torch.float64)
+    projected = ProjectedOperator(H, lambda X: X - V @ (V.T @ X))
+    (whole,), (direct,) = lanczos(H, z, steps), lanczos(projected, z - V @ (V.T @ z), steps, scale=size)
+    found = without(whole, V, values[known], 0.0)
+    assert steps - 3 <= len(found.T) and float((V.T @ found.Q).norm()) < 1e-6
+    if len(found.T) == steps:  # a Lanczos run of H
+        R = H.matrix @ found.Q - found.Q @ found.T
+        assert float(R[:, :-1].norm()) < 1e-7 * size and float((R[:, -1] - found.r).norm()) < 1e-7 * size
+    for degree in range(2 * steps - 8):  # the moments of the start vector's measure of the others
+        moments = [float(torch.linalg.matrix_power(run.T / size, degree)[0, 0]) for run in (found, direct)]
+        assert moments[0] == pytest.approx(moments[1], abs=1e-7), degree
+
+
+def test_whoever_watches_sees_runs_with_the_ends_in_them_and_the_density_is_that_without():
+    H, seen = operator("both tails"), []
+    density = spectral_density(H, generator(), 48, 4, ends=ends_of(H, 1e-9), watch=seen.extend)
+    unseen = spectral_density(H, generator(), 48, 4, ends=ends_of(H, 1e-9))
+    values = eigenvalues(H)
+    assert float(torch.stack([torch.linalg.eigvalsh(run.T)[-1] for run in seen]).min()) > float(values[-4])
+    assert torch.allclose(density.known, unseen.known) and density.matvecs == unseen.matvecs == 48
+    assert density.integral(torch.square).value == pytest.approx(unseen.integral(torch.square).value, rel=1e-9)
+    total = density.integral(torch.abs)
+    assert total.low < unseen.integral(torch.abs).value < total.high
 
 
 @pytest.mark.parametrize("f", [torch.abs, torch.square])

@@ -1,0 +1,163 @@
+"""What the stages of long work found, kept in a folder until the work is done: the same command continues from there.
+
+A stage writes its result when it ends, in a file of its own and at once.  The folder is for one command: what another one left
+(other settings, another checkpoint, another version) is not read.  Results are dataclasses and `msgspec` structures, whose
+types are checked on reading.
+"""
+
+import hashlib
+import shutil
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from math import inf
+from pathlib import Path
+from time import monotonic
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+import torch
+from torch import Tensor
+
+from analysis.console.stages import Stages
+from landscape.probes import spawn
+from landscape.results import Progress
+
+T = TypeVar("T")
+
+
+class TimeUp(Exception):
+    """The time that the command was given has ended."""
+
+
+class Entry(msgspec.Struct):
+    """A stage's result, the notes it made, how often it did what is counted, and the seconds it took."""
+
+    key: str
+    value: msgspec.Raw
+    notes: list[str]
+    counts: list[int]
+    seconds: float
+
+
+class Kept:
+    """Runs stages, or reads what they found before.
+
+    folder: None to keep nothing.  told: all that the numbers depend on, as text.  streams: names of all stages; each draws from
+    a stream of its own, so that its numbers do not depend on which others have run.  count: of products and such, so far.
+    deadline: by `monotonic`; a stage under way is then given up, one to come is not begun.
+
+    notes, counts: of all stages; unreached: stages that time did not reach.
+    """
+
+    def __init__(
+        self,
+        stages: Stages,
+        generator: torch.Generator,
+        streams: Sequence[str],
+        count: Callable[[], list[int]] = lambda: [],
+        folder: Path | None = None,
+        told: str = "",
+        deadline: float = inf,
+    ) -> None:
+        self.stages, self.folder, self.count, self.deadline = stages, folder, count, deadline
+        self.key = hashlib.sha256(told.encode()).hexdigest()
+        self.streams = {name: spawn(generator) for name in streams}
+        self.notes: list[str] = []
+        self.counts: list[int] = []
+        self.unreached: list[str] = []
+
+    @property
+    def left(self) -> float:
+        """Seconds."""
+        return max(self.deadline - monotonic(), 0.0)
+
+    def run(
+        self, name: str, kind: type[T], work: Callable[[torch.Generator, Progress, list[str]], T], partial: bool = False
+    ) -> T | None:
+        """What the stage finds, or found before; None where time did not reach it.
+
+        work: is given random numbers, whom to tell how far it is, and where to note what it leaves out.  partial: it ends in
+        time by itself; what it has by then is returned but not kept.
+        """
+        if (entry := self._read(name)) is not None:
+            with suppress(msgspec.ValidationError):
+                value = msgspec.msgpack.decode(entry.value, type=kind, dec_hook=_tensor)
+                self.stages.known(name, entry.seconds)
+                self._add(entry)
+                return value
+        if not partial and self.left == 0:
+            self.unreached.append(name)
+            return None
+        notes, before = [], self.count()
+        try:
+            with self.stages.stage(name) as report:
+                value = work(self.streams[name], report if partial else self._timed(report), notes)
+        except TimeUp:
+            self.unreached.append(name)
+            return None
+        counts = [after - first for after, first in zip(self.count(), before, strict=True)]
+        content = msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_plain))
+        entry = Entry(self.key, content, notes, counts, self.stages.timing[name])
+        if not (partial and self.left == 0):
+            self._write(name, entry)
+        self._add(entry)
+        return value
+
+    def remove(self) -> None:
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _timed(self, report: Progress) -> Progress:
+        def timed(done: int, most: int, state: str) -> None:
+            report(done, most, state)
+            if self.left == 0:
+                raise TimeUp
+
+        return timed
+
+    def _add(self, entry: Entry) -> None:
+        self.notes += entry.notes
+        self.counts = [sum(both) for both in zip(self.counts or [0] * len(entry.counts), entry.counts, strict=True)]
+
+    def _read(self, name: str) -> Entry | None:
+        """None also for what is damaged: it is measured again."""
+        if self.folder is None:
+            return None
+        with suppress(OSError, msgspec.DecodeError):
+            entry = msgspec.msgpack.decode(self._file(name).read_bytes(), type=Entry)
+            return entry if entry.key == self.key else None
+        return None
+
+    def _write(self, name: str, entry: Entry) -> None:
+        if self.folder is None:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        file = self._file(name)
+        temporary = file.with_suffix(".tmp")
+        temporary.write_bytes(msgspec.msgpack.encode(entry))
+        temporary.replace(file)
+
+    def _file(self, name: str) -> Path:
+        assert self.folder is not None
+        return self.folder / f"{name.replace(' ', '-')}.msgpack"
+
+
+def kept_stages(folder: Path) -> list[str]:
+    """The stages that are kept in a folder."""
+    return sorted(file.stem.replace("-", " ") for file in folder.glob("*.msgpack"))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        array = value.detach().cpu().numpy()
+        return {"device": value.device.type, "dtype": array.dtype.str, "shape": array.shape, "bytes": array.tobytes()}
+    raise NotImplementedError(f"expected a tensor, got {type(value).__name__}")
+
+
+def _tensor(kind: type, content: Any) -> Tensor:
+    try:
+        array = np.frombuffer(content["bytes"], dtype=np.dtype(content["dtype"])).reshape(content["shape"])
+        return torch.from_numpy(array.copy()).to(content["device"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"expected a tensor, got {error}") from None

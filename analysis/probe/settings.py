@@ -1,0 +1,76 @@
+"""How much of everything a probe measures."""
+
+from dataclasses import dataclass, field
+
+from analysis.measures.depth import STEPS as DEPTH_STEPS
+from landscape import EigenSettings, PowerSettings, TraceSettings
+from landscape.errors import InputError
+from landscape.slices.finite_probe import NOISE_POINTS, STEPS
+
+FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density's run and along a side of a slice
+FEWEST_PRODUCTS = 16  # of a density
+
+
+@dataclass(frozen=True)
+class ProbeSettings:
+    """How much of everything; the defaults are for numbers to 1%.
+
+    checked_vectors, checked_views: of the self-checks; None: all views.
+    trace_samples: exactly so many for each trace; None: as many as `traces` asks for.
+    power: iterates of power iteration; power_apart: with products of its own.  density_matvecs: products of the spectral
+        density, of which a tenth sees the ends again; 0: it is left out.
+    slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
+        of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
+        slice_plane: whether to render more than its two axes.
+    probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
+        noise of a render.
+    depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
+    memory: GiB for the vectors of a basis.
+    """
+
+    checked_vectors: int = 4
+    checked_views: int | None = None
+    traces: TraceSettings = field(default_factory=lambda: TraceSettings(rtol=0.01, max_probes=2048))
+    trace_samples: int | None = None
+    eigen: EigenSettings = field(default_factory=lambda: EigenSettings(largest=2, smallest=1, max_matvecs=3000))
+    power: PowerSettings = field(default_factory=lambda: PowerSettings(max_matvecs=40))
+    power_apart: bool = False
+    density_matvecs: int = 108
+    slice_points: int = 41
+    slice_radius: float = 3.0
+    slice_rise: float = 0.001
+    slice_tolerance: float = 0.01
+    slice_plane: bool = True
+    probe_steps: tuple[float, ...] = STEPS
+    depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=1024))
+    depth_steps: tuple[float, ...] = DEPTH_STEPS
+    noise_points: int = NOISE_POINTS
+    memory: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.slice_points < FEWEST_POINTS or self.slice_points % 2 == 0:
+            raise InputError(
+                f"expected an odd number of at least {FEWEST_POINTS} slice points, got {self.slice_points}"
+            )
+        if not (self.slice_radius > 0 and self.slice_rise > 0):
+            raise InputError(f"expected slice_radius and slice_rise > 0, got {self.slice_radius} and {self.slice_rise}")
+        if not self.memory > 0:
+            raise InputError(f"expected memory > 0, got {self.memory}")
+        if self.density_matvecs and self.density_matvecs < FEWEST_PRODUCTS:
+            raise InputError(f"expected {FEWEST_PRODUCTS} products of the density or more, got {self.density_matvecs}")
+
+    @classmethod
+    def quick(cls) -> "ProbeSettings":
+        """Numbers to 10%, in a quarter of the time."""
+        return cls(
+            checked_vectors=2,
+            checked_views=1,
+            traces=TraceSettings(rtol=0.1),
+            trace_samples=5,
+            eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=1000),
+            density_matvecs=0,
+            slice_points=21,
+            slice_plane=False,
+            probe_steps=(),
+            depth=None,
+        )
