@@ -4,7 +4,8 @@ compare_traces      |trace| of every attribute with its interval; filled: positi
 compare_densities   the share of directions whose curvature is at most -x (left) or at least x (right), both axes logarithmic;
                     means over the start vectors of the quadrature, thin: each of these alone; dashed: the ends of the
                     spectrum
-compare_slices      the planes of the two steepest directions, cut to the steps that all slices reach, with the same levels
+compare_slices      the planes of the two steepest directions, cut to the steps that all slices reach, with the same levels;
+                    dots: renders
 compare_sections    the loss along each of these directions, as far as each slice goes
 """
 
@@ -23,6 +24,7 @@ from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.run_files import COMPARISON, read_comparison
 from analysis.records.schema import Trace
 from figures.plane import Plane, plane, same_scale
+from figures.slice2d import RENDERED
 from figures.style import (
     BLACK,
     COLUMN,
@@ -136,7 +138,7 @@ def beyond(nodes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def draw_slices(records: Records) -> Figure:
     """The planes in the window that all of them have."""
-    planes = {label: plane(record) for label, record in records.items() if "slice" in record.arrays}
+    planes = {label: plane(record) for label, record in records.items() if _has_surface(record)}
     reach = [min(float(np.abs(getattr(field, axis).steps).max()) for field in planes.values()) for axis in "xy"]
     exponent = exponent_of(*reach)
     windows = {label: _window(field, *reach) for label, field in planes.items()}
@@ -151,11 +153,15 @@ def draw_slices(records: Records) -> Figure:
         figure = new_figure(0.4 + (0.3 + min(WIDTH / columns * shape, TALLEST)) * rows, 2 * COLUMN)
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         filled = None
-        for axes, (label, (x, y, change, _)) in zip(panels.ravel(), windows.items(), strict=False):
+        for axes, (label, (x, y, change, _)), field in zip(
+            panels.ravel(), windows.items(), planes.values(), strict=False
+        ):
             values, steps = change.T / 10.0**power, (x / 10.0**exponent, y / 10.0**exponent)
             axes.set_facecolor(MISSING)
             filled = axes.contourf(*steps, values, levels=levels, cmap=FIELD_MAP, extend="both")
             axes.contour(*steps, values, levels=levels, colors=BLACK, linewidths=0.4)
+            i, j = np.nonzero(field.dots)
+            axes.plot(steps[0][i], steps[1][j], **RENDERED)
             axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
             axes.set_title(literal(label), loc="left")
             axes.set(
@@ -169,6 +175,11 @@ def draw_slices(records: Records) -> Figure:
         figure.supylabel(f"step along the second{unit_suffix(exponent)}", fontsize=7)
         figure.colorbar(filled, ax=panels, label=f"change of loss{unit_suffix(power)}")  # pyright: ignore[reportArgumentType]
     return figure
+
+
+def _has_surface(record: Record[ProbeRecord]) -> bool:
+    about = record.data.slice
+    return "slice" in record.arrays and about is not None and about.resolved
 
 
 def _window(field: Plane, x: float, y: float) -> tuple[np.ndarray, np.ndarray, np.ma.MaskedArray, np.ndarray]:
@@ -233,7 +244,8 @@ def draw_comparison(folder: Path, suffix: str = "png") -> list[Path]:
     records = {label: read_record(path, ProbeRecord) for label, path in read_comparison(folder).runs.items()}
     arrays = [record.arrays for record in records.values()]
     known = {"compare_densities": any("nodes" in each.get("spectrum", {}) for each in arrays)}
-    known |= dict.fromkeys(("compare_slices", "compare_sections"), any("slice" in each for each in arrays))
+    known |= {"compare_slices": any(map(_has_surface, records.values()))}
+    known |= {"compare_sections": any("slice" in each for each in arrays)}
     return [save(draw(records), folder / f"{name}.{suffix}") for name, draw in FIGURES.items() if known.get(name, True)]
 
 

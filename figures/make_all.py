@@ -22,9 +22,10 @@ FIGURES = {
 
 def recorded_figures(record: Record) -> tuple[str, ...]:
     """Names of the figures that the record has the numbers for."""
-    axes = len(record.data.slice.directions) if record.data.slice and "slice" in record.arrays else 0
+    slice = record.data.slice if "slice" in record.arrays else None
+    axes = len(slice.directions) if slice else 0
     known = {"traces": isinstance(record.data, ProbeRecord), "spectrum": "spectrum" in record.arrays}
-    known |= {"slice1d": axes == 1, "slice2d": axes == 2, "surface": axes == 2}
+    known |= {"slice1d": axes == 1, "slice2d": axes == 2, "surface": axes == 2 and bool(slice and slice.resolved)}
     return tuple(name for name in FIGURES if known[name])
 
 

@@ -123,9 +123,11 @@ def _record_of(run: Path) -> Record:
                 raise ValueError(
                     f"expected a slice along {' and '.join(NAMES)} in {run / name}, got others; {_slice(run)}"
                 )
-            return found
+            if found.data.slice is None or found.data.slice.resolved:
+                return found
     raise FileNotFoundError(
-        f"expected a slice of {run} in {' or '.join(str(run / name) for name, _ in SLICES)}, found none; {_slice(run)}"
+        f"expected a slice of {run} in {' or '.join(str(run / name) for name, _ in SLICES)}, with a surface, "
+        f"found none; {_slice(run)}"
     )
 
 

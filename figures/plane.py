@@ -3,7 +3,7 @@
 x, y        steps along the two directions: in units of the stored parameters where they are unit vectors, else as `scale` says
 change      loss minus the loss at the centre
 unit        sqrt(2 loss_scale / |curvature|): the step within which the curvature alone changes the loss by loss_scale
-evaluated   a point that is a true render; the others are interpolated
+evaluated   a point that is a true render; the others are interpolated, or unknown where the plane is not resolved
 crossed     a render whose order of splats or set of visible ones is not the centre's: the loss may jump on the way there
 """
 
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.records import schema
+from analysis.records.findings import unresolved
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
 from figures.style import exponent_of, literal, unit_suffix
@@ -29,6 +30,7 @@ class Direction:
     steps: np.ndarray
     exponent: int
     scale: str = "param. units"
+    kind: str = ""
 
     @property
     def label(self) -> str:
@@ -52,7 +54,8 @@ class Direction:
 class Plane:
     """change, model [nx, ny], masked where not finite, in units of 10**exponent; model and crossed may be absent.
 
-    interpolation_error: as a share of the range of the loss; 0 where every point is evaluated, None where unbounded.
+    error: of the interpolation, as a share of the range of the loss: the tolerance that its bound met; 0 where every point
+    is evaluated.  unresolved: why there is no surface, in words; empty where there is one.
     """
 
     x: Direction
@@ -61,13 +64,25 @@ class Plane:
     model: np.ma.MaskedArray | None
     crossed: np.ndarray | None
     evaluated: np.ndarray
-    interpolation_error: float | None
+    error: float | None
+    unresolved: str
     exponent: int
     loss_scale: float
 
     @property
     def label(self) -> str:
         return f"change of loss{unit_suffix(self.exponent)}"
+
+    @property
+    def others(self) -> list[tuple[float, float]]:
+        """Where other checkpoints lie: at the ends of lines."""
+        lines = [direction.kind == "line" for direction in (self.x, self.y)]
+        return [place for place, line in zip([(1.0, 0.0), (0.0, 1.0)], lines, strict=True) if line]
+
+    @property
+    def dots(self) -> np.ndarray:
+        """Renders, which pictures mark where there are other points."""
+        return self.evaluated & (not self.evaluated.all())
 
     @property
     def crossed_share(self) -> float | None:
@@ -99,7 +114,8 @@ def plane(record: Record) -> Plane:
         model=masked[1] if len(masked) == 2 else None,
         crossed=arrays.get("crossed"),
         evaluated=arrays.get("evaluated", np.ones(arrays["loss"].shape, bool)),
-        interpolation_error=about.interpolation_error,
+        error=about.interpolation_error if about.tolerance is None else about.tolerance,
+        unresolved="" if about.resolved else unresolved(about, record.data.provenance),
         exponent=exponent,
         loss_scale=about.loss_scale,
     )
@@ -108,7 +124,9 @@ def plane(record: Record) -> Plane:
 def direction(about: schema.Direction, steps: np.ndarray, exponent: int) -> Direction:
     """An axis as it was recorded."""
     curvature, unit = (np.nan if number is None else number for number in (about.curvature, about.unit))
-    return Direction(literal(about.name), curvature, unit, steps, exponent, literal(about.scale or Direction.scale))
+    return Direction(
+        literal(about.name), curvature, unit, steps, exponent, literal(about.scale or Direction.scale), about.kind or ""
+    )
 
 
 def _alike(arrays: dict[str, np.ndarray]) -> bool:

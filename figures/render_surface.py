@@ -1,8 +1,8 @@
 """Render a height field off-screen with PyVista: `python render_surface.py FIELD.npz OUT.png`.
 
 A program of its own: where a machine has no usable OpenGL, VTK may end the process that renders.  FIELD.npz holds
-`height` [nx, ny] in [0, 1], nan where there is none, `colour` [256, 3] as bytes, and `levels`, the heights of the
-contour lines.  The scene is the box of `Box`, seen from `Box.EYE` in parallel projection.
+`height` [nx, ny] in [0, 1], nan where there is none, `dots` [nx, ny], the points to mark, `colour` [256, 3] as bytes, and
+`levels`, the heights of the contour lines.  The scene is the box of `Box`, seen from `Box.EYE` in parallel projection.
 """
 
 import sys
@@ -30,7 +30,7 @@ class Box:
         return 0.5 + (np.asarray(points) - cls.TARGET) @ np.stack([right, up], axis=1) / cls.EXTENT
 
 
-def render(height: np.ndarray, colour: np.ndarray, levels: np.ndarray, out: Path) -> None:
+def render(height: np.ndarray, dots: np.ndarray, colour: np.ndarray, levels: np.ndarray, out: Path) -> None:
     """Write the picture of the surface with its contour lines, and the lines once more on the floor, on white."""
     import pyvista as pv
     from matplotlib.colors import ListedColormap
@@ -52,6 +52,10 @@ def render(height: np.ndarray, colour: np.ndarray, levels: np.ndarray, out: Path
     if lines.n_points:
         plotter.add_mesh(lines.translate([0, 0, 0.004]), color="black", line_width=2)
         plotter.add_mesh(lines.scale([1, 1, 0]), color="#808080", line_width=2)
+    marked = dots & np.isfinite(height)
+    if marked.any():
+        places = np.stack([x[marked], y[marked], height[marked] * Box.TOP + 0.006], axis=1)
+        plotter.add_mesh(pv.PolyData(places), color="black", point_size=8, render_points_as_spheres=True)
     plotter.camera.parallel_projection = True
     plotter.camera.position = tuple(Box.TARGET + 10 * Box.EYE)
     plotter.camera.focal_point = tuple(Box.TARGET)
@@ -67,4 +71,4 @@ if __name__ == "__main__":
         print("expected FIELD.npz OUT.png; to draw a record: python -m figures.surface RUN/probe", file=sys.stderr)
         sys.exit(2)
     with np.load(sys.argv[1], allow_pickle=False) as field:
-        render(field["height"], field["colour"], field["levels"], Path(sys.argv[2]))
+        render(field["height"], field["dots"], field["colour"], field["levels"], Path(sys.argv[2]))

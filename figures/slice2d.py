@@ -1,11 +1,14 @@
 """Figure: the loss on a plane through the checkpoint, as contours, and its two cross-sections through the centre.
 
-Dots: true renders; between them the loss is interpolated.  Blue dots: crossed points, where the order of the splats or the
-set of visible ones is not the centre's.  White dashed lines: the quadratic model at the contours' levels.  Grey: no finite
-loss.  The cross-sections share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes
-count steps in curvature units, within one of which the curvature alone changes the loss by the amount named.
+Dots: true renders, among them all of the cross-sections; between them the loss is interpolated.  Blue dots: crossed points,
+where the order of the splats or the set of visible ones is not the centre's.  White dashed lines: the quadratic model at the
+contours' levels.  Grey: no finite loss.  Crosses: other checkpoints that the plane leads to.  The cross-sections share their
+vertical axis, so that a steep direction looks steep beside a flat one; their upper axes count steps in curvature units, within
+one of which the curvature alone changes the loss by the amount named.  Where too few points are renders to know the others, the
+cross-sections are drawn alone, and a sentence says what resolves the plane.
 """
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -21,6 +24,7 @@ from figures.plane import Direction, Plane, curvature_text, plane, same_scale
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
 
 LEVELS = 12
+WRAP = 76  # characters in a line of the sentence
 ACROSS, INTERVALS = 5, 3  # between ticks of the plane and of a cross-section: labels such as -0.008 stay apart
 RENDERED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": BLACK, "markeredgewidth": 0}
 CROSSED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": SKY, "markeredgewidth": 0}
@@ -30,12 +34,16 @@ def draw(record: Record) -> Figure:
     """The slice of one record.  Raises ValueError where none was recorded."""
     field = plane(record)
     with style():
-        figure = new_figure(4.7)
-        above, below = figure.subfigures(2, 1, height_ratios=[1.35, 1], squeeze=False)[:, 0]
-        axes = above.subplots()
-        contours = _draw_plane(axes, field)
-        if contours is not None:
-            above.colorbar(contours, cax=axes.inset_axes((1.03, 0.0, 0.045, 1.0)), label=field.label)
+        if field.unresolved:
+            figure = new_figure(2.9)
+            below = figure
+            figure.suptitle(textwrap.fill(field.unresolved, WRAP), fontsize=6)
+        else:
+            figure = new_figure(4.7)
+            above, below = figure.subfigures(2, 1, height_ratios=[1.35, 1], squeeze=False)[:, 0]
+            axes = above.subplots()
+            if (contours := _draw_plane(axes, field)) is not None:
+                above.colorbar(contours, cax=axes.inset_axes((1.03, 0.0, 0.045, 1.0)), label=field.label)
         first, second = below.subplots(1, 2, sharey=True)
         _draw_section(first, field.x, field, axis=0)
         _draw_section(second, field.y, field, axis=1)
@@ -65,6 +73,9 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
         axes.plot(x[rows], y[columns], **CROSSED)
     axes.xaxis.set_major_locator(MaxNLocator(ACROSS))
     axes.plot([0], [0], "+", color=VERMILION, markersize=7, markeredgewidth=1.2)
+    for place in field.others:
+        ends = place[0] / 10.0**field.x.exponent, place[1] / 10.0**field.y.exponent
+        axes.plot(*ends, "x", color=VERMILION, markersize=5, markeredgewidth=1.2)
     axes.set_xlabel(field.x.label)
     axes.set_ylabel(field.y.label)
     if same := same_scale(np.ptp(field.x.steps), np.ptp(field.y.steps)):
@@ -87,7 +98,9 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
     axes.plot(direction.scaled, line, color=BLACK)
     if not field.evaluated.all():
         known = field.evaluated.take(other.centre, axis=1 - axis)
-        axes.plot(direction.scaled[known], line[known], **RENDERED)
+        crossed = known & (False if field.crossed is None else field.crossed.take(other.centre, axis=1 - axis))
+        axes.plot(direction.scaled[known & ~crossed], line[known & ~crossed], **RENDERED)
+        axes.plot(direction.scaled[crossed], line[crossed], **CROSSED)
     if field.model is not None:
         axes.plot(direction.scaled, field.model.take(other.centre, axis=1 - axis), "--", color=VERMILION, linewidth=0.9)
     axes.axvline(0, color="0.7", linewidth=0.5, zorder=0)
@@ -105,9 +118,8 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
 def _legend(field: Plane) -> list[Line2D]:
     handles = [Line2D([], [], color=BLACK, label="loss, true renders")]
     if not field.evaluated.all():
-        error = field.interpolation_error
-        size = "unbounded" if error is None else f"{100 * error:.1g}%"
-        label = f"loss, {field.evaluated.mean():.0%} renders (error {size})"
+        size = "unbounded" if field.error is None else f"<{100 * field.error:.2g}%"
+        label = "loss, renders" if field.unresolved else f"loss, {field.evaluated.mean():.0%} renders (error {size})"
         handles = [Line2D([], [], color=BLACK, marker=".", markersize=4, label=label)]
     if field.model is not None:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))

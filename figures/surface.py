@@ -1,4 +1,4 @@
-"""Figure: the recorded slice as a surface over its two directions, rendered off-screen by PyVista.
+"""Figure: the recorded slice as a surface over its two directions, rendered off-screen by PyVista.  Dots: renders.
 
 The picture is rendered by a process of its own (`figures.render_surface`) and put behind axes drawn here, so that
 labels look like those of every other figure.  Where the renderer does not work, a warning says so, and so does the
@@ -40,8 +40,10 @@ class RendererMissing(UserWarning):
 
 
 def draw(record: Record) -> Figure:
-    """The slice of one record as a surface.  Raises ValueError where none was recorded."""
+    """The slice of one record as a surface.  Raises ValueError where none was recorded, or too few points are renders."""
     field = plane(record)
+    if field.unresolved:
+        raise ValueError(f"expected a plane that is known between its axes; {field.unresolved}")
     low, high = float(field.change.min()), float(field.change.max())
     span = high - low if high > low else 1.0
     ticks = np.asarray(MaxNLocator(5).tick_values(low, low + span))
@@ -49,12 +51,12 @@ def draw(record: Record) -> Figure:
     with style():
         figure = new_figure(2.6)
         try:
-            image = _rendered(*_heights(field))
+            image = _rendered(*_heights(field), field.dots)
         except RuntimeError as error:
             warnings.warn(
                 f"matplotlib drew the surface, because the off-screen renderer failed: {error}", RendererMissing, 2
             )
-            image = _drawn_by_matplotlib(_heights(field)[0])
+            image = _drawn_by_matplotlib(_heights(field)[0], field.dots)
             figure.supxlabel("drawn without the off-screen renderer (not available)", fontsize=6, color=VERMILION)
         axes = figure.subplots()
         axes.imshow(image, extent=(0, 1, 0, 1), interpolation="antialiased")
@@ -77,12 +79,12 @@ def _heights(field: Plane) -> tuple[np.ndarray, np.ndarray]:
     return ((field.change - low) / span).filled(np.nan), levels
 
 
-def _rendered(heights: np.ndarray, levels: np.ndarray) -> np.ndarray:
+def _rendered(heights: np.ndarray, levels: np.ndarray, dots: np.ndarray) -> np.ndarray:
     """The renderer's picture.  RuntimeError says what it said when it failed."""
     colour = (mpl.colormaps[FIELD_MAP](np.arange(256))[:, :3] * 255).astype(np.uint8)
     with tempfile.TemporaryDirectory() as folder:
         field, out = Path(folder, "field.npz"), Path(folder, "surface.png")
-        np.savez(field, height=heights, colour=colour, levels=levels[(levels > 0) & (levels < 1)])
+        np.savez(field, height=heights, colour=colour, levels=levels[(levels > 0) & (levels < 1)], dots=dots)
         try:
             done = subprocess.run(
                 [*RENDERER, str(field), str(out)], capture_output=True, text=True, timeout=TIME_LIMIT, check=False
@@ -95,7 +97,7 @@ def _rendered(heights: np.ndarray, levels: np.ndarray) -> np.ndarray:
         return imread(out)
 
 
-def _drawn_by_matplotlib(heights: np.ndarray) -> np.ndarray:
+def _drawn_by_matplotlib(heights: np.ndarray, dots: np.ndarray) -> np.ndarray:
     """Surface in the renderer's box and view, painted back to front."""
     figure = Figure(figsize=(3, 3), dpi=300)
     axes = figure.add_axes((0, 0, 1, 1))
@@ -109,6 +111,7 @@ def _drawn_by_matplotlib(heights: np.ndarray) -> np.ndarray:
     for i, j in sorted(cells, key=lambda cell: float(x[cell] * Box.EYE[0] + y[cell] * Box.EYE[1])):
         ring = corners[[i, i + 1, i + 1, i], [j, j, j + 1, j + 1]]
         axes.fill(ring[:, 0], ring[:, 1], color=colours[i, j], linewidth=0.1)
+    axes.plot(*corners[dots & np.isfinite(heights)].T, ".", color=BLACK, markersize=1.2)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())

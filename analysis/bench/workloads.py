@@ -19,7 +19,7 @@ from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.view import View
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
-from splat.training.scene_reference import SceneReference
+from splat.training.origin.scene_reference import SceneReference
 from splat.training.start import gaussians_from_points
 from splat.training.state import TrainConfig, Training
 

@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 import tyro
 
 from analysis.bench.options import BenchOptions
-from analysis.commands.options import DemoOptions, SfmOptions
+from analysis.commands.options import ConvertOptions, DemoOptions, SfmOptions
 from analysis.console.failures import report
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, TrajectoryOptions
@@ -28,6 +28,7 @@ Options = (
     | Annotated[SliceOptions, tyro.conf.subcommand("slice")]
     | Annotated[CompareOptions, tyro.conf.subcommand("compare")]
     | Annotated[ClaimsOptions, tyro.conf.subcommand("claims")]
+    | Annotated[ConvertOptions, tyro.conf.subcommand("convert")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
     | Annotated[TrajectoryOptions, tyro.conf.subcommand("trajectory")]
     | Annotated[BenchOptions, tyro.conf.subcommand("bench")]
@@ -81,7 +82,7 @@ def run(options: Options, arguments: Sequence[str]) -> int:
         case ProbeOptions():
             from analysis.console.drawing import drawing
 
-            with drawing("make_all", *options.pictures) as drawn:
+            with drawing("make_all") as drawn:
                 from analysis.probe.command import run_probe
 
                 return run_probe(options, ["landscape", *arguments], drawn)
@@ -101,6 +102,10 @@ def run(options: Options, arguments: Sequence[str]) -> int:
             from analysis.runs.claims.command import run_claims
 
             return run_claims(options)
+        case ConvertOptions():
+            from analysis.commands.convert import run_convert
+
+            return run_convert(options)
         case DemoOptions():
             from analysis.commands.demo import run_demo
 

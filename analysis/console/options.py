@@ -4,6 +4,8 @@ Each command's options are a plain dataclass beside the command, in an `options.
 The help keeps the line breaks of their docstrings: a line is a sentence.
 """
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 from tyro.conf import arg
@@ -11,3 +13,24 @@ from tyro.conf import arg
 DeviceName = Literal["auto", "cpu", "cuda"]
 T = TypeVar("T")
 Unset = Annotated[T | None, arg(help_behavior_hint="")]  # its docstring says what stands for None
+
+
+@dataclass(frozen=True)
+class ForeignOptions:
+    """What a file that another tool trained does not say; a checkpoint of landscape train holds all but max_views."""
+
+    trained_by: Unset[str] = None
+    """Of another tool's file: whose conventions to follow.
+    graphdeco, gsplat (up to 1.5; gsplat-raw without normalisation of the world), gsplat-1.6, nerfstudio, brush, lichtfeld.
+    Default: what the file says."""
+    views: Unset[int | Literal["all"]] = None
+    """Of another tool's file: number of its training views, by the scene's protocol.
+    Default: what the tool's files say, else all that are not held out."""
+    train_list: Unset[Path] = None
+    """Of another tool's file: a text file with the name of a training view in each line."""
+    images: Unset[str] = None
+    """Of another tool's file: folder of images within the scene."""
+    downscale: Unset[float] = None
+    """Of another tool's file: factor by which its images were reduced.  Default: what its tool does."""
+    max_views: Unset[int] = None
+    """Measure on at most so many training views, spread evenly over the cameras.  Default: all."""

@@ -18,6 +18,7 @@ from splat.model.typed import leaves
 from splat.training.state import MethodSettings, TrainConfig
 
 T = TypeVar("T")
+LABELS = ("name", "protocol")  # say which settings the others are
 
 
 def assignments(texts: Sequence[str]) -> dict[str, str]:
@@ -57,11 +58,11 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
 
 def _names(settings: TrainConfig | MethodSettings) -> list[str]:
     """Of every single setting, but for the method's among the training's."""
-    return [name for name in leaves(asdict(settings)) if name != "name" and not name.startswith("method.")]
+    return [name for name in leaves(asdict(settings)) if name not in LABELS and not name.startswith("method.")]
 
 
 def _settable(kind: type) -> list[str]:
-    return [name for name in get_type_hints(kind) if name != "name"]
+    return [name for name in get_type_hints(kind) if name not in LABELS]
 
 
 def _changed(settings: T, path: list[str], value: Any, key: str) -> T:

@@ -152,7 +152,9 @@ def depth_split(
     for ray, view in zip(rays, objective.linearized, strict=True):
         components.append(along_and_across(view.gradient[objective.blocks["means"]].view(-1, 3), ray))
         for part, gauss_newton in enumerate(parts):
-            own[:, part] += _split_traces(view.block_diagonal(gauss_newton=gauss_newton).geometry[:, :3, :3], ray).cpu()
+            own[:, part] += _split_traces(
+                view.block_diagonal(gauss_newton=gauss_newton, approximate=True).geometry[:, :3, :3], ray
+            ).cpu()
     pairs = objective.gather_rows(torch.stack(components, dim=1)).flatten(0, 1)
     dims = (len(objective.active), LATERAL_DIRECTIONS * len(objective.active))
     traces = [

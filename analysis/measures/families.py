@@ -271,7 +271,7 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnd
     if name == WHOLE and ends is not None:
         return Lead(torch.cat([ends.largest.vectors[:, :1], ends.smallest.vectors[:, :1]], dim=1))
     objective = hessian.objective
-    own, pixelwise = objective.gaussian_blocks
+    own, pixelwise = objective.approximate_blocks
     if hessian.gauss_newton:
         own = objective.pixelwise_blocks
     known = BlockEigenvectors(objective, own, pixelwise, None if name == WHOLE else name, scale)

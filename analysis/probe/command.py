@@ -15,6 +15,7 @@ import torch
 from rich.console import Console
 
 from analysis.console.drawing import Draw
+from analysis.console.options import ForeignOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.measurement import ProbeSettings, measure
@@ -30,14 +31,15 @@ from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import spawn
 from splat.backend.device import device_named
 from splat.curvature.objective import SceneObjective
+from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
-from splat.training.checkpoint import Checkpoint, load_checkpoint
+from splat.training.checkpoint import Checkpoint, open_checkpoint
+from splat.training.origin.foreign import Foreign
 
 if TYPE_CHECKING:
     from analysis.measures.families import FamilyOptions
 
 CHECK_FAILED = 1
-WITHOUT_SURFACE = "the picture of the slice as a surface was left out; python -m figures.surface {} draws it"
 
 
 def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | None = None) -> int:
@@ -65,10 +67,9 @@ def _run(
     console, start = Console(stderr=True, quiet=not writes), perf_counter()
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
-        checkpoint = load_checkpoint(options.checkpoint)
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
-        scene = checkpoint.load_scene(options.checkpoint, options.scene)
-        objective = scene_objective(checkpoint, scene, ranks)
+        objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     console.print(_introduction(scene, checkpoint, objective), highlight=False)
     with stages:
         generator = torch.Generator(device).manual_seed(options.seed)
@@ -84,10 +85,9 @@ def _run(
             )
             data, arrays["families"] = families.added_to(data), families.arrays()
             data.provenance.families = asdict(family_options)
-        if options.quick:
-            data.notes.append(WITHOUT_SURFACE.format(out))
+        data.notes += checkpoint.assumptions
         if writes:
-            _write(out, data, arrays, objective, stages, start, drawn, options.pictures)
+            _write(out, data, arrays, objective, stages, start, drawn)
     if writes:
         _conclude(data, out)
     failed = any(check.passed is False for check in data.checks.values())
@@ -102,25 +102,46 @@ def _write(
     stages: Stages,
     start: float,
     drawn: Draw | None,
-    pictures: Sequence[str],
 ) -> None:
     """The record, its pictures and its page, all at once."""
     with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
         write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
-        write_with_pictures(folder, data, arrays, stages, start, drawn, pictures)
+        write_with_pictures(folder, data, arrays, stages, start, drawn)
         from analysis.records.report import write_report
 
         write_report(folder, surface.result())
 
 
+def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
+    """A checkpoint, our own or another tool's, and its scene.  out: beside which a picture explains a refusal."""
+    listed = None
+    if ask.train_list is not None:
+        try:
+            listed = tuple(ask.train_list.read_text(encoding="utf-8").split("\n"))
+        except UnicodeDecodeError as error:
+            raise InputError(f"expected names of views, one in each line, in {ask.train_list}, got no text") from error
+        listed = tuple(name.strip() for name in listed if name.strip())
+    foreign = Foreign(folder, ask.views, listed, ask.trained_by, ask.images, ask.downscale)
+    checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
+    scene = checkpoint.load_scene(path, folder)
+    return checkpoint.thinned(scene, ask.max_views), scene
+
+
 def scene_objective(
-    checkpoint: Checkpoint, scene: Scene, ranks: Ranks | None = None, *, keep_unseen: bool = False
+    checkpoint: Checkpoint,
+    scene: Scene,
+    ranks: Ranks | None = None,
+    *,
+    keep_unseen: bool = False,
+    loss: LossSettings | None = None,
 ) -> SceneObjective:
-    """The training's loss over its views, at the checkpoint; ranks: share them.  keep_unseen: see `SceneObjective`."""
+    """A loss, by default the training's, over its views, at the checkpoint; ranks: share them.  keep_unseen: see
+    `SceneObjective`."""
     ranks = ranks or ALONE
     training, views = checkpoint.training, scene.load(ranks.share(checkpoint.scene.train, "training view"))
-    return training.config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
+    config = replace(training.config, loss=loss or training.config.loss)
+    return config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
 
 def _settings(options: ProbeOptions, *, shared: bool) -> ProbeSettings:

@@ -7,7 +7,7 @@
     power iteration *   both ends as the paper takes them
     density *           stochastic Lanczos quadrature, for sums and quantiles of |lambda|
     finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
-    slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
+    slice               the plane of the two largest eigenvalues' vectors: renders along both axes and where needed between them
     depth *             the positions' gradient and curvature along the rays and across them, and what finite steps there do
 
 * not in a quick probe, which has too few products for them.  Every kernel has worked once when the checks are done: what
@@ -19,6 +19,7 @@ time ran out.
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import inf
 from time import monotonic
 
 import torch
@@ -70,8 +71,6 @@ FEWEST_STEPS, FEWEST_POINTS = 4, 5  # of a density and along a side of a slice t
 FEWEST_STARTS = 3  # of a density of less than MANY_MATVECS; two have three times the interval
 MANY_MATVECS = 48
 MOST_AT_ONCE = 4  # start vectors
-FEWEST_HELD_OUT = 5  # points of a slice that can tell how good it is
-FEWEST_RENDERS = 100  # of all views, with which an adaptive slice of an eigenvectors' plane meets its tolerance
 SHORTEST = 1e-9  # seconds
 
 
@@ -84,7 +83,7 @@ class ProbeSettings:
     power: None: no power iteration.  density_matvecs: products of the spectral density; 0: it is left out.
     slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
         of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
-        slice_holdout: renders that judge this error.
+        slice_plane: whether to render more than its two axes.
     probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
         noise of a render.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
@@ -102,7 +101,7 @@ class ProbeSettings:
     slice_radius: float = 3.0
     slice_rise: float = 0.001
     slice_tolerance: float = 0.01
-    slice_holdout: int = 30
+    slice_plane: bool = True
     probe_steps: tuple[float, ...] = STEPS
     depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=64))
     depth_steps: tuple[float, ...] = DEPTH_STEPS
@@ -131,8 +130,8 @@ class ProbeSettings:
             eigen=EigenSettings(largest=2, smallest=1, rtol=0.1, max_matvecs=60),
             power=None,
             density_matvecs=0,
-            slice_tolerance=0.1,
-            slice_holdout=FEWEST_HELD_OUT,
+            slice_points=21,
+            slice_plane=False,
             probe_steps=(),
             depth=None,
             seconds=12.0,
@@ -179,7 +178,7 @@ def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
         gradient, value, render = _linearised(objective, report)
-        blocks = objective.gaussian_blocks
+        blocks = objective.approximate_blocks
     with stage("checks") as report:
         operator_check = check_operator(operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(hessian, spawn(generator), report, settings.checked_views)
@@ -207,7 +206,7 @@ def measure(objective: SceneObjective, settings: ProbeSettings, generator: torch
         with budget.stage("finite probe") as share:
             finite = _finite(objective, operator, ends, settings, render, share)
     with budget.stage("slice") as share:
-        plane = _plane(objective, gradient, value, ends, settings, render, share)
+        plane = _plane(objective, gradient, value, ends, settings, share)
     if settings.depth is not None:
         with budget.stage("depth") as share:
             depth = measure_depth(objective, settings.depth, settings.depth_steps, render, share)
@@ -291,13 +290,7 @@ def _finite(
 
 
 def _plane(
-    objective: SceneObjective,
-    gradient: Tensor,
-    value: float,
-    ends: EigenEnds,
-    settings: ProbeSettings,
-    render: float,
-    share: Share,
+    objective: SceneObjective, gradient: Tensor, value: float, ends: EigenEnds, settings: ProbeSettings, share: Share
 ) -> PlaneSlice | None:
     center, loss_scale = objective.active.flat, settings.slice_rise * value
     curvatures: Float64[Tensor, 2] = ends.largest.values[:2]
@@ -308,14 +301,15 @@ def _plane(
     axes = [symmetric_axis(settings.slice_radius * unit, settings.slice_points) for unit in (first, second)]
     vectors = ends.largest.vectors[:, :2]
     workers = 1 if objective.ranks.size > 1 or by_triton(center) else thread_count()
-    allowed = _within(settings, share.seconds, render, workers)
+    # without a budget for it, the two axes alone
+    most, limit = (inf if settings.slice_plane else 1), max(share.seconds, SHORTEST)
+    allowed = SliceSettings(settings.slice_tolerance, workers=workers, max_evaluations=most, max_seconds=limit)
     evaluate = evaluation(objective, allowed.workers)
     # Ritz vectors: H between any two of them is their values' diagonal matrix
     known = curvatures.diag()
     plane = evaluate_slice(
         evaluate, center, vectors, axes, gradient, known, allowed, share.generator, progress=share.report
     )
-    share.notes.extend(slice_notes(plane))
     return PlaneSlice(plane, loss_scale, (first, second))
 
 
@@ -329,20 +323,3 @@ def evaluation(objective: SceneObjective, workers: int) -> Loss:
             return objective.evaluate(theta)
 
     return alone
-
-
-def slice_notes(found: Slice) -> list[str]:
-    """That a slice is not as good as was asked for."""
-    if found.reason in ("tolerance", "exact"):
-        return []
-    return [f"the slice's interpolation stopped at its {found.reason}, before its error was down to the tolerance"]
-
-
-def _within(settings: ProbeSettings, seconds: float, each: float, workers: int) -> SliceSettings:
-    """Adaptive, on all points asked for: with less time than that takes, at so many seconds a render, a quarter of the renders
-    is held out, and refinement decides as often."""
-    points, tolerance, limit = settings.slice_points**2, settings.slice_tolerance, max(seconds, SHORTEST)
-    if min(points, FEWEST_RENDERS) * each <= seconds:
-        return SliceSettings(tolerance, settings.slice_holdout, workers=workers, max_seconds=limit)
-    few = min(settings.slice_holdout, max(FEWEST_HELD_OUT, int(seconds / each / 4)))
-    return SliceSettings(tolerance, holdout=few, batch=few, workers=workers, max_seconds=limit)

@@ -1,12 +1,12 @@
 """Options of `landscape probe`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from analysis.console.options import DeviceName, Unset
+from analysis.console.options import DeviceName, ForeignOptions, Unset
 
 
 @dataclass(frozen=True)
@@ -14,26 +14,29 @@ class ProbeOptions:
     """Measure the loss landscape at a checkpoint: traces, extreme eigenvalues, anisotropy, a slice."""
 
     checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN/checkpoint.pt, as written by landscape train."""
+    """RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
     scene: Unset[Path] = None
-    """Folder of the scene, where it has moved since the training."""
+    """Folder of the scene: where it has moved since the training, or of another tool's file."""
     out: Unset[Path] = None
     """Folder of the results.  Default: probe, beside the checkpoint."""
     seed: int = 0
     """Seed of the random vectors."""
     device: DeviceName = "auto"
     """Where to work.  auto: on the GPU where there is one that can be used, else on the CPU."""
+    loss: Literal["training", "3dgs"] = "training"
+    """Whose curvature.  training: the loss that the checkpoint was trained with.
+    3dgs: that of 3DGS, whatever it was trained with, so that trainings with other losses can be compared."""
     strict: FlagCreatePairsOff[bool] = False
     """Exit with 1 if a self-check fails; the record is written all the same."""
     quick: FlagCreatePairsOff[bool] = False
     """Numbers to 10% instead of 1%, in a quarter of the time.
     Without power iteration, the spectral density and the indices that need it, the finite probe, the comparison of depth with
-    lateral directions, and surface.png."""
+    lateral directions, and the slice's plane between its two axes."""
     seconds: Unset[float] = None
     """Time for the estimators together, in seconds; what a stage did not reach in its share is said.  inf: no limit.
     Default: 45, with --quick 12; under torchrun inf, and nothing else."""
     slice_points: Unset[int] = None
-    """Points along each side of the slice, odd, 5 or more.  Default: 41."""
+    """Points along each side of the slice, odd, 5 or more.  Default: 41, with --quick 21."""
     slice_rise: float = 0.001
     """What a curvature unit is: the step within which the curvature alone changes the loss by this share of it.
     The slice reaches 3 units each way."""
@@ -52,8 +55,4 @@ class ProbeOptions:
     Any but parameters measures the families, as --families does."""
     family_seconds: float = 1800.0
     """Time for the families together, in seconds, beside that of --seconds.  inf: no limit."""
-
-    @property
-    def pictures(self) -> tuple[str, ...]:
-        """What `figures.make_all` is told, beside the folder."""
-        return ("--without", "surface") if self.quick else ()
+    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)

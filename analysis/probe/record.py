@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from msgspec import convert
+from msgspec import UNSET, convert
 
 from analysis.measures.localization import conditions, localize, mass_shares
 from analysis.probe.measurement import Measured, PlaneSlice
@@ -91,6 +91,7 @@ def provenance_of(
         seed,
         lanes=lanes_of(np.float32),
         checkpoint=str(path),
+        origin=UNSET if checkpoint.origin is None else checkpoint.origin,
         scene=scene.name,
         scene_folder=str(scene.root),
         views=list(checkpoint.scene.train),

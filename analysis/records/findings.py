@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from analysis.records import schema
+from analysis.records.provenance import Provenance
 from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
 
@@ -49,7 +50,7 @@ def findings(data: ProbeRecord) -> list[Line]:
         *_of_depth(data.depth),
         *_of_counts(data.counts),
         *_of_skips(data.skipped),
-        *of_slice(data.slice),
+        *of_slice(data.slice, data.provenance),
         *(Line(_sentence(note), "caution") for note in data.notes),
     ]
     return sorted(lines, key=lambda line: line.level != "failure")
@@ -249,20 +250,38 @@ def _of_counts(counts: Counts) -> list[Line]:
     return [*lines, Line(f"The operator acts on {used}, over {counts.views} views.")]
 
 
-def of_slice(plane: schema.Slice | None) -> list[Line]:
-    """The sentences of a slice alone."""
+def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
+    """The sentences of a slice alone.  made: where its record comes from."""
     if plane is None:
         return [Line("No slice of the loss was recorded.", "caution")]
     lines, error, count = [], plane.interpolation_error, plane.holdout_points
     rendered = plane.points if plane.evaluated_points is None else plane.evaluated_points
-    if rendered < plane.points:
-        size = f"of at most {100 * error:.2g}% of the range of the loss" if error is not None else "without bound"
-        text = f"Of the slice's {plane.points:,} points {rendered:,} are renders; the others are interpolated, "
-        lines.append(Line(f"{text}with an error at {count} random point{'' if count == 1 else 's'} {size}."))
+    if not plane.resolved:
+        lines.append(Line(unresolved(plane, made), "caution"))
+    elif rendered < plane.points:
+        text = f"Of the slice's {plane.points:,} points {rendered:,} are renders, among them all of both axes; the others are "
+        text += "interpolated" + (
+            f" to {100 * plane.tolerance:.2g}% of the range of the loss" if plane.tolerance else ""
+        )
+        seen = plane.error_seen if plane.error_seen is not None else error
+        size = f"at most {100 * seen:.2g}%" if seen is not None else "without bound"
+        text += f" (the error at {count} random point{'' if count == 1 else 's'}: {size}"
+        lines.append(Line(f"{text}; the bound for all: {100 * error:.2g}%)." if error is not None else f"{text})."))
     if plane.crossed_points:
         share = f"{plane.crossed_points:,} of the slice's {rendered:,} rendered points"
         lines.append(Line(f"At {share} the order of the splats or the set of visible ones is not the checkpoint's."))
     return lines
+
+
+def unresolved(plane: schema.Slice, made: Provenance) -> str:
+    """Why a plane is not drawn, and the command that resolves it."""
+    asked = "" if plane.tolerance is None else f" to {100 * plane.tolerance:.2g}% of the range of the loss"
+    limited = "--max-renders" in (made.command or "")
+    remedy = "leave out --max-renders" if limited else f"landscape slice {made.checkpoint} renders more"
+    return (
+        f"Between its two sections the plane is not known{asked} from {plane.evaluated_points:,} of {plane.points:,} renders, "
+        f"and no surface is drawn; {remedy}."
+    )
 
 
 def _sentence(note: str) -> str:

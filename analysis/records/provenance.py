@@ -27,6 +27,7 @@ class Machine(Struct, kw_only=True):
 class Provenance(Struct, kw_only=True):
     """Where the numbers come from.  versions: of Python and packages, None for what is not installed.
 
+    origin: of another tool's file, what was assumed.
     other: the checkpoint at the other end of a line.  settings: of the command; families: those of the families.
     """
 
@@ -35,6 +36,7 @@ class Provenance(Struct, kw_only=True):
     versions: dict[str, str | None]
     machine: Machine
     checkpoint: Maybe[str] = UNSET
+    origin: Maybe[dict[str, Any]] = UNSET
     other: Maybe[str | None] = UNSET
     scene: Maybe[str] = UNSET
     scene_folder: Maybe[str] = UNSET

@@ -124,9 +124,9 @@ def _uri(path: Path, kind: str) -> str:
 
 
 def interactive_surface(record: Record[ProbeRecord]) -> go.Figure | None:
-    """The recorded slice as a surface to turn and zoom, with the quadratic model where known; None without a slice."""
+    """The recorded slice as a surface to turn and zoom, with the quadratic model where known; None without one."""
     about = record.data.slice
-    if about is None or "slice" not in record.arrays:
+    if about is None or "slice" not in record.arrays or not about.resolved:
         return None
     arrays = record.arrays["slice"]
     layers = [("loss", "loss", "Cividis", 1.0), ("model", "quadratic model", "Greys", 0.45)]

@@ -306,8 +306,10 @@ class Slice(Struct, kw_only=True):
 
     cosine: of the angle between the two directions before the second was put at a right angle.  center_loss: L at the centre,
     a render of the slice's own.  points, evaluated_points, crossed_points: of the grid, see ARRAYS; evaluations: renders of
-    all views.  interpolation_error: the largest error of predictions at `holdout_points` random points, as a share of the
-    range of the evaluated losses; 0 where all points are evaluated, None where a prediction met a loss that is not finite.
+    all views.  tolerance: what was asked of the points that are interpolated, as a share of the range of the evaluated losses;
+    None where all are evaluated.  resolved: whether that was reached; else only evaluated points have a loss.
+    interpolation_error: the bound of the error at every interpolated point (`landscape.slices.interpolation`), as such a share;
+    0 where all points are evaluated, None where there is none.  error_seen: the largest at `holdout_points` random points;
     share_beyond: with 95% confidence at most this share of the interpolated points is off by more.  reason: as for `Trace`.
     """
 
@@ -319,7 +321,10 @@ class Slice(Struct, kw_only=True):
     crossed_points: Count = 0
     evaluations: Count = 0
     center_loss: float
+    tolerance: Number = None
+    resolved: bool = True
     interpolation_error: Number = 0.0
+    error_seen: Number = None
     holdout_points: Count = 0
     share_beyond: Number = None
     reason: str = ""

@@ -5,14 +5,16 @@ OUT/compare.csv     every number, see `analysis/runs/compare_table.py`
 OUT/compare.json    {"runs": {LABEL: folder of its record}}, from which `figures/compare.py` draws
 OUT/*.png           traces, densities of the spectrum and slices in common limits
 
-What must be the same for curvatures to be comparable at all is demanded: the loss, the training views and their sizes.  What
-must be kept in mind beside that is said: other starts, steps, budgets, checks that failed, numbers of Gaussians.
+What must be the same for curvatures to be comparable at all is demanded: the loss that was probed, the training views and their
+sizes.  Runs that were trained with other losses are probed with that of 3DGS (`landscape probe --loss 3dgs`).  What must be
+kept in mind beside that is said: other starts, steps, losses of training, budgets, failed checks, numbers of Gaussians.
 """
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 
@@ -20,14 +22,16 @@ from analysis.console.drawing import draw
 from analysis.console.options import DeviceName
 from analysis.console.overrides import leaves
 from analysis.probe.options import ProbeOptions
-from analysis.records.findings import of_budgets
+from analysis.probe.record import loss_name
+from analysis.records.findings import of_budgets, unresolved
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.report import pictures_in, template_environment
 from analysis.records.run_files import CHECKPOINT, COMPARISON, METRICS, Comparison, Scores, read_scores
-from analysis.runs.compare_table import Run, compare_table, comparison, frame
+from analysis.runs.compare_table import Row, Run, compare_table, comparison, frame
 from analysis.runs.options import CompareOptions
+from analysis.runs.seeds import Group, grouped, groups_of, identical, sayings
 from landscape.errors import InputError
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
@@ -43,27 +47,42 @@ PICTURES = {
 
 def run_compare(options: CompareOptions) -> int:
     """Read, probe where asked to, compare; returns the exit code."""
-    folders = _folders(options.runs)
+    groups = groups_of(options.runs, options.group)
+    paths = [folder for group in groups for folder in group.folders]
+    folders = _folders(paths)
     common = Path(os.path.commonpath(folders))
     common = common.parent if common in folders else common
     labels = [str(folder.relative_to(common)) for folder in folders]
     checkpoints = [load_checkpoint(folder / CHECKPOINT) for folder in folders]
-    require_same(labels, checkpoints)
-    missing = [path for path, checkpoint in zip(options.runs, checkpoints) if not probed(path, checkpoint)]
+    require_same(labels, checkpoints, trained_alike=False)
+    loss = (
+        "3dgs"
+        if any(c.training.config.loss != checkpoints[0].training.config.loss for c in checkpoints)
+        else "training"
+    )
+    missing = [path for path, checkpoint in zip(paths, checkpoints) if not probed(path, checkpoint)]
     if missing and not options.probe:
-        again = "; ".join(f"landscape probe {path / CHECKPOINT}" for path in missing)
+        more = "" if loss == "training" else f" --loss {loss}"
+        again = "; ".join(f"landscape probe {path / CHECKPOINT}{more}" for path in missing)
         raise InputError(
             f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
         )
     for path in missing:
-        _probe(path, options.device)
+        _probe(path, options.device, loss)
     runs = [
         Run(path, label, checkpoint, _scores(path), read_record(path / PROBE, ProbeRecord).data)
-        for path, label, checkpoint in zip(options.runs, labels, checkpoints)
+        for path, label, checkpoint in zip(paths, labels, checkpoints)
     ]
-    out = options.out or common / "compare"
-    _write(runs, out)
+    require_same_loss(runs)
+    named = [_relative(group, common) for group in groups]
+    _write(runs, named, identical(labels, checkpoints), options.out or common / "compare")
     return 0
+
+
+def _relative(group: Group, common: Path) -> Group:
+    """The group with its label as those of runs are, where it is a folder."""
+    path = Path(group.label).resolve()
+    return replace(group, label=str(path.relative_to(common))) if path.is_relative_to(common) else group
 
 
 def _folders(runs: Sequence[Path]) -> list[Path]:
@@ -73,14 +92,15 @@ def _folders(runs: Sequence[Path]) -> list[Path]:
     return folders
 
 
-def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> None:
-    """ValueError where the runs' curvatures are those of different functions."""
+def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint], *, trained_alike: bool = True) -> None:
+    """InputError where the runs' curvatures are those of different functions; trained_alike: of the loss of training."""
     demanded: dict[str, Callable[[Checkpoint], Any]] = {
         "training views": lambda c: c.scene.train,
         "sizes of the views": lambda c: c.scene.sizes,
-        "loss": lambda c: c.training.config.loss,
         "background": lambda c: c.training.config.background,
     }
+    if trained_alike:
+        demanded["loss"] = lambda c: c.training.config.loss
     for what, of in demanded.items():
         first = of(checkpoints[0])
         for label, checkpoint in zip(labels, checkpoints, strict=True):
@@ -91,6 +111,17 @@ def require_same(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> No
                 )
 
 
+def require_same_loss(runs: Sequence[Run]) -> None:
+    """InputError where the records are of different losses; older ones do not name theirs, which is the training's."""
+    losses = [run.data.objective.loss or loss_name(run.checkpoint.training.config.loss) for run in runs]
+    for run, loss in zip(runs, losses, strict=True):
+        if loss != losses[0]:
+            raise InputError(
+                f"expected probes of the same loss, as curvatures are not comparable else, got {losses[0]} in {runs[0].label} "
+                f"and {loss} in {run.label}; probe all of them with --loss 3dgs"
+            )
+
+
 def probed(run: Path, checkpoint: Checkpoint) -> bool:
     """Whether the run has a record of this checkpoint's step."""
     if not (run / PROBE / ProbeRecord.FILE).is_file():
@@ -98,11 +129,12 @@ def probed(run: Path, checkpoint: Checkpoint) -> bool:
     return read_record(run / PROBE, ProbeRecord).data.provenance.iteration == checkpoint.training.step
 
 
-def _probe(run: Path, device: DeviceName) -> None:
+def _probe(run: Path, device: DeviceName, loss: Literal["training", "3dgs"]) -> None:
     from analysis.probe.command import run_probe
 
     path = run / CHECKPOINT
-    run_probe(ProbeOptions(path, device=device), ["landscape", "probe", str(path), "--device", device])
+    command = ["landscape", "probe", str(path), "--device", device, "--loss", loss]
+    run_probe(ProbeOptions(path, device=device, loss=loss), command)
 
 
 def _scores(run: Path) -> Scores | None:
@@ -118,6 +150,8 @@ def cautions(runs: Sequence[Run]) -> list[str]:
         "start": lambda run: getattr(run.checkpoint.scene, "start", None),
         "seed": lambda run: run.checkpoint.training.config.seed,
         "held-out views": lambda run: run.checkpoint.scene.test,
+        "losses of the trainings": lambda run: run.checkpoint.training.config.loss,
+        "protocol": lambda run: run.checkpoint.training.config.protocol,
         "random background": lambda run: run.checkpoint.training.config.random_background,
         "precision": lambda run: run.data.provenance.dtype,
     }
@@ -135,6 +169,8 @@ def cautions(runs: Sequence[Run]) -> list[str]:
         order = ", ".join(run.label for run in runs)
         lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
     for run in runs:
+        if run.data.slice and not run.data.slice.resolved:
+            lines.append(f"{run.label}: {unresolved(run.data.slice, run.data.provenance)}")
         failed = [name.replace("_", " ") for name, check in run.data.checks.items() if check.passed is False]
         lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]
         ends = {"max": run.data.eigenvalues.max.reason, "min": run.data.eigenvalues.min.reason}
@@ -164,33 +200,50 @@ def split_controls(runs: Sequence[Run]) -> list[str]:
     return lines
 
 
-def _write(runs: Sequence[Run], out: Path) -> None:
-    """Table, pictures, page; and the table and the cautions once more for the terminal."""
+def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], out: Path) -> None:
+    """Table, pictures, page; and what it says, the table and the cautions once more for the terminal."""
     console, labels = Console(), [run.label for run in runs]
     rows, notes = comparison(runs), cautions(runs)
+    shown = grouped(rows, groups)
+    says = [*same, *sayings(shown, groups)]
+    shown_runs = {folder: group.label for group in groups for folder in group.folders[:1]}
+    if len(shown_runs) < len(runs):
+        notes.append(f"The pictures show the first run of each group: {', '.join(map(str, shown_runs))}.")
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode())
-    index = Comparison(runs={run.label: str((run.folder / PROBE).resolve()) for run in runs})
+    index = Comparison(runs={label: str((folder / PROBE).resolve()) for folder, label in shown_runs.items()})
     write_atomically(out / COMPARISON, json_text(plain(index)).encode())
     try:
         draw("compare", out)
     except RuntimeError as error:  # the numbers stand without pictures
         notes.append(" ".join(str(error).split()))
-    write_atomically(out / PAGE, render_page(runs, rows, notes, out).encode())
-    console.print(compare_table(rows, labels))
+    names = [group.label for group in groups]
+    write_atomically(out / PAGE, render_page(runs, names, shown, says, notes, out).encode())
+    for line in says:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    console.print(compare_table(shown, names))
     for note in notes:
         console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
     console.print(f"open {out / PAGE}; numbers: {out / TABLE}", highlight=False, soft_wrap=True)
 
 
-def render_page(runs: Sequence[Run], rows: Sequence[Any], notes: Sequence[str], out: Path) -> str:
-    """The page as text, with the pictures that lie in the folder."""
+def render_page(
+    runs: Sequence[Run],
+    groups: Sequence[str],
+    rows: Sequence[Row],
+    says: Sequence[str],
+    notes: Sequence[str],
+    out: Path,
+) -> str:
+    """The page as text, with the pictures that lie in the folder.  groups: names of the rows' columns."""
     environment = template_environment()
     sections = {
         name: [row for row in rows if row.section == name] for name in dict.fromkeys(row.section for row in rows)
     }
     return environment.get_template("compare.html.jinja").render(
         runs=runs,
+        groups=groups,
+        says=says,
         sections=sections,
         notes=notes,
         controls=split_controls(runs),

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from analysis.console.options import DeviceName, Unset
 
@@ -41,7 +41,10 @@ class CompareOptions:
     """Compare probed runs in one table and on one page: scores, traces, spectra, anisotropy, slices."""
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
-    """Two or more folders that landscape train wrote, of the same views and loss, each probed."""
+    """Two or more folders that landscape train wrote, of the same views and loss, each probed.
+    A folder whose sub-folders are runs, such as OUT/SCENE/METHOD of a sweep, stands for all its seeds: mean and spread."""
+    group: UseAppendAction[tuple[str, ...]] = ()
+    """LABEL=RUN,RUN: runs that differ in their seed alone, as one; may be repeated."""
     out: Unset[Path] = None
     """Folder of the page, the table and the pictures.  Default: compare, in the folder that holds all runs."""
     probe: FlagCreatePairsOff[bool] = False

@@ -1,9 +1,9 @@
 """`landscape slice`: one checkpoint in, its loss along a line or over a plane out, as a record with pictures.
 
-    load            the checkpoint, its scene, the other checkpoint of a line
+    load            the checkpoint, its scene, the other checkpoints of a line or a plane
     linearise       every view held still
     directions      eigenvectors from the probe beside the checkpoint or by Lanczos, and their curvatures
-    slice           renders where needed, in parallel, interpolated elsewhere (`landscape.slices.refinement`)
+    slice           renders in parallel; of a plane where needed, interpolated elsewhere (`landscape.slices.refinement`)
     finite steps    along a line: second differences at steps over four decades, beside the infinitesimal curvature
 
 What is found on the way is kept in `.NAME.unfinished` beside the record, from which the same command continues, whatever
@@ -16,7 +16,7 @@ import shlex
 import shutil
 from collections.abc import Sequence
 from functools import partial
-from math import ceil, inf
+from math import inf
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -29,8 +29,8 @@ from torch import Tensor
 
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.probe.command import scene_objective
-from analysis.probe.measurement import evaluation, slice_notes
+from analysis.probe.command import opened, scene_objective
+from analysis.probe.measurement import evaluation
 from analysis.probe.record import loss_name, provenance_of
 from analysis.records.findings import of_slice, resolved
 from analysis.records.provenance import require_seed
@@ -56,10 +56,9 @@ from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
 from splat.backend.device import device_named
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
-from splat.model.gaussians import Gaussians
+from splat.model.files.read import is_foreign, read_splats
 from splat.training.checkpoint import Checkpoint, load_checkpoint
 
-COARSE = {1: 9, 2: 21}  # points that an adaptive slice begins with, by its dimension
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
@@ -67,7 +66,7 @@ DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     """Slice the checkpoint's loss; returns the exit code.  command: as typed, for the record."""
     require_seed(options.seed)
-    shape = Shape.of(options.along, options.dimension, options.radius, options.points, options.other is not None)
+    shape = Shape.of(options.along, options.dimension, options.radius, options.points, len(options.others))
     device = device_named(options.device)
     settings = _settings(options, shape, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
@@ -76,23 +75,22 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     console, start = Console(stderr=True), perf_counter()
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
-        checkpoint = load_checkpoint(options.checkpoint)
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
-        other = None if options.other is None else _other_end(checkpoint, options.other)
-        scene = checkpoint.load_scene(options.checkpoint, options.scene)
-        objective = scene_objective(checkpoint, scene, keep_unseen=other is not None)
+        others = [_other_end(checkpoint, path) for path in options.others]
+        objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
     with stages:
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:
-            found = _measure(objective, shape, other, known, settings, options, unfinished, stages)
+            found = _measure(objective, shape, others, known, settings, options, unfinished, stages)
         except BaseException:
             if unfinished.is_dir():
                 console.print(f"what was rendered is kept; to continue: {shlex.join(command)}", **SAID)
             raise
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
-        made.other = None if options.other is None else str(options.other)
-        data = slice_record(found, objective, notes + slice_notes(found.slice), made)
+        made.other = ", ".join(map(str, options.others)) or None
+        data = slice_record(found, objective, notes + checkpoint.assumptions, made)
         with record_folder(out, SliceRecord) as folder:
             write_with_pictures(folder, data, slice_arrays(found), stages, start)
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -101,37 +99,33 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
 
 
 def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
-    """As asked for; a line of few points holds an eighth of them out, and a GPU is full with one render."""
+    """As asked for; a GPU is full with one render."""
     most = torch.get_num_threads() if device.type == "cpu" else 1
     workers = most if options.workers is None else options.workers
-    holdout = min(SliceSettings.holdout, ceil(options.points**shape.dimension / 8))
     if options.all_points:
         if options.max_renders is not None:
             raise InputError("expected --all-points or --max-renders, got both; leave one out")
         return SliceSettings(tolerance=None, workers=workers)
-    least = COARSE[shape.dimension] + holdout + 1
+    least = options.points * shape.dimension + 1
     if options.max_renders is not None and options.max_renders < least:
         raise InputError(
-            f"expected --max-renders of at least {least}, with which a slice of dimension {shape.dimension} can begin and be "
-            f"judged, got {options.max_renders}"
+            f"expected --max-renders of at least {least}, the points of the axes, which are all rendered, and the centre, got "
+            f"{options.max_renders}; take fewer --points"
         )
     renders = inf if options.max_renders is None else options.max_renders
-    return SliceSettings(options.tolerance, holdout, workers=workers, max_evaluations=renders)
+    return SliceSettings(options.tolerance, workers=workers, max_evaluations=renders)
 
 
 def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
-    """The other checkpoint's parameters, quaternions as unit ones on the near side."""
-    here, there = checkpoint.training.gaussians, load_checkpoint(path).training.gaussians
+    """The other checkpoint's parameters, with its quaternions near those here."""
+    here = checkpoint.training.gaussians
+    there = read_splats(path).gaussians if is_foreign(path) else load_checkpoint(path).training.gaussians
     if (len(here), here.sh_degree) != (len(there), there.sh_degree):
         raise InputError(
             f"expected a checkpoint of {len(here):,} Gaussians with SH degree {here.sh_degree} at the other end of the line, "
             f"got {len(there):,} with {there.sh_degree} in {path}; take two of one training after densification has ended"
         )
-    there = Gaussians(there.flat.to(here.flat, copy=True), there.sh_degree)
-    quats = there.quats
-    quats /= quats.norm(dim=1, keepdim=True)
-    quats *= torch.where((quats * here.quats).sum(dim=1, keepdim=True) < 0, -1.0, 1.0).to(quats)
-    return there.flat
+    return there.with_flat(there.flat.to(here.flat)).aligned_to(here).flat
 
 
 def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list[str]) -> list[Tensor]:
@@ -151,7 +145,7 @@ def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list
 def _measure(
     objective: SceneObjective,
     shape: Shape,
-    other: Float[Tensor, " n"] | None,
+    others: list[Float[Tensor, " n"]],
     known: list[Tensor],
     settings: SliceSettings,
     options: SliceOptions,
@@ -168,7 +162,7 @@ def _measure(
     operator = CountingOperator(SceneHessian(objective))
     true = CountingOperator(SceneHessian(objective, keep_null=True))  # H itself: a line may lead anywhere
     with stages.stage("directions") as report:
-        exact = find_directions(shape, objective, operator, other, known, generators, report)
+        exact = find_directions(shape, objective, operator, others, known, generators, report)
         _keep_eigenvectors(exact, unfinished)
         directions = at_right_angles(exact)
         vectors = torch.stack([direction.vector for direction in directions], dim=1)
@@ -228,7 +222,7 @@ def _conclude(data: SliceRecord, out: Path) -> None:
         say(f"{text}; one curvature unit is a step of {quantity(direction.unit)}")
     if data.finite_probe:
         say(_finite_curvature(data.finite_probe))
-    for line in of_slice(data.slice):
+    for line in of_slice(data.slice, data.provenance):
         say(line.text)
     for note in data.notes:
         say(note, style="yellow")

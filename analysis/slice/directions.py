@@ -4,7 +4,8 @@
     random          r₁, r₂: Gaussian, of every attribute of every Gaussian as long as that attribute is (of a mean: as its
                     distance from the origin), so that a radius of 0.001 changes each by about a thousandth; 0.001
     gradient        unit vector of the steepest ascent.  Radius in parameter units; 3 curvature units
-    line            from the checkpoint, at 0, to the other, at 1.  Radius: how far beyond both; 0.5
+    line            from the checkpoint, at 0, to the other, at 1.  Radius: how far beyond both; 0.5.  With a third checkpoint a
+                    plane through all three, at (0, 0), (1, 0) and (0, 1): line₁, line₂
 
     curvature unit  sqrt(2 rise L / |d.H d|): the step within which the curvature alone changes the loss by rise L
 
@@ -59,7 +60,7 @@ class Shape:
 
     @classmethod
     def of(
-        cls, along: Sequence[Along], dimension: int | None, radii: Sequence[float], points: int, other: bool
+        cls, along: Sequence[Along], dimension: int | None, radii: Sequence[float], points: int, others: int
     ) -> "Shape":
         """The shape that was asked for; ValueError where the wishes contradict each other."""
         if twice := [kind for kind in dict.fromkeys(along) if along.count(kind) > 1]:
@@ -67,16 +68,25 @@ class Shape:
                 f"expected directions of different kinds, got --along {twice[0]} twice; leave one out, and for a plane of one "
                 "kind, eigenvectors or random, give --dimension 2"
             )
-        default: Along = "line" if other else "eigenvectors"
+        default: Along = "line" if others else "eigenvectors"
         named = list(along) or [default]
         kinds: tuple[Along, ...] = tuple(sorted(named, key=lambda kind: kind != "line"))  # a line keeps its ends
         if len(kinds) > 2:
             raise InputError(f"expected one or two directions, got {' and '.join(kinds)}; slice again for the others")
-        if ("line" in kinds) != other:
-            given = "one more checkpoint; add --along line" if other else "no other checkpoint; name it"
+        if ("line" in kinds) != bool(others):
+            given = "one more checkpoint; add --along line" if others else "no other checkpoint; name it"
             raise InputError(f"expected two checkpoints for a line and one otherwise, got {given}")
-        most = 2 if len(kinds) == 2 or set(kinds) <= PLANES else 1
+        if others > 2 or (others == 2 and len(kinds) == 2):
+            raise InputError(
+                f"expected at most three checkpoints, for the plane through them alone, got {1 + others} along "
+                f"{' and '.join(kinds)}; leave one out"
+            )
+        most = 2 if len(kinds) == 2 or set(kinds) <= PLANES or others == 2 else 1
         wanted = most if dimension is None else dimension
+        if others == 2 and wanted == 1:
+            raise InputError(
+                "expected two checkpoints for a line, got three, which span a plane; leave out one, or --dimension"
+            )
         if wanted > most or (wanted == 1 and len(kinds) == 2):
             advice = "give --along once" if wanted == 1 else "give --along twice"
             raise InputError(f"expected directions for dimension {wanted}, got {' and '.join(kinds)}; {advice}")
@@ -109,12 +119,12 @@ def find_directions(
     shape: Shape,
     objective: SceneObjective,
     operator: SymmetricOperator,
-    other: Float[Tensor, " n"] | None,
+    others: Sequence[Float[Tensor, " n"]],
     known: Sequence[Float[Tensor, "n k"]],
     generators: dict[str, torch.Generator],
     report: Progress,
 ) -> list[Direction]:
-    """The directions of a shape.  other: where a line ends; known: eigenvectors to try before they are computed."""
+    """The directions of a shape.  others: where lines end; known: eigenvectors to try before they are computed."""
     center, found = objective.active.flat, []
     for kind in shape.kinds:
         count = shape.dimension if len(shape.kinds) == 1 else 1
@@ -129,8 +139,10 @@ def find_directions(
         elif kind == "gradient":
             found.append(Direction(kind, "gradient", gradient_direction(objective.gradient)[:, 0]))
         else:
-            assert other is not None
-            found.append(Direction(kind, "line", line_between(center, other)[:, 0], scale="share of the way"))
+            vectors = torch.cat([line_between(center, other) for other in others], dim=1)
+            orthonormal(vectors)  # refuses three checkpoints on one line
+            names = ["line"] if len(others) == 1 else ["line₁", "line₂"]
+            found += [Direction(kind, name, vectors[:, i], scale="share of the way") for i, name in enumerate(names)]
     return found
 
 

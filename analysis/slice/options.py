@@ -1,12 +1,12 @@
 """Options of `landscape slice`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from analysis.console.options import DeviceName, Unset
+from analysis.console.options import DeviceName, ForeignOptions, Unset
 
 Along = Literal["eigenvectors", "random", "gradient", "line"]
 
@@ -15,13 +15,14 @@ Along = Literal["eigenvectors", "random", "gradient", "line"]
 class SliceOptions:
     """Slice the training loss through a checkpoint: along a line or over a plane, with the quadratic model beside it.
 
-    Points are rendered where the others do not predict them well.  A slice that was killed continues when it is run again.
+    Of a plane both axes are rendered, and points between them until these predict the others well.  A slice that was killed
+    continues when it is run again.
     """
 
     checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN/checkpoint.pt, as written by landscape train."""
-    other: Annotated[Positional[Path | None], arg(metavar="[OTHER]", help_behavior_hint="")] = None
-    """Where a line leads to: a checkpoint with as many Gaussians and the same SH degree."""
+    """RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    others: Annotated[Positional[tuple[Path, ...]], arg(metavar="[OTHER [THIRD]]", help_behavior_hint="")] = ()
+    """Where a line leads to: a checkpoint with as many Gaussians and the same SH degree.  Two: the plane through all three."""
     along: UseAppendAction[tuple[Along, ...]] = ()
     """Directions; given twice, the plane of the first direction of each.  Default: eigenvectors, or line where OTHER is given.
     eigenvectors: of the two largest eigenvalues, from RUN/probe or else computed.
@@ -29,7 +30,7 @@ class SliceOptions:
     gradient: the steepest ascent.
     line: to OTHER."""
     dimension: Unset[Literal[1, 2]] = None
-    """1: a line; 2: a plane.  Default: 2 for eigenvectors and random, 1 for gradient and line."""
+    """1: a line; 2: a plane.  Default: 2 for eigenvectors, random and two OTHER checkpoints, 1 for gradient and line."""
     radius: UseAppendAction[tuple[float, ...]] = ()
     """How far to look each way; given twice, one for each direction.
     eigenvectors: in curvature units: the step within which the curvature alone changes the loss by 0.1%.  Default: 3.
@@ -39,7 +40,8 @@ class SliceOptions:
     points: int = 41
     """Points along each direction, odd; a line to OTHER may get a few more or less."""
     tolerance: float = 0.01
-    """Largest error of the points that are interpolated instead of rendered, as a share of the range of the loss."""
+    """Error of the points of a plane that are interpolated instead of rendered, as a share of the range of the loss.
+    Both axes are rendered in full; where too few renders are made to reach it, no surface is drawn."""
     all_points: FlagCreatePairsOff[bool] = False
     """Render every point, whatever the tolerance."""
     max_renders: Unset[int] = None
@@ -51,6 +53,7 @@ class SliceOptions:
     seed: int = 0
     """Seed of random directions, of the start of Lanczos, and of the points that judge the interpolation."""
     scene: Unset[Path] = None
-    """Folder of the scene, where it has moved since the training."""
+    """Folder of the scene: where it has moved since the training, or of another tool's file."""
     out: Unset[Path] = None
     """Folder of the results.  Default: beside the checkpoint, such as slice-eigenvectors-2d or slice-line-1d."""
+    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)

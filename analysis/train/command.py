@@ -7,7 +7,8 @@ RUN/history.csv     what the method noted along the way, a row each with its "st
 RUN/trajectory.csv, RUN/start/checkpoint.pt     with --probe-every: the landscape along the way, see
 `analysis/train/trajectory.py`
 RUN/test/NAME.png   the held-out views as rendered at the end
-RUN/metrics.json    {"step", "gaussians", "train": scores, "test": scores or null, "seconds", "provenance"}, where scores are
+RUN/metrics.json    {"step", "method", "protocol", "gaussians", "train": scores, "test": scores or null, "seconds",
+                    "provenance"}, where scores are
                     {"psnr", "ssim", "lpips", "masked", "views": {NAME: {"psnr", "ssim", "lpips"}}}, psnr in dB;
                     "Infinity" for a perfect image; lpips null where it cannot be computed; masked: inside masks only
 """
@@ -39,12 +40,13 @@ from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
 from analysis.train.options import TrainOptions
 from analysis.train.remarks import remarks
+from analysis.train.source import from_checkpoint
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
 from landscape.errors import InputError
 from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
-from splat.model.typed import leaves
+from splat.model.typed import leaves, typed
 from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
@@ -54,10 +56,11 @@ from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_at
 from splat.training.densify import DensifySettings
 from splat.training.loop import prepare, train
 from splat.training.methods.methods import METHODS
-from splat.training.scene_reference import SceneReference
+from splat.training.methods.protocols import presets
+from splat.training.origin.scene_reference import SceneReference
 from splat.training.score.evaluate import Evaluation, ViewScore, evaluate, have_masks
 from splat.training.score.perceptual import MissingPerceptual, load_lpips
-from splat.training.start import initial_gaussians
+from splat.training.start import Source, initial_gaussians
 from splat.training.state import TrainConfig, Training
 
 HISTORY, RENDERS = "history.csv", "test"
@@ -84,7 +87,8 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_share)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
-    scene, split, config, reference = planned(options, out)
+    plan, given = from_checkpoint(options, planned(options, out), out)
+    scene, split, config, reference = plan
     device = device_named(options.device)
     views, held_out = scene.load(split.train), scene.load(split.test)
     for together in (views, held_out):
@@ -95,7 +99,9 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         training = resumed(out / CHECKPOINT, config, reference)
     else:
         generator = torch.Generator().manual_seed(config.seed)
-        start = initial_gaussians(scene, views, 0, generator=generator, source=options.start)
+        start = given
+        if start is None:
+            start = initial_gaussians(scene, views, 0, generator=generator, source=reference.start)
         training = Training.start(start, scene.extent(split.train), config)
     training.move(device)
     prepare(training, views)  # refuses what cannot be trained before there is a folder
@@ -108,7 +114,7 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         f"{scene.name}: {len(views)} views to train on, {len(held_out)} held out, {camera.width} x {camera.height} px, "
         f"{len(training.gaussians)} Gaussians"
     )
-    begun = None if options.resume else (options.start, len(training.gaussians))
+    begun = None if options.resume else (reference.start, len(training.gaussians))
     for remark in remarks(scene, _asked(options, scene), config, begun):
         console.print(remark, **WARNING)
     trajectory = None if along is None else Trajectory(out, training, views, along)
@@ -126,15 +132,16 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
 
 def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig, SceneReference]:
     """What the options stand for, before any image is read.  ValueError or FileNotFoundError where they are wrong."""
-    colour = COLOURS.get(options.background)
+    colour, preset = COLOURS.get(options.background or "scene"), presets(options.method, options.protocol)
     scene = load_scene(
         options.scene, options.images, options.downscale, colour, options.masks, options.depths,
         strict_frames=options.strict_frames,
     )  # fmt: skip
     views = usual_views(scene) if options.views is None else options.views
     split = split_scene(scene, None if views == "all" else views)
+    start = typed(Source, options.start or preset.get("start", "scene"), "start")
     reference = SceneReference.to(
-        scene, out / CHECKPOINT, split, options.images, options.downscale, options.start, options.depths
+        scene, out / CHECKPOINT, split, options.images, options.downscale, start, options.depths
     )
     return scene, split, _config(options, scene), reference
 
@@ -150,7 +157,7 @@ def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
     if options.method not in METHODS:
         raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}")
     config = TrainConfig(
-        iterations=options.iterations,
+        iterations=TrainConfig.iterations if options.iterations is None else options.iterations,
         seed=options.seed,
         sh_degree=options.sh_degree,
         background=(red, green, blue),
@@ -158,6 +165,7 @@ def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
         loss=LossSettings(pixel=options.pixel_loss, ssim_weight=options.ssim_weight),
         densify=DensifySettings(enabled=options.densify),
         method=METHODS[options.method](),
+        protocol=options.protocol,
     )
     changes = assignments(options.set)
     for key, name in OPTIONS.items():
@@ -167,7 +175,10 @@ def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
                 f"expected one value for {key}, got --set {key}={changes[key]} beside the option --{name.replace('_', '-')}, "
                 f"which is {given}; leave one out"
             )
-    return overridden(config, changes)
+    given = {key for key, name in OPTIONS.items() if getattr(options, name) != getattr(TrainOptions, name)}
+    preset = presets(options.method, options.protocol)
+    beneath = {key: value for key, value in preset.items() if key not in given | {"start"}}
+    return overridden(config, beneath | changes)
 
 
 def _require_run(out: Path, resume: bool) -> None:
@@ -293,6 +304,8 @@ def _report(training: Training, views: list[View], held_out: list[View], out: Pa
         tested = evaluate(training.gaussians, held_out, background, config.render, lpips=lpips, on_image=keep)
     metrics = {
         "step": training.step,
+        "method": config.method.name,
+        "protocol": config.protocol,
         "gaussians": len(training.gaussians),
         "train": _scores(seen),
         "test": _scores(tested) if tested else None,

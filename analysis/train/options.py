@@ -21,8 +21,8 @@ class TrainOptions:
     """Number of training views, chosen by the scene's protocol (see the README).
     all: every view that is not held out; of DTU the protocol's 9.
     Default: 8 for Blender, else 3."""
-    iterations: int = 2000
-    """Steps of the training, each on one view."""
+    iterations: Unset[int] = None
+    """Steps of the training, each on one view.  Default: 2000, or those of the --protocol."""
     seed: int = 0
     """Seed of everything random: the same seed gives the same checkpoint, bit for bit."""
     images: Unset[str] = None
@@ -31,12 +31,17 @@ class TrainOptions:
     """Divide width and height of the images by this factor, 1 or more, by averaging."""
     strict_frames: FlagCreatePairsOff[bool] = False
     """Refuse a transforms.json that lists frames without an image, instead of skipping these."""
-    start: Literal["scene", "points", "triangulated", "random"] = "scene"
-    """What the Gaussians start from.
+    start: Unset[Literal["scene", "points", "triangulated", "random", "box"]] = None
+    """What the Gaussians start from.  Default: scene, or that of the --protocol.
     scene: points where there are any, else random.
     points: the points of the scene's files that at least two training views see.
     triangulated: points found in the training views alone, given their poses.
-    random: random points in the volume that the training views have in common."""
+    random: random points in the volume that the training views have in common.
+    box: random points in the box of the scene's points."""
+    from_: Annotated[Unset[Path], arg(name="from")] = None
+    """A checkpoint, our own or another tool's, whose Gaussians to start from, with its renderer and in its world."""
+    trained_by: Unset[str] = None
+    """Whose conventions another tool's file of --from follows, see landscape probe.  Default: what the file says."""
     masks: Unset[Path] = None
     """Folder of object masks, named after the images; the scores are taken inside them.
     Default: mask or masks in the scene, or what its files name."""
@@ -44,6 +49,11 @@ class TrainOptions:
     """Folder of relative depth maps for the training views, NAME.npy or 16-bit NAME.png, for methods that use depth."""
     method: str = "3dgs"
     """What is trained: 3dgs, stablegs, sam, dropgaussian, dropoutgs, cor-gs, fsgs or dngaussian."""
+    protocol: Literal["common", "llff"] = "common"
+    """Whose training the method is added to.
+    common: the same for all methods, that of 3DGS.
+    llff: the method's own, as in its released code for LLFF; the table is splat/training/methods/protocols.csv.
+    Options and --set go before it."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """KEY=VALUE changes a setting of the method or of the training, as in vsp_weight=0; may be repeated.
     An unknown KEY is answered with the names of all."""
@@ -53,8 +63,9 @@ class TrainOptions:
     """Continue the run in OUT; the other options must be those that it was started with."""
     sh_degree: int = 3
     """Highest degree of spherical harmonics, 0 to 3; the training starts with degree 0, and one joins every 1000 steps."""
-    background: Literal["scene", "black", "white", "random"] = "scene"
-    """Colour behind the Gaussians.  scene: white where the images are transparent, else black.
+    background: Unset[Literal["scene", "black", "white", "random"]] = None
+    """Colour behind the Gaussians.  Default: scene, or that of the --protocol.
+    scene: white where the images are transparent, else black.
     random: another one at every step."""
     densify: bool = True
     """Whether to clone, split and prune Gaussians and reset opacities, as 3DGS does."""

@@ -214,7 +214,7 @@ def measure(
     operator = CountingOperator(hessian)
     traces = exact_traces(objective, streams[0], replace(settings.traces, max_seconds=max(left() / 2, 0.0)))
     fixed = perf_counter() - began
-    leads = BlockEigenvectors(objective, *objective.gaussian_blocks).warm_start()
+    leads = BlockEigenvectors(objective, *objective.approximate_blocks).warm_start()
     ends = extreme_eigenpairs(operator, streams[1], replace(settings.eigen, max_seconds=max(left(), 0.0)), leads)
     least = fixed + FEWEST_MATVECS * operator.seconds / operator.matvecs
     short = [f"trace of {name}" for name, trace in traces.items() if trace.reason == "time budget"]

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from landscape.results import StopReason, plain
+from landscape.slices.interpolation import error_bound, share_beyond
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,8 +17,9 @@ class Slice:
 
     coordinates: increasing x_d of the grid, in multiples of the directions.
     loss: one axis for each direction (rows for coordinates[0], columns for coordinates[1]).  The objective at points that are
-        `evaluated`, interpolated values elsewhere.
+        `evaluated`, interpolated values elsewhere; nan there if the slice is not `resolved`.
     holdout: |prediction - objective| at the random points of the last hold-out; empty where none was drawn.
+    tolerance: what was asked of the interpolation, as a share of the range; None: nothing is interpolated.
     model: center_loss + slope . x + x^T curvature x / 2, with the derivatives of the objective in x.  All three are None where
         neither gradient nor operator was given.
     discontinuous: evaluated points on another smooth piece than the centre (for a scene: another order of the splats or set of
@@ -37,7 +39,13 @@ class Slice:
     discontinuous: Bool[Tensor, "..."] | None
     evaluations: int
     reason: StopReason
-    looks: int = 1
+    tolerance: float | None = None
+    looks: int = 0
+
+    @property
+    def resolved(self) -> bool:
+        """Whether every point is evaluated, or known to within the tolerance."""
+        return self.reason in ("exact", "tolerance")
 
     @property
     def difference(self) -> Float64[Tensor, "..."] | None:
@@ -51,26 +59,25 @@ class Slice:
         return float(finite.max() - finite.min()) if finite.numel() else 0.0
 
     @property
+    def error_seen(self) -> float:
+        """The largest error of the hold-out over the range; 0 if every point is evaluated, infinite without a hold-out."""
+        return self._relative(float(self.holdout.max()) if self.holdout.numel() else inf)
+
+    @property
     def interpolation_error(self) -> float:
-        """The largest error of the hold-out over the range: 0 if every point is evaluated, infinite without a hold-out."""
-        if self.evaluated.all():
+        """The bound of the error at every interpolated point over the range (`interpolation`), from those of the hold-out."""
+        others = int((~self.evaluated).sum())
+        return self._relative(error_bound(self.holdout.numpy(), others, self.looks))
+
+    def _relative(self, error: float) -> float:
+        if self.evaluated.all() or error == 0:
             return 0.0
-        if not self.holdout.numel():
-            return inf
-        if not self.holdout.any():
-            return 0.0
-        return float(self.holdout.max()) / self.range if self.range else inf
+        return error / self.range if self.range else inf
 
     @property
     def share_beyond(self) -> float:
-        """The largest share of interpolated points with errors above interpolation_error, with 95% confidence.
-
-        If this share is p, m random points miss all such points with a probability of at most (1 - p)^m.  p is chosen so that
-        this is 0.05 / 2^k at the k-th look: several looks have more chances to be lucky.
-        """
-        if self.evaluated.all():
-            return 0.0
-        return 1 - (0.05 / 2**self.looks) ** (1 / self.holdout.numel()) if self.holdout.numel() else 1.0
+        """The largest share of interpolated points with errors above error_seen, with 95% confidence."""
+        return 0.0 if self.evaluated.all() else share_beyond(self.holdout.numel(), self.looks)
 
     def record(self) -> dict[str, Any]:
         return {
@@ -78,4 +85,4 @@ class Slice:
             "evaluated_points": int(self.evaluated.sum()),
             "crossed_points": 0 if self.discontinuous is None else int(self.discontinuous.sum()),
             "holdout_points": self.holdout.numel(),
-        } | plain(self, "evaluations center_loss interpolation_error share_beyond reason")
+        } | plain(self, "evaluations center_loss tolerance resolved interpolation_error error_seen share_beyond reason")

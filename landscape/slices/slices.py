@@ -1,6 +1,7 @@
 """Slices of an objective L: its values on a grid along one or two directions e_d, and its quadratic model.
 
-    f(x)     = L(center + sum_d x_d e_d)              evaluated where needed (`refinement`), interpolated elsewhere
+    f(x)     = L(center + sum_d x_d e_d)              evaluated where needed (`refinement`), interpolated elsewhere,
+                                                      never on the axes
     model(x) = L + b . x + x^T A x / 2                b = E^T g,  A = E^T H E
 
 x is in multiples of the directions: in parameter units for unit vectors.  `curvature_reach` gives ranges in units of the
@@ -19,9 +20,10 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.linalg import column_lengths
 from landscape.operators.operator import SymmetricOperator, product
-from landscape.results import Progress, StopReason
+from landscape.results import Progress
 from landscape.slices.grid_evaluations import GridEvaluations, Loss
-from landscape.slices.refinement import SliceSettings, evaluate_adaptively
+from landscape.slices.interpolation import PlaneInterpolant
+from landscape.slices.refinement import Refined, SliceSettings, evaluate_adaptively
 from landscape.slices.slice import Slice
 
 
@@ -73,52 +75,60 @@ def evaluate_slice(
     loss(theta): the objective, or (objective, smooth_piece) if it is piecewise smooth (`grid_evaluations`); it must be safe to
     call from settings.workers threads.  coordinates: increasing, in multiples of the directions.  gradient, operator: both at
     center, or neither.  They give the quadratic model, for d matvecs; none if the operator is given as the matrix E^T H E.
-    generator: draws the hold-out points (`refinement`); may be None only if settings.tolerance is.  store: a file that keeps
+    settings: for a plane; every point of a line is evaluated.  generator: draws the hold-out points (`refinement`) of a plane;
+    may be None only if settings.tolerance is.  store: a file that keeps
     the evaluations, from which an interrupted run continues.  Raises InputError if the objective at the centre is not finite,
     or store holds another slice.
 
     >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
-    >>> line = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :1], [axis], generator=generator)
-    >>> line.loss[::10], int(line.evaluated.sum()), line.reason
-    (tensor([4., 1., 0., 1., 4.], dtype=torch.float64), 13, 'tolerance')
+    >>> bowl = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :2], [axis, axis], generator=generator)
+    >>> bowl.loss[20, ::10], bowl.loss.shape, int(bowl.evaluated.sum()), bowl.reason
+    (tensor([4., 1., 0., 1., 4.], dtype=torch.float64), torch.Size([41, 41]), 161, 'tolerance')
     """
     _require_slice(center, directions, coordinates)
     _require_model(gradient, operator, directions)
-    if settings.tolerance is not None and generator is None:
-        raise ValueError(
-            "expected a generator for the hold-out points of an adaptive slice, got none; "
-            "pass torch.Generator().manual_seed(0), or SliceSettings(tolerance=None) to evaluate every point"
-        )
+    if len(coordinates) == 2 and settings.tolerance is not None:
+        if generator is None:
+            raise ValueError(
+                "expected a generator for the hold-out points of a plane, got none; "
+                "pass torch.Generator().manual_seed(0), or SliceSettings(tolerance=None) to evaluate every point"
+            )
+        if not all((axis == 0).any() for axis in coordinates):
+            raise InputError(
+                "expected coordinates of a plane with 0 among them, for the axes through the centre, got others; "
+                "take symmetric_axis, or SliceSettings(tolerance=None) to evaluate every point"
+            )
     axes = [axis.detach().double() for axis in coordinates]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
     shape, points = grid.shape[:-1], grid.reshape(-1, len(axes))
     file = None if store is None else Path(store)
     found = GridEvaluations(loss, center, directions, points, settings.workers, file, progress)
-    reason: StopReason
-    if settings.tolerance is None or generator is None:
-        found.require(range(len(points)))
-        values, holdout, looks, reason = found.value, np.empty(0), 0, "exact"
-    else:
-        x, y = axes[0].numpy(), axes[1].numpy() if len(axes) == 2 else np.zeros(1)
-        values, holdout, looks, reason = evaluate_adaptively(found, x, y, settings, generator)
     slope = curvature = model = None
     if gradient is not None and operator is not None:
         slope, curvature = _derivatives(gradient, operator, directions)
         model = found.center_loss + points @ slope + ((points @ curvature) * points).sum(dim=1) / 2
         model = model.reshape(shape)
+    if len(axes) == 1 or settings.tolerance is None or generator is None:
+        found.require(range(len(points)))
+        refined = Refined(found.value, np.empty(0), 0, "exact")
+    else:
+        mixed = None if curvature is None else float(curvature[0, 1])
+        plane = PlaneInterpolant(axes[0].numpy(), axes[1].numpy(), mixed)
+        refined = evaluate_adaptively(found, plane, settings, generator)
     return Slice(
         coordinates=tuple(axes),
-        loss=torch.from_numpy(values).reshape(shape),
+        loss=torch.from_numpy(refined.values).reshape(shape),
         evaluated=torch.from_numpy(found.known).reshape(shape),
-        holdout=torch.from_numpy(holdout),
+        holdout=torch.from_numpy(refined.holdout),
         center_loss=found.center_loss,
         model=model,
         slope=slope,
         curvature=curvature,
         discontinuous=torch.from_numpy(found.discontinuous).reshape(shape) if found.has_pieces else None,
         evaluations=int(found.known.sum()) + 1,
-        reason=reason,
-        looks=looks,
+        reason=refined.reason,
+        tolerance=None if found.known.all() else settings.tolerance,
+        looks=refined.looks,
     )
 
 

@@ -1,9 +1,9 @@
 """Eigenvectors of the Hessian's blocks of single Gaussians: start vectors for a search of the ends of the spectrum.
 
 Steep eigenvectors of a scene have their weight on one or two Gaussians, and the block of a Gaussian's geometry and opacity is
-known exactly (`PerGaussianBlocks`).  Its eigenvectors, at right angles to the quaternion as in `SceneHessian`, are near them.
+known (`PerGaussianBlocks`).  Its eigenvectors, at right angles to the quaternion as in `SceneHessian`, are near them.
 
-Coupling of pixels.  For SSIM the blocks hold the diagonal of l'' only, which is too much: SSIM is blind to even changes of a
+Coupling of pixels.  Approximate blocks have the diagonal of SSIM's l'' only, too much: SSIM is blind to even changes of a
 window.  The window's blur B (a Gaussian, standard deviation sigma px) keeps the share rho = |B u|^2 / |u|^2 of an image u, and
 that share of the pixelwise part has to go.  A splat that moves across its narrower axis changes the image by the slope of a
 Gaussian, so with its conic C (px^-2) and the larger eigenvalue c of C

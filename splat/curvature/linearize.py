@@ -22,13 +22,16 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
+from splat.losses.cpu.loss import CpuLinearLoss
 from splat.losses.protocols import ViewLoss
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.dispatch import linearize_projection
 from splat.projection.formulas import ProjectionJacobian, lens_of
+from splat.raster.cpu.raster import CpuRaster
 from splat.raster.dispatch import Adjoint, Tangent
 from splat.render.forward import rasterize_view, touches
 
@@ -49,7 +52,7 @@ class LinearizedView:
     ):
         self.gaussians = gaussians
         self._raster = rasterize_view(gaussians, camera, background, settings)
-        self._loss = loss.linearize(self._raster.planes)
+        self._loss, self._couples = loss.linearize(self._raster.planes), loss.couples_pixels
         self._adjoint = self._raster.backward(self._loss.gradient)
         self._index = self._raster.touched
         self._projection = linearize_projection(
@@ -129,13 +132,36 @@ class LinearizedView:
         cotangents = self._loss.hvp(self._tangent(U).planes)
         return self._pulled([self._raster.backward(cotangent) for cotangent in cotangents])
 
-    def block_diagonal(self, *, gauss_newton: bool = False) -> PerGaussianBlocks:
-        """Every Gaussian's diagonal block of the Hessian, or of its Gauss-Newton part, exactly, in one pass over the pixels.
+    def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
+        """Every Gaussian's diagonal block of the Hessian, or of its Gauss-Newton part, exactly.
 
-        "Exactly" for losses that are sums over pixels; of SSIM's l'' the coupling between pixels is left out.
+        approximate: in one pass over the pixels, with the diagonal of l'' in place of l'': without SSIM's coupling of pixels.
+        The exact ones of a loss with SSIM are made on the CPU alone (InputError on a GPU).
         """
-        blocks = self._raster.gaussian_blocks(self._adjoint, self._loss.diagonal, self._index, gauss_newton)
-        return PerGaussianBlocks(*self._projection.blocks(blocks, not gauss_newton))
+        return self.block_diagonals(approximate=approximate, parts=(gauss_newton,))[0]
+
+    def block_diagonals(
+        self, *, approximate: bool = False, parts: Sequence[bool] = (False, True)
+    ) -> list[PerGaussianBlocks]:
+        """`block_diagonal` of several parts at once, which share the pass of the coupling; parts: which are Gauss-Newton."""
+        raster, index = self._raster, self._index
+        if approximate or not self._couples:
+            curvature, coupled = self._loss.diagonal, 0.0
+        elif isinstance(raster, CpuRaster):
+            assert isinstance(self._loss, CpuLinearLoss)
+            coupling = self._loss.coupling()
+            curvature = torch.from_numpy(coupling.uncoupled).view_as(self._adjoint.cotangent[:3])
+            coupled = raster.coupled_blocks(coupling, index)
+        else:
+            raise InputError(
+                "expected Gaussians on the CPU for exact blocks of a loss with SSIM, got them on a GPU; move them there or ask "
+                "for approximate ones"
+            )
+        found = []
+        for gauss_newton in parts:
+            blocks = self._raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton) + coupled
+            found.append(PerGaussianBlocks(*self._projection.blocks(blocks, not gauss_newton)))
+        return found
 
     def loss_curvatures(self, U: Float[Tensor, "p k"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
         """(J u)^T l'' (J u) of every column, and the same with l'' replaced by its pixel-diagonal: no backward pass."""

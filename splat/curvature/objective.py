@@ -205,21 +205,21 @@ class SceneObjective:
         """The gradient of L at the active Gaussians."""
         return self.mean_over_views(torch.stack([view.gradient for view in self.linearized]).sum(dim=0))
 
-    def block_diagonal(self, *, gauss_newton: bool = False) -> PerGaussianBlocks:
-        """The block of every Gaussian in the Hessian of L, or in its Gauss-Newton part.
+    def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
+        """The block of every Gaussian in the Hessian of L, or in its Gauss-Newton part: exact, on the CPU.
 
-        Exact but for the coupling of pixels by SSIM: only the diagonal of the loss's l'' enters.
+        approximate: with the diagonal of the loss's l'' in place of l'', without the coupling of pixels by SSIM.
         """
-        parts = (view.block_diagonal(gauss_newton=gauss_newton) for view in self.linearized)
+        parts = (view.block_diagonal(gauss_newton=gauss_newton, approximate=approximate) for view in self.linearized)
         total = reduce(add, parts)
         return PerGaussianBlocks(self.mean_over_views(total.geometry), self.mean_over_views(total.sh))
 
     @cached_property
-    def gaussian_blocks(self) -> tuple[PerGaussianBlocks, PerGaussianBlocks | None]:
-        """The blocks of the Hessian and, where the loss couples pixels, `pixelwise_blocks`."""
-        return self.block_diagonal(), self.pixelwise_blocks if self.couples_pixels else None
+    def approximate_blocks(self) -> tuple[PerGaussianBlocks, PerGaussianBlocks | None]:
+        """The approximate blocks of the Hessian and, where the loss couples pixels, `pixelwise_blocks`."""
+        return self.block_diagonal(approximate=True), self.pixelwise_blocks if self.couples_pixels else None
 
     @cached_property
     def pixelwise_blocks(self) -> PerGaussianBlocks:
         """The blocks of the Gauss-Newton part with the diagonal of l'' in place of l''."""
-        return self.block_diagonal(gauss_newton=True)
+        return self.block_diagonal(gauss_newton=True, approximate=True)

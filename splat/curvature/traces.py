@@ -2,7 +2,7 @@
 
 With E_b the columns of the identity in block b, J the Jacobian of the images, D the diagonal of the loss's l'':
 
-    tr(H_b) = T_b + E[x - y]      T_b: trace with D in place of l'', exact (`SceneObjective.block_diagonal`)
+    tr(H_b) = T_b + E[x - y]      T_b: trace with D in place of l'' (`SceneObjective.approximate_blocks`)
     x = (J E_b z)^T l'' (J E_b z),  y = (J E_b z)^T D (J E_b z)      z: random signs;  E[y] = C_b is known exactly
 
 y is a control variate: each sample is x - c (y - C_b), where c is fitted to the other samples so that the mean stays unbiased.
@@ -71,7 +71,7 @@ def exact_traces(
     if samples is not None and samples < LEAST_SAMPLES:
         raise InputError(f"expected at least {LEAST_SAMPLES} samples, got {samples}")
     quats, units = objective.active.quats, None if scale is None else objective.active.with_flat(scale)
-    whole, coupled = objective.gaussian_blocks
+    whole, coupled = objective.approximate_blocks
     if gauss_newton:
         whole = objective.pixelwise_blocks
     known = {name: value for name, value in whole.traces(quats, units).items() if name in names}

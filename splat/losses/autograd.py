@@ -3,6 +3,8 @@
 `loss_against` and `consistency_loss` alone decide which kernels these are: those where the images are.
 """
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -52,8 +54,17 @@ class _PhotometricGradient(torch.autograd.Function):
         return *last_derivative(values, image, weight, outputs[0]), None, None
 
 
-def view_loss(image: Float[Tensor, "3 h w"], loss: ViewLoss) -> Float[Tensor, ""]:
-    """The loss of an image as a torch scalar, twice differentiable; loss: from `loss_against`."""
+@dataclass(frozen=True, eq=False)
+class Clamped:
+    """A view's loss of the image clamped to [0, 1]: where the image is outside, its gradient is 0."""
+
+    loss: ViewLoss
+
+
+def view_loss(image: Float[Tensor, "3 h w"], loss: ViewLoss | Clamped) -> Float[Tensor, ""]:
+    """The loss of an image as a torch scalar, twice differentiable; loss: from `loss_against`, as it is or clamped."""
+    if isinstance(loss, Clamped):
+        return view_loss(image.clamp(0, 1), loss.loss)
     return _Photometric.apply(image, loss)  # pyright: ignore[reportReturnType]
 
 

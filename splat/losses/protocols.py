@@ -65,6 +65,11 @@ class ImageLoss(Protocol):
 class ViewLoss(ImageLoss, Protocol):
     """The loss of images against one target."""
 
+    @property
+    def couples_pixels(self) -> bool:
+        """Whether the loss has second derivatives across pixels, as SSIM has."""
+        ...
+
     def value(self, image: Float[Tensor, "k H W"]) -> float: ...
 
     def linearize(self, image: Float[Tensor, "k H W"], second_order: bool = True) -> LinearLoss:

@@ -119,6 +119,17 @@ class Gaussians:
     def to(self, dtype: torch.dtype) -> "Gaussians":
         return self.with_flat(self.flat.to(dtype))
 
+    def aligned_to(self, other: "Gaussians") -> "Gaussians":
+        """The same Gaussians with unit quaternions of the sign that is nearer to another's: q and -q are one rotation.
+
+        Differences of parameters, lines and planes between checkpoints are taken after this.
+        """
+        found = Gaussians(self.flat.clone(), self.sh_degree)
+        quats = found.quats
+        quats /= quats.norm(dim=1, keepdim=True)
+        quats *= torch.where((quats * other.quats).sum(dim=1, keepdim=True) < 0, -1.0, 1.0).to(quats)
+        return found
+
     def select(self, index: Tensor, sh_degree: int | None = None, fresh: Tensor | None = None) -> "Gaussians":
         """The Gaussians at index (a mask or indices, may repeat), with the SH bands up to sh_degree (zero-padded above).
 

@@ -295,9 +295,15 @@ BLOCK_INDEX, BENDS = _block_index(), _bends()
 
 
 @formula
+def colour_slopes(free, beta, R, colour):
+    """D, the colours' derivatives in q.  free: w where the cap does not hold, else 0; beta likewise."""
+    return free * colour[0] - beta * R[0], free * colour[1] - beta * R[1], free * colour[2] - beta * R[2]
+
+
+@formula
 def step_block(w, free, beta, R, g, h, colour):
-    """D, R in front of the splat, and s + v.  free: w where the cap does not hold, else 0; beta likewise."""
-    D = (free * colour[0] - beta * R[0], free * colour[1] - beta * R[1], free * colour[2] - beta * R[2])
+    """D, R in front of the splat, and s + v."""
+    D = colour_slopes(free, beta, R, colour)
     weight = D[0] * (g[0] + h[0] * D[0]) + D[1] * (g[1] + h[1] * D[1]) + D[2] * (g[2] + h[2] * D[2])
     return D, plus(R, w, colour), weight
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.losses.autograd import view_loss
+from splat.losses.autograd import Clamped, view_loss
 from splat.losses.protocols import ViewLoss
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
@@ -28,7 +28,7 @@ class LossAndGradient:
 def loss_and_gradient(
     gaussians: Gaussians,
     camera: Camera,
-    loss: ViewLoss,
+    loss: ViewLoss | Clamped,
     background: Float[Tensor, "3"],
     settings: RenderSettings = RenderSettings(),
     opacity_scale: Float[Tensor, " n"] | None = None,

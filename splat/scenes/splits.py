@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from landscape.errors import InputError
 from splat.scenes.layers import dtu_number
@@ -134,6 +135,23 @@ def _every_eighth(names: Sequence[str]) -> tuple[str, ...]:
 def _number(name: str) -> int | None:
     match = re.search(r"(\d+)(\.\w+)?$", name)
     return int(match[1]) if match else None
+
+
+def spread_views(frames: Sequence[Frame], count: int) -> list[str]:
+    """Names of frames spread evenly: the one nearest to the middle of the cameras, then always the farthest from those chosen.
+
+    InputError where fewer than one is asked for.
+    """
+    if count < 1:
+        raise InputError(f"expected at least 1 view, got {count}")
+    centres = torch.stack([frame.camera.centre for frame in frames])
+    chosen = [int((centres - centres.mean(dim=0)).norm(dim=1).argmin())]
+    distances = (centres - centres[chosen[0]]).norm(dim=1)
+    while len(chosen) < min(count, len(frames)):
+        distances[chosen] = -1.0
+        chosen.append(int(distances.argmax()))
+        distances = torch.minimum(distances, (centres - centres[chosen[-1]]).norm(dim=1))
+    return [frames[i].name for i in chosen]
 
 
 def explicit_split(names: Sequence[str], train: Sequence[str | int], test: Sequence[str | int] | None = None) -> Split:

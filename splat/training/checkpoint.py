@@ -20,28 +20,61 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
+from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.settings import current_settings
 from splat.model.typed import Count, leaves, typed
 from splat.scenes.scene import Scene
+from splat.scenes.splits import spread_views
 from splat.training.densify import ScreenGradients
 from splat.training.methods.methods import METHODS
 from splat.training.optim.adam import Adam
-from splat.training.scene_reference import SceneReference
+from splat.training.origin.foreign import Foreign, foreign_training
+from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import Method, ThreeDGS, TrainConfig, Training
 
 FORMAT, VERSION = "splat-landscape checkpoint", 2
 KIND = "expected a checkpoint written by landscape train"
+# settings that older files lack, where the training was the one of their defaults
+LATER = {
+    "protocol",
+    "clamp_image",
+    "rates.position_hold",
+    "densify.split_distance",
+    "densify.grow_opacity",
+    "densify.first_reset",
+}
 REMEDY = "take another copy of the file, or train anew"
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A training as it was saved, the scene that it belongs to, and the version of torch that wrote it."""
+    """A training as it was saved, the scene that it belongs to, and the version of torch that wrote it.
+
+    origin: of another tool's file, what was assumed (`foreign_training`).
+    """
 
     training: Training
     scene: SceneReference
     torch_version: str
+    origin: dict[str, Any] | None = None
+
+    @property
+    def assumptions(self) -> list[str]:
+        """Sentences on what was assumed of another tool's file."""
+        if self.origin is None:
+            return []
+        said = "trained by {trained_by} ({trained_by_source}), training views: {views}; {psnr:.1f} dB on two of them"
+        return [said.format(**self.origin), *self.origin["notes"]]
+
+    def thinned(self, scene: Scene, count: int | None) -> "Checkpoint":
+        """With at most so many of its training views, spread evenly over their cameras; None: all."""
+        if count is None or count >= len(self.scene.train):
+            return self
+        chosen = set(spread_views(scene.select(self.scene.train), count))
+        kept = [i for i, name in enumerate(self.scene.train) if name in chosen]
+        train, sizes = [self.scene.train[i] for i in kept], [self.scene.sizes[i] for i in kept]
+        return replace(self, scene=replace(self.scene, train=train, sizes=sizes))
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
         """The scene that this checkpoint, read from path, belongs to, see `SceneReference.load`."""
@@ -158,6 +191,22 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise
 
 
+def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:
+    """The checkpoint of `load_checkpoint`, or another tool's file as one; ask, picture: see `foreign_training`.
+
+    InputError too where our own is given what only another's needs.
+    """
+    if is_foreign(path):
+        training, scene, origin = foreign_training(path, ask, picture)
+        return Checkpoint(training, scene, str(torch.__version__), origin)
+    loaded = load_checkpoint(path)
+    if needless := [name for name, value in vars(ask).items() if value is not None and name != "scene"]:
+        raise InputError(
+            f"expected no --{needless[0].replace('_', '-')} for {path}: a checkpoint of landscape train holds that already"
+        )
+    return loaded
+
+
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint, its tensors on the CPU.
 
@@ -193,7 +242,7 @@ def _read(file: BinaryIO, path: Path) -> Any:
         bad_seek = isinstance(error, OSError) and error.errno == errno.EINVAL  # to where a damaged index points
         if lacks_memory(error) or (isinstance(error, OSError) and not bad_seek):
             raise
-        ply = " (Gaussians from a PLY file cannot be read)" if path.suffix.lower() == ".ply" else ""
+        ply = " (of other tools' files, probe, slice and convert read those)" if path.suffix.lower() == ".ply" else ""
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise InputError(f"{KIND}, got {path}, which is not one or is damaged{ply}: {reason}; {REMEDY}") from error
 
@@ -255,7 +304,7 @@ def _config(content: dict[str, Any]) -> TrainConfig:
     method, render = {**METHODS[name].BEFORE, **method}, current_settings(render)
     content = {**content, "render": render, "method": {}}
     config = replace(typed(TrainConfig, content, "config"), method=typed(METHODS[name], method, "config.method"))
-    if different := leaves({**content, "method": method}).keys() ^ leaves(asdict(config)).keys():
+    if different := (leaves({**content, "method": method}).keys() ^ leaves(asdict(config)).keys()) - LATER:
         raise InputError(f"'config' has missing or unknown keys: {', '.join(sorted(map(str, different)))}")
     return config
 

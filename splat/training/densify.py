@@ -5,6 +5,10 @@ At an interval, after `start` and before `stop`, a Gaussian whose mean screen-sp
     is cloned  if its largest scale is at most clone_scale x extent: an exact copy beside it, opacity included;
     is split   if it is larger: replaced by two drawn from it, mean ~ N(mean, R S S R^T), scales / 1.6, all else copied.
 
+With `split_distance`, a Gaussian far from its neighbours is split too, whatever its gradient, as CoR-GS's and FSGS's codes do:
+
+    mean squared distance to the three nearest > split_distance x extent,   largest scale > extent
+
 Then Gaussians that are nearly transparent are removed, and, once opacities have been reset, those larger than
 prune_scale x extent.  (The published code also means to remove what is large on screen, but zeroes the radii before it
 looks at them, so that it never does.)  Opacities are lowered to reset_opacity every `reset_every` steps before `stop`;
@@ -19,6 +23,7 @@ from dataclasses import dataclass
 from math import floor, log
 from typing import Annotated
 
+import scipy
 import torch
 from jaxtyping import Bool, Float, Int
 from msgspec import Meta
@@ -32,6 +37,7 @@ from splat.projection.reference import Splats, on_screen, rotation_matrices
 
 SPLIT_INTO = 2
 SPLIT_SHRINK = 0.8 * SPLIT_INTO
+NEIGHBOURS = 3
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,10 @@ class DensifySettings(Settings):
     with them short runs densify too, and have half of their steps to settle.
 
     gradient_threshold: of the mean screen-space gradient, in normalised device coordinates.  clone_scale, prune_scale: in units
-    of the extent.  min_opacity: below it a Gaussian is removed; reset_opacity: what a reset lowers opacities to.
+    of the extent; split_distance: its squared distances are in units of extent x world unit.  min_opacity: below it a Gaussian
+    is removed; grow_opacity: only above it one is cloned, or split for its gradient; reset_opacity: what a reset lowers
+    opacities to.  first_reset: step of the first reset, None: reset_every.  None elsewhere: nothing is removed for its size,
+    split for its distance, or reset.
     """
 
     enabled: bool = True
@@ -54,14 +63,17 @@ class DensifySettings(Settings):
     every_share: Share = 0.05
     gradient_threshold: Positive = 2e-4
     clone_scale: Positive = 0.01
-    prune_scale: Positive = 0.1
+    split_distance: Positive | None = None
+    prune_scale: Positive | None = 0.1
     min_opacity: Share = 0.005
+    grow_opacity: Share = 0.0
     reset_every: Length = 3000
-    reset_opacity: Annotated[float, Meta(gt=0, lt=1)] = 0.01
+    first_reset: Length | None = None
+    reset_opacity: Annotated[float, Meta(gt=0, lt=1)] | None = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.min_opacity >= self.reset_opacity:
+        if self.reset_opacity is not None and self.min_opacity >= self.reset_opacity:
             raise InputError(
                 "expected min_opacity < reset_opacity (else a reset would remove every Gaussian), "
                 f"got {self.min_opacity} and {self.reset_opacity}"
@@ -82,12 +94,13 @@ class DensifySettings(Settings):
 
     def resets_opacity(self, step: int, iterations: int, *, white: bool) -> bool:
         """white: whether that is what the views are seen against."""
-        due = step % self.reset_every == 0 or (white and step == self.begins(iterations))
-        return due and self.collects(step, iterations)
+        since = step - (self.first_reset or self.reset_every)
+        due = (since >= 0 and since % self.reset_every == 0) or (white and step == self.begins(iterations))
+        return due and self.reset_opacity is not None and self.collects(step, iterations)
 
     def prunes_large(self, step: int) -> bool:
         """3DGS removes large Gaussians only after the first opacity reset."""
-        return step > self.reset_every
+        return self.prune_scale is not None and step > (self.first_reset or self.reset_every)
 
 
 @dataclass(eq=False)
@@ -139,9 +152,14 @@ def densify(
     prune_large: bool,
 ) -> Densified:
     """Clone, split and prune.  gradients: `ScreenGradients.mean`.  Kept Gaussians come first, in their order."""
-    high = gradients > settings.gradient_threshold
-    small = gaussians.log_scales.amax(dim=1) <= log(settings.clone_scale * extent)
-    keep, clone, split = (mask.nonzero()[:, 0] for mask in (~(high & ~small), high & small, high & ~small))
+    high = (gradients > settings.gradient_threshold) & (gaussians.opacity_logits.sigmoid() > settings.grow_opacity)
+    largest = gaussians.log_scales.amax(dim=1)
+    small = largest <= log(settings.clone_scale * extent)
+    divide = high & ~small
+    if settings.split_distance is not None:
+        squared = neighbours(gaussians, NEIGHBOURS)[0].square().mean(dim=1)
+        divide |= (squared > settings.split_distance * extent) & (largest > log(extent))
+    keep, clone, split = (mask.nonzero()[:, 0] for mask in (~divide, high & small & ~divide, divide))
     parents = torch.cat([keep, clone, split.repeat_interleave(SPLIT_INTO)])
     result = gaussians.select(parents)
     fresh = torch.arange(len(parents), device=parents.device) >= len(keep)
@@ -149,10 +167,20 @@ def densify(
 
     remain = result.opacity_logits.sigmoid() >= settings.min_opacity
     if prune_large:
+        assert settings.prune_scale is not None
         remain &= result.log_scales.amax(dim=1) <= log(settings.prune_scale * extent)
     return Densified(
         result.select(remain), parents[remain], fresh[remain], len(clone), len(split), int((~remain).sum())
     )
+
+
+def neighbours(gaussians: Gaussians, count: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
+    """Distances between the means to the nearest others, world units, and which they are.  k: count, at most n - 1."""
+    means = gaussians.means.cpu().double().numpy()
+    wanted = list(range(2, min(count, len(means) - 1) + 2))  # the nearest is the Gaussian itself
+    found = scipy.spatial.KDTree(means).query(means, k=wanted)
+    distances, nearest = (torch.as_tensor(each).to(gaussians.flat.device) for each in found)
+    return distances, nearest
 
 
 def draw_from_parents(gaussians: Gaussians, start: int, generator: torch.Generator) -> None:

@@ -3,7 +3,7 @@
 Steps are counted from 1.  Views come in epochs, each a new random order.  All randomness comes from one generator, and
 `Training` holds all that the next step depends on: a training that is saved and loaded continues to the same bits.
 
-    position rate(step) = extent * position^(1 - s) * position_final^s,   s = step / iterations
+    position rate(step) = extent * position^(1 - s) * position_final^s,   s = max(0, step - hold) / (iterations - hold)
     SH degree(step)     = min(sh_degree, (step - 1) // sh_degree_every)
 
 The Gaussians hold only the SH bands in use; a band joins as zeros, which is the same as one whose gradient was zero.
@@ -26,7 +26,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
-from splat.losses.autograd import loss_against
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.scenes.view import View
 from splat.training.state import Step, Training
@@ -74,7 +73,7 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
     """
     prepare(training, views)
     config, method, dtype = training.config, training.method, training.gaussians.flat.dtype
-    losses = [loss_against(view.image, config.loss, training.gaussians.flat) for view in views]
+    losses = [config.loss_against(view.image, training.gaussians.flat) for view in views]
     while training.step < config.iterations:
         # what the step is about: a view, a background, the loss against that view
         number = training.step + 1
@@ -84,7 +83,7 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
         if config.random_background:
             drawn = torch.rand(3, generator=training.generator, dtype=dtype)
             target = with_background(view, background, drawn)
-            background, loss = drawn, loss_against(target, config.loss, training.gaussians.flat)
+            background, loss = drawn, config.loss_against(target, training.gaussians.flat)
         step = Step(number, training, training.gaussians, views, chosen, background, loss)
 
         # the photometric gradient, and what the method makes of it

@@ -8,6 +8,9 @@ points      points: the scene's, from structure from motion, those seen by at le
                 the scene files' depth range, else half and one and a half times the camera's distance to the place that
                 all cameras look at.  Gaussians of the background's colour in front of it would have no gradient: they
                 stay, and hide the object from other viewpoints
+            box: DNGaussian's start (its scene/dataset_readers.py): random places in the box of the scene's points, of the sides
+                1.3 (max - min), BOX_DENSITY of them per world unit of the longest side, grey.  The box begins at the
+                BOX_RANK-th smallest coordinate, so that it is not centred on the points
             scene: points where the scene has any, else random
 means       the points; those at one place (exactly, as triangulation leaves them) are one, of their mean colour
 quats       the identity
@@ -35,13 +38,14 @@ from splat.scenes.scene import Scene
 from splat.scenes.sfm.triangulation import triangulated_points
 from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
 
-Source = Literal["scene", "points", "triangulated", "random"]
+Source = Literal["scene", "points", "triangulated", "random", "box"]
 OPACITY = 0.1
 NEIGHBOURS = 3
 SMALLEST_SCALE = sqrt(1e-7)  # of the median scale: for points that all but coincide with three others
 NEAR, FAR = 0.5, 1.5  # of the distance to the cameras' common target; Blender's 4 gives its usual 2 and 6
 MAX_DRAWS = 200  # per random point wanted
 SEEN_BY = 2  # views at least, or all if they are fewer
+BOX_RANK, BOX_SHARE, BOX_DENSITY = 20, 1.3, 50
 
 
 def initial_gaussians(
@@ -60,8 +64,11 @@ def initial_gaussians(
     >>> initial_gaussians(scene, scene.load(), sh_degree=1, generator=torch.Generator().manual_seed(0)).sh_degree
     1
     """
-    if source == "points" and scene.points is None:
+    if source in ("points", "box") and scene.points is None:
         raise InputError(f"expected a scene with points, {scene.root} has none; start from triangulated or random ones")
+    if source == "box":
+        assert scene.points is not None
+        return gaussians_from_points(points_in_box(scene.points, generator), views, sh_degree, seen_by=0)
     if source == "triangulated":
         return gaussians_from_points(triangulated_points(views), views, sh_degree)
     if source != "random" and scene.points is not None:
@@ -71,9 +78,11 @@ def initial_gaussians(
     return gaussians_from_points(points, views, sh_degree)
 
 
-def gaussians_from_points(points: Points, views: Sequence[View | Frame], sh_degree: int = 3) -> Gaussians:
-    """float32 Gaussians at the points that SEEN_BY of the views see."""
-    needed = min(SEEN_BY, len(views))
+def gaussians_from_points(
+    points: Points, views: Sequence[View | Frame], sh_degree: int = 3, seen_by: int = SEEN_BY
+) -> Gaussians:
+    """float32 Gaussians at the points that so many of the views see."""
+    needed = min(seen_by, len(views))
     seen = points.sightings(views) >= needed
     kept, colours = _merged(points.xyz[seen], points.rgb[seen])
     n = len(kept)
@@ -109,6 +118,19 @@ def _neighbour_distances(xyz: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     distances, _ = scipy.spatial.KDTree(xyz.numpy()).query(xyz.numpy(), k=NEIGHBOURS + 1)
     scales = torch.from_numpy(np.sqrt(np.square(distances[:, 1:]).mean(axis=1)))
     return scales.clamp_min(SMALLEST_SCALE * float(scales.median()))
+
+
+def points_in_box(points: Points, generator: torch.Generator) -> Points:
+    """Random grey points in a box round others."""
+    if len(points) < BOX_RANK:
+        raise InputError(
+            f"expected at least {BOX_RANK} points for a box round them, got {len(points)}; start from random"
+        )
+    sides = points.xyz.amax(dim=0) - points.xyz.amin(dim=0)
+    n = int(BOX_DENSITY * sides.max())
+    corner = points.xyz.sort(dim=0).values[BOX_RANK - 1]
+    places = torch.rand(n, 3, generator=generator, dtype=torch.float64)
+    return Points(corner + BOX_SHARE * sides * places, torch.full((n, 3), 0.5))
 
 
 def points_in_common_volume(

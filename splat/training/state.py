@@ -19,6 +19,7 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
 from splat.curvature.objective import SceneObjective
+from splat.losses.autograd import Clamped, loss_against
 from splat.losses.protocols import ViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
@@ -30,6 +31,7 @@ from splat.scenes.view import View
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.training.optim.adam import Adam
 
+Protocol = Literal["common", "llff"]
 Row = dict[str, Count | float | bool | str]  # of a history
 
 
@@ -46,7 +48,7 @@ class Step:
     views: Sequence[View]
     chosen: int
     background: Float[Tensor, "3"]
-    loss: ViewLoss
+    loss: ViewLoss | Clamped
 
     @property
     def config(self) -> "TrainConfig":
@@ -148,12 +150,14 @@ class ThreeDGS(MethodSettings):
 class LearningRates(Settings):
     """Adam's rates of 3DGS, about what a step changes a stored parameter by.
 
-    position, position_final: per unit of the scene's extent, at the first step and at the last.  sh_constant, sh_higher: of the
+    position, position_final: per unit of the scene's extent, at the first step and at the last.  position_hold: steps before
+    the first of them begins to fall.  sh_constant, sh_higher: of the
     SH band of degree 0 and of those above.
     """
 
     position: Positive = 1.6e-4
     position_final: Positive = 1.6e-6
+    position_hold: Count = 0
     log_scales: NonNegative = 5e-3
     quats: NonNegative = 1e-3
     opacity_logits: NonNegative = 0.05
@@ -168,6 +172,9 @@ class TrainConfig(Settings):
     sh_degree: the highest SH degree, 0 to 3; one is added every sh_degree_every steps, from 0.
     background: the colour that the views were composited over, RGB in [0, 1], drawn behind the Gaussians.
     random_background: instead draw a colour each step, under the Gaussians and under views that have an alpha channel.
+    clamp_image: the loss of a step is that of the image clamped to [0, 1]; the objective whose Hessian is studied never clamps.
+    protocol: whose training this is: that which is common to all methods, or a published one (`methods/protocols.csv`), which
+        set the other settings.
     method: what is added to 3DGS, with its settings (`splat/training/methods/methods.py`).
     InputError where a setting is out of its range.
 
@@ -182,6 +189,8 @@ class TrainConfig(Settings):
     sh_degree_every: Length = 1000
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
     random_background: bool = False
+    clamp_image: bool = False
+    protocol: Protocol = "common"
     loss: LossSettings = field(default_factory=LossSettings)
     rates: LearningRates = field(default_factory=LearningRates)
     densify: DensifySettings = field(default_factory=DensifySettings)
@@ -195,6 +204,11 @@ class TrainConfig(Settings):
 
     def background_colour(self, dtype: torch.dtype) -> Float[Tensor, "3"]:
         return torch.tensor(self.background, dtype=dtype)
+
+    def loss_against(self, image: Float[Tensor, "3 h w"], like: Tensor) -> ViewLoss | Clamped:
+        """The loss that a step descends, against a view's image; like: see `loss_against`."""
+        loss = loss_against(image, self.loss, like)
+        return Clamped(loss) if self.clamp_image else loss
 
     def objective(
         self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False, ranks: Ranks = ALONE
@@ -290,6 +304,7 @@ class Training:
                 densify(self.gaussians, gradients, self.extent, schedule, self.generator, prune_large=large)
             )
         if schedule.resets_opacity(step, iterations, white=self.config.is_white):
+            assert schedule.reset_opacity is not None
             reset_opacities(self.gaussians, schedule.reset_opacity)
             self.adam.forget("opacity_logits")
 
@@ -313,7 +328,7 @@ class Training:
 
 def position_rate(rates: LearningRates, extent: float, step: int, iterations: int) -> float:
     """Position learning rate at a step, world units."""
-    s = step / iterations
+    s = max(0, step - rates.position_hold) / max(1, iterations - rates.position_hold)
     return extent * rates.position ** (1 - s) * rates.position_final**s
 
 

@@ -190,12 +190,34 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     }
     assert dots == {BLACK: 3 * 5, SKY: 2 * 5}
     said = " ".join(text for text, _ in words(figure, laid_out(figure)))
-    assert "loss, 7% renders (error 0.4%)" in said and "order changed: 40%" in said
+    assert "loss, 7% renders (error <0.4%)" in said and "order changed: 40%" in said
     sections = [axes for axes in figure.axes if "step along" in axes.get_xlabel()]
     along = [
         [len(np.asarray(line.get_xdata())) for line in axes.lines if line.get_marker() == "."] for axes in sections
     ]
-    assert [5] in along
+    assert [3, 2] in along  # the crossed ones apart
+
+
+def test_a_plane_of_too_few_renders_is_drawn_as_its_sections_with_the_command_that_resolves_it(tmp_path):
+    data, arrays = synthetic()
+    evaluated = np.zeros((21, 17), bool)
+    evaluated[10], evaluated[:, 8] = True, True
+    arrays["slice"]["evaluated"], arrays["slice"]["crossed"] = evaluated, evaluated & False
+    arrays["slice"]["loss"][~evaluated] = np.nan
+    data["slice"] |= {"resolved": False, "tolerance": 0.01, "evaluated_points": 37, "interpolation_error": None}
+    record = written(tmp_path / "probe", data, arrays)
+    figure = slice2d.draw(record)
+    require_layout(figure)
+    said = " ".join(" ".join(text.split()) for text, _ in words(figure, laid_out(figure)))
+    command = f"landscape slice {record.data.provenance.checkpoint} renders more"
+    assert "37 of 357 renders" in said and command in said.replace("\n", " ")
+    assert not any(axes.collections for axes in figure.axes)  # no contours
+    for axes, count in zip(figure.axes[:2], (21, 17), strict=True):
+        curve = next(line for line in axes.lines if line.get_linestyle() == "-" and line.get_color() == BLACK)
+        assert np.isfinite(np.asarray(curve.get_ydata(), float)).sum() == count
+    with pytest.raises(ValueError, match=r"landscape slice .* renders more"):
+        surface.draw(record)
+    assert "surface.png" not in [path.name for path in make_all.draw_probe(record.folder)]
 
 
 def test_a_missing_slice_is_said_and_the_other_figures_are_drawn(tmp_path):
@@ -234,11 +256,24 @@ def test_the_command_draws_the_folder_named_on_its_standard_input(tmp_path):
     assert {path.name: path.read_bytes() for path in alone} == by_processes
 
 
+def test_pyvista_marks_the_renders(tmp_path):
+    heights, dots = np.zeros((9, 9)), np.zeros((9, 9), bool)
+    dots[2, 6] = True
+    try:
+        marked = surface._rendered(heights, np.array([]), dots)
+    except RuntimeError as error:
+        pytest.skip(f"no off-screen renderer on this machine: {error}")
+    changed = np.abs(marked - surface._rendered(heights, np.array([]), dots & False)).sum(axis=-1) > 0.05
+    rows, columns = np.nonzero(changed)
+    place = np.array([columns.mean(), len(changed) - 1 - rows.mean()]) / len(changed)
+    assert place == pytest.approx(Box.project(np.array([-0.5, 0.5, 0.006])), abs=0.005)
+
+
 def test_pyvista_renders_the_field_where_the_labels_are_put(tmp_path):
     heights = np.zeros((9, 9))
     heights[-1, :] = 1.0  # high at the right end of x
     try:
-        image = surface._rendered(heights, np.array([]))
+        image = surface._rendered(heights, np.array([]), np.zeros((9, 9), bool))
     except RuntimeError as error:
         pytest.skip(f"no off-screen renderer on this machine: {error}")
     size = image.shape[0]

@@ -105,8 +105,8 @@ def test_products_of_a_scene_stay_on_the_device_and_do_not_wait(monkeypatch):
         fake.brought.clear()
         hessian.apply(V)
         assert not +fake.waits and not +fake.brought  # so that they can be recorded
-        _ = objective.gradient, objective.block_diagonal(), objective.loss(flat), scene_units(objective)
-        known = BlockEigenvectors(objective, *objective.gaussian_blocks)
+        _ = objective.gradient, objective.block_diagonal(approximate=True), objective.loss(flat), scene_units(objective)
+        known = BlockEigenvectors(objective, *objective.approximate_blocks)
         known.steepest(1, 1)
         localize(V[:, 0], objective.active, conditions(objective.active, [views[0].camera]))
         split_control(objective.active, [views[0].camera])

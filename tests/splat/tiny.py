@@ -8,7 +8,7 @@ from splat.model.gaussians import Gaussians
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.densify import DensifySettings
-from splat.training.scene_reference import SceneReference
+from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig
 
 WIDTH, HEIGHT, EXTENT = 20, 14, 2.0

@@ -59,7 +59,9 @@ def _truth(objective: SceneObjective, hessian: SceneHessian) -> Truth:
         return torch.Generator().manual_seed(1_000_000 + stream)  # far from the seeds of what is compared
 
     traces = exact_traces(objective, generator(0), TraceSettings.fixed(SAMPLES))
-    scales = {name: float(part.abs().sum()) for name, part in objective.block_diagonal().diagonals.items()}
+    scales = {
+        name: float(part.abs().sum()) for name, part in objective.block_diagonal(approximate=True).diagonals.items()
+    }
     ends = extreme_eigenpairs(hessian, generator(1), EigenSettings(rtol=FINE, basis=128, max_matvecs=MOST))
     active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)
     density = spectral_density(hessian, generator(2), STARTS * STEPS, STARTS, active=active, ends=ends, trace=trace)

@@ -196,7 +196,7 @@ def _lanczos(text: str, settings: EigenSettings, origin: Origin = "own", applies
 
 def _from_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
     """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
-    start = BlockEigenvectors(case.scene, case.scene.block_diagonal()).warm_start()
+    start = BlockEigenvectors(case.scene, case.scene.block_diagonal(approximate=True)).warm_start()
     operator.charge(PASS)
     return _end_answers(extreme_eigenpairs(operator, generator(seed), start=start))
 
@@ -262,8 +262,8 @@ def _diagonal(_: Case, operator: MeteredOperator, seed: int, probes: int, method
 
 
 def _diagonal_of_blocks(case: Case, operator: MeteredOperator, _: int) -> list[Answer]:
-    """The diagonal of every Gaussian's block, less the radial directions of the quaternions; exact without SSIM."""
-    parts = case.scene.block_diagonal().diagonals_across(case.scene.active.quats)
+    """The diagonal of every Gaussian's approximate block, less the radial directions of the quaternions; exact without SSIM."""
+    parts = case.scene.block_diagonal(approximate=True).diagonals_across(case.scene.active.quats)
     values = torch.empty(case.operator.dim, dtype=torch.float64)
     for name, rows in case.operator.blocks.items():
         values[rows] = parts[name].reshape(-1)

@@ -9,7 +9,8 @@
     gsplat            ... by that package's kernels (on a GPU)
     linearize         what `LinearizedView` does once
     H v K             a product with K vectors, per vector
-    block diagonal    Hessian blocks of all attributes, one pass
+    block diagonal    approximate Hessian blocks of all attributes, one pass
+    exact blocks      the same with SSIM's coupling of pixels (on a CPU)
 
 One code for the CPU and for GPUs: where the workload's Gaussians are decides which kernels run, and a `Meter` measures them.
 
@@ -134,6 +135,7 @@ class ViewBench:
             "linearize": self._linearize,
             **products,
             "block diagonal": self._block_diagonal,
+            **({} if by_triton(self.like) else {"exact blocks": self.linearized.block_diagonal}),
         }
 
     def peers(self) -> Calls:
@@ -149,7 +151,7 @@ class ViewBench:
 
     def _block_diagonal(self) -> PerGaussianBlocks:
         vars(self.linearized._loss).pop("diagonal", None)  # it keeps the loss's share, which is part of the cost
-        return self.linearized.block_diagonal()
+        return self.linearized.block_diagonal(approximate=True)
 
     @property
     def pairs(self) -> int:

@@ -78,7 +78,7 @@ def _probed(cell: Cell, sweep: Sweep) -> bool:
         return False
     data = read_record(cell.out / PROBE, ProbeRecord).data
     whole = bool(data.split_control) or not sweep.split_control
-    return data.provenance.iteration == cell.training.iterations and whole
+    return data.provenance.iteration == cell.steps and whole
 
 
 @contextmanager

@@ -34,6 +34,8 @@ from analysis.console.overrides import leaves, read_value
 from analysis.probe.options import ProbeOptions
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError
+from splat.training.methods.protocols import presets
+from splat.training.state import TrainConfig
 
 FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
@@ -56,6 +58,11 @@ class Cell:
     scene: str
     method: str
     training: TrainOptions
+
+    @property
+    def steps(self) -> int:
+        preset = presets(self.training.method, self.training.protocol).get("iterations", TrainConfig.iterations)
+        return int(preset if self.training.iterations is None else self.training.iterations)
 
     @property
     def seed(self) -> int:

@@ -40,7 +40,7 @@ class SweepProgress:
             refresh_per_second=2,
             expand=True,
         )
-        self._task = self._bar.add_task("", total=sum(cell.training.iterations for cell in sweep.cells), state="")
+        self._task = self._bar.add_task("", total=sum(cell.steps for cell in sweep.cells), state="")
 
     def __enter__(self) -> "SweepProgress":
         self._bar.start()
@@ -97,7 +97,7 @@ class SweepProgress:
         total = 0.0
         for cell, each in zip(self.sweep.cells, spent, strict=True):
             pace = mean(paces.get((cell.scene, cell.method), [other]))
-            total += pace * (cell.training.iterations - each.step)
+            total += pace * (cell.steps - each.step)
             total += self._probe_seconds() * ("probe" in self.to_do[cell.name])
         return total / self.jobs
 

@@ -15,9 +15,10 @@ from torch import Tensor
 from splat.backend.cpu.planes import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
+from splat.losses.cpu.seconds import Coupling, second_rows
 from splat.losses.cpu.sweeps import PRODUCT_FIELDS, Loss, diagonal_rows, gradient_rows, product_rows
 from splat.losses.cpu.window import RING, Frame, moments_rows
-from splat.losses.formulas import KINDS
+from splat.losses.formulas import KINDS, SECONDS
 from splat.losses.reference import LossSettings, window
 
 RINGS = 5 << 18  # bytes of rings in a sweep: with more, another vector costs more cache than it shares
@@ -48,6 +49,11 @@ class CpuImageLoss:
         planes[:] = 0
         planes[:, : self.frame.height, : self.frame.width] = image.detach().numpy()
         return torch.from_numpy(planes)
+
+    @property
+    def couples_pixels(self) -> bool:
+        """Whether the loss has second derivatives across pixels."""
+        return self.structural > 0
 
     def cropped(self, planes: Float[Tensor, "k H W"]) -> Float[Tensor, "3 h w"]:
         """The first three planes without their padding."""
@@ -156,6 +162,16 @@ class CpuLinearLoss:
     def workspace(self, vectors: int) -> int:
         """Bytes that `hvp` of so many tangents takes beside its result and a few rows a thread."""
         return min(vectors, self._together) * self.gradient[:3].nbytes
+
+    def coupling(self) -> Coupling:
+        """l'' of a loss with SSIM, taken apart."""
+        loss = self.loss
+        image, target, _ = loss._against(self._image)
+        found = loss.planes(SECONDS + 1)
+        found[:, :, loss.frame.height :] = 0
+        seconds, uncoupled = found[:SECONDS].reshape(-1), found[SECONDS].reshape(-1)
+        self._sweep(second_rows, seconds, uncoupled)
+        return Coupling(image, target, seconds, uncoupled)
 
     @cached_property
     def diagonal(self) -> Float[Tensor, "3 H W"]:

@@ -33,6 +33,11 @@ class CudaImageLoss:
         self.which = {"KIND": KINDS[settings.pixel], "SSIM": self.ssim}
 
     @property
+    def couples_pixels(self) -> bool:
+        """Whether the loss has second derivatives across pixels."""
+        return self.ssim
+
+    @property
     def programs(self) -> int:
         return cdiv(3 * self.shape[0] * self.shape[1], BLOCK)
 

@@ -14,9 +14,12 @@ from torch import Tensor
 from splat.backend.cpu.planes import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range, over_tiles
+from splat.losses.cpu.seconds import Coupling
 from splat.model.settings import RenderSettings
-from splat.raster.cpu import binning, blocks, compositing, packing, tangents, tile
+from splat.raster.cpu import binning, blocks, compositing, coupling, footprints, packing, tangents, tile
 from splat.raster.formulas import SPLAT, thresholds_of
+
+FOOTPRINT_BYTES = 1 << 28  # of the splats whose footprints are kept at a time
 
 
 class CpuRaster:
@@ -145,6 +148,30 @@ class CpuRaster:
         moments = adjoint.moments.numpy()
         over_range(len(index), blocks.reduce_blocks, index.numpy(), splat_start, sums, moments, not gauss_newton, found)
         return torch.from_numpy(found)
+
+    def coupled_blocks(self, loss: Coupling, index: Int[Tensor, " m"]) -> Float64[Tensor, "m 9 9"]:
+        """What the coupling of pixels by the loss adds to the diagonal blocks of the splats at index (ascending)."""
+        (lists, splat_start), splats = self.reached, index.numpy()
+        blocks = np.zeros((len(splats), SPLAT, SPLAT))
+        layout, row = footprints.footprints_of(lists, splat_start), footprints.FOOTPRINT * lanes_of(self.dtype)
+        ends = layout.place[splat_start[splats + 1]]
+        together = max(FOOTPRINT_BYTES // (row * self.dtype.itemsize), 1)
+        done = 0
+        while done < len(splats):
+            first = splat_start[splats[done]]
+            stop = max(int(np.searchsorted(ends, layout.place[first] + together, side="right")), done + 1)
+            last = splat_start[splats[stop - 1] + 1]
+            found = aligned((int(layout.place[last] - layout.place[first]) * row,), self.dtype)
+            view, size = (self.params, lists, self.frame, self.pixels, layout), (self.height, self.width)
+            over_tiles(footprints.find_footprints, *view, first, last, found)
+            heaviest = done + np.argsort(np.diff(layout.place[splat_start])[splats[done:stop]])[::-1]
+            part = np.zeros((stop - done, SPLAT, SPLAT))
+            over_tiles(
+                coupling.coupled_blocks, splats[heaviest], self.params, self.frame, size, layout, first, found, *loss[:3], part
+            )  # fmt: skip
+            blocks[heaviest] = part
+            done = stop
+        return torch.from_numpy(blocks)
 
     def jvp(self, directions: Float[Tensor, "n k 9"]) -> "CpuTangent":
         """J u for tangents of the splats."""

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.losses.autograd import consistency_loss
+from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.projection.reference import on_screen
@@ -21,8 +22,12 @@ def agreement_gradients(
     camera: Camera,
     opacity_scales: tuple[Float[Tensor, " n"] | None, Float[Tensor, " n"] | None] = (None, None),
     weight: float = 1.0,
+    settings: LossSettings | None = None,
 ) -> tuple[Float[Tensor, " p"], Float[Tensor, " q"]] | None:
-    """The gradients of weight l(I_0, I_1) in the parameters of either field.  None where neither has a Gaussian in sight."""
+    """The gradients of weight l(I_0, I_1) in the parameters of either field.  None where neither has a Gaussian in sight.
+
+    settings: of l, where it is not the loss of training.
+    """
     flats = [field.flat.detach().requires_grad_() for field in fields]
     renders = [
         render(field.with_flat(flat), camera, step.background, step.config.render, opacity_scale=scale)
@@ -30,6 +35,6 @@ def agreement_gradients(
     ]
     if not any(on_screen(each.splats.detach(), camera).any() for each in renders):
         return None
-    loss = weight * consistency_loss(renders[0].image, renders[1].image, step.config.loss)
+    loss = weight * consistency_loss(renders[0].image, renders[1].image, settings or step.config.loss)
     first, second = torch.autograd.grad(loss, flats)
     return first, second

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,8 @@ import torch
 from PIL import Image
 
 from analysis.commands.cli import main
-from analysis.train.command import render_name
+from analysis.train.command import planned, render_name
+from analysis.train.options import TrainOptions
 from splat.losses.reference import psnr
 from splat.model.gaussians import ATTRIBUTES
 from splat.render.render import render
@@ -346,6 +348,39 @@ def test_random_backgrounds_and_other_losses_train(original, tmp_path):
     config = load_checkpoint(out / "checkpoint.pt").training.config
     assert config.random_background and config.loss.pixel == "charbonnier" and not config.densify.enabled
     assert config.sh_degree == 0
+
+
+def test_a_protocol_sets_what_no_option_gives_and_the_run_says_so(original, tmp_path):
+    own = ["--method", "cor-gs", "--protocol", "llff", "--set", "prune_start=3"]
+    options = [(), ("--background", "white", "--set", "densify.first_reset=7")]
+    for out, more, background, reset in zip(("a", "b"), options, (True, False), (501, 7), strict=True):
+        assert main(arguments(original, tmp_path / out, *own, *more)) == 0
+        config = load_checkpoint(tmp_path / out / "checkpoint.pt").training.config
+        assert (config.protocol, config.iterations) == ("llff", ITERATIONS)
+        assert (config.random_background, config.densify.first_reset) == (background, reset)
+        assert config.densify.prune_scale is None and config.densify.gradient_threshold == 5e-4
+        metrics = json.loads((tmp_path / out / "metrics.json").read_text())
+        assert (metrics["method"], metrics["protocol"]) == ("cor-gs", "llff")
+
+
+def test_the_steps_of_a_protocol_are_taken_unless_others_are_given(original):
+    own = TrainOptions(original, method="dropgaussian", protocol="llff")
+    steps = [
+        planned(replace(own, **given), Path("runs"))[2].iterations
+        for given in ({}, {"iterations": 30}, {"protocol": "common"})
+    ]
+    assert steps == [10_000, 30, 2000]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--method", "sam", "--protocol", "llff"), "expected a method with a published training for llff (cor-gs, "),
+        (("--set", "protocol=llff"), "expected a setting of the training (iterations, "),
+    ],
+)
+def test_a_protocol_that_a_method_lacks_and_one_by_set_are_refused(original, tmp_path, capsys, options, message):
+    refuse(capsys, arguments(original, tmp_path / "run", *options), message)
 
 
 def test_a_method_and_its_settings_are_named_on_the_command_line(original, tmp_path, capsys):

@@ -292,7 +292,7 @@ def test_the_own_blocks_lead_where_they_know_the_ends_in_every_metric(objective,
     monkeypatch.setattr("analysis.measures.families.families", watched)
     found(objective, checkpoint, metric=metric)
     assert len(seen) == 2 * len(BLOCKS)
-    own, pixelwise = objective.gaussian_blocks
+    own, pixelwise = objective.approximate_blocks
     for (gauss_newton, block), (operator, lead) in seen.items():
         scale = None if metric == "parameters" else operator.scale[:, 0]
         attribute = None if block == "all" else block

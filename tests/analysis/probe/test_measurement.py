@@ -10,7 +10,7 @@ import torch
 from analysis.bench.accuracy.cases import splat_cases
 from analysis.console.budget import Share
 from analysis.probe import measurement
-from analysis.probe.measurement import ProbeSettings, _density, _within, measure
+from analysis.probe.measurement import ProbeSettings, _density, measure
 from landscape import CountingOperator, EigenSettings, extreme_eigenpairs
 from landscape.operators.operator import DenseOperator
 from landscape.spectrum.density import spectral_density
@@ -46,12 +46,6 @@ def test_time_and_memory_bound_the_products_of_a_density(seconds, room, shape, s
     assert operator.matvecs == (shape[0] * shape[1] if shape else 0)  # none for the time alone
 
 
-def test_a_quick_slice_is_judged_by_few_points_whatever_the_time():
-    settings = ProbeSettings.quick()
-    holdouts = [_within(settings, seconds, each=0.5, workers=2).holdout for seconds in (50.0, 40.0, 2.0)]
-    assert holdouts == [settings.slice_holdout, settings.slice_holdout, 5]
-
-
 def test_kernels_are_compiled_before_the_time_runs_and_blocks_made_once(monkeypatch):
     """The clock is read for the budget after the first product, render, block and float64 gradient."""
     calls: list[str] = []
@@ -76,14 +70,9 @@ def test_kernels_are_compiled_before_the_time_runs_and_blocks_made_once(monkeypa
     assert {"block_diagonal", "evaluate", "check_against_gradient"} <= {*first}
     assert calls.count("block_diagonal") == 1 and calls.count("gauss_newton") == 1
     assert found.value == pytest.approx(objective.loss(objective.active.flat))
+    assert found.plane is not None  # the two axes alone
+    assert int(found.plane.slice.evaluated.sum()) == 9 and not found.plane.slice.resolved
     assert {trace.probes for trace in found.traces.values()} == {settings.trace_samples}
-
-
-@pytest.mark.parametrize(("renders", "held_out", "batch"), [(100, 30, 32), (80, 20, 20), (4, 5, 5)])
-def test_a_slice_with_little_time_keeps_its_points_and_holds_out_fewer(renders, held_out, batch):
-    allowed = _within(ProbeSettings(), seconds=0.5 * renders, each=0.5, workers=2)
-    assert (allowed.holdout, allowed.batch, allowed.workers) == (held_out, batch, 2)
-    assert allowed.max_seconds == 0.5 * renders and allowed.tolerance == ProbeSettings().slice_tolerance
 
 
 def test_the_slices_model_has_the_hessian_between_its_directions():

@@ -287,12 +287,16 @@ def test_the_findings_says_what_was_skipped_and_what_could_not_run():
 def test_the_findings_say_how_much_of_the_slice_is_interpolated():
     data, _ = synthetic()
     data["slice"] |= {"evaluated_points": 80, "crossed_points": 70, "interpolation_error": 0.004, "holdout_points": 30}
+    data["slice"] |= {"error_seen": 0.002, "tolerance": 0.01}
     said = sentences(data)
     assert "Of the slice's 357 points 80 are renders" in said
-    assert "an error at 30 random points of at most 0.4% of the range of the loss" in said
+    assert "interpolated to 1% of the range of the loss" in said
+    assert "(the error at 30 random points: at most 0.2%; the bound for all: 0.4%)" in said
     assert "70 of the slice's 80 rendered points" in said
-    data["slice"]["interpolation_error"] = None
-    assert "30 random points without bound" in sentences(data)
+    data["slice"] |= {"interpolation_error": None, "error_seen": None}
+    assert "30 random points: without bound" in sentences(data)
+    data["slice"]["resolved"] = False
+    assert "from 80 of 357 renders, and no surface is drawn; landscape slice" in sentences(data)
 
 
 def test_an_unbounded_ratio_is_given_by_its_bound():

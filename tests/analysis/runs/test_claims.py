@@ -150,7 +150,7 @@ def test_a_table_of_something_else_and_a_run_named_twice_are_refused(tmp_path, c
 def test_the_study_in_the_repository_decides_every_statement():
     names = set()
     for cell in read_sweep(Path(__file__).parents[3] / "notebooks" / "study.toml").cells:
-        config = TrainConfig(iterations=cell.training.iterations, method=METHODS[cell.training.method]())
+        config = TrainConfig(iterations=cell.steps, method=METHODS[cell.training.method]())
         config = overridden(config, assignments(cell.training.set))
         names.add(method_name(config.method, config))
     needed = {"3dgs", "stablegs", "stablegs viewpoints=one", ATTRIBUTES_ALONE, VIEWPOINTS_ALONE}

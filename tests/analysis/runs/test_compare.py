@@ -16,6 +16,7 @@ from splat.losses.reference import LossSettings
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.methods.sam import SAM
 from tests.figures.test_trajectory_figure import rows
 from tests.recorded import depth_section, synthetic, written
 
@@ -148,6 +149,39 @@ def test_the_page_and_the_terminal_show_every_run_with_errors_and_brackets(train
         assert bracketed(Index(value=7 * scale, low=6 * scale, high=9 * scale, note="")).bracket in page
 
 
+def test_runs_with_the_same_parameters_are_said_to_be_the_same(runs, capsys, no_pictures):
+    shutil.copy(Path(runs[0]) / "checkpoint.pt", Path(runs[1]) / "checkpoint.pt")
+    assert main(["compare", *runs]) == 0
+    assert capsys.readouterr().out.startswith("sam/0: parameters are identical to plain/0.")
+    changed(runs[1], method=SAM())
+    assert main(["compare", *runs]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("sam/0: the method never acted: parameters are identical to plain/0.")
+    page = (Path(runs[0]).parents[1] / "compare/compare.html").read_text()
+    assert page.index("never acted") < page.index("<h2>Pictures") < page.index("<h2>Numbers")
+
+
+def test_seeds_are_compared_by_mean_and_spread(runs, capsys, no_pictures, tmp_path):
+    folders = [Path(run).parent for run in runs]
+    for folder, scale in zip(folders, (1.0, 0.5), strict=True):
+        shutil.copytree(folder / "0", folder / "1")
+        shutil.rmtree(folder / "1/probe")
+        record(folder / "1/probe", 1.1 * scale)
+    assert main(["compare", *map(str, folders), "--out", str(tmp_path / "cells")]) == 0
+    said, page = capsys.readouterr().out, (tmp_path / "cells/compare.html").read_text()
+    assert "sam and plain differ by more than the spread of their seeds in" in said and "trace of position" in said
+    trace = synthetic(1.0)[0]["traces"]["means"]["value"]
+    cell = measured(1.05 * trace, 0.1 * trace / 2**0.5)
+    assert cell in said and cell in page and "The pictures show the first run of each group" in said
+    table = pd.read_csv(tmp_path / "cells/compare.csv")
+    assert set(table["run"]) == {"plain/0", "plain/1", "sam/0", "sam/1"}
+    assert json.loads((tmp_path / "cells/compare.json").read_text())["runs"].keys() == {"plain", "sam"}
+    named = ["--group", f"A={folders[0]}/0,{folders[0]}/1", "--group", f"B={folders[1]}/0,{folders[1]}/1"]
+    assert main(["compare", *named, "--out", str(tmp_path / "named")]) == 0
+    assert "B and A differ by more than the spread of their seeds in" in capsys.readouterr().out
+    refused(capsys, ["--group", "A"], "--group LABEL=RUN,RUN")
+
+
 def test_pictures_are_drawn_from_the_records_and_lie_in_the_page(trained, tmp_path):
     assert main(["compare", str(trained / "plain/0"), str(trained / "sam/0"), "--out", str(tmp_path)]) == 0
     drawn = sorted(path.stem for path in tmp_path.glob("*.png"))
@@ -156,11 +190,7 @@ def test_pictures_are_drawn_from_the_records_and_lie_in_the_page(trained, tmp_pa
 
 
 def test_other_functions_are_not_compared(runs, capsys):
-    changed(runs[1], loss=LossSettings(ssim_weight=0.5))
-    refused(
-        capsys, runs, "expected runs with the same loss", "ssim_weight=0.2", "in plain/0", "ssim_weight=0.5", "in sam/0"
-    )
-    changed(runs[1], loss=LossSettings(), background=(1.0, 1.0, 1.0))
+    changed(runs[1], background=(1.0, 1.0, 1.0))
     refused(capsys, runs, "expected runs with the same background")
     path = Path(runs[0]) / "checkpoint.pt"
     loaded = load_checkpoint(path)
@@ -169,6 +199,33 @@ def test_other_functions_are_not_compared(runs, capsys):
     save_checkpoint(path, loaded.training, replace(loaded.scene, train=loaded.scene.train[::-1]))
     refused(capsys, runs, "expected runs with the same training views")
     assert not (Path(runs[0]).parents[1] / "compare").exists()
+
+
+def test_probes_of_other_losses_are_not_compared(runs, capsys, no_pictures):
+    changed(runs[1], loss=LossSettings(literal=True), protocol="llff")
+    assert main(["compare", *runs]) == 0  # both records are of one loss
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The losses of the trainings are not the same." in said and "The protocol is not the same." in said
+    path = Path(runs[1]) / "probe/probe.json"
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps(data | {"objective": data["objective"] | {"loss": "L1 + 0.2 (1 − SSIM)"}}))
+    refused(capsys, runs, "expected probes of the same loss", "L1 + 0.2 (1 − SSIM) in sam/0", "--loss 3dgs")
+
+
+def test_runs_trained_with_other_losses_are_probed_with_that_of_3dgs(runs, capsys, monkeypatch, no_pictures):
+    changed(runs[1], loss=LossSettings(literal=True))
+    for run in runs:
+        shutil.rmtree(Path(run) / "probe")
+    refused(capsys, runs, "; ".join(f"landscape probe {run}/checkpoint.pt --loss 3dgs" for run in runs))
+    asked = []
+
+    def probe(options, command) -> int:
+        asked.append((options.loss, command[-1]))
+        record(options.checkpoint.parent / "probe", 1.0)
+        return 0
+
+    monkeypatch.setattr("analysis.probe.command.run_probe", probe)
+    assert main(["compare", *runs, "--probe"]) == 0 and asked == [("3dgs", "3dgs")] * 2
 
 
 def test_trajectories_of_other_functions_are_not_drawn_into_one_picture(runs, capsys, monkeypatch):
@@ -195,7 +252,9 @@ def test_a_run_without_a_record_is_refused_with_the_command_or_probed(runs, caps
         return 0
 
     monkeypatch.setattr("analysis.probe.command.run_probe", probe)
-    assert main(["compare", *runs, "--probe"]) == 0 and asked == [f"{command} --device auto" for command in commands]
+    assert main(["compare", *runs, "--probe"]) == 0 and asked == [
+        f"{command} --device auto --loss training" for command in commands
+    ]
     assert (Path(runs[0]).parents[1] / "compare/compare.csv").exists()
 
 

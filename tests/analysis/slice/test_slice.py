@@ -21,6 +21,7 @@ from analysis.records.records import Record, read_record
 from analysis.records.schema import FiniteProbe
 from analysis.slice.command import _finite_curvature
 from figures.make_all import recorded_figures
+from figures.plane import plane
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
@@ -256,12 +257,19 @@ def test_of_two_kinds_the_second_is_turned_to_a_right_angle(run, objective, tmp_
 
 
 def test_an_adaptive_slice_says_what_it_rendered_and_stays_below_the_most(run, objective, tmp_path, capsys):
-    record = sliced(tmp_path / "slice", run / "double.pt", "--max-renders", "80", "--tolerance", "1e-6")
+    record = sliced(tmp_path / "slice", run / "double.pt", "--max-renders", "200", "--tolerance", "1e-6")
     check_renders(record, objective)
     about = record.data.slice
-    assert about.evaluations <= 80 and about.points == 41 * 41 and about.reason == "evaluation budget"
+    assert (
+        about.evaluations <= 200
+        and not about.resolved
+        and about.points == 41 * 41
+        and about.reason == "evaluation budget"
+    )
     said = capsys.readouterr()
-    assert "evaluation budget" in said.out and f"{about.evaluated_points} are renders" in said.out
+    words = " ".join(said.out.split())
+    assert f"from {about.evaluated_points} of 1,681 renders, and no surface is drawn; leave out --max-renders." in words
+    assert np.isfinite(record.arrays["slice"]["loss"]).sum() == about.evaluated_points
     assert str(tmp_path / "slice") in said.out and "slice.json" in said.out
 
 
@@ -366,6 +374,18 @@ def test_the_pictures_are_those_of_a_plane_or_of_a_line(run, eigen, tmp_path, mo
     assert recorded_figures(eigen) == ("slice2d", "surface")
 
 
+def test_a_plane_leads_through_three_checkpoints(run, tmp_path):
+    names = ("behind", "double", "turned")
+    record = sliced(tmp_path / "plane", *(str(run / f"{name}.pt") for name in names), "--points", "9", "--all-points")  # pyright: ignore[reportArgumentType]
+    arrays, places = record.arrays["slice"], ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+    for name, (x, y) in zip(names, places, strict=True):
+        objective = objective_of(run / f"{name}.pt")
+        truth = objective.loss(objective.active.flat)
+        assert float(arrays["loss"][arrays["x"] == x][:, arrays["y"] == y][0, 0]) == pytest.approx(truth, rel=1e-12)
+    assert [direction.name for direction in record.data.slice.directions] == ["line₁", "line₂"]
+    assert plane(record).others == [(1.0, 0.0), (0.0, 1.0)]
+
+
 def few(run: Path, tmp_path: Path) -> str:
     """A checkpoint with other Gaussians."""
     loaded = load_checkpoint(run / "double.pt")
@@ -386,7 +406,7 @@ def few(run: Path, tmp_path: Path) -> str:
         (["--radius", "0"], ["radii", "above 0"]),
         (["--radius", "1", "--radius", "1", "--radius", "1"], ["at most 2 radii"]),
         (["--tolerance", "2"], ["tolerance between 0 and 1"]),
-        (["--max-renders", "10"], ["at least 52"]),
+        (["--max-renders", "10"], ["at least 83"]),
         (["--max-renders", "60", "--all-points"], ["leave one out"]),
         (["--workers", "0"], ["workers"]),
         (["--along", "line"], ["no other checkpoint", "name it"]),
@@ -397,13 +417,22 @@ def few(run: Path, tmp_path: Path) -> str:
         (["--seed", "-1"], ["seed in [0, 2^63), got -1"]),
         (["--along", "random", "--radius", "100"], ["too long"]),
         (["OTHER", "--along", "gradient"], ["one more checkpoint", "--along line"]),
+        (["OTHER", "BEHIND", "--along", "line", "--along", "gradient"], ["at most three checkpoints"]),
+        (["OTHER", "BEHIND", "BEHIND"], ["at most three checkpoints"]),
+        (["OTHER", "BEHIND", "--dimension", "1"], ["two checkpoints for a line, got three"]),
+        (["OTHER", "OTHER"], ["directions that are not parallel"]),
         (["FEW"], ["15 Gaussians with SH degree", "got 9", "after densification"]),
         (["SAME"], ["differ"]),
         (["NOWHERE"], ["nowhere.pt", "no such file"]),
     ],
 )
 def test_bad_input_gets_one_sentence_and_leaves_no_record(run, tmp_path, capsys, options, words):
-    named = {"OTHER": str(run / "turned.pt"), "SAME": str(run / "double.pt"), "NOWHERE": str(tmp_path / "nowhere.pt")}
+    named = {
+        "BEHIND": str(run / "behind.pt"),
+        "OTHER": str(run / "turned.pt"),
+        "SAME": str(run / "double.pt"),
+        "NOWHERE": str(tmp_path / "nowhere.pt"),
+    }
     if "FEW" in options:
         named["FEW"] = few(run, tmp_path)
     out = tmp_path / "out" / "slice"

@@ -24,24 +24,29 @@ from tests.splat.random_scenes import random_camera, random_gaussians, random_li
 
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")
 PIXEL_SUMS = [LossSettings(kind, ssim_weight=0) for kind in ("l1", "charbonnier", "l2")]
+WITH_SSIM = [LossSettings(), LossSettings("charbonnier", ssim_weight=0.5), LossSettings("l2", ssim_weight=1.0)]
 
 
-def awkward_gaussians() -> Gaussians:
-    """Clamped by the cap, stopped behind opaque ones, a needle, one across the image's edge, two at the same place."""
-    gaussians = random_gaussians(24, sh_degree=1, seed=3, logit=1.0, spread=0.8)
+def awkward_gaussians(sh_degree: int = 1) -> Gaussians:
+    """Clamped by the cap, stopped behind opaque ones, a needle, one across the image's edge, two at the same place, black."""
+    gaussians = random_gaussians(24, sh_degree=sh_degree, seed=3, logit=1.0, spread=0.8)
     gaussians.opacity_logits[:8] = 7.0  # the cap holds near their centres, and pixels stop behind several of them
     gaussians.log_scales[:8] = -0.5
     gaussians.log_scales[8] = torch.tensor([1.0, -6.0, -6.0])
     gaussians.means[9] = torch.tensor([1.9, 0.0, 4.0])
     gaussians.means[10] = gaussians.means[11]
+    gaussians.sh[12, 0] = torch.tensor([-3.0, 0.5, 0.5])  # one colour is clamped at 0
+    gaussians.means[13] = torch.tensor([9.0, 0.0, 4.0])  # off the screen
     return gaussians
 
 
-def objective_of(gaussians: Gaussians, loss: LossSettings, noise: float) -> SceneObjective:
+def objective_of(
+    gaussians: Gaussians, loss: LossSettings, noise: float, size: tuple[int, int] = (32, 28)
+) -> SceneObjective:
     """Two views whose targets are the renders themselves plus noise: small noise is a good fit."""
     generator, views = torch.Generator().manual_seed(5), []
     for seed in (0, 1):
-        camera: Camera = random_camera(32, 28, seed=seed, focal=34.0)
+        camera: Camera = random_camera(*size, seed=seed, focal=34.0)
         image = render(gaussians, camera, BACKGROUND).image
         target = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype)
         views.append(View(str(seed), camera, target.float()))
@@ -55,20 +60,68 @@ def dense(operator: SceneHessian) -> Tensor:
     return operator.apply(torch.eye(operator.dim, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("loss", PIXEL_SUMS, ids=lambda loss: loss.pixel)
+def geometry_rows(objective: SceneObjective) -> Tensor:
+    """Where each Gaussian's geometry and opacity lie among all parameters, (n, 11)."""
+    each = [
+        torch.arange(rows.stop)[rows].view(len(objective.active), -1)
+        for rows in (objective.blocks[name] for name in GEOMETRY)
+    ]
+    return torch.cat(each, dim=1)
+
+
+@pytest.mark.parametrize(
+    ("loss", "sh_degree"),
+    [*((loss, 1) for loss in PIXEL_SUMS + WITH_SSIM), *((WITH_SSIM[1], degree) for degree in (0, 2, 3))],
+    ids=str,
+)
 @pytest.mark.parametrize("gauss_newton", [False, True])
-def test_own_blocks_are_those_of_the_dense_hessian(loss: LossSettings, gauss_newton: bool) -> None:
-    objective = objective_of(awkward_gaussians(), loss, noise=0.3)
-    own, n = objective.block_diagonal(gauss_newton=gauss_newton), len(objective.active)
+def test_own_blocks_are_those_of_the_dense_hessian(loss: LossSettings, sh_degree: int, gauss_newton: bool) -> None:
+    objective = objective_of(awkward_gaussians(sh_degree), loss, noise=0.3, size=(33, 27))
+    own = objective.block_diagonal(gauss_newton=gauss_newton)
     H = dense(SceneHessian(objective, gauss_newton=gauss_newton, keep_null=True))
-    rows = torch.cat([torch.arange(H.shape[0])[objective.blocks[name]].view(n, -1) for name in GEOMETRY], dim=1)
-    expected = torch.stack([H[index][:, index] for index in rows])
+    expected = torch.stack([H[index][:, index] for index in geometry_rows(objective)])
     scale = 1e-10 * float(H.diagonal().abs().max())
     assert float((own.geometry - expected).abs().max()) <= scale
     assert float((own.sh.reshape(-1) - H.diagonal()[objective.blocks["sh"]]).abs().max()) <= scale
     traces = own.traces()
     for name, block in objective.blocks.items():
         assert abs(traces[name] - float(H.diagonal()[block].sum())) <= 1e-10 * float(H.diagonal()[block].abs().sum())
+
+
+def test_own_blocks_with_ssim_are_differences_of_gradients() -> None:
+    objective, step = objective_of(random_gaussians(20, sh_degree=1, seed=7), WITH_SSIM[1], noise=0.1), 1e-5
+    own, flat = objective.block_diagonal().geometry, objective.active.flat
+    for gaussian, rows in enumerate(geometry_rows(objective)[:3]):
+        columns = []
+        for row in rows:
+            ends = []
+            for sign in (1, -1):
+                moved = flat.clone()
+                moved[row] += sign * step
+                views = [objective.linearize(index, objective.active.with_flat(moved)) for index in range(2)]
+                ends.append((views[0].gradient + views[1].gradient)[rows] / 2)
+            columns.append((ends[0] - ends[1]) / (2 * step))
+        # the truncation is step^2 / 6 times a third derivative: one more factor of some 1 / (a splat's size) each
+        assert float((torch.stack(columns) - own[gaussian]).abs().max() / own[gaussian].abs().max()) < 1e-6
+
+
+def test_splats_that_are_looked_at_together_change_no_bit(monkeypatch) -> None:
+    objective = objective_of(awkward_gaussians(), WITH_SSIM[0], noise=0.3)
+    whole = objective.block_diagonal().geometry
+    monkeypatch.setattr("splat.raster.cpu.raster.FOOTPRINT_BYTES", 1)
+    assert torch.equal(objective.block_diagonal().geometry, whole)
+
+
+def test_traces_of_exact_blocks_are_within_the_error_of_sampled_ones() -> None:
+    objective = objective_of(awkward_gaussians(), WITH_SSIM[0], noise=0.05)
+    sampled = exact_traces(objective, torch.Generator().manual_seed(0), samples=64)
+    exact = objective.block_diagonal().traces(objective.active.quats)
+    approximate = objective.block_diagonal(approximate=True).traces(objective.active.quats)
+    for name, estimate in sampled.items():
+        assert abs(exact[name] - estimate.value) < 4 * estimate.standard_error
+    assert any(
+        abs(approximate[name] - estimate.value) > 4 * estimate.standard_error for name, estimate in sampled.items()
+    )
 
 
 def test_memory_decides_which_views_are_kept_and_changes_no_bit(monkeypatch) -> None:
@@ -167,7 +220,9 @@ def test_intervals_of_fixed_and_adaptive_budgets_cover_as_stated(noise: float) -
     H, names = dense(SceneHessian(objective)), list(objective.blocks)
     truth = {name: float(H.diagonal()[rows].sum()) for name, rows in objective.blocks.items()}
     quats, generator = objective.active.quats, torch.Generator().manual_seed(0)
-    known, pixelwise = (objective.block_diagonal(gauss_newton=part).traces(quats) for part in (False, True))
+    known, pixelwise = (
+        objective.block_diagonal(gauss_newton=part, approximate=True).traces(quats) for part in (False, True)
+    )
     draws = [torch.stack(samples_of(objective, generator, names, 100)) for _ in range(40)]
     pool = torch.stack(draws, dim=2).flatten(2)
     fixed, adaptive = TraceSettings.fixed(8), TraceSettings(rtol=0.05, max_probes=64)

@@ -107,3 +107,12 @@ def test_quaternions_too_short_for_their_curvature_are_refused():
         gaussians.require_finite()
     gaussians.quats[1:3] = 1e-9
     gaussians.require_finite()
+
+
+def test_aligned_gaussians_have_unit_quaternions_on_the_near_side():
+    here = random_gaussians(5, 1)
+    turned = here.with_flat(here.flat.clone())
+    turned.quats.mul_(torch.tensor([-3.0, 2.0, -0.1, 1.0, -1.0]).to(here.flat)[:, None])
+    before, aligned = turned.flat.clone(), turned.aligned_to(here)
+    torch.testing.assert_close(aligned.quats, here.quats / here.quats.norm(dim=1, keepdim=True))
+    assert torch.equal(turned.flat, before) and torch.equal(aligned.means, here.means)

@@ -15,7 +15,7 @@ import torch
 
 from landscape.errors import InputError
 from splat.model.settings import RenderSettings
-from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
+from splat.training.checkpoint import LATER, load_checkpoint, save_checkpoint, write_atomically
 from splat.training.loop import train
 from splat.training.methods.methods import ThreeDGS
 from splat.training.state import Training
@@ -245,7 +245,16 @@ def test_saved_moments_and_sums_are_finite_and_squares_not_negative(path, part, 
 def test_a_ply_file_is_refused_by_its_name(tmp_path):
     path = tmp_path / "point_cloud.ply"
     path.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
-    refused(path, r"damaged \(Gaussians from a PLY file cannot be read\)")
+    refused(path, r"damaged \(of other tools")
+
+
+def test_a_checkpoint_that_lacks_later_settings_stands_for_their_defaults(path):
+    content, config = torch.load(path, weights_only=True), load_checkpoint(path).training.config
+    for name in LATER:
+        *above, last = name.split(".")
+        del (content["config"][above[0]] if above else content["config"])[last]
+    torch.save(content, path)
+    assert load_checkpoint(path).training.config == config
 
 
 @pytest.mark.parametrize("older", [{}, {"sums": "ordered"}, {"sums": "atomic"}])

@@ -95,6 +95,30 @@ def test_transparent_gaussians_are_removed_and_large_ones_only_when_asked():
     assert run(gaussians, [LOW] * 3).parents.tolist() == [0, 1, 2]
 
 
+def test_without_a_prune_scale_nothing_is_removed_for_its_size():
+    assert not replace(SETTINGS, prune_scale=None).prunes_large(30_000) and SETTINGS.prunes_large(30_000)
+
+
+def test_only_opaque_gaussians_grow_where_an_opacity_is_asked_for():
+    gaussians = gaussians_of_sizes(0.5, 0.5, 3.0, 3.0)
+    gaussians.opacity_logits[[1, 3]] = log(0.09 / 0.91)
+    assert run(gaussians, [HIGH] * 4).parents.tolist() == [0, 1, 0, 1, 2, 2, 3, 3]
+    grown = run(gaussians, [HIGH] * 4, settings=replace(SETTINGS, grow_opacity=0.1))
+    assert grown.parents.tolist() == [0, 1, 3, 0, 2, 2]
+
+
+def test_large_gaussians_far_from_their_neighbours_are_split_whatever_their_gradient():
+    gaussians = gaussians_of_sizes(120.0, 120.0, 80.0, 120.0, 120.0)  # the extent is 100
+    away = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 9, 0], [0, 0, 8], [0, 0, 5]])
+    gaussians.means.copy_(away)
+    squared = torch.cdist(away, away).square().sort(dim=1).values[:, 1:4].mean(dim=1)
+    settings = replace(SETTINGS, split_distance=20.0)
+    assert (squared > 20 * EXTENT).tolist() == [False, False, True, True, False]
+    change = run(gaussians, [LOW, HIGH, LOW, LOW, LOW], settings=settings)
+    assert change.parents.tolist() == [0, 2, 4, 1, 1, 3, 3] and change.split == 2
+    assert run(gaussians, [LOW, HIGH, LOW, LOW, LOW]).split == 1
+
+
 def test_opacity_reset_lowers_what_is_above_and_leaves_what_is_below():
     gaussians = tiny_gaussians(3)
     gaussians.opacity_logits.copy_(torch.tensor([2.0, -3.0, -6.0]))
@@ -142,6 +166,17 @@ def test_a_run_of_30000_steps_densifies_and_resets_when_3dgs_does():
     assert steps(30_000, "resets_opacity", white=False) == [3000, 6000, 9000, 12_000]
     assert steps(30_000, "resets_opacity", white=True) == [500, 3000, 6000, 9000, 12_000]
     assert not SETTINGS.prunes_large(3000) and SETTINGS.prunes_large(3001)
+
+
+def test_resets_begin_at_a_step_of_their_own_or_never():
+    def resets(settings: DensifySettings) -> list[int]:
+        return [step for step in range(1, 10_001) if settings.resets_opacity(step, 10_000, white=False)]
+
+    whole = DensifySettings(stop_share=1.0)
+    assert resets(whole) == [3000, 6000, 9000]
+    assert resets(replace(whole, first_reset=501)) == [501, 3501, 6501, 9501]
+    assert resets(replace(whole, reset_opacity=None, min_opacity=0.01)) == []
+    assert not replace(whole, first_reset=501).prunes_large(501) and replace(whole, first_reset=501).prunes_large(502)
 
 
 def test_short_runs_densify_in_their_second_quarter():

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from splat.losses.reference import LossSettings, photometric_loss
+from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
@@ -62,6 +63,30 @@ def test_position_rate_decays_exponentially_to_its_final_value():
     assert position_rate(rates, 3.0, 0, 700) == pytest.approx(3.0 * rates.position, rel=1e-14)
     assert position_rate(rates, 3.0, 700, 700) == pytest.approx(3.0 * rates.position_final, rel=1e-14)
     assert position_rate(rates, 1.0, 350, 700) == pytest.approx(sqrt(rates.position * rates.position_final), rel=1e-14)
+
+
+def test_the_position_rate_is_held_for_its_first_steps():
+    rates = LearningRates(position_hold=100)
+    assert {position_rate(rates, 3.0, step, 700) for step in (1, 50, 100)} == {3.0 * rates.position}
+    assert position_rate(rates, 1.0, 400, 700) == pytest.approx(sqrt(rates.position * rates.position_final), rel=1e-14)
+    assert position_rate(rates, 3.0, 700, 700) == pytest.approx(3.0 * rates.position_final, rel=1e-14)
+    assert position_rate(LearningRates(position_hold=900), 1.0, 700, 700) == rates.position
+
+
+def test_a_clamped_image_has_no_gradient_where_it_is_outside():
+    views, gaussians = tiny_views(torch.float64), tiny_gaussians(dtype=torch.float64)
+    gaussians.sh[:, 0] += 3.0  # too bright
+    camera, background = views[0].camera, torch.zeros(3, dtype=torch.float64)
+    flat = gaussians.flat.clone().requires_grad_()
+    image = render(gaussians.with_flat(flat), camera, background, backend="reference").image
+    assert 0 < (image > 1).sum() < image.numel()
+    expected = photometric_loss(image.clamp(0, 1), views[0].image)
+    (gradient,) = torch.autograd.grad(expected, flat)
+    for clamp in (True, False):
+        loss = TrainConfig(clamp_image=clamp).loss_against(views[0].image, gaussians.flat)
+        got = loss_and_gradient(gaussians, camera, loss, background)
+        same = abs(got.loss - expected.item()) < 1e-10, (got.gradient - gradient).norm() < 1e-8 * gradient.norm()
+        assert same == (clamp, clamp)
 
 
 def test_every_parameter_has_the_rate_of_its_attribute_and_band():

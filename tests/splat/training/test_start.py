@@ -1,7 +1,7 @@
 """The Gaussians that a training starts from."""
 
 from dataclasses import replace
-from math import cos, log, pi, sin
+from math import cos, log, pi, sin, sqrt
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +10,20 @@ import pytest
 import torch
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.harmonics import Y00
 from splat.render.render import render
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import split_scene
 from splat.scenes.view import Frame, Points, View, inside_image
-from splat.training.start import Source, gaussians_from_points, initial_gaussians, points_in_common_volume
+from splat.training.start import (
+    Source,
+    gaussians_from_points,
+    initial_gaussians,
+    points_in_box,
+    points_in_common_volume,
+)
 
 NAMES = ("a", "b", "c")
 
@@ -167,6 +174,25 @@ def test_the_generator_decides_the_points() -> None:
         points_in_common_volume(views(), 50, torch.Generator().manual_seed(seed)).xyz for seed in (1, 1, 2)
     )
     assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_a_box_of_random_points_begins_at_the_twentieth_coordinate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splat.training.start.BOX_DENSITY", 1000)
+    frames = tuple(Frame(v.name, v.camera, lambda v=v: v) for v in views())
+    scene = Scene("s", Path("s"), "synthetic", frames, some_points(), torch.zeros(3))
+    generator = torch.Generator().manual_seed(0)
+    gaussians = initial_gaussians(scene, views(), 0, generator=generator, source="box")
+    assert scene.points is not None
+    xyz = scene.points.xyz
+    sides = xyz.amax(dim=0) - xyz.amin(dim=0)
+    corner = torch.from_numpy(np.sort(xyz.numpy(), axis=0)[19])
+    assert len(gaussians) == int(1000 * sides.max())
+    shares = (gaussians.means.double() - corner) / (1.3 * sides)
+    assert 0 <= shares.min() < 0.01 and 0.99 < shares.max() <= 1 + 1e-6
+    assert (shares.mean(dim=0) - 0.5).abs().max() < 4 / sqrt(12 * len(gaussians))
+    assert not gaussians.sh.any()
+    with pytest.raises(InputError, match="expected at least 20 points for a box"):
+        points_in_box(some_points(19), generator)
 
 
 def test_parallel_cameras_need_a_depth_range() -> None:

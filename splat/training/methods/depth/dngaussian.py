@@ -5,12 +5,12 @@
                 Gaussians, not a mixture, come to lie at the right place; from step hard_start + 1
     D_soft      depth with the opacities as they are: only they have a gradient; from step soft_start + 1
     E           mean of (N(D) - N(prior))^2 over the pixels where |N(D) - N(prior)| > tolerance, N either of
-    N_local     (D - mean_P) / (std_P + 0.01 std)           mean_P, std_P over the patch of a pixel, std over the image
-    N_global    (D - mean_P) / std
+    N_local     (D - mean_P) / (std_P + 0.01 std)           mean_P, std_P over the patch of a pixel, std over all patches
+    N_global    (D - mean_P) / (std_D + 0.01 std)           std_D over the image, a constant to the derivative
     P           square patches side by side from the top left corner; pixels left over at the edges do not count; their
                 side is drawn anew for each E, uniform in [smallest_patch, largest_patch], at most the image's
 
-std over the image is a constant to the derivative.  D and prior: see `prior.py`.  Weights, starts, sides and tolerance
+D and prior: see `prior.py`.  Weights, starts, sides and tolerance
 are those of the published code for LLFF (Fictionarry/DNGaussian, train_llff.py and scripts/run_llff.sh).  It takes a step of
 Adam for each of the three losses, the paper their sum, as here.
 
@@ -124,9 +124,14 @@ def normalised(depth: Float[Tensor, "h w"], side: int, *, local: bool) -> Float[
     rows, columns = (size // side for size in depth.shape)
     patches = depth[: rows * side, : columns * side].reshape(rows, side, columns, side)
     patches = patches.transpose(1, 2).reshape(rows * columns, side * side)
-    centred, overall = patches - patches.mean(dim=1, keepdim=True), depth.detach().std()
-    if not local:
-        return centred / overall
-    variance = centred.square().sum(dim=1, keepdim=True) / (side * side - 1)
-    std = torch.where(variance > 0, variance, 1).sqrt() * (variance > 0)  # of a constant patch 0, and so its derivative
-    return centred / (std + EPS * overall)
+    centred = patches - patches.mean(dim=1, keepdim=True)
+    spread = _std(centred, 1) if local else depth.detach().std()
+    divisor = spread + EPS * _std(patches - patches.mean(), (0, 1))
+    return centred / torch.where(divisor > 0, divisor, 1)
+
+
+def _std(centred: Float[Tensor, "patches pixels"], dims: int | tuple[int, int]) -> Tensor:
+    """The standard deviation of values with mean 0; 0, with its derivative, where all are 0."""
+    squares = centred.square()
+    variance = squares.sum(dim=dims, keepdim=True) / (squares.numel() / squares.sum(dim=dims).numel() - 1)
+    return torch.where(variance > 0, variance, 1).sqrt() * (variance > 0)

@@ -8,7 +8,8 @@ Proximity-guided unpooling, at every densification up to `unpool_until`:
                 opacity of the destination, no rotation (1, 0, 0, 0), SH 0; edges of both directions count
 
 The paper's threshold is 10 in the units of the scene; here it is relative to the scene, as in the published code
-(VITA-Group/FSGS, scene/gaussian_model.py).
+(VITA-Group/FSGS, scene/gaussian_model.py).  `released` repeats what else that code does: its score is the mean of the squared
+distances; the j-th of the s K edges of s sources runs from source j mod s, not j div K; the step `unpool_until` is left out.
 
 Depth supervision, at every step:
 
@@ -18,15 +19,14 @@ Depth supervision, at every step:
 
 with late_depth_weight after `depth_until`.  depth_weight 0 leaves the unpooling alone, and needs no depth maps.
 
-Not here: the same term at pseudo-views, whose prior is a monocular network's answer to the rendered image, and splitting by
-the score, which only the code does.
+Not here: the same term at pseudo-views, whose prior is a monocular network's answer to the rendered image.  Splitting by the
+score, which only the code does, is `densify.split_distance`.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
-import scipy
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -36,7 +36,7 @@ from splat.model.typed import Count, Length, NonNegative, Positive
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render_depth
 from splat.scenes.view import View
-from splat.training.densify import Densified
+from splat.training.densify import Densified, neighbours
 from splat.training.methods.depth.prior import DepthKind, prior, require_maps
 from splat.training.state import Method, MethodSettings, Step, TrainConfig, Training
 
@@ -48,6 +48,7 @@ class FSGS(MethodSettings):
     """neighbours: K; threshold, large: in units of the scene's extent; unpool_until, depth_until: steps.
 
     depths: what the depth maps hold, "disparity" (larger is nearer) or "depth" (larger is farther).
+    released: unpool as the published code does.
     """
 
     name: Literal["fsgs"] = "fsgs"
@@ -59,6 +60,8 @@ class FSGS(MethodSettings):
     late_depth_weight: NonNegative = 0.001
     depth_until: Count = 9500
     depths: DepthKind = "disparity"
+    released: bool = False
+    BEFORE: ClassVar[dict[str, Any]] = {"released": False}
 
     def create(self, seed: int) -> Method:
         return FSGSMethod(self, seed)
@@ -92,7 +95,7 @@ class FSGSMethod(Method[FSGS]):
 
     def after_step(self, step: Step) -> None:
         settings, training = self.settings, step.training
-        if step.number > settings.unpool_until:
+        if step.number > settings.unpool_until - settings.released:
             return
         schedule = step.config.method.density_control(step.config)
         if schedule.densifies(step.number, step.config.iterations):
@@ -131,12 +134,11 @@ def unpool(gaussians: Gaussians, extent: float, settings: FSGS) -> Densified:
     everyone = torch.arange(n, device=device)
     source = destination = everyone[:0]
     if k:
-        means = gaussians.means.cpu().double().numpy()
-        found = scipy.spatial.KDTree(means).query(means, k=k + 1)
-        distances, nearest = (torch.as_tensor(each[:, 1:]).to(device) for each in found)  # the nearest is itself
-        wide = distances.mean(dim=1) > settings.threshold * extent
+        distances, nearest = neighbours(gaussians, k)
+        scores = (distances.square() if settings.released else distances).mean(dim=1)
+        wide = scores > settings.threshold * extent
         wide &= gaussians.log_scales.exp().amax(dim=1) > settings.large * extent
-        source = everyone[wide].repeat_interleave(k)
+        source = everyone[wide].repeat(k) if settings.released else everyone[wide].repeat_interleave(k)
         destination = nearest[wide].reshape(-1)
     parents = torch.cat([everyone, destination])
     result = gaussians.select(parents)

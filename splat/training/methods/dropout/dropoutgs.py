@@ -2,7 +2,8 @@
 
     L = L_recon(I) + weight l(I, I_drop)
     I_drop   the sampled view rendered without a random share `p` of the Gaussians; the others keep their opacity
-    l        the loss of training, between the two images, differentiated in both
+    l        the loss of training, between the two images, differentiated in both; the pixel loss has the weight 1 - lambda even
+             where it has 1 against the photograph (`loss.literal`), as published
 
 p and weight are constant from the first step; 0.4 and 0.2 are those of the published code for LLFF with 3 views
 (xuyx55/DropoutGS, scripts/train_llff.sh).  The step's render, and with it density control, sees every Gaussian.  Two more
@@ -40,5 +41,6 @@ class DropoutGSMethod(Method[DropoutGS]):
     def gradient(self, step: Step, base: LossAndGradient) -> LossAndGradient:
         keep = dropout(len(step.gaussians), self.settings.p, step.gaussians.flat.dtype, self.generator)
         fields, scales = (step.gaussians, step.gaussians), (None, keep)
-        found = agreement_gradients(step, fields, step.camera, scales, self.settings.weight)
+        loss = replace(step.config.loss, literal=False)
+        found = agreement_gradients(step, fields, step.camera, scales, self.settings.weight, loss)
         return base if found is None else replace(base, gradient=base.gradient + (found[0] + found[1]))

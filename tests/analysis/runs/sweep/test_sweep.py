@@ -132,6 +132,15 @@ def test_narrower_settings_go_first_and_paths_are_those_of_the_file(folder):
     assert read_sweep(folder / "sweep.toml", Path("elsewhere")).cells[0].out == Path("elsewhere/still/3dgs/1")
 
 
+def test_cells_of_a_protocol_count_its_steps_unless_the_file_gives_others(folder):
+    file = written(folder, "iterations = 12", 'protocol = "llff"')
+    for steps in (6, 10_000):
+        cells = [cell for cell in read_sweep(file).cells if cell.training.method == "stablegs"]
+        assert {cell.steps for cell in cells} == {steps}
+        assert "--protocol" in arguments(cells[0].training)
+        file.write_text(file.read_text().replace("iterations = 6", ""))
+
+
 def test_a_cell_is_the_command_that_a_user_would_type(folder):
     for cell in read_sweep(folder / "sweep.toml").cells:
         assert tyro.cli(TrainOptions, args=arguments(cell.training)[1:]) == cell.training
@@ -144,7 +153,7 @@ def test_a_cell_is_the_command_that_a_user_would_type(folder):
         ("views = 3", 'views = "few"', "expected a whole number or all or none for scenes.still.views, got 'few'"),
         ("views = 3", "view = 3", "expected a key among path, .*, got scenes.still.view"),
         ("views = 3", "seed = 3", "expected a key among path, .*, got scenes.still.seed"),
-        ("iterations = 6", "iterations = 0.5", "expected a whole number for iterations, got 0.5"),
+        ("iterations = 6", "iterations = 0.5", "expected a whole number or none for iterations, got 0.5"),
         ("iterations = 6", "iteration = 6", "expected a key among out, seeds, .*, got iteration"),
         ("seeds = [1, 0]", "seeds = [1, 1]", r"expected different seeds, at least one, got seeds = \[1, 1\]"),
         ("seeds = [1, 0]", "seeds = [0.5]", "expected a whole number for seeds, got 0.5"),

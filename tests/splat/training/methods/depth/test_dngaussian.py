@@ -41,12 +41,12 @@ def added(step: Step) -> Gaussians:
 def test_depth_is_normalised_in_whole_patches_from_the_corner(side, local):
     depth = np.random.default_rng(0).normal(size=(14, 20))
     depth[:side, :side] = 2.0  # a patch without variation
+    corners = [(top, left) for top in range(0, 14 - side + 1, side) for left in range(0, 20 - side + 1, side)]
+    patches = [depth[top : top + side, left : left + side].ravel() for top, left in corners]
     rows = []
-    for top in range(0, 14 - side + 1, side):
-        for left in range(0, 20 - side + 1, side):
-            patch = depth[top : top + side, left : left + side].ravel()
-            scale = patch.std(ddof=1) + 0.01 * depth.std(ddof=1) if local else depth.std(ddof=1)
-            rows.append((patch - patch.mean()) / scale)
+    for patch in patches:
+        scale = (patch if local else depth).std(ddof=1) + 0.01 * np.std(patches, ddof=1)
+        rows.append((patch - patch.mean()) / (scale or 1))
     got = normalised(torch.from_numpy(depth), side, local=local)
     np.testing.assert_allclose(got.numpy(), np.array(rows), rtol=1e-12, atol=1e-14)
 
@@ -57,9 +57,9 @@ def loss_by_hand(rendered: torch.Tensor, target: torch.Tensor, sides: list[int],
     for side, weight, local in zip(sides, (0.1, 1.0), (True, False), strict=True):
         both = []
         for depth in (rendered, target):
-            overall = depth.std().detach()
             patches = torch.nn.functional.unfold(depth[None, None], side, stride=side)[0].T
-            spread = patches.std(dim=1, keepdim=True) + 0.01 * overall if local else overall
+            spread = patches.std(dim=1, keepdim=True) if local else depth.std().detach()
+            spread = spread + 0.01 * patches.std()
             both.append((patches - patches.mean(dim=1, keepdim=True)) / spread)
         difference = both[0] - both[1]
         total = total + weight * difference[difference.abs() > tolerance].square().mean()

@@ -38,15 +38,22 @@ def edges_by_hand(means: np.ndarray, largest: np.ndarray, settings: FSGS) -> lis
     for i in range(len(means)):
         others = sorted((float(np.linalg.norm(means[i] - means[j])), j) for j in range(len(means)) if j != i)
         nearest = others[: settings.neighbours]
-        score = sum(distance for distance, _ in nearest) / len(nearest)
+        score = sum(distance ** (2 if settings.released else 1) for distance, _ in nearest) / len(nearest)
         if score > settings.threshold * EXTENT and largest[i] > settings.large * EXTENT:
             edges += [(i, j) for _, j in nearest]
+    if settings.released:
+        sources = list(dict.fromkeys(i for i, _ in edges))
+        edges = [(sources[e % len(sources)], j) for e, (_, j) in enumerate(edges)]
     return edges
 
 
+@pytest.mark.parametrize("released", [False, True])
 @pytest.mark.parametrize("neighbours", [1, 3, 40])
-def test_unpooling_grows_one_gaussian_on_every_edge_of_a_distant_large_one(neighbours):
-    settings, gaussians = replace(WIDE, neighbours=neighbours), tiny_gaussians(20, sh_degree=1, dtype=torch.float64)
+def test_unpooling_grows_one_gaussian_on_every_edge_of_a_distant_large_one(neighbours, released):
+    settings, gaussians = (
+        replace(WIDE, neighbours=neighbours, released=released),
+        tiny_gaussians(20, sh_degree=1, dtype=torch.float64),
+    )
     change = unpool(gaussians, EXTENT, settings)
     means = gaussians.means.numpy()
     edges = edges_by_hand(means, gaussians.log_scales.exp().amax(dim=1).numpy(), settings)
@@ -68,6 +75,13 @@ def test_a_scene_of_one_or_two_gaussians_is_unpooled_too(n):
     gaussians = tiny_gaussians(n)
     grown = unpool(gaussians, EXTENT, FSGS(threshold=1e-6, large=0.0)).fresh.sum()
     assert grown == {1: 0, 2: 2}[n]
+
+
+def test_as_released_the_last_step_of_the_unpooling_is_left_out():
+    config = replace(tiny_config(), method=replace(WIDE, unpool_until=6, depth_weight=0.0, released=True))
+    training = Training.start(tiny_gaussians(), EXTENT, config)
+    list(train(training, tiny_views()))
+    assert [row["step"] for row in training.method.history] == [4]
 
 
 def test_unpooling_happens_at_densifications_until_its_last_step():

@@ -1,9 +1,12 @@
 """The random dropout regularisation of DropoutGS against one autograd expression."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 from splat.losses.cpu.loss import CpuViewLoss
-from splat.losses.reference import photometric_loss
+from splat.losses.reference import LossSettings, photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.training.methods.dropout import dropoutgs
@@ -12,10 +15,12 @@ from splat.training.state import Step, TrainConfig, Training
 from tests.splat.tiny import EXTENT, tiny_gaussians, tiny_views
 
 
-def test_the_gradient_is_that_of_the_loss_and_of_the_agreement(monkeypatch):
+@pytest.mark.parametrize("literal", [False, True])
+def test_the_gradient_is_that_of_the_loss_and_of_the_agreement(monkeypatch, literal):
     masks, draw = [], dropoutgs.dropout
     monkeypatch.setattr(dropoutgs, "dropout", lambda *a: masks.append(draw(*a)) or masks[-1])
     views, config = tiny_views(torch.float64), TrainConfig(10, method=DropoutGS(p=0.5, weight=0.3))
+    config = replace(config, loss=LossSettings(literal=literal))
     training = Training.start(tiny_gaussians(sh_degree=1, dtype=torch.float64), EXTENT, config)
     background = torch.tensor([0.2, 0.4, 0.1], dtype=torch.float64)
     loss = CpuViewLoss(views[1].image, config.loss, torch.float64)
@@ -31,6 +36,6 @@ def test_the_gradient_is_that_of_the_loss_and_of_the_agreement(monkeypatch):
         render(these, step.camera, background, backend="reference").image
         for these in (gaussians, gaussians.select(stays))
     )
-    total = photometric_loss(whole, views[1].image) + 0.3 * photometric_loss(whole, dropped)
+    total = photometric_loss(whole, views[1].image, config.loss) + 0.3 * photometric_loss(whole, dropped)
     (expected,) = torch.autograd.grad(total, flat)
     assert (gradient - expected).norm() < 1e-10 * expected.norm()

@@ -7,6 +7,7 @@ from pathlib import Path
 from landscape.errors import InputError
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split
+from splat.training.origin.frames import posed
 from splat.training.start import Source
 
 
@@ -17,7 +18,8 @@ class SceneReference:
     absolute, relative: the scene's folder, and the same from the checkpoint's folder.  images: the folder of images in
     it, where one was named; downscale: the factor by which its images were reduced further.  train, test: names of the views;
     sizes: (width, height) of the training views, px.  start: what the Gaussians started from (`splat/training/start.py`);
-    depths: the folder of depth maps, where one was named.  Older files have neither.
+    depths: the folder of depth maps, where one was named.  similarity, centred: as `posed` takes them, where another tool
+    trained in another world.  Older files have none of these.
     """
 
     absolute: str
@@ -29,6 +31,8 @@ class SceneReference:
     sizes: list[list[int]]
     start: Source = "scene"
     depths: str | None = None
+    similarity: list[list[float]] | None = None
+    centred: bool = False
 
     @classmethod
     def to(
@@ -89,4 +93,4 @@ class SceneReference:
                     f"expected view {frame.name!r} of {there} at {size[0]} x {size[1]} px, as in the training, got "
                     f"{frame.camera.width} x {frame.camera.height}; its images have changed, restore them or train anew"
                 )
-        return scene
+        return posed(scene, self.similarity, centred=self.centred)

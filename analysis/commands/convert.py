@@ -1,0 +1,68 @@
+"""`landscape convert`: Gaussians from one tool's file to another's."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from rich.console import Console
+
+from analysis.commands.options import ConvertOptions
+from analysis.probe.command import opened
+from landscape.errors import InputError
+from splat.model.files.read import is_foreign, read_splats
+from splat.model.files.splat_file import SplatFile
+from splat.model.files.splat_ply import splat_ply
+from splat.model.files.tensor_files import gsplat_bytes
+from splat.model.settings import RenderSettings
+from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
+
+OURS = "splat-landscape"
+
+
+def run_convert(options: ConvertOptions) -> int:
+    """Read, write, and say what was written; returns the exit code."""
+    if options.out.exists():
+        raise FileExistsError(f"expected a new file to write, but {options.out} exists; choose another")
+    to = options.to or ("graphdeco" if options.out.suffix.lower() == ".ply" else "own")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    notes = _to_own(options) if to == "own" else _to_tool(options, to)
+    console = Console(stderr=True)
+    for note in notes:
+        console.print(note, style="yellow", soft_wrap=True, highlight=False, markup=False)
+    return 0
+
+
+def _to_own(options: ConvertOptions) -> list[str]:
+    """A run that has just stopped at these Gaussians; of further numbers it has no place for."""
+    if not is_foreign(options.source):
+        raise InputError(
+            f"expected another tool's file to make our own of, got {options.source}; name --to graphdeco or gsplat"
+        )
+    checkpoint, _ = opened(options.source, options.scene, options.foreign, options.out)
+    here = os.path.relpath(checkpoint.scene.absolute, options.out.parent.resolve())
+    save_checkpoint(options.out, checkpoint.training, replace(checkpoint.scene, relative=here))
+    extra = read_splats(options.source).extra
+    lost = [f"not written, as our own checkpoint has no place for it: {', '.join(extra)}"] if extra else []
+    return [f"{len(checkpoint.training.gaussians)} Gaussians", *checkpoint.assumptions, *lost]
+
+
+def _to_tool(options: ConvertOptions, to: str) -> list[str]:
+    found = read_splats(options.source) if is_foreign(options.source) else _own(options)
+    extra: Mapping[str, np.ndarray] = found.extra
+    content = (
+        splat_ply(found.gaussians, extra, found.tool)
+        if to == "graphdeco"
+        else gsplat_bytes(found.gaussians, found.step or 0, extra, found.tool)
+    )
+    write_atomically(options.out, content)
+    kept = [f"with {', '.join(extra)}"] if extra else []
+    return [f"{len(found.gaussians)} Gaussians", *kept, *found.notes]
+
+
+def _own(options: ConvertOptions) -> SplatFile:
+    """tool: none where the settings are not our defaults, which the file could not say."""
+    checkpoint = load_checkpoint(options.source)
+    training, scene = checkpoint.training, checkpoint.scene
+    usual = training.config.render == RenderSettings() and scene.similarity is None and not scene.centred
+    return SplatFile(training.gaussians, OURS, OURS if usual else None, training.step)

@@ -1,0 +1,102 @@
+"""Interpolation of a function over a plane from both axes through its centre, its Hessian there, and scattered points.
+
+    f(x, y) = f(x, 0) + f(0, y) - f(0, 0) + x y (a + r(x, y)),      r(0, 0) = 0
+
+Both axes are known at every coordinate, so that nothing is interpolated there.  a = d2f/dxdy at the centre; with it value,
+gradient and Hessian at the centre are those of f, whatever r is.  A smooth f has a smooth r, known wherever f is known off the
+axes; between these places r is a thin-plate spline (Duchon 1977).  Where a is not known, r(0, 0) is left free.
+
+The error of the interpolant is judged by its predictions at n points drawn at random from those that it does not know:
+
+    seen      the largest error among them.  With confidence 1 - c at most 1 - c^(1/n) of the other points are off by more
+    bound     of the error at each of m other points.  The k errors beyond the quantile u at 3/4 are taken as exponential.  Of
+              these, with a sum S of their excesses, a further one exceeds u + z with probability (1 + z / S)^-k, so that all m
+              stay below it with confidence 1 - c where z = S ((m / 4 c)^(1/k) - 1); at least what was seen
+"""
+
+from math import inf
+
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+
+CONFIDENCE = 0.95
+TAIL = 0.25  # share of the errors that the tail is fitted to
+FEWEST_NODES = 4  # of a spline
+
+
+class PlaneInterpolant:
+    """The interpolant on a grid x times y that has 0 in both.  Points are numbered as in the flattened grid.
+
+    axes: the points of both axes.  coarse: the corners, the middles of the sides and of the halves.  mixed: a.
+
+    >>> x = np.linspace(-1, 1, 9)
+    >>> grid, f = PlaneInterpolant(x, x, mixed=0.5), (x[:, None] ** 2 + x * x[:, None] * (0.5 + x)).ravel()
+    >>> known = np.isin(np.arange(81), np.concatenate([grid.axes, grid.coarse]))
+    >>> int(known.sum()), float(abs(grid(np.where(known, f, np.nan)) - f).max()) < 1e-14
+    (33, True)
+    """
+
+    def __init__(self, x: np.ndarray, y: np.ndarray, mixed: float | None = None):
+        self._x, self._y, self._mixed = x, y, mixed
+        self._i, self._j = (int(np.flatnonzero(axis == 0)[0]) for axis in (x, y))
+        number = np.arange(len(x) * len(y)).reshape(len(x), len(y))
+        self.axes = np.unique(np.concatenate([number[:, self._j], number[self._i]]))
+        self.coarse = number[np.ix_(_halves(self._i, len(x)), _halves(self._j, len(y)))].ravel()
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """At all points, from values [points] that are nan where not known.  nan where the axes have no finite value."""
+        f = values.reshape(len(self._x), len(self._y))
+        along = f[:, [self._j]] + f[[self._i]] - f[self._i, self._j]
+        products = np.outer(self._x, self._y)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            r = (f - along) / products - (self._mixed or 0.0)
+        return (along + products * ((self._mixed or 0.0) + self._spline(r))).ravel()
+
+    def _spline(self, r: np.ndarray) -> np.ndarray:
+        """r everywhere, from where it is finite; 0 where it is known nowhere."""
+        places = np.stack(np.meshgrid(*(t / np.abs(t).max() for t in (self._x, self._y)), indexing="ij"), axis=-1)
+        known = np.isfinite(r)
+        known[self._i, :] = known[:, self._j] = False  # 0 / 0
+        if self._mixed is not None:
+            r[self._i, self._j], known[self._i, self._j] = 0.0, True
+        if known.sum() < FEWEST_NODES:
+            return np.zeros_like(r)
+        return RBFInterpolator(places[known], r[known])(places.reshape(-1, 2)).reshape(r.shape)
+
+
+def _halves(centre: int, n: int) -> list[int]:
+    """The ends of an axis and the middles between these and the centre."""
+    return sorted({0, centre // 2, (centre + n) // 2, n - 1} - {centre})
+
+
+def share_beyond(judged: int, looks: int) -> float:
+    """Largest share of points off by more than what was seen at so many random ones, at the look of this number.
+
+    The k-th look has the confidence 1 - 0.05 / 2^k: several looks have more chances to be lucky.
+
+    >>> round(share_beyond(64, 1), 3)
+    0.056
+    """
+    return 1 - _chance(looks) ** (1 / judged) if judged else 1.0
+
+
+def error_bound(errors: np.ndarray, others: int, looks: int) -> float:
+    """Of the error at every one of so many other points, from the errors at random ones.  Infinite without any.
+
+    >>> round(error_bound(np.linspace(0, 1, 64), others=1000, looks=1), 1)
+    2.4
+    """
+    if not others:
+        return 0.0
+    if not errors.size or not np.isfinite(errors).all():
+        return inf
+    threshold = float(np.quantile(errors, 1 - TAIL))
+    excess = errors[errors > threshold] - threshold
+    if not excess.size:
+        return float(errors.max())
+    rarer = max(TAIL * others / _chance(looks), 1.0) ** (1 / excess.size) - 1
+    return max(threshold + float(excess.sum()) * rarer, float(errors.max()))
+
+
+def _chance(looks: int) -> float:
+    return (1 - CONFIDENCE) / 2**looks

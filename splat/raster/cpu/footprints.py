@@ -1,0 +1,113 @@
+"""What every splat does to the pixels under it: w = alpha T, and D_c = dI_c/dq of the three colours c, q = ln alpha.
+
+They are found tile by tile, from back to front as in `blocks.py`, and laid out splat by splat for passes that look at a splat
+as a whole: four vectors (w, D) for each row of each intersection, an intersection's rows one after the other, the
+intersections of a splat side by side.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from splat.backend.cpu.jit import formula, kernel
+from splat.backend.cpu.planes import TILE_ROWS, scratch
+from splat.backend.cpu.simd import lanes, load, select, store
+from splat.raster.cpu.tile import (
+    STOP,
+    Lists,
+    T,
+    corner_of,
+    intersection,
+    load3,
+    next_tile,
+    reached,
+    row_range,
+    row_v,
+    store3,
+)
+from splat.raster.formulas import alpha_row, colour_slopes, plus, reciprocal
+
+FOOTPRINT = 4  # vectors of a row: w, D
+BEHIND, STATE = 2, 5  # after T and STOP, in a row of pixels: R
+
+
+class Footprints(NamedTuple):
+    """Where the rows of each splat lie.
+
+    tiles, rows: (accumulators,) tile of an intersection, and its rows as in `Lists`; place: (accumulators + 1,) which row is an
+    intersection's first; splat_start: (n + 1,) the first accumulator of each splat.
+    """
+
+    tiles: np.ndarray
+    rows: np.ndarray
+    place: np.ndarray
+    splat_start: np.ndarray
+
+
+@kernel
+def number_rows(lists, tiles, rows, place):
+    """Fill tiles, rows and place of `Footprints`."""
+    for tile in range(lists.start.size - 1):
+        for e in range(lists.start[tile], lists.start[tile + 1]):
+            tiles[lists.accumulator[e]], rows[lists.accumulator[e]] = tile, lists.rows[e]
+    place[0] = 0
+    for a in range(rows.size):
+        top, bottom = row_range(rows[a])
+        place[a + 1] = place[a] + bottom - top
+
+
+def footprints_of(lists: Lists, splat_start: np.ndarray) -> Footprints:
+    """Of the intersections of lists that are numbered splat by splat."""
+    tiles, rows = np.empty((2, splat_start[-1]), np.int32)
+    place = np.empty(splat_start[-1] + 1, np.int64)
+    number_rows(lists, tiles, rows, place)
+    return Footprints(tiles, rows, place, splat_start)
+
+
+@kernel
+def find_footprints(counter, params, lists, frame, pixels, footprints, begin, end, found):
+    """w and D (rows, FOOTPRINT vectors) of the accumulators begin .. end - 1."""
+    L = lanes(params)
+    state = scratch(params, STATE * L * TILE_ROWS)
+    tile = next_tile(counter, lists)
+    while tile >= 0:
+        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        for y in range(TILE_ROWS):
+            b, p = STATE * L * y, corner + y * frame.stride
+            last = load(pixels.transmittance, p)
+            store(state, b + T * L, last)
+            store(state, b + STOP * L, load(pixels.stop, p))
+            for c in range(3):
+                store(state, b + (BEHIND + c) * L, last * frame.background[c])
+        first, count = reached(lists, tile, pixels, corner, frame.stride)
+        for k in range(count - 1, -1, -1):
+            a = lists.accumulator[first + k]
+            at = np.int64(-1)
+            if begin <= a < end:
+                at = (footprints.place[a] - footprints.place[begin]) * FOOTPRINT * L
+            footprint_of(params, lists, first + k, k, x0, y0, frame, state, found, at)
+        tile = next_tile(counter, lists)
+
+
+@formula
+def footprint_of(params, lists, e, k, x0, y0, frame, state, found, at):
+    """Undo intersection e, and write its rows to found at `at`, unless it is negative."""
+    L = lanes(params)
+    _splat, _u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    for y in range(top, bottom):
+        b = STATE * L * y
+        v = row_v(frame, L, y, terms)
+        alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
+        r = reciprocal(1.0 - alpha)
+        before = load(state, b + T * L) * r
+        w, beta = alpha * before, alpha * r
+        free = w
+        if capped:
+            free, beta = select(uncapped <= frame.cap, w, 0.0), select(uncapped <= frame.cap, beta, 0.0)
+        R = load3(state, b + BEHIND * L, L)
+        store(state, b + T * L, before)
+        store3(state, b + BEHIND * L, L, plus(R, w, colour))
+        if at >= 0:
+            to = at + (y - top) * FOOTPRINT * L
+            store(found, to, w)
+            store3(found, to + L, L, colour_slopes(free, beta, R, colour))

@@ -1,0 +1,220 @@
+"""A file of Gaussians that another tool trained, as a training on its scene that can be probed and continued.
+
+The trainer's conventions are those of its preset; the views are those that were asked for, that the tool's files name, or that
+its convention holds.  Before anything is measured the Gaussians are rendered on training views: where that is not their
+picture, frame, images or conventions are wrong, and so would be all numbers.
+"""
+
+import io
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from math import ceil
+from pathlib import Path
+from statistics import fmean
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from PIL import Image
+
+from landscape.errors import InputError
+from splat.losses.reference import psnr
+from splat.model.files.read import read_splats
+from splat.model.files.splat_file import SplatFile
+from splat.model.gaussians import Gaussians
+from splat.render.render import render
+from splat.scenes.scene import Scene, load_scene
+from splat.scenes.splits import Split, explicit_split, split_scene
+from splat.scenes.view import View
+from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_frame, posed
+from splat.training.origin.presets import PRESETS, Preset, preset_of
+from splat.training.origin.scene_reference import SceneReference
+from splat.training.state import TrainConfig, Training
+
+LEAST_PSNR = 15.0  # dB; scenes that are trained at all have more on their training views
+GUARDED = 2  # views
+NERFSTUDIO_SHARE = 0.9
+LOSSY = "curvature of the quantised scene: the file has rounded the trained numbers"
+WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """What a file of another tool does not say.
+
+    scene: folder.  views: how many, by the scene's protocol; train_list: names of the training views.  trained_by: a name of
+    `PRESETS`.  images, downscale: as for `load_scene`.
+    """
+
+    scene: Path | None = None
+    views: int | Literal["all"] | None = None
+    train_list: tuple[str, ...] | None = None
+    trained_by: str | None = None
+    images: str | None = None
+    downscale: float | None = None
+
+
+def foreign_training(path: Path, ask: Foreign, picture: Path) -> tuple[Training, SceneReference, dict[str, Any]]:
+    """The training, its scene as seen from path, and what was assumed, for the record.
+
+    picture: where render and photograph are written side by side when they do not agree.  InputError then, and for what is
+    missing or cannot be.
+    """
+    if ask.scene is None:
+        raise InputError(f"expected --scene FOLDER for {path}: a file of another tool does not name its scene")
+    found = read_splats(path)
+    name, source = preset_of(found.tool, ask.trained_by)
+    preset = PRESETS[name]
+    if found.antialiased:
+        raise InputError(
+            f"expected Gaussians whose renderer was not antialiased, got {path}, which says that it was: this program "
+            "does not have that filter yet, and without it the picture is another"
+        )
+    scene, images, downscale = _scene(found, ask, preset)
+    split, how = _split(scene, found, ask, path)
+    reference = SceneReference.to(scene, path, split, images, downscale)
+    config = _config(scene, found, preset)
+    world, level = _world(found.gaussians, scene, reference, config, _worlds(preset, scene, path), picture, name)
+    similarity = None if world is None else world.tolist()
+    reference = replace(reference, similarity=similarity, centred=preset.centred)
+    moved = posed(scene, similarity, centred=preset.centred)
+    training = Training.start(found.gaussians, moved.extent(split.train), config)
+    training.step = found.step or 0
+    notes = [*found.notes, *preset.different, *([LOSSY] if found.lossy else [])]
+    said = {"format": found.format, "trained_by": name, "trained_by_source": source, "views": how, "notes": notes}
+    return training, reference, {**said, "psnr": level, "similarity": similarity, "preset": asdict(preset)}
+
+
+def _scene(found: SplatFile, ask: Foreign, preset: Preset) -> tuple[Scene, str | None, float]:
+    """The scene with the images that the trainer saw: those asked for, else as its settings say, else as it does by default."""
+    assert ask.scene is not None
+    images, resolution = ask.images, found.settings.get("resolution", -1)
+    named = found.settings.get("images")
+    if images is None and isinstance(named, str) and (ask.scene / named).is_dir() and re.fullmatch(r"images\w*", named):
+        images = named
+    background = WHITE if found.settings.get("white_background") is True else None
+    downscale = 1.0 if ask.downscale is None else ask.downscale
+    scene = load_scene(ask.scene, images, downscale, background)
+    if ask.downscale is None and preset.widest is not None:
+        width = max(frame.camera.width for frame in scene.frames)
+        if isinstance(resolution, int) and resolution in (1, 2, 4, 8):
+            downscale = float(resolution)
+        elif isinstance(resolution, int | float) and 0 < resolution < width:
+            downscale = width / resolution
+        elif width > preset.widest:
+            downscale = width / preset.widest
+        if downscale > 1:
+            scene = load_scene(ask.scene, images, downscale, background)
+    return scene, images, downscale
+
+
+def _split(scene: Scene, found: SplatFile, ask: Foreign, path: Path) -> tuple[Split, str]:
+    """The training views, and where they are known from."""
+    if ask.train_list is not None:
+        if ask.views is not None:
+            raise InputError("expected --views or --train-list, got both; leave one out")
+        return explicit_split(scene.names, ask.train_list), "as listed"
+    if ask.views is not None:
+        return split_scene(scene, None if ask.views == "all" else ask.views), f"asked for: {ask.views}"
+    held_out = split_scene(scene)
+    if found.settings.get("eval") is False:
+        held_out = explicit_split(scene.names, scene.names)
+    used = _used(path, scene) if found.settings else set()
+    if used:
+        train = [name for name in held_out.train if name in used]
+        if train:
+            return explicit_split(scene.names, train, held_out.test), "from cameras.json and cfg_args"
+    if "eval" in found.settings:
+        return held_out, "from cfg_args"
+    if found.tool == "nerfstudio" and scene.kind == "transforms":
+        count = len(scene.names)
+        places = np.linspace(0, count - 1, ceil(count * NERFSTUDIO_SHARE), dtype=int)
+        return explicit_split(scene.names, [scene.names[i] for i in places]), "guessed: nine tenths, as nerfstudio does"
+    return held_out, "guessed: all but those that its protocol holds out, every eighth of most scenes"
+
+
+def _used(path: Path, scene: Scene) -> set[str]:
+    """Names of the scene's images that graphdeco's `cameras.json` lists; empty where there is none, or one of another scene."""
+    file = (
+        path.resolve().parents[2] / "cameras.json"
+        if "point_cloud" in path.resolve().parts[-3:]
+        else path.parent / "cameras.json"
+    )
+    if not file.is_file():
+        return set()
+    try:
+        listed = {Path(str(camera["img_name"])).stem for camera in json.loads(file.read_text(encoding="utf-8"))}
+    except (ValueError, OSError, KeyError, TypeError, RecursionError):
+        return set()
+    return {name for name in scene.names if Path(name).stem in listed}
+
+
+def _config(scene: Scene, found: SplatFile, preset: Preset) -> TrainConfig:
+    """3DGS, with the preset's renderer, on the scene's background."""
+    red, green, blue = scene.background.tolist()
+    return TrainConfig(iterations=max(1, found.step or 1), background=(red, green, blue), render=preset.render)
+
+
+def _worlds(preset: Preset, scene: Scene, path: Path) -> Sequence[Similarity | None]:
+    if preset.world == "gsplat":
+        return gsplat_frames(scene)
+    return [nerfstudio_frame(path, scene)] if preset.world == "nerfstudio" else [None]
+
+
+def _world(
+    gaussians: Gaussians,
+    scene: Scene,
+    reference: SceneReference,
+    config: TrainConfig,
+    worlds: Sequence[Similarity | None],
+    picture: Path,
+    name: str,
+) -> tuple[Similarity | None, float]:
+    """The world in which the Gaussians look most like the photographs, and their PSNR there, dB."""
+    names = [reference.train[i * len(reference.train) // GUARDED] for i in range(min(GUARDED, len(reference.train)))]
+    tried = []
+    for world in worlds:
+        similarity = None if world is None else world.tolist()
+        views = posed(scene, similarity, centred=PRESETS[name].centred).load(names)
+        images = [_render(gaussians, view, config) for view in views]
+        level = fmean(psnr(image, view.image) for image, view in zip(images, views, strict=True))
+        tried.append((level, world, images[0], views[0]))
+    level, world, image, view = max(tried, key=lambda each: each[0])
+    if not level >= LEAST_PSNR:
+        _save_side_by_side(image, view, picture)
+        raise InputError(
+            f"expected Gaussians that look like the scene's photographs, got {level:.1f} dB on training views "
+            f"(at least {LEAST_PSNR:.0f}); {_suspicion(image, config, name, len(worlds))}; "
+            f"{picture} shows the render beside the photograph"
+        )
+    return world, level
+
+
+@torch.no_grad()
+def _render(gaussians: Gaussians, view: View, config: TrainConfig) -> torch.Tensor:
+    background = config.background_colour(gaussians.flat.dtype)
+    return render(gaussians, view.camera, background, config.render).image.clamp(0, 1)
+
+
+def _suspicion(image: torch.Tensor, config: TrainConfig, name: str, worlds: int) -> str:
+    """What is likely wrong."""
+    bare = (image - config.background_colour(image.dtype)[:, None, None]).abs().amax(dim=0) < 1 / 255
+    if bare.float().mean() > 0.5:
+        return (
+            f"they are hardly in sight: their world is not that of {name}'s cameras ({worlds} tried); name another "
+            "--trained-by, such as gsplat where the world was normalised"
+        )
+    return (
+        "it is probably another scene, other images (--images, --downscale) or another trainer (--trained-by), "
+        "whose world or signs differ"
+    )
+
+
+def _save_side_by_side(image: torch.Tensor, view: View, path: Path) -> None:
+    both = torch.cat([image, view.image], dim=2).permute(1, 2, 0)
+    buffer = io.BytesIO()
+    Image.fromarray((both * 255).round().to(torch.uint8).numpy()).save(buffer, format="PNG")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(buffer.getvalue())

@@ -1,0 +1,215 @@
+"""A file of another tool is the same training as our own checkpoint of the same Gaussians, on the views and in the world of its
+trainer; where it is not the picture of its scene, nothing is measured.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import pytest
+import torch
+
+from landscape.errors import InputError
+from splat.curvature.hessian import SceneHessian
+from splat.curvature.objective import SceneObjective
+from splat.model.gaussians import Gaussians
+from splat.scenes.scene import load_scene
+from splat.scenes.splits import split_scene, spread_views
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import Checkpoint, open_checkpoint, save_checkpoint
+from splat.training.loop import train
+from splat.training.origin.foreign import Foreign
+from splat.training.origin.presets import PRESETS
+from splat.training.origin.scene_reference import SceneReference
+from splat.training.state import TrainConfig, Training
+from tests.splat.model.files import written
+
+OURS = "splat-landscape"
+MADE = synthetic_scene(SyntheticSettings(gaussians=60, views=12, width=24, height=16))
+
+
+def gaussians() -> Gaussians:
+    """The truth with colours of degree 3 that are a little off, so that the loss is not at 0."""
+    g = MADE.truth.select(torch.arange(len(MADE.truth)), 3)
+    g.sh.add_(0.1 * torch.randn(g.sh.shape, generator=torch.Generator().manual_seed(0)))
+    return g
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    write_transforms_scene(MADE.scene, tmp_path / "scene")
+    return tmp_path
+
+
+def opened(path: Path, **ask) -> Checkpoint:
+    ask = {"scene": path.parents[0] / "scene", **ask}
+    return open_checkpoint(path, Foreign(**ask), path.with_name("mismatch.png"))
+
+
+def stored(path: Path, content: bytes) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    return path
+
+
+def own(path: Path, scene: Path) -> Path:
+    loaded = load_scene(scene)
+    split = split_scene(loaded)
+    training = Training.start(gaussians(), loaded.extent(split.train), TrainConfig())
+    save_checkpoint(path, training, SceneReference.to(loaded, path, split, None, 1.0))
+    return path
+
+
+def objective(checkpoint: Checkpoint, path: Path) -> SceneObjective:
+    scene, training = checkpoint.load_scene(path), checkpoint.training
+    return training.config.objective(training.gaussians, scene.load(checkpoint.scene.train))
+
+
+WRITTEN: dict[str, Callable[[Gaussians], bytes]] = {
+    "graphdeco.ply": lambda g: written.ply(written.columns(g)),
+    "gsplat.ply": lambda g: written.ply(written.columns(g, normals=False)),
+    "brush.ply": written.brush,
+    "chkpnt7.pth": written.graphdeco_pth,
+    "ckpt_6_rank0.pt": written.gsplat_pt,
+    "step-9.ckpt": written.splatfacto,
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_loss_gradient_and_products_are_those_of_our_own_checkpoint(folder, name):
+    path = stored(folder / name, WRITTEN[name](gaussians()))
+    ours = objective(open_checkpoint(own(folder / "own.pt", folder / "scene"), Foreign(), path), folder / "own.pt")
+    names = open_checkpoint(folder / "own.pt", Foreign(), path).scene.train
+    theirs = objective(opened(path, trained_by=OURS, train_list=tuple(names)), path)
+    assert torch.equal(theirs.active.flat, ours.active.flat)
+    flat = ours.active.flat
+    assert theirs.loss(flat) == pytest.approx(ours.loss(flat), rel=1e-5)
+    torch.testing.assert_close(theirs.gradient, ours.gradient, rtol=1e-5, atol=1e-9)
+    v = torch.randn(len(flat), 1, generator=torch.Generator().manual_seed(0))
+    both = [SceneHessian(each).apply(v) for each in (theirs, ours)]
+    torch.testing.assert_close(*both, rtol=1e-5, atol=1e-5 * float(both[1].abs().max()))
+
+
+def test_a_training_continues_from_it(folder):
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
+    found = opened(path, trained_by=OURS)
+    config = replace(found.training.config, iterations=3)
+    training = Training.start(found.training.gaussians, found.training.extent, config)
+    views = found.load_scene(path).load(found.scene.train)
+    before = objective(found, path).loss(objective(found, path).active.flat)
+    assert [done.step for done in train(training, views)] == [1, 2, 3]
+    assert not torch.equal(training.gaussians.flat, found.training.gaussians.flat) and before > 0
+
+
+def test_what_is_not_the_scenes_picture_is_not_measured_and_shown(folder):
+    g = gaussians()
+    g.means.mul_(-1)
+    path = stored(folder / "a.ply", written.ply(written.columns(g)))
+    with pytest.raises(InputError, match=r"got \d+\.\d dB on training views .*mismatch\.png") as caught:
+        opened(path, trained_by=OURS)
+    assert "\n" not in str(caught.value)
+    assert path.with_name("mismatch.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("comments", "ask", "message"),
+    [
+        ((), {}, "expected --trained-by with one of graphdeco, gsplat"),
+        (("trained by someone",), {}, "which says 'someone'"),
+        ((), {"trained_by": "nobody"}, "got nobody"),
+        ((), {"trained_by": OURS, "scene": None}, "expected --scene FOLDER"),
+        (("Exported from Brush", "SplatRenderMode: mip"), {}, "antialiased"),
+        ((), {"trained_by": OURS, "views": 2, "train_list": ("view_001",)}, "--views or --train-list"),
+        ((), {"trained_by": OURS, "train_list": ("nothing",)}, "name of one view"),
+        ((), {"trained_by": "nerfstudio"}, "dataparser_transforms.json"),
+    ],
+)
+def test_what_the_file_does_not_say_is_asked_for(folder, comments, ask, message):
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians()), comments))
+    with pytest.raises(InputError, match=message):
+        opened(path, **ask)
+
+
+def test_our_own_checkpoint_is_given_nothing_that_it_holds(folder):
+    path = own(folder / "own.pt", folder / "scene")
+    assert open_checkpoint(path, Foreign(scene=folder / "scene"), path).origin is None
+    with pytest.raises(InputError, match="no --trained-by"):
+        opened(path, trained_by="gsplat")
+
+
+def names(*numbers: int) -> list[str]:
+    return [f"images/view_{i:03}.png" for i in numbers]
+
+
+@pytest.mark.parametrize(
+    ("settings", "cameras", "ask", "expected", "source"),
+    [
+        (None, None, {}, names(*range(1, 8), 9, 10, 11), "guessed"),
+        (None, None, {"views": 2}, names(1, 11), "asked for"),
+        (None, None, {"train_list": ("view_003", "view_000.png")}, names(3, 0), "as listed"),
+        ("Namespace(eval=True)", None, {}, names(*range(1, 8), 9, 10, 11), "cfg_args"),
+        ("Namespace(eval=False)", None, {}, names(*range(12)), "cfg_args"),
+        ("Namespace(eval=True)", ["view_000", "view_002", "view_005.JPG"], {}, names(2, 5), "cameras.json"),
+        ("Namespace(eval=True)", "not a list", {}, names(*range(1, 8), 9, 10, 11), "cfg_args"),
+    ],
+)
+def test_views_are_asked_for_or_read_or_guessed_and_said(folder, settings, cameras, ask, expected, source):
+    path = stored(folder / "m/point_cloud/iteration_50/point_cloud.ply", written.ply(written.columns(gaussians())))
+    if settings:
+        stored(folder / "m/cfg_args", settings.encode())
+    if cameras:
+        listed = [{"img_name": name} for name in cameras] if isinstance(cameras, list) else cameras
+        stored(folder / "m/cameras.json", json.dumps(listed).encode())
+    found = opened(path, scene=folder / "scene", trained_by="graphdeco", **ask)
+    assert found.scene.train == expected
+    assert found.origin and source in found.origin["views"]
+    assert found.training.step == (50 if settings else 0)
+
+
+def test_nerfstudio_trains_on_nine_tenths_of_a_transforms_file(folder):
+    path = stored(folder / "step-9.ckpt", written.splatfacto(gaussians()))
+    assert opened(path, trained_by=OURS).scene.train == names(*range(10), 11)
+
+
+def test_the_presets_conventions_reach_the_renderer_and_the_record(folder):
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
+    found = opened(path, trained_by="gsplat-raw")
+    render = found.training.config.render
+    assert (render.alpha_max, render.near, render.blur) == (0.999, 0.01, 0.3)
+    assert found.origin and found.origin["preset"]["render"]["alpha_max"] == 0.999
+    assert any("SSIM" in line for line in found.assumptions)
+    assert "trained by gsplat-raw (asked for)" in found.assumptions[0]
+
+
+def test_3dgs_looks_through_the_middle_of_images_of_1600_px_at_most(folder, monkeypatch):
+    file = folder / "scene" / "transforms.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        frame["cx"] += 0.2
+    file.write_text(json.dumps(content))
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
+    found = opened(path, trained_by="graphdeco")
+    scene = found.load_scene(path)
+    assert {(frame.camera.cx, frame.camera.cy) for frame in scene.frames} == {(12.0, 8.0)}
+    assert scene.load(found.scene.train)[0].camera.cx == 12.0
+    assert opened(path, trained_by=OURS).load_scene(path).frames[0].camera.cx == pytest.approx(12.2)
+    monkeypatch.setitem(cast(dict, PRESETS), "graphdeco", replace(PRESETS["graphdeco"], widest=12))
+    assert opened(path, trained_by="graphdeco").scene.sizes[0] == [12, 8]
+
+
+def test_fewer_views_are_spread_over_the_cameras(folder):
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
+    found = opened(path, trained_by=OURS, views="all")
+    scene = found.load_scene(path)
+    few = found.thinned(scene, 3)
+    assert len(few.scene.train) == len(few.scene.sizes) == 3 and set(few.scene.train) < set(found.scene.train)
+    assert few.scene.train == sorted(few.scene.train, key=found.scene.train.index)
+    chosen = torch.stack([frame.camera.centre for frame in scene.select(few.scene.train)])
+    first = torch.stack([frame.camera.centre for frame in scene.select(found.scene.train[:3])])
+    assert torch.pdist(chosen).min() > torch.pdist(first).min()
+    assert found.thinned(scene, None) is found.thinned(scene, 99) is found
+    with pytest.raises(InputError, match="at least 1 view"):
+        spread_views(scene.frames, 0)
