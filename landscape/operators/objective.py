@@ -5,11 +5,13 @@
 theta is one flat vector.  The graph of g is built once and kept; a product with one vector is one backward pass through it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from itertools import accumulate
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.func import functional_call
 
 from landscape.errors import InputError
 from landscape.operators.operator import require_blocks, require_vectors
@@ -47,6 +49,38 @@ class ObjectiveHessian:
         value = loss(self._point)
         _require_loss(value)
         self.value, self._gradient = float(value.detach()), _traced_gradient(value, self._point)
+
+    @classmethod
+    def of_module(
+        cls, module: torch.nn.Module, loss: Callable[[Tensor, Tensor], Tensor], data: Iterable[tuple[Tensor, Tensor]]
+    ) -> "ObjectiveHessian":
+        """The Hessian of a module's mean loss over batches, in its parameters that require a gradient; a block for each.
+
+        loss: from outputs and targets to a tensor of one number.  data: (inputs, targets) of each batch, all weighted alike;
+        the graph of all is kept.  Call `module.eval()` first where it has dropout, whose noise has no Hessian.
+
+        >>> net = torch.nn.Linear(2, 1, bias=False)
+        >>> H = ObjectiveHessian.of_module(net, torch.nn.functional.mse_loss, [(torch.eye(2), torch.zeros(2, 1))])
+        >>> H.blocks, H.apply(torch.eye(2))  # of |w|^2 / 2
+        ({'weight': slice(0, 2, None)}, tensor([[1., 0.],
+                [0., 1.]]))
+        """
+        parameters = {name: part.detach() for name, part in module.named_parameters() if part.requires_grad}
+        if not parameters:
+            raise InputError(f"expected a module with parameters that require a gradient, got {type(module).__name__}")
+        batches, sizes = list(data), [part.numel() for part in parameters.values()]
+        if not batches:
+            raise InputError("expected at least one batch (inputs, targets), got none")
+        ends = list(accumulate(sizes))
+        blocks = {name: slice(end - size, end) for name, size, end in zip(parameters, sizes, ends, strict=True)}
+
+        def mean_loss(theta: Tensor) -> Tensor:
+            parts = zip(parameters.items(), theta.split(sizes), strict=True)
+            state = {name: part.view_as(shape) for (name, shape), part in parts}
+            losses = [loss(functional_call(module, state, (inputs,)), targets) for inputs, targets in batches]
+            return torch.stack(losses).mean()
+
+        return cls(mean_loss, torch.cat([part.reshape(-1) for part in parameters.values()]), blocks)
 
     @property
     def gradient(self) -> Float[Tensor, " n"]:

@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from landscape.errors import InputError
 from landscape.operators.objective import ObjectiveHessian
 
 
@@ -72,3 +73,31 @@ def test_bad_points_and_losses_are_refused():
         ObjectiveHessian(lambda x: x, POINT)
     with pytest.raises(ValueError, match="finite scalar loss"):
         ObjectiveHessian(lambda x: (x - 3).log().sum(), POINT)
+
+
+def test_the_hessian_of_a_module_is_that_of_its_dense_loss():
+    torch.manual_seed(0)
+    net = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Tanh(), torch.nn.Linear(4, 2)).double()
+    net[0].bias.requires_grad_(False)
+    batches = [(torch.randn(5, 3, dtype=torch.float64), torch.randn(5, 2, dtype=torch.float64)) for _ in range(2)]
+    H = ObjectiveHessian.of_module(net, torch.nn.functional.mse_loss, batches)
+    names = ["0.weight", "2.weight", "2.bias"]
+    parts = [net.get_parameter(name) for name in names]
+    assert list(H.blocks) == names
+    assert [rows.stop - rows.start for rows in H.blocks.values()] == [part.numel() for part in parts]
+
+    def loss(*values):
+        outputs = [torch.func.functional_call(net, dict(zip(names, values)), (x,)) for x, _ in batches]
+        return sum(torch.nn.functional.mse_loss(out, y) for out, (_, y) in zip(outputs, batches)) / 2
+
+    dense = torch.autograd.functional.hessian(loss, tuple(parts))
+    sizes = [part.numel() for part in parts]
+    rows = [torch.cat([dense[i][j].reshape(sizes[i], sizes[j]) for j in range(3)], dim=1) for i in range(3)]
+    torch.testing.assert_close(H.apply(torch.eye(H.dim, dtype=torch.float64)), torch.cat(rows), rtol=1e-12, atol=1e-14)
+
+
+def test_a_module_without_parameters_and_no_batches_are_refused():
+    with pytest.raises(InputError, match="parameters that require a gradient"):
+        ObjectiveHessian.of_module(torch.nn.ReLU(), torch.nn.functional.mse_loss, [(torch.ones(1), torch.ones(1))])
+    with pytest.raises(InputError, match="at least one batch"):
+        ObjectiveHessian.of_module(torch.nn.Linear(1, 1), torch.nn.functional.mse_loss, [])

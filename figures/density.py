@@ -1,0 +1,81 @@
+"""Figure: the density of the spectrum, as a histogram that a broadening makes smooth.
+
+`python -m figures.density RUN/probe` draws density.png beside the record.  From Python, `draw_density(found)` draws a
+`landscape.SpectralDensity` of any objective.  It is the mean of the start vectors' quadratures, each node a Gaussian of width
+sigma = BROADENING of the range; a peak narrower than sigma is not resolved.
+"""
+
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from analysis.records.quantities import quantity
+from analysis.records.records import ProbeRecord, Record
+from figures.style import BLUE, new_figure, script, style
+
+BROADENING = 0.01
+POINTS = 2000
+DECADES = 8  # below the highest point
+
+
+class Quadrature(Protocol):
+    """nodes (starts, k): eigenvalues; weights (starts, k): the share of directions at each, of sum 1 over k."""
+
+    @property
+    def nodes(self) -> Any: ...
+
+    @property
+    def weights(self) -> Any: ...
+
+
+def draw_density(density: Quadrature) -> Figure:
+    """Density over curvature, logarithmic; density: see `Quadrature`."""
+    curvature, height, sigma = smooth_density(np.asarray(density.nodes), np.asarray(density.weights))
+    with style():
+        figure = new_figure(2.2)
+        axes = figure.subplots()
+        axes.fill_between(curvature, height, height.max() / 10**DECADES, color=BLUE, alpha=0.25, linewidth=0)
+        axes.plot(curvature, height, color=BLUE, linewidth=0.9)
+        axes.set_yscale("log")
+        axes.set_ylim(height.max() / 10**DECADES, 3 * height.max())
+        axes.set_xlabel("curvature")
+        axes.set_ylabel("density of directions")
+        axes.set_title(f"Spectral density, broadened by σ = {quantity(sigma)}", loc="left")
+        axes.grid(True)
+    return figure
+
+
+def smooth_density(
+    nodes: Float[np.ndarray, "starts k"], weights: Float[np.ndarray, "starts k"]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Curvatures, density there (of integral 1), and sigma.
+
+    >>> x, y, sigma = smooth_density(np.array([[0.0, 1.0]]), np.array([[0.75, 0.25]]))
+    >>> round(float(np.sum(y) * (x[1] - x[0])), 6), round(sigma, 6)
+    (1.0, 0.01)
+    """
+    low, high = float(nodes.min()), float(nodes.max())
+    sigma = BROADENING * (high - low or abs(high) or 1.0)
+    curvature = np.linspace(low - 5 * sigma, high + 5 * sigma, POINTS)
+    apart = (curvature[:, None] - nodes.ravel()) / sigma
+    shares = weights.ravel() / weights.sum()
+    return curvature, np.exp(-0.5 * apart**2) @ shares / (sigma * np.sqrt(2 * np.pi)), sigma
+
+
+def draw(record: Record[ProbeRecord]) -> Figure:
+    """The density of one record.  Raises ValueError where none was recorded."""
+    arrays = record.arrays.get("spectrum", {})
+    if "nodes" not in arrays:
+        raise ValueError(f"expected a spectral density in {record.folder}, got a record without; probe without --quick")
+    return draw_density(_OfRecord(arrays["nodes"], arrays["weights"]))
+
+
+class _OfRecord:
+    def __init__(self, nodes: np.ndarray, weights: np.ndarray):
+        self.nodes, self.weights = nodes, weights
+
+
+if __name__ == "__main__":
+    script(draw, "density", ProbeRecord)

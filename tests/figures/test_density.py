@@ -1,0 +1,33 @@
+import numpy as np
+import pytest
+
+from figures import density
+from tests.figures.test_figures import require_layout
+from tests.recorded import synthetic, written
+
+
+def test_the_density_of_a_record_stays_inside_its_column(tmp_path):
+    require_layout(density.draw(written(tmp_path / "probe", *synthetic())))
+
+
+def test_a_record_without_a_density_is_refused(tmp_path):
+    data, arrays = synthetic()
+    for name in ("nodes", "weights"):
+        del arrays["spectrum"][name]
+    with pytest.raises(ValueError, match="probe without --quick"):
+        density.draw(written(tmp_path / "probe", data, arrays))
+
+
+def test_the_smooth_density_has_the_moments_of_the_quadrature():
+    random = np.random.default_rng(0)
+    nodes, weights = random.standard_normal((3, 20)), random.dirichlet(np.ones(20), 3)
+    curvature, height, sigma = density.smooth_density(nodes, weights)
+    step = curvature[1] - curvature[0]
+    assert np.sum(height) * step == pytest.approx(1, abs=1e-6)
+    assert np.sum(height * curvature) * step == pytest.approx(np.sum(nodes * weights) / 3, abs=1e-6)
+    assert np.sum(height * curvature**2) * step == pytest.approx(np.sum(nodes**2 * weights) / 3 + sigma**2, abs=1e-6)
+
+
+def test_equal_eigenvalues_have_a_density():
+    curvature, height, sigma = density.smooth_density(np.full((1, 3), 2.0), np.full((1, 3), 1 / 3))
+    assert curvature[height.argmax()] == pytest.approx(2, abs=sigma)
