@@ -49,7 +49,7 @@ def command() -> NoReturn:
     """
     gc.set_threshold(100_000)
     _open_streams()
-    Console.on_broken_pipe = _say_no_more
+    Console.on_broken_pipe = _say_no_more  # pyright: ignore[reportAttributeAccessIssue]
     code = main()
     with ignored():  # the work is done
         try:

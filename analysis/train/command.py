@@ -79,7 +79,7 @@ OPTIONS = {  # settings of the training that have an option of their own
 }
 AGAIN = "repeat its command with --resume, or choose another --out"
 PLAIN: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}  # paths and names may hold brackets
-WARNING = PLAIN | {"style": "yellow"}
+WARNING: dict[str, Any] = PLAIN | {"style": "yellow"}
 SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
 
 

@@ -198,7 +198,7 @@ class Records(Format):
             rows = comparison(runs)
             frame(rows, ["a", "b"]).to_csv(index=False)
             console.print(compare_table(rows, ["a", "b"]))
-        render_page(runs, rows, cautions(runs), self.root)
+        render_page(runs, ["a", "b"], rows, [], cautions(runs), self.root)
         render_report(record, None if self.chance.random() < 5 * DRAWN else "")
         if self.chance.random() < DRAWN:
             self.draw(record)
@@ -275,8 +275,7 @@ class TrajectoryCsv(Format):
 
             from figures.trajectory import draw
 
-            table.to_csv(self.root / "trajectories.csv", index=False)
-            plt.close(draw(self.root / "trajectories.csv"))
+            plt.close(draw(table))
 
 
 class RunFiles(Format):
@@ -451,7 +450,7 @@ class Pictures(SceneFolder):
                 np.save(self.root / f"depths/{name}.npy", depth.astype(np.float32))
             else:
                 Image.fromarray((depth * 1e4).astype(np.uint16)).save(self.root / f"depths/{name}.png")
-        self.layers = {"depths": self.root / "depths"}
+        self.layers = {"depths": self.root / "depths"}  # pyright: ignore[reportAttributeAccessIssue]
         self.by_bytes, self.changed = False, ""
 
     def broken(self) -> list[str]:
