@@ -234,7 +234,9 @@ def _conclude(data: ProbeRecord, out: Path, verbose: bool) -> None:
     if verbose:
         console.print(probe_table(data, console.width))
         pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-        console.print(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", soft_wrap=True, highlight=False, markup=False)
+        console.print(
+            f"pictures: {pictures}; numbers: {data.FILE}, in {out}", soft_wrap=True, highlight=False, markup=False
+        )
     if data.families:
         console.print(family_table(data))
     for line in remarks(data, verbose):
