@@ -200,8 +200,8 @@ def _check_labels(texture: bytes, count: int, palette: int) -> None:
 def _from_gsply(reader: str, content: bytes, kind: str, clamped: int = 0, *, antialiased: bool = False) -> SplatFile:
     """What gsply's reader of this name makes of the content."""
     try:
-        import gsply
-        from gsply.sog_reader import sogread
+        import gsply  # pyright: ignore[reportMissingImports]
+        from gsply.sog_reader import sogread  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise InputError(
             f"it is a {kind}, which the optional package gsply reads: pip install 'gsply[spz,sogs]', or convert it to PLY"

@@ -34,7 +34,7 @@ def test_curvature_along_them_is_the_extreme_of_single_gaussians(objective):
         rows = torch.cat([torch.arange(k) + objective.blocks[name].start + i * k for name, k in widths.items()])
         values.append(torch.linalg.eigvalsh(dense[rows][:, rows]))
     values = torch.cat(values).sort().values
-    V = BlockEigenvectors(objective, *objective.gaussian_blocks).steepest(3, 2)
+    V = BlockEigenvectors(objective, *objective.approximate_blocks).steepest(3, 2)
     assert torch.allclose(V.norm(dim=0), torch.ones(5, dtype=V.dtype))
     assert torch.allclose(H.project(V), V, atol=1e-12)
     found = (V * H.apply(V)).sum(dim=0)
@@ -48,7 +48,7 @@ def test_blocks_hold_the_share_of_their_pixelwise_part_that_ssim_leaves(ssim_wei
     near = replace(near, camera=replace(near.camera, centre=near.camera.centre + 4 * near.camera.rotation[2]))
     gaussians, loss = random_gaussians(12, 1, logit=1.0), LossSettings(ssim_weight=ssim_weight)
     objective = SceneObjective(gaussians, [far, near], loss, BACKGROUND)
-    own, pixelwise = objective.gaussian_blocks
+    own, pixelwise = objective.approximate_blocks
     known, n = BlockEigenvectors(objective, own, pixelwise), len(objective.active)
     values, vectors = known.pairs(torch.arange(n))
     found = vectors.double() * values[:, None] @ vectors.double().mT
@@ -89,7 +89,7 @@ def test_near_a_fit_values_are_five_times_closer_than_pixel_by_pixel():
     made = synthetic_scene(SyntheticSettings(60, 2, 24, 18, sh_degree=0))
     near = made.truth.with_flat(made.truth.flat + 0.02 * random_like(made.truth.flat.shape, 0).to(made.truth.flat))
     objective = SceneObjective(near, made.scene.load())
-    H, (own, pixelwise) = SceneHessian(objective), objective.gaussian_blocks
+    H, (own, pixelwise) = SceneHessian(objective), objective.approximate_blocks
     errors = []
     for known in (BlockEigenvectors(objective, own, pixelwise), BlockEigenvectors(objective, own)):
         V, values = known.steepest(6, 6), known.pairs(torch.arange(60))[0].flatten().sort().values
@@ -111,7 +111,7 @@ def test_scaled_or_of_one_attribute_they_are_those_of_the_dense_blocks(attribute
     own = torch.where(owner.flat[:, None] == owner.flat, H.apply(torch.eye(H.dim, dtype=H.dtype)), 0.0)
     rows = slice(0, H.dim) if attribute is None else objective.blocks[attribute]
     own, size = own[rows, rows], float(own[rows, rows].abs().max())
-    known = BlockEigenvectors(objective, *objective.gaussian_blocks, attribute, scale)
+    known = BlockEigenvectors(objective, *objective.approximate_blocks, attribute, scale)
     of_geometry = owner.flat[rows] < n
     expected = torch.linalg.eigvalsh(own[of_geometry][:, of_geometry])
     assert torch.allclose(known.pairs(torch.arange(n))[0].flatten().sort().values, expected, atol=1e-10 * size)
@@ -126,7 +126,7 @@ def test_a_search_from_the_warm_start_finds_the_same_ends(ssim_weight):
     loss = LossSettings(ssim_weight=ssim_weight)
     objective = SceneObjective(random_gaussians(40, 1, logit=1.0), two_views(), loss, BACKGROUND)
     H, settings = SceneHessian(objective), EigenSettings(2, 1, rtol=1e-3)
-    start = BlockEigenvectors(objective, *objective.gaussian_blocks).warm_start()
+    start = BlockEigenvectors(objective, *objective.approximate_blocks).warm_start()
     led = extreme_eigenpairs(H, torch.Generator().manual_seed(0), settings, start)
     truth = torch.linalg.eigvalsh(H.apply(torch.eye(H.dim, dtype=H.dtype)).double())
     for pairs, true in ((led.largest, truth[-2:].flip(0)), (led.smallest, truth[:1])):
