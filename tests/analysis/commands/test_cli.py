@@ -217,7 +217,7 @@ def test_an_image_that_is_missing_or_damaged_is_refused(scene, tmp_path, capsys)
     path.write_bytes(content[: len(content) // 2])
     refuse(capsys, arguments(scene, tmp_path / "run"), path.name)
     path.unlink()
-    refuse(capsys, arguments(scene, tmp_path / "run"), path.name, "missing")
+    refuse(capsys, arguments(scene, tmp_path / "run", "--strict-frames"), path.name)
 
 
 def test_more_views_than_the_scene_has_are_refused(original, tmp_path, capsys):
