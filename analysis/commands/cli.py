@@ -114,10 +114,12 @@ def _parsed(arguments: Sequence[str]) -> Options:
 def at_files(options: Options) -> Options:
     """A run folder stands for its checkpoint where one is asked for, and a checkpoint for its run."""
     changes: dict[str, object] = {}
-    for name in ("checkpoint", "other", "subject"):
+    for name in ("checkpoint", "subject"):
         path = getattr(options, name, None)
         if isinstance(path, Path) and (path / CHECKPOINT).is_file():
             changes[name] = path / CHECKPOINT
+    if others := getattr(options, "others", ()):
+        changes["others"] = tuple(path / CHECKPOINT if (path / CHECKPOINT).is_file() else path for path in others)
     if runs := getattr(options, "runs", ()):
         changes["runs"] = tuple(run.parent if run.name == CHECKPOINT else run for run in runs)
     return replace(options, **changes) if changes else options

@@ -6,6 +6,7 @@ Its keys are the fields of `_File` and of `_Training`, side by side.
 """
 
 import errno
+import glob
 import io
 import os
 import sys
@@ -16,6 +17,7 @@ from math import inf
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import psutil
 import torch
 from torch import Tensor
 
@@ -185,11 +187,20 @@ def write_atomically(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
+        _drop_abandoned(path)
     except BaseException as error:
         partial.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno and error.filename is None:
             error.filename = str(path)  # a full disk's error has none
         raise
+
+
+def _drop_abandoned(path: Path) -> None:
+    """Remove what killed processes left of the same file."""
+    for partial in path.parent.glob(f".{glob.escape(path.name)}.partial-*"):
+        process = partial.name.rpartition("-")[2]
+        if process.isdigit() and not psutil.pid_exists(int(process)):
+            partial.unlink(missing_ok=True)
 
 
 def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:

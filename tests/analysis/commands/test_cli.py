@@ -407,7 +407,7 @@ def test_a_run_stands_for_its_checkpoint_and_a_checkpoint_for_its_run(tmp_path):
     run.mkdir()
     named = (
         ProbeOptions(run),
-        SliceOptions(tmp_path / "none", run),
+        SliceOptions(tmp_path / "none", (run,)),
         BenchOptions(run),
         CompareOptions((run, run / "checkpoint.pt")),
     )
@@ -415,7 +415,7 @@ def test_a_run_stands_for_its_checkpoint_and_a_checkpoint_for_its_run(tmp_path):
     (run / "checkpoint.pt").touch()
     probe, line, bench, _ = (at_files(options) for options in named)
     assert probe == ProbeOptions(run / "checkpoint.pt") and bench == BenchOptions(run / "checkpoint.pt")
-    assert line == SliceOptions(tmp_path / "none", run / "checkpoint.pt")
+    assert line == SliceOptions(tmp_path / "none", (run / "checkpoint.pt",))
 
 
 def test_the_version_is_said(capsys):
