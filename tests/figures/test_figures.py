@@ -247,8 +247,8 @@ def test_a_missing_renderer_is_said_aloud_and_in_the_picture(tmp_path, monkeypat
 
 def test_the_command_draws_the_folder_named_on_its_standard_input(tmp_path):
     folder = written(tmp_path / "probe", *synthetic()).folder
-    command = [sys.executable, "-m", "figures.make_all", "-"]
-    for said, names in (("", []), (f"{folder}\n", ["spectrum.png", "traces.png"])):
+    command = [sys.executable, "-m", "figures.make_all", "--without", "surface", "--without", "slice2d", "-"]
+    for said, names in (("", []), (str(folder), ["spectrum.png", "traces.png"])):
         done = subprocess.run(command, input=said, capture_output=True, text=True, env=module_environment(), check=True)
         assert done.stderr == "" and sorted(path.name for path in folder.glob("*.png")) == names
     by_processes = {path.name: path.read_bytes() for path in folder.glob("*.png")}
