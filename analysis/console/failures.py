@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from analysis.console.interruption import Interrupted
 from landscape.errors import InputError, lacks_memory, lacks_space
 
-LONGEST = 1000  # characters of a sentence
+LONGEST = 4000  # characters of a sentence; the list of all settings, the longest of our own, takes a third
 BAD_INPUT, BUG, NO_MEMORY, FULL_DISK, INTERRUPTED, NO_READER = 2, 70, 71, 74, 130, 141
 
 
