@@ -180,8 +180,8 @@ def test_a_cut_file_of_a_kernel_is_compiled_anew(tmp_path):
 
     assert ran() == "8.0\n"
     for suffix in ("nbi", "nbc"):
-        (file,) = (tmp_path / "cache").rglob(f"small.twice-*.{suffix}")
-        file.write_bytes(file.read_bytes()[:40])
+        for file in (tmp_path / "cache").rglob(f"small.twice-*.{suffix}"):
+            file.write_bytes(file.read_bytes()[:40])
         assert ran() == "8.0\n"
 
 

@@ -150,7 +150,7 @@ def test_the_rank_is_that_of_the_specifications_hessian() -> None:
 
 def test_a_view_does_not_see_gaussians_in_its_tiles_but_in_no_pixel() -> None:
     gaussians, camera = random_gaussians(5, 1, seed=1, logit=1.0, spread=0.3), random_camera(26, 22, focal=24.0)
-    column, row = 12.0, 11.0  # the corner of a pixel
+    column, row = 13.0, 11.0  # the corner of a pixel, not between tiles, whether they are 4 or 8 pixels wide
     corner = torch.tensor([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, 1.0], dtype=torch.float64)
     gaussians.means[0], gaussians.log_scales[0] = camera.centre + camera.rotation.T @ (2 * corner), -4.0
     gaussians.opacity_logits[0] = -5.0  # an alpha above 1 / 255 in the middle, but not half a pixel off
