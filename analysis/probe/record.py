@@ -67,7 +67,7 @@ def probe_arrays(found: Measured) -> dict[str, dict[str, np.ndarray]]:
     arrays = {
         "traces": {name: trace.samples.numpy() for name, trace in found.traces.items()},
         "spectrum": {"ritz_values": values, "residuals": residuals},
-        "eigenvectors": {"largest": found.ends.largest.vectors.cpu().numpy()},
+        "eigenvectors": {end: getattr(found.ends, end).vectors.cpu().numpy() for end in ("largest", "smallest")},
     }
     if found.density is not None:
         arrays["spectrum"] |= dict(zip(("nodes", "weights"), (x.numpy() for x in found.density.table()), strict=True))

@@ -30,7 +30,7 @@ from splat.model.untrusted import beside, locked, require_modest
 
 ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
-    "eigenvectors": {"largest": "parameters k"},
+    "eigenvectors": {"largest": "parameters k", "smallest": "parameters m?"},
     "traces": {"*": "probes?"},
     "families": {"*": "starts steps?"},
     "slice": {"x": "nx", "y": "ny?", "loss": "grid", "model": "grid?", "evaluated": "grid?", "crossed": "grid?"},
@@ -40,7 +40,7 @@ ARRAYS = {
 
 spectrum      ritz_values, residuals: approximate eigenvalues, the two ends among them; where the density was estimated also
               nodes, weights: a quadrature for each start vector, eigenvalues that are known among the nodes of all
-eigenvectors  unit vectors of the k largest eigenvalues, of the Gaussians in sight
+eigenvectors  unit vectors of the k largest and the m smallest eigenvalues, of the Gaussians in sight
 traces        ATTRIBUTE: the samples whose mean is the trace
 families      SCENE.OPERATOR.BLOCK.nodes and .weights: the quadrature of each family's density
 slice         x, y: increasing steps along the directions; loss: L on the grid, [nx, ny] or, along a line, [nx]; model: the

@@ -14,7 +14,7 @@ from torch import Tensor
 from landscape.operators.operator import require_vectors
 from splat.backend.gpu.graphs import CudaGraphCache, CudaGraphs
 from splat.curvature.active_spaces import Projector, projector_of
-from splat.curvature.kept_views import VECTORS
+from splat.curvature.linearize import VECTORS
 from splat.curvature.objective import SceneObjective
 
 # bytes of workspace; beyond it a GPU takes longer for a view's product than its kernels take to launch

@@ -16,7 +16,7 @@ Between P and R tangents and adjoints of splats are in the coordinates of `proje
 projection, loss) are those of the device of the Gaussians.  On a GPU no product waits for the device.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from jaxtyping import Float, Float64
@@ -34,6 +34,8 @@ from splat.projection.formulas import ProjectionJacobian, lens_of
 from splat.raster.cpu.raster import CpuRaster
 from splat.raster.dispatch import Adjoint, Tangent
 from splat.render.forward import rasterize_view, touches
+
+VECTORS = 8  # at a time in a product: a wider block gains nothing more, because it leaves the second-level cache
 
 
 class LinearizedView:
@@ -178,3 +180,34 @@ class LinearizedView:
     def _pulled(self, adjoints: Sequence[Adjoint]) -> Float[Tensor, "p k"]:
         """P'^T of adjoints of the splats."""
         return self._projection.vjp(torch.stack([adjoint.moments for adjoint in adjoints], dim=1))
+
+
+class KeptViews:
+    """Iterates over linearized views: the first `kept` stay in memory, the others are linearized anew every time.
+
+    linearize: makes the view of an index; count: how many views; memory: bytes for views and the workspace of a product with
+    VECTORS vectors.  The first view is made here, always kept, and stands for the size of all.  Memory decides how many views
+    are kept and nothing else, so that results do not depend on it.
+    """
+
+    def __init__(self, linearize: Callable[[int], LinearizedView], count: int, memory: int):
+        first = linearize(0)
+        more = (memory - first.bytes - first.workspace(VECTORS)) // first.bytes
+        self.kept = 1 + min(max(more, 0), count - 1)
+        self._linearize, self._count, self._views = linearize, count, {0: first}
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[LinearizedView]:
+        for index in range(self._count):
+            if index >= self.kept:
+                yield self._linearize(index)
+                continue
+            if index not in self._views:
+                self._views[index] = self._linearize(index)
+            yield self._views[index]
+
+    def workspace(self, vectors: int) -> int:
+        """Bytes that a product with so many vectors takes at a time in the first view."""
+        return self._views[0].workspace(min(vectors, VECTORS))

@@ -28,8 +28,7 @@ from torch import Tensor
 from landscape.operators.distributed import ALONE, Ranks
 from splat.backend.memory import free_memory
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
-from splat.curvature.kept_views import KeptViews
-from splat.curvature.linearize import LinearizedView
+from splat.curvature.linearize import KeptViews, LinearizedView
 from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians

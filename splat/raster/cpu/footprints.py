@@ -3,6 +3,8 @@
 They are found tile by tile, from back to front as in `blocks.py`, and laid out splat by splat for passes that look at a splat
 as a whole: four vectors (w, D) for each row of each intersection, an intersection's rows one after the other, the
 intersections of a splat side by side.
+
+`find_neighbours` goes over the same pixels from front to back: how many each splat has weight in, and which splat is in front.
 """
 
 from typing import NamedTuple
@@ -11,7 +13,7 @@ import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.planes import TILE_ROWS, scratch
-from splat.backend.cpu.simd import lanes, load, select, store
+from splat.backend.cpu.simd import broadcast, iota, lanes, load, maximum, select, store
 from splat.raster.cpu.tile import (
     STOP,
     Lists,
@@ -111,3 +113,48 @@ def footprint_of(params, lists, e, k, x0, y0, frame, state, found, at):
             to = at + (y - top) * FOOTPRINT * L
             store(found, to, w)
             store3(found, to + L, L, colour_slopes(free, beta, R, colour))
+
+
+@kernel
+def find_neighbours(counter, params, lists, frame, pixels, width, height, covered, before):
+    """Of every intersection: `covered`, in how many pixels of the image its splat has weight, and `before`, the splat next in
+    front of it among those of its tile that have weight in one of these pixels, or -1."""
+    L = lanes(params)
+    state, row = (
+        scratch(params, 2 * L * TILE_ROWS),
+        scratch(params, L),
+    )  # the stop, and the last intersection with weight
+    tile = next_tile(counter, lists)
+    while tile >= 0:
+        x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
+        inside = iota(params) < broadcast(params, width - x0)
+        for y in range(TILE_ROWS):
+            stop = load(pixels.stop, corner + y * frame.stride)
+            store(state, 2 * L * y, select(inside, stop, -1.0) if y0 + y < height else broadcast(params, -1.0))
+            store(state, (2 * y + 1) * L, -1.0)
+        first, count = reached(lists, tile, pixels, corner, frame.stride)
+        for k in range(count):
+            e = first + k
+            covered[e], nearest = neighbours_of(params, lists, e, k, x0, y0, frame, state, row)
+            before[e] = lists.splat[first + nearest] if nearest >= 0 else -1
+        tile = next_tile(counter, lists)
+
+
+@formula
+def neighbours_of(params, lists, e, k, x0, y0, frame, state, row):
+    """In how many pixels intersection e has weight, and the nearest intersection in front of it in one of them, or -1."""
+    L = lanes(params)
+    _splat, _u, terms, _colour, index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
+    none, one = broadcast(params, 0.0), broadcast(params, 1.0)
+    ones, nearest = none, -one
+    for y in range(top, bottom):
+        b = 2 * L * y
+        alpha, _uncapped = alpha_row(row_v(frame, L, y, terms), terms, index < load(state, b), frame.cap)
+        seen, last = alpha > 0.0, load(state, b + L)
+        ones = ones + select(seen, one, none)
+        nearest = maximum(nearest, select(seen, last, -one))
+        store(state, b + L, select(seen, index, last))
+    store(row, 0, ones)
+    covered = row.sum()
+    store(row, 0, nearest)
+    return np.int64(covered), np.int64(row.max())

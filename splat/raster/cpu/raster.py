@@ -173,6 +173,15 @@ class CpuRaster:
             done = stop
         return torch.from_numpy(blocks)
 
+    def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of every intersection: its splat, in how many pixels it has weight, and the splat next in front of it among those of
+        its tile that have weight in one of these pixels (-1: none)."""
+        lists = self.reached[0]
+        covered, before = np.empty((2, lists.splat.size), np.int32)
+        size = (self.width, self.height)
+        over_tiles(footprints.find_neighbours, self.params, lists, self.frame, self.pixels, *size, covered, before)
+        return lists.splat, covered, before
+
     def jvp(self, directions: Float[Tensor, "n k 9"]) -> "CpuTangent":
         """J u for tangents of the splats."""
         return CpuTangent(self, directions)

@@ -10,8 +10,7 @@ from torch import Tensor
 from landscape.traces.control import controlled
 from landscape.traces.trace import TraceSettings
 from splat.curvature.hessian import SceneHessian
-from splat.curvature.kept_views import VECTORS
-from splat.curvature.linearize import LinearizedView
+from splat.curvature.linearize import VECTORS, LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import LEAST_SAMPLES, SampledTrace, _signs, coupling_samples, exact_traces
 from splat.losses.cpu.loss import CpuViewLoss
