@@ -22,6 +22,7 @@ from torch import Tensor
 from analysis.console.stages import Stages
 from landscape.probes import spawn
 from landscape.results import Progress
+from splat.training.checkpoint import write_atomically
 
 T = TypeVar("T")
 
@@ -133,10 +134,7 @@ class Kept:
         if self.folder is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        file = self._file(name)
-        temporary = file.with_suffix(".tmp")
-        temporary.write_bytes(msgspec.msgpack.encode(entry))
-        temporary.replace(file)
+        write_atomically(self._file(name), msgspec.msgpack.encode(entry))
 
     def _file(self, name: str) -> Path:
         assert self.folder is not None

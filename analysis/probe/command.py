@@ -8,7 +8,7 @@ import shlex
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
 from hashlib import file_digest
 from math import inf, isfinite
@@ -31,7 +31,7 @@ from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import remarks, summary
 from analysis.probe.views import write_views
 from analysis.records.provenance import require_seed, versions
-from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
+from analysis.records.records import Arrays, ProbeRecord, Record, record_folder
 from analysis.records.tables import family_table, probe_table
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
@@ -75,24 +75,22 @@ def _run(
             "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
         )
     writes = ranks is None or ranks.rank == 0
-    require_replaceable(out)
-    console = Console(stderr=True, quiet=not writes)
+    console, unfinished = Console(stderr=True, quiet=not writes), out.with_name(f".{out.name}.unfinished")
     stages = Stages(console)
-    with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
+    with stages.stage("load"):
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True, markup=False)
-    unfinished = out.with_name(f".{out.name}.unfinished")
-    folder = None if ranks else unfinished
     told = (
         f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {settings} "
         f"{options.seed} {device} {versions()}"
     )
     deadline = begun + limit - DRAWING
-    with stages, _kept(unfinished, command, console):
+    # a folder that cannot be written, or that another command is writing, is noticed before anything is measured
+    with record_folder(out) if writes else nullcontext() as folder, stages, _kept(unfinished, command, console):
         generator = torch.Generator(device).manual_seed(options.seed)
-        found = measure(objective, settings, generator, stages, folder, told, deadline)
+        found = measure(objective, settings, generator, stages, None if ranks else unfinished, told, deadline)
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         if family_options is not None:
@@ -105,8 +103,8 @@ def _run(
             data, arrays["families"] = families.added_to(data), families.arrays()
             data.provenance.families = asdict(family_options)
         data.notes += checkpoint.assumptions
-        if writes:
-            _write(out, data, arrays, objective, stages, start, drawn)
+        if folder is not None:
+            _write(folder, data, arrays, objective, stages, start, drawn)
     if writes:
         if not found.unreached:
             shutil.rmtree(unfinished, ignore_errors=True)
@@ -133,7 +131,7 @@ def _digest(path: Path) -> str:
 
 
 def _write(
-    out: Path,
+    folder: Path,
     data: ProbeRecord,
     arrays: Arrays,
     objective: SceneObjective,
@@ -141,8 +139,8 @@ def _write(
     start: float,
     drawn: Draw | None,
 ) -> None:
-    """The record, its pictures and its page, all at once."""
-    with record_folder(out) as folder, ThreadPoolExecutor(1) as pool:
+    """The record, its pictures and its page, into the folder."""
+    with ThreadPoolExecutor(1) as pool:
         write_views(folder, objective)
         surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
         write_with_pictures(folder, data, arrays, stages, start, drawn)

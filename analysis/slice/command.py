@@ -11,7 +11,7 @@ ended this one; the directory goes when the record is complete.  A line moves al
 ends only.
 """
 
-import os
+import io
 import shlex
 import shutil
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ from splat.backend.device import device_named
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
-from splat.training.checkpoint import Checkpoint, load_checkpoint
+from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
@@ -70,36 +70,15 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     device = device_named(options.device)
     settings = _settings(options, shape, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
-    # a folder that cannot be written, or that another command is writing, is noticed before anything is rendered
-    with record_folder(out, SliceRecord) as folder:
-        data = _sliced(options, command, shape, device, settings, out, folder)
-    shutil.rmtree(_unfinished(out), ignore_errors=True)
-    _conclude(data, out)
-    return 0
-
-
-def _unfinished(out: Path) -> Path:
-    return out.with_name(f".{out.name}.unfinished")
-
-
-def _sliced(
-    options: SliceOptions,
-    command: Sequence[str],
-    shape: Shape,
-    device: torch.device,
-    settings: SliceSettings,
-    out: Path,
-    folder: Path,
-) -> SliceRecord:
-    """Slice, and write the record with its pictures into the folder."""
-    unfinished, console, start = _unfinished(out), Console(stderr=True), perf_counter()
+    unfinished, console, start = out.with_name(f".{out.name}.unfinished"), Console(stderr=True), perf_counter()
     stages = Stages(console)
-    with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
+    with stages.stage("load"):
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
         others = [_other_end(checkpoint, path) for path in options.others]
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
-    with stages:
+    # a folder that cannot be written, or that another command is writing, is noticed before anything is rendered
+    with record_folder(out, SliceRecord) as folder, stages:
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:
@@ -112,7 +91,9 @@ def _sliced(
         made.other = ", ".join(map(str, options.others)) or None
         data = slice_record(found, objective, notes + checkpoint.assumptions, made)
         write_with_pictures(folder, data, slice_arrays(found), stages, start)
-    return data
+    shutil.rmtree(unfinished, ignore_errors=True)
+    _conclude(data, out)
+    return 0
 
 
 def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
@@ -211,10 +192,9 @@ def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> Non
     if not vectors:
         return
     unfinished.mkdir(parents=True, exist_ok=True)
-    partial = unfinished / f"eigenvectors.{os.getpid()}.tmp"
-    with partial.open("wb") as stream:
-        np.save(stream, np.stack(vectors, axis=1), allow_pickle=False)
-    partial.replace(unfinished / "eigenvectors.npy")
+    buffer = io.BytesIO()
+    np.save(buffer, np.stack(vectors, axis=1), allow_pickle=False)
+    write_atomically(unfinished / "eigenvectors.npy", buffer.getvalue())
 
 
 def _evaluation(objective: SceneObjective, workers: int) -> Loss:

@@ -2,6 +2,7 @@
 
 import os
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -68,12 +69,27 @@ def test_a_training_that_a_signal_ends_saves_and_says_how_to_continue(scene, tmp
     assert load_checkpoint(out / "checkpoint.pt").training.step > 0 and hidden(tmp_path) == hidden(out) == []
 
 
-@pytest.mark.parametrize("ready", ["lock", "partial"])
-def test_a_probe_that_a_signal_ends_leaves_nothing_and_names_the_signal(run, tmp_path, ready):
+@pytest.mark.parametrize("words", [["probe"], ["slice", "--points", "31", "--all-points"]])
+def test_what_a_signal_ends_keeps_what_it_found_and_goes_on_from_there(run, tmp_path, words):
+    out = tmp_path / "record"
+    command = [words[0], str(run / "checkpoint.pt"), "--out", str(out), *words[1:]]
+    process = started(command)
+    waits_for(process, lambda: any((tmp_path / ".record.unfinished").glob("[!.]*.[mn]*")))
+    process.terminate()
+    said = process.communicate()[1]
+    assert process.returncode == 143 and said.endswith("landscape: interrupted by SIGTERM\n"), said
+    assert "Aborted at" not in said and "Traceback" not in said and shlex.join(command) in said
+    assert [path.name for path in tmp_path.iterdir()] == [".record.unfinished"]
+    again = started(command)
+    said = again.communicate()[1]
+    assert again.returncode == 0 and (words[0] == "slice" or "kept from before" in said), said
+    assert [path.name for path in tmp_path.iterdir()] == ["record"]
+
+
+def test_a_probe_that_a_signal_ends_as_it_begins_leaves_nothing(run, tmp_path):
     out = tmp_path / "probe"
     process = started(["probe", str(run / "checkpoint.pt"), "--out", str(out)])
-    waits_for(process, beside(out).exists if ready == "lock" else lambda: bool(list(tmp_path.glob(".probe.partial-*"))))
-    time.sleep(0.0 if ready == "lock" else 2.0)
+    waits_for(process, beside(out).exists)
     process.terminate()
     said = process.communicate()[1]
     assert process.returncode == 143 and said.endswith("landscape: interrupted by SIGTERM\n"), said
@@ -129,6 +145,17 @@ def test_of_two_trainings_in_one_folder_one_is_refused_in_a_sentence(scene, tmp_
     assert first.returncode == 143 and load_checkpoint(out / "checkpoint.pt").training.step > 0
 
 
+@pytest.mark.parametrize("word", ["probe", "slice"])
+def test_a_folder_that_is_taken_or_cannot_be_written_is_known_at_once(run, tmp_path, capsys, word):
+    command = [word, str(run / "checkpoint.pt"), "--out"]
+    with locked(beside(tmp_path / "record"), "no other"):
+        assert main([*command, str(tmp_path / "record")]) == 2
+    assert main([*command, "/proc/self/record"]) == 2  # where not even root may write
+    said = capsys.readouterr().err
+    assert "got another at work" in said and "/.record.lock: No such file" in said and "linearise" not in said
+    assert main([word, str(tmp_path / "none/checkpoint.pt")]) == 2 and list(tmp_path.iterdir()) == []
+
+
 def limited(size: int) -> Callable[[], None]:
     return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
@@ -141,8 +168,8 @@ def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_pa
         ["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"], preexec_fn=limited(8192)
     )
     said = done.communicate()[1]
-    assert done.returncode == 74 and str(tmp_path / "probe") in said and "Traceback" not in said, said
-    assert list(tmp_path.iterdir()) == []
+    assert done.returncode == 74 and str(tmp_path / ".probe.unfinished/") in said and "Traceback" not in said, said
+    assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]  # from where it goes on
 
 
 def test_without_a_home_or_a_folder_beside_the_code_kernels_are_kept_with_temporary_files(tmp_path, monkeypatch):
