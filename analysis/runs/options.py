@@ -23,7 +23,7 @@ class SweepOptions:
     jobs: int = 1
     """Runs at once, each on its share of the processors."""
     probe: FlagCreatePairsOff[bool] = False
-    """Also probe every run after its training; split_control = true in the file adds the split control."""
+    """Also probe every run after its training, as a table [probe] in the file does, which may hold options of the probe."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from splat.training.start import Source
 from splat.training.state import TrainConfig
 
 FEW = 500  # Gaussians at the start; density control adds others near those that are there, so that places without stay empty
-HOW_TO_START = {
+HOW_TO_START: dict[Source, str] = {
+    "box": "the published training does so; --start scene begins at the scene's own points",
     "random": "`landscape sfm PHOTOS` makes a scene with points, and --start triangulated finds some in the training views",
     "triangulated": "take more --views or larger images, or --start random",
     "points": "take more --views, or --start triangulated or random",
@@ -29,8 +30,8 @@ def poor_start(scene: Scene, source: Source, gaussians: int) -> str:
     >>> poor_start(scene, "triangulated", 41)
     'it starts from 41 points only, and may leave places empty; take more --views or larger images, or --start random'
     """
-    kind = source if source != "scene" else "random" if scene.points is None else "points"
-    if kind == "random":
+    kind: Source = source if source != "scene" else "random" if scene.points is None else "points"
+    if kind in ("random", "box"):
         return f"it starts from {gaussians:,} random points, of which most lie on no surface; {HOW_TO_START[kind]}"
     few = f"it starts from {gaussians:,} points only, and may leave places empty; {HOW_TO_START[kind]}"
     return few if gaussians < FEW else ""

@@ -313,7 +313,7 @@ class SweepToml(Format):
 
     def write(self) -> None:
         (self.root / self.name).write_text(
-            'out = "runs"\nseeds = [0, 1]\niterations = 30\nprobe = true\nprobe_seconds = 4.5\nviews = 3\n'
+            'out = "runs"\nseeds = [0, 1]\niterations = 30\nviews = 3\n[probe]\nseconds = 4.5\n'
             '[scenes.fern]\npath = "fern"\nviews = 3\n[methods.3dgs]\n[methods."asp only"]\nmethod = "stablegs"\n'
             'set = { vsp_weight = 0, probe.attributes = ["means"] }\n'
         )
@@ -325,7 +325,7 @@ class SweepToml(Format):
         from analysis.runs.sweep.sweep_file import arguments, read_sweep
 
         for cell in read_sweep(self.root / self.name).cells:
-            arguments(cell.training)
+            arguments("train", cell.training)
 
 
 class SceneFolder(Format):

@@ -28,6 +28,8 @@ from rich.console import Console
 
 from analysis.console.drawing import module_environment
 from analysis.console.interruption import interruption
+from analysis.probe.options import ProbeOptions
+from analysis.probe.record import loss_name
 from analysis.records.provenance import usable_cores
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS
@@ -37,6 +39,7 @@ from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import PROBE, of_other_threads, summarize, tables, unfinished, write_results
 from analysis.train.command import planned, resumed
 from landscape.errors import InputError
+from splat.losses.reference import LossSettings
 
 CELL_FAILED = 1
 LOCK = ".lock"
@@ -70,15 +73,17 @@ def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
         raise type(error)(f"{sweep.file}, {cell.name}: {error}") from None
     if training.step < config.iterations or not (cell.out / METRICS).is_file():
         return wanted
-    return ["probe"] if sweep.probe and not _probed(cell, sweep) else []
+    return ["probe"] if sweep.probe and not _probed(cell, sweep.probe, config.loss) else []
 
 
-def _probed(cell: Cell, sweep: Sweep) -> bool:
+def _probed(cell: Cell, options: ProbeOptions, loss: LossSettings) -> bool:
+    """Whether there is a record of the last step, with the loss and the control that the options ask for."""
     if not (cell.out / PROBE / ProbeRecord.FILE).is_file():
         return False
     data = read_record(cell.out / PROBE, ProbeRecord).data
-    whole = bool(data.split_control) or not sweep.split_control
-    return data.provenance.iteration == cell.steps and whole
+    asked = loss_name(LossSettings() if options.loss == "3dgs" else loss)
+    whole = bool(data.split_control) or not options.split_control
+    return data.provenance.iteration == cell.steps and whole and (data.objective.loss or asked) == asked
 
 
 @contextmanager
@@ -157,7 +162,7 @@ class _Cells:
     def _command(self, cell: Cell, stage: Stage) -> int:
         """Run `landscape train` or `landscape probe`; returns its exit code, negative where a signal killed it."""
         words = (
-            arguments(replace(cell.training, resume=cell.out.exists()))
+            arguments("train", replace(cell.training, resume=cell.out.exists()))
             if stage == "train"
             else probe_arguments(cell, self.sweep)
         )
@@ -181,12 +186,8 @@ class _Cells:
 
 
 def probe_arguments(cell: Cell, sweep: Sweep) -> list[str]:
-    words = ["probe", str(cell.out / CHECKPOINT)]
-    if sweep.probe_seconds is not None:
-        words += ["--seconds", str(sweep.probe_seconds)]
-    if sweep.split_control:
-        words += ["--split-control", "--family-seconds", str(sweep.family_seconds)]
-    return words
+    assert sweep.probe is not None
+    return arguments("probe", replace(sweep.probe, checkpoint=cell.out / CHECKPOINT, out=cell.out / PROBE))
 
 
 def log_of(cell: Cell) -> Path:

@@ -4,10 +4,10 @@
     seeds = [0, 1, 2]
     iterations = 3000                        # any option of `landscape train`, for every cell
     start = "triangulated"
-    probe = true                             # probe every cell after its training
-    split_control = true                     # ... with the split control
-    probe_seconds = 45                       # ... with so much time, and for the families
-    family_seconds = 600
+
+    [probe]                                  # probe every cell after its training
+    loss = "3dgs"                            # and any option of `landscape probe`
+    split_control = true
 
     [scenes.fern]
     path = "../data/fern"                    # and any option of `landscape train`, for this scene
@@ -26,7 +26,7 @@ that is stopped has compared like with like.
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -39,15 +39,10 @@ from splat.training.state import TrainConfig
 
 FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
+OF_THE_CELL = {"checkpoint", "out", "scene", "foreign"}  # options of probe that the cell decides
 TRAINING = {name: hint for name, hint in get_type_hints(TrainOptions).items() if name not in OF_THE_SWEEP}
-TOP = {
-    "out": Path,
-    "seeds": tuple[int, ...],
-    "probe": bool,
-    "split_control": bool,
-    "probe_seconds": float,
-    "family_seconds": float,
-}
+PROBING = {name: hint for name, hint in get_type_hints(ProbeOptions).items() if name not in OF_THE_CELL}
+TOP = {"out": Path, "seeds": tuple[int, ...]}
 SCENE, METHOD = {"path": Path}, {"method": str}
 
 
@@ -80,15 +75,12 @@ class Cell:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Cells in the order in which they run; probe: whether each is probed, and how.  scenes: in the file's order."""
+    """Cells in the order in which they run; probe: how each is probed, None for not at all.  scenes: in the file's order."""
 
     file: Path
     out: Path
     cells: tuple[Cell, ...]
-    probe: bool
-    split_control: bool
-    probe_seconds: float | None
-    family_seconds: float
+    probe: ProbeOptions | None
 
     @property
     def scenes(self) -> list[str]:
@@ -111,6 +103,7 @@ def read_sweep(file: Path, out: Path | None = None, probe: bool = False) -> Swee
 
 def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -> Sweep:
     tables = {name: _tables(content.pop(name, None), name) for name in ("scenes", "methods")}
+    table = content.pop("probe", {} if probe else None)
     top = _values(content, TOP | TRAINING, "", file.parent)
     seeds = top.pop("seeds", (0,))
     if not seeds or len(set(seeds)) < len(seeds):
@@ -119,7 +112,6 @@ def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -
         raise InputError(
             'expected the folder of the results, as in out = "sweeps/fern", got no out; add it or give --out'
         )
-    own = {name: top.pop(name) for name in TOP if name in top and name not in ("out", "seeds")}
     shared = {name: value for name, value in top.items() if name in TRAINING}
     pairs = {
         (scene, method): shared | _scene(scene_table, scene, file) | _method(method_table, method, file)
@@ -131,15 +123,16 @@ def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -
         for seed in seeds
         for (scene, method), options in pairs.items()
     )
-    return Sweep(
-        file=file,
-        out=folder,
-        cells=cells,
-        probe=probe or own.get("probe", False),
-        split_control=own.get("split_control", False),
-        probe_seconds=own.get("probe_seconds"),
-        family_seconds=own.get("family_seconds", ProbeOptions.family_seconds),
-    )
+    return Sweep(file, folder, cells, None if table is None else _probe(table, file))
+
+
+def _probe(table: Any, file: Path) -> ProbeOptions:
+    """The options of every cell's probe; its checkpoint is the cell's."""
+    if not isinstance(table, dict):
+        raise InputError(
+            f"expected a table [probe] of options of landscape probe, empty for its defaults, got {table!r}"
+        )
+    return ProbeOptions(Path(), **_values(table, PROBING, "probe.", file.parent))
 
 
 def _tables(found: Any, name: str) -> dict[str, dict[str, Any]]:
@@ -196,17 +189,18 @@ def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def arguments(training: TrainOptions) -> list[str]:
+def arguments(command: str, options: TrainOptions | ProbeOptions) -> list[str]:
     """The words of the command line that say the same as the options.
 
-    >>> arguments(TrainOptions(Path("fern"), out=Path("runs/fern"), views=9, densify=False, set=("gamma=0.5",)))
-    ['train', 'fern', '--out', 'runs/fern', '--views', '9', '--set', 'gamma=0.5', '--no-densify']
+    >>> arguments("train", TrainOptions(Path("fern"), out=Path("runs/fern"), densify=False, set=("gamma=0.5",)))
+    ['train', 'fern', '--out', 'runs/fern', '--set', 'gamma=0.5', '--no-densify']
     """
-    words = ["train", str(training.scene)]
-    for field in fields(training)[1:]:
-        value = getattr(training, field.name)
+    positional, *named = fields(options)
+    words = [command, str(getattr(options, positional.name))]
+    for field in named:
+        value = getattr(options, field.name)
         option = field.name.replace("_", "-")
-        if value == field.default:
+        if value == (field.default if field.default_factory is MISSING else field.default_factory()):
             continue
         if isinstance(value, bool):
             words.append(f"--{option}" if value else f"--no-{option}")

@@ -105,5 +105,7 @@ class SweepProgress:
     def _probe_seconds(self) -> float:
         if self.probes:
             return mean(self.probes)
-        whole = self.sweep.probe_seconds or A_PROBE
-        return whole + self.sweep.family_seconds * self.sweep.split_control
+        options = self.sweep.probe
+        if options is None:
+            return 0.0
+        return (options.seconds or A_PROBE) + options.family_seconds * options.split_control

@@ -5,6 +5,7 @@ import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,13 +16,14 @@ from torch import Tensor
 from analysis.commands.cli import main
 from analysis.train.command import planned
 from analysis.train.options import TrainOptions
-from analysis.train.remarks import _not_reached
+from analysis.train.remarks import _not_reached, poor_start
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
 from splat.training.methods.corgs import CoRGS
 from splat.training.methods.stablegs.stablegs import StableGS
+from splat.training.start import Source
 from splat.training.state import TrainConfig
 
 SIZE = (24, 18)
@@ -84,6 +86,8 @@ def test_frames_without_an_image_and_a_poor_start_are_said(original, tmp_path, c
     assert "points only, and may leave places empty; take more --views" in said
     assert train(scene, tmp_path / "random", "--start", "random") == 0
     assert "random points, of which most lie on no surface" in capsys.readouterr().err
+    sources: tuple[Source, ...] = get_args(Source)
+    assert all(poor_start(load_scene(scene), source, 2) for source in sources)
     assert train(scene, tmp_path / "run", "--iterations", "2", "--resume") == 2  # the same scene, but other settings
     assert "iterations = 1" in capsys.readouterr().err
 

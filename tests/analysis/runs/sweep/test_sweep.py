@@ -17,6 +17,7 @@ import torch
 import tyro
 
 from analysis.commands.cli import main
+from analysis.probe.record import loss_name
 from analysis.records.provenance import usable_cores
 from analysis.runs.sweep.sweep import _Cells, locked, missing, probe_arguments
 from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
@@ -24,6 +25,7 @@ from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import results
 from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
+from splat.losses.reference import LossSettings
 from splat.render.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -97,7 +99,7 @@ def finished(folder) -> Sweep:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("splat.render.loss_and_gradient.render", press)
-        assert main(arguments(sweep.cells[0].training)) == 130
+        assert main(arguments("train", sweep.cells[0].training)) == 130
     assert load_checkpoint(sweep.cells[0].out / "checkpoint.pt").training.step == 3
     assert main(["sweep", str(sweep.file), "--jobs", "2"]) == 0
     return sweep
@@ -137,13 +139,13 @@ def test_cells_of_a_protocol_count_its_steps_unless_the_file_gives_others(folder
     for steps in (6, 10_000):
         cells = [cell for cell in read_sweep(file).cells if cell.training.method == "stablegs"]
         assert {cell.steps for cell in cells} == {steps}
-        assert "--protocol" in arguments(cells[0].training)
+        assert "--protocol" in arguments("train", cells[0].training)
         file.write_text(file.read_text().replace("iterations = 6", ""))
 
 
 def test_a_cell_is_the_command_that_a_user_would_type(folder):
     for cell in read_sweep(folder / "sweep.toml").cells:
-        assert tyro.cli(TrainOptions, args=arguments(cell.training)[1:]) == cell.training
+        assert tyro.cli(TrainOptions, args=arguments("train", cell.training)[1:]) == cell.training
 
 
 @pytest.mark.parametrize(
@@ -207,7 +209,7 @@ def test_ctrl_c_stops_a_sweep_after_its_cells_have_saved(folder, tmp_path, capsy
 def test_a_cell_that_was_stopped_ends_with_the_same_bits(finished, tmp_path):
     cell = finished.cells[0]
     whole = cell.out.with_name("whole")
-    assert main(arguments(replace(cell.training, out=whole))) == 0
+    assert main(arguments("train", replace(cell.training, out=whole))) == 0
     assert (whole / "checkpoint.pt").read_bytes() == (cell.out / "checkpoint.pt").read_bytes()
 
 
@@ -264,20 +266,24 @@ def test_two_sweeps_do_not_work_in_one_folder(folder, tmp_path, no_commands, cap
 
 
 def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, folder):
-    controlled = "probe = true\nsplit_control = true\nfamily_seconds = 7"
+    controlled = "[probe]\nsplit_control = true\nfamily_seconds = 7"
     with_probe = read_sweep(finished.file, probe=True)
-    control = read_sweep(written(folder, "seeds = [1, 0]", f"{controlled}\nseeds = [1]"))
+    control = read_sweep(written(folder, "[scenes.still]", f"{controlled}\n[scenes.still]"))
     cell = with_probe.cells[0]
     assert missing(cell, finished) == [] and missing(cell, with_probe) == missing(cell, control) == ["probe"]
     data, arrays = synthetic()
     data["provenance"]["iteration"] = 12
+    data["objective"]["loss"] = loss_name(LossSettings())
     recorded.written(cell.out / "probe", data, arrays)
     try:
         assert missing(cell, with_probe) == [] and missing(cell, control) == ["probe"]
-        assert probe_arguments(cell, control)[2:] == ["--split-control", "--family-seconds", "7.0"]
+        assert probe_arguments(cell, control)[4:] == ["--split-control", "--family-seconds", "7.0"]
         row = results([cell], {cell.name: "done"}).iloc[0]
         assert row["trace_means"] == data["traces"]["means"]["value"] and row["lambda_min_error"] == 3.0
         assert (row["saddle_low"], row["saddle_high"]) == (139.0, 143.0) and row["share"] is None
+        data["objective"]["loss"] = "another"
+        recorded.written(cell.out / "probe", data, arrays)
+        assert missing(cell, with_probe) == ["probe"]
     finally:
         shutil.rmtree(cell.out / "probe")
 
