@@ -31,7 +31,7 @@ from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import remarks, summary
 from analysis.probe.views import write_views
 from analysis.records.provenance import require_seed, versions
-from analysis.records.records import Arrays, ProbeRecord, Record, record_folder
+from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
@@ -76,8 +76,9 @@ def _run(
         )
     writes = ranks is None or ranks.rank == 0
     console, unfinished = Console(stderr=True, quiet=not writes), out.with_name(f".{out.name}.unfinished")
+    require_replaceable(out)
     stages = Stages(console)
-    with stages.stage("load"):
+    with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
@@ -87,7 +88,7 @@ def _run(
         f"{options.seed} {device} {versions()}"
     )
     deadline = begun + limit - DRAWING
-    # a folder that cannot be written, or that another command is writing, is noticed before anything is measured
+    # a folder that is being written by another command, or cannot be, is noticed before anything is measured
     with record_folder(out) if writes else nullcontext() as folder, stages, _kept(unfinished, command, console):
         generator = torch.Generator(device).manual_seed(options.seed)
         found = measure(objective, settings, generator, stages, None if ranks else unfinished, told, deadline)

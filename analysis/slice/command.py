@@ -35,7 +35,7 @@ from analysis.probe.record import loss_name, provenance_of
 from analysis.records.findings import of_slice, resolved
 from analysis.records.provenance import require_seed
 from analysis.records.quantities import measured, quantity
-from analysis.records.records import SliceRecord, record_folder, refusing_damage
+from analysis.records.records import SliceRecord, record_folder, refusing_damage, require_replaceable
 from analysis.records.schema import FiniteProbe
 from analysis.slice.directions import (
     RISE,
@@ -71,13 +71,14 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     settings = _settings(options, shape, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
     unfinished, console, start = out.with_name(f".{out.name}.unfinished"), Console(stderr=True), perf_counter()
+    require_replaceable(out, SliceRecord)
     stages = Stages(console)
-    with stages.stage("load"):
+    with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
         others = [_other_end(checkpoint, path) for path in options.others]
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
-    # a folder that cannot be written, or that another command is writing, is noticed before anything is rendered
+    # a folder that is being written by another command, or cannot be, is noticed before anything is rendered
     with record_folder(out, SliceRecord) as folder, stages:
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
