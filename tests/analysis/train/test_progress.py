@@ -40,15 +40,15 @@ def run(scene) -> Path:
 def test_a_row_is_the_first_training_view_as_the_checkpoint_renders_it(run):
     table = pd.read_csv(run / "train.csv")
     assert list(table["step"]) == [0, 10, 20, 25] and list(table["seconds"]) == sorted(table["seconds"])
-    for row in table.iloc[1:].itertuples():
-        path = run / f"step-{row.step}" / "checkpoint.pt"
+    for _, row in table.iloc[1:].iterrows():
+        path = run / f"step-{row['step']:.0f}" / "checkpoint.pt"
         loaded = load_checkpoint(path)
         training, (view,) = loaded.training, loaded.load_scene(path).load(loaded.scene.train[:1])
         with torch.no_grad():
             image = render(training.gaussians, view.camera, torch.zeros(3), training.config.render).image
-        assert row.psnr == pytest.approx(psnr(image, view.image), rel=1e-6)
-        assert row.loss == pytest.approx(float(photometric_loss(image, view.image, training.config.loss)), rel=1e-5)
-        assert row.gaussians == len(training.gaussians)
+        assert row["psnr"] == pytest.approx(psnr(image, view.image), rel=1e-6)
+        assert row["loss"] == pytest.approx(float(photometric_loss(image, view.image, training.config.loss)), rel=1e-5)
+        assert row["gaussians"] == len(training.gaussians)
 
 
 def test_what_is_kept_is_the_checkpoint_of_its_step_and_finds_its_scene(scene, run):
@@ -91,26 +91,25 @@ def test_a_row_is_there_when_it_is_made_and_a_resumed_run_continues_the_file(sce
     assert [line.split(",")[0] for line in written.splitlines()] == ["step", "0", "10", "20"]
     (out / "train.csv").write_text(written + "2")  # of a line that was cut short
     assert main(words(scene, out, "--resume")) == 0
-    tables = [pd.read_csv(each / "train.csv").drop(columns="seconds") for each in (out, run)]
-    pd.testing.assert_frame_equal(*tables, check_exact=True)
+    ended, whole = (pd.read_csv(each / "train.csv").drop(columns="seconds") for each in (out, run))
+    pd.testing.assert_frame_equal(ended, whole, check_exact=True)
 
 
 def test_off_a_terminal_every_row_is_a_line_with_the_time_left(scene, tmp_path, capsys):
     assert main(words(scene, tmp_path / "run")) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("step ")]
     assert [line.split(":")[0] for line in lines] == [f"step {step} of 25" for step in (0, 10, 20, 25)]
-    for line, row in zip(lines, pd.read_csv(tmp_path / "run" / "train.csv").itertuples(), strict=True):
-        assert f"loss {row.loss:.4f}, {row.psnr:.2f} dB, {row.gaussians} Gaussians" in line
-        assert line.endswith(" s left") == (row.step in (10, 20))
+    for line, (_, row) in zip(lines, pd.read_csv(tmp_path / "run" / "train.csv").iterrows(), strict=True):
+        assert f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB, {row['gaussians']:.0f} Gaussians" in line
+        assert line.endswith(" s left") == (row["step"] in (10, 20))
 
 
 def test_tensorboard_is_given_the_rows(scene, tmp_path):
-    pytest.importorskip("tensorboard", reason="pip install -e '.[tensorboard]'")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
+    reader = "tensorboard.backend.event_processing.event_accumulator"
+    package = pytest.importorskip(reader, reason="pip install -e '.[tensorboard]'")
     out = tmp_path / "run"
     assert main(words(scene, out, "--tensorboard")) == 0
-    events, table = EventAccumulator(str(out / "tensorboard")).Reload(), pd.read_csv(out / "train.csv")
+    events, table = package.EventAccumulator(str(out / "tensorboard")).Reload(), pd.read_csv(out / "train.csv")
     for name in ("loss", "psnr", "gaussians"):
         found = events.Scalars(name)
         assert [each.step for each in found] == list(table["step"])
