@@ -219,17 +219,18 @@ def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:
     return loaded
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
+def load_checkpoint(path: str | Path) -> Checkpoint:
     """Read a checkpoint, its tensors on the CPU.
 
     OSError where there is none or the system does not give it, MemoryError or torch's where memory is short; InputError, which
     says what is wrong with it, where it is damaged or of another kind.
 
-    >>> load_checkpoint(Path("nowhere/checkpoint.pt"))
+    >>> load_checkpoint("nowhere/checkpoint.pt")
     Traceback (most recent call last):
         ...
     FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file
     """
+    path = Path(path)
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
         raise FileNotFoundError(f"{KIND} at {path}, found {found}")
