@@ -76,7 +76,7 @@ Level = Literal["coarse", "whole"]
 FEWEST_OF_DENSITY = 16  # products
 COARSE_MATVECS = 24  # products of a coarse record's search for the ends
 # renders with their gradients, for each view, that a record takes (measured on 8,000 Gaussians)
-TYPICAL = {"coarse": 32.0, "whole": 160.0}
+TYPICAL = {"coarse": 20.0, "whole": 64.0}
 COLUMNS = (
     "step", "gaussians", "state", "note", "seconds", "time_share", "visible_gaussians", "parameters", "matvecs",
     *(f"trace_{name}{key}" for name in ATTRIBUTES for key in ("", "_error", "_low", "_high", "_dim", "_reason")),
