@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 
 from analysis.bench.options import BenchOptions
-from analysis.commands.options import ConvertOptions, DemoOptions, SfmOptions
+from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions
 from analysis.console.failures import report
 from analysis.console.interruption import ignored, raising
 from analysis.probe.options import ProbeOptions
@@ -33,6 +33,7 @@ Options = (
     | Annotated[SweepOptions, tyro.conf.subcommand("sweep")]
     | Annotated[ProbeOptions, tyro.conf.subcommand("probe")]
     | Annotated[SliceOptions, tyro.conf.subcommand("slice")]
+    | Annotated[MapOptions, tyro.conf.subcommand("map")]
     | Annotated[CompareOptions, tyro.conf.subcommand("compare")]
     | Annotated[ClaimsOptions, tyro.conf.subcommand("claims")]
     | Annotated[ConvertOptions, tyro.conf.subcommand("convert")]
@@ -151,6 +152,13 @@ def run(options: Options, arguments: Sequence[str]) -> int:
             from analysis.slice.command import run_slice
 
             return run_slice(options, ["landscape", *arguments])
+        case MapOptions():
+            from analysis.console.drawing import drawing
+
+            with drawing("maps") as drawn:
+                from analysis.commands.map.command import run_map
+
+                return run_map(options, ["landscape", *arguments], drawn)
         case TrajectoryOptions():
             from analysis.runs.trajectories import run_trajectory
 
