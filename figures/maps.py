@@ -36,7 +36,7 @@ class Sheet:
         self.tall, self.columns = self.across * aspect, columns
         self.size = (rest + rows * self.tall, columns * (self.across + MARGIN) + MARGIN)
         self.tops = [sum(self.tall + HEAD + LEGEND * each for each in legends[:row]) + HEAD for row in range(rows)]
-        self.figure = Figure(figsize=self.size[::-1], dpi=DOTS)
+        self.figure = Figure(figsize=(self.size[1], self.size[0]), dpi=DOTS)
 
     def axes(self, row: int, column: int, title: str) -> Axes:
         found = self._at(row, column, 0.0, self.tall)

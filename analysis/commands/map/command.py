@@ -26,7 +26,6 @@ from analysis.commands.map.files import coloured_ply, fields_ply, top_table
 from analysis.commands.map.pictures import error_shade, view_maps, write_maps
 from analysis.commands.options import MapOptions
 from analysis.console.drawing import Draw
-from analysis.console.overrides import did_you_mean
 from analysis.console.stages import Stages
 from analysis.measures.localization import masses
 from analysis.probe.command import opened, scene_objective
@@ -36,7 +35,7 @@ from analysis.records.quantities import Shade, quantity
 from analysis.records.records import record_folder, require_replaceable
 from analysis.records.run_files import MapRecord, Panel
 from analysis.slice.directions import recorded_eigenvectors
-from landscape.errors import InputError
+from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
 from splat.curvature.fields import FIELDS, Field, Values, scene_fields
 from splat.curvature.objective import SceneObjective
