@@ -5,6 +5,8 @@ came, what to do.  Anything else that is raised is a fault of the program, for w
 """
 
 import errno
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the last: a limit on the size of files
 OUT_OF_MEMORY = (  # words of torch, of Python's threads and of C++
@@ -14,6 +16,16 @@ OUT_OF_MEMORY = (  # words of torch, of Python's threads and of C++
 
 class InputError(ValueError):
     """Input, settings, a file, a scene, a checkpoint or an operator that cannot be used as given."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The end of a message about a name that is none of the known ones.
+
+    >>> did_you_mean("warmup", ["warm_up", "gamma"]), did_you_mean("teapot", ["gamma"])
+    ('; did you mean warm_up?', '')
+    """
+    near = get_close_matches(name, list(known), n=1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def lacks_memory(error: BaseException) -> bool:

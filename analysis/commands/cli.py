@@ -12,33 +12,49 @@ from dataclasses import replace
 from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, Annotated, NoReturn
+from typing import IO, NoReturn
 
 import tyro
 from rich.console import Console
 
 from analysis.bench.options import BenchOptions
-from analysis.commands.options import ConvertOptions, DemoOptions, SfmOptions
+from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions
 from analysis.console.failures import report
 from analysis.console.interruption import ignored, raising
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, TrajectoryOptions
 from analysis.slice.options import SliceOptions
 from analysis.train.options import TrainOptions
+from landscape.errors import InputError, did_you_mean
 
 DEBUG, CHECKPOINT = "--debug", "checkpoint.pt"
+COMMANDS = {
+    "sfm": SfmOptions,
+    "train": TrainOptions,
+    "sweep": SweepOptions,
+    "probe": ProbeOptions,
+    "slice": SliceOptions,
+    "map": MapOptions,
+    "compare": CompareOptions,
+    "claims": ClaimsOptions,
+    "convert": ConvertOptions,
+    "demo": DemoOptions,
+    "trajectory": TrajectoryOptions,
+    "bench": BenchOptions,
+}
 Options = (
-    Annotated[SfmOptions, tyro.conf.subcommand("sfm")]
-    | Annotated[TrainOptions, tyro.conf.subcommand("train")]
-    | Annotated[SweepOptions, tyro.conf.subcommand("sweep")]
-    | Annotated[ProbeOptions, tyro.conf.subcommand("probe")]
-    | Annotated[SliceOptions, tyro.conf.subcommand("slice")]
-    | Annotated[CompareOptions, tyro.conf.subcommand("compare")]
-    | Annotated[ClaimsOptions, tyro.conf.subcommand("claims")]
-    | Annotated[ConvertOptions, tyro.conf.subcommand("convert")]
-    | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
-    | Annotated[TrajectoryOptions, tyro.conf.subcommand("trajectory")]
-    | Annotated[BenchOptions, tyro.conf.subcommand("bench")]
+    SfmOptions
+    | TrainOptions
+    | SweepOptions
+    | ProbeOptions
+    | SliceOptions
+    | MapOptions
+    | CompareOptions
+    | ClaimsOptions
+    | ConvertOptions
+    | DemoOptions
+    | TrajectoryOptions
+    | BenchOptions
 )
 
 
@@ -100,14 +116,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parsed(arguments: Sequence[str]) -> Options:
-    """The options of a subcommand.  SystemExit for help, and where they cannot be parsed."""
-    return tyro.cli(
-        Options,  # pyright: ignore[reportArgumentType]
+    """The options of a command, which are parsed alone: what an error advises is of that command.
+
+    SystemExit for help, and where they cannot be parsed; InputError for a command that there is not.
+    """
+    name, config = (*arguments, "")[0], (tyro.conf.DisallowNone,)
+    if name in COMMANDS:
+        return tyro.cli(COMMANDS[name], prog=f"landscape {name}", args=arguments[1:], config=config)
+    if name and not name.startswith("-"):
+        raise InputError(f"expected a command among {', '.join(COMMANDS)}, got {name!r}{did_you_mean(name, COMMANDS)}")
+    return tyro.extras.subcommand_cli_from_dict(
+        COMMANDS,  # pyright: ignore[reportArgumentType]
         prog="landscape",
         description=f"See the loss landscape of a 3D Gaussian Splatting scene.\n{DEBUG}, before or after the subcommand, shows "
         "where in the program an error came up.  --version alone shows the version.",
         args=arguments,
-        config=(tyro.conf.DisallowNone,),
+        config=config,
     )
 
 
@@ -151,6 +175,13 @@ def run(options: Options, arguments: Sequence[str]) -> int:
             from analysis.slice.command import run_slice
 
             return run_slice(options, ["landscape", *arguments])
+        case MapOptions():
+            from analysis.console.drawing import drawing
+
+            with drawing("maps") as drawn:
+                from analysis.commands.map.command import run_map
+
+                return run_map(options, ["landscape", *arguments], drawn)
         case TrajectoryOptions():
             from analysis.runs.trajectories import run_trajectory
 

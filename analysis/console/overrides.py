@@ -8,12 +8,11 @@ VALUE   a plain value, or text that is read by the setting's type: a number, tru
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields, is_dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from landscape.errors import InputError
+from landscape.errors import InputError, did_you_mean
 from splat.model.settings import current_settings
 from splat.model.typed import leaves
 from splat.training.state import MethodSettings, TrainConfig
@@ -56,16 +55,6 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
             )
         config = _changed(config, path if path[0] in own else ["method", *path], value, key)
     return config
-
-
-def did_you_mean(name: str, known: Sequence[str]) -> str:
-    """The end of a message about a name that is none of the known ones.
-
-    >>> did_you_mean("warmup", ["warm_up", "gamma"]), did_you_mean("teapot", ["gamma"])
-    ('; did you mean warm_up?', '')
-    """
-    near = get_close_matches(name, known, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _names(settings: TrainConfig | MethodSettings) -> list[str]:

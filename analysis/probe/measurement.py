@@ -29,13 +29,12 @@ from torch import Tensor
 from analysis.console.kept import Kept
 from analysis.console.stages import Stages
 from analysis.measures.depth import measure_depth
-from analysis.measures.gradient_check import check_against_gradient
+from analysis.measures.gradient_check import ProductCheck, check_against_gradient
 from analysis.measures.memory import basis_within, vectors_within
 from analysis.probe.settings import FEWEST_STEPS, ProbeSettings
 from analysis.records.schema import Depth
 from landscape import (
     CountingOperator,
-    DerivativeCheck,
     EigenEnds,
     OperatorCheck,
     Slice,
@@ -106,7 +105,7 @@ class Measured:
     value: float
     gradient_norm: float
     operator_check: OperatorCheck
-    gradient_check: DerivativeCheck
+    gradient_check: ProductCheck
     traces: dict[str, TraceEstimate]
     ends: EigenEnds
     power: EigenEnds | None
@@ -161,7 +160,7 @@ class _Point:
 
 
 def _all_stages(
-    at: _Point, kept: Kept, operator_check: OperatorCheck, gradient_check: DerivativeCheck, checks: tuple[int, int]
+    at: _Point, kept: Kept, operator_check: OperatorCheck, gradient_check: ProductCheck, checks: tuple[int, int]
 ) -> Measured:
     objective, settings = at.objective, at.settings
     traces = kept.run("traces", dict[str, TraceEstimate], lambda g, report, _: _traces(at, kept.left, g, report), True)

@@ -44,7 +44,7 @@ def findings(data: ProbeRecord) -> list[Line]:
     """The sentences of a record, failures first."""
     ends = data.eigenvalues
     lines = [
-        *_of_checks(data.checks),
+        *of_checks(data.checks),
         *_of_traces(data.traces),
         *_of_ends(ends),
         *of_budgets({"max": ends.max.reason, "min": ends.min.reason}),
@@ -71,7 +71,8 @@ def headline(data: ProbeRecord) -> list[Line]:
     return found[:3]
 
 
-def _of_checks(checks: Mapping[str, Check]) -> list[Line]:
+def of_checks(checks: Mapping[str, Check]) -> list[Line]:
+    """What failed or could not run of a probe's self-checks, or that all passed."""
     lines = []
     for name, check in checks.items():
         label, note = name.replace("_", " "), _in_brackets(check.note)
@@ -80,7 +81,10 @@ def _of_checks(checks: Mapping[str, Check]) -> list[Line]:
         elif not check.passed:
             value, bound = quantity(check.value), quantity(check.bound)
             text = f"The check of {label} failed: {value}, where at most {bound} is allowed{note}."
-            lines.append(Line(f"{text} Do not trust the numbers below.", "failure"))
+            if name == "round_off" and _is_finite(check.value):
+                lines.append(Line(f"{text} Its numbers are uncertain by as much.", "caution"))
+            else:
+                lines.append(Line(f"{text} Do not trust its numbers.", "failure"))
     if checks and all(check.passed for check in checks.values()):
         lines.append(Line(f"All {len(checks)} checks passed."))
     return lines

@@ -24,7 +24,7 @@ from analysis.console.options import DeviceName
 from analysis.console.overrides import leaves
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import loss_name
-from analysis.records.findings import of_budgets, unresolved
+from analysis.records.findings import of_budgets, of_checks, unresolved
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, read_record
@@ -172,8 +172,7 @@ def cautions(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         if run.data.slice and not run.data.slice.is_resolved:
             lines.append(f"{run.label}: {unresolved(run.data.slice, run.data.provenance)}")
-        failed = [name.replace("_", " ") for name, check in run.data.checks.items() if check.passed is False]
-        lines += [f"{run.label}: the check of {name} failed; do not trust its numbers." for name in failed]
+        lines += [f"{run.label}: {line.text}" for line in of_checks(run.data.checks) if line.level != "fact"]
         ends = {"max": run.data.eigenvalues.max.reason, "min": run.data.eigenvalues.min.reason}
         lines += [f"{run.label}: {line.text}" for line in of_budgets(ends)]
         lines += [f"{run.label} was not scored."] * (run.scores is None)

@@ -2,45 +2,39 @@
 
 RUN/checkpoint.pt   the latest checkpoint, see `splat/training/checkpoint.py`; written at the start, every so many steps, on
                     Ctrl-C and at the end
+RUN/step-N/checkpoint.pt    with --keep-checkpoints: those after step N that stay, each in a folder of its own, as a probe
+                    of it writes there
+RUN/train.csv       how it goes, see `analysis/train/progress.py`
 RUN/seconds.json    how long that took, see `analysis/train/training_time.py`
 RUN/history.csv     what the method noted along the way, a row each with its "step"; where there is any
 RUN/trajectory.csv, RUN/start/checkpoint.pt     with --probe-every: the landscape along the way, see
 `analysis/train/trajectory.py`
-RUN/test/NAME.png   the held-out views as rendered at the end
+RUN/test/           the held-out views as rendered at the end, see `analysis/train/scores.py`
 RUN/metrics.json    {"step", "method", "protocol", "gaussians", "train": scores, "test": scores or null, "seconds",
                     "provenance"}, where scores are
                     {"psnr", "ssim", "lpips", "masked", "views": {NAME: {"psnr", "ssim", "lpips"}}}, psnr in dB;
                     "Infinity" for a perfect image; lpips null where it cannot be computed; masked: inside masks only
 """
 
-import io
-import math
 import os
 import shlex
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from itertools import count
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 import torch
-from PIL import Image
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
-from rich.table import Table
-from rich.text import Text
-from torch import Tensor
 
 from analysis.console.interruption import interruption
 from analysis.console.overrides import assignments, overridden
-from analysis.records.json_files import json_text, plain
-from analysis.records.provenance import provenance
-from analysis.records.run_files import CHECKPOINT, METRICS
+from analysis.records.run_files import CHECKPOINT
 from analysis.train.options import TrainOptions
-from analysis.train.remarks import remarks
+from analysis.train.progress import TrainingProgress, scalar_writer
+from analysis.train.remarks import begins, remarks
+from analysis.train.scores import PLAIN, report
 from analysis.train.source import from_checkpoint
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
@@ -49,7 +43,6 @@ from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
 from splat.model.typed import leaves, typed
 from splat.model.untrusted import beside, locked
-from splat.scenes.images import IMAGE_SUFFIXES
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, split_scene, usual_views
@@ -60,12 +53,11 @@ from splat.training.loop import prepare, train
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
 from splat.training.origin.scene_reference import SceneReference
-from splat.training.score.evaluate import Evaluation, ViewScore, evaluate, have_masks
-from splat.training.score.perceptual import MissingPerceptual, load_lpips
+from splat.training.score.evaluate import have_masks
 from splat.training.start import Source, initial_gaussians
 from splat.training.state import TrainConfig, Training
 
-HISTORY, RENDERS = "history.csv", "test"
+HISTORY, KEPT = "history.csv", "step-{}"
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 OPTIONS = {  # settings of the training that have an option of their own
     "iterations": "iterations",
@@ -78,15 +70,68 @@ OPTIONS = {  # settings of the training that have an option of their own
     "densify.enabled": "densify",
 }
 AGAIN = "repeat its command with --resume, or choose another --out"
-PLAIN: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}  # paths and names may hold brackets
 WARNING: dict[str, Any] = PLAIN | {"style": "yellow"}
-SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A training with its scene, its views and its folder.  keep: checkpoints that stay beside the latest."""
+
+    out: Path
+    training: Training
+    scene: Scene
+    views: list[View]
+    held_out: list[View]
+    reference: SceneReference
+    keep: int | Literal["all"] = 0
+
+    def create(self, *, keep_start: bool) -> None:
+        """Make the folder with its first checkpoint appear at once.  keep_start: with a copy that stays."""
+        partial = self.out.absolute().with_name(f".{self.out.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed: the lock is ours
+        partial.mkdir()
+        try:
+            save_checkpoint(partial / CHECKPOINT, self.training, self.reference)
+            if keep_start:
+                self._save_within(partial / START)
+            os.rename(partial, self.out)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+
+    def save(self, spent: TrainingTime, *, stays: bool) -> None:
+        """Write the checkpoint and what belongs to it.  stays: also among those that are kept, of which the oldest go."""
+        if stays and self.keep:
+            self._save_within(self.out / KEPT.format(self.training.step))
+        save_checkpoint(self.out / CHECKPOINT, self.training, self.reference)
+        spent.write(self.out)
+        if history := self.training.method.history:
+            write_atomically(self.out / HISTORY, pd.DataFrame(history).to_csv(index=False).encode())
+        if self.keep != "all":
+            steps = [
+                path.parent.name.removeprefix("step-") for path in self.out.glob(f"{KEPT.format('*')}/{CHECKPOINT}")
+            ]
+            kept = sorted(int(step) for step in steps if step.isdigit())
+            for step in kept[: max(len(kept) - self.keep, 0)]:
+                (folder := self.out / KEPT.format(step)).joinpath(CHECKPOINT).unlink()
+                if not any(folder.iterdir()):  # else it holds somebody's probe
+                    folder.rmdir()
+
+    def _save_within(self, folder: Path) -> None:
+        folder.mkdir(exist_ok=True)
+        deeper = replace(self.reference, relative=os.path.join(os.pardir, self.reference.relative))
+        save_checkpoint(folder / CHECKPOINT, self.training, deeper)
 
 
 def run_training(options: TrainOptions, command: Sequence[str]) -> int:
     """Train, or continue, a run; returns the exit code.  command: as typed, for the message on how to resume."""
-    if options.checkpoint_every < 1:
-        raise InputError(f"expected checkpoint_every of at least 1, got {options.checkpoint_every}")
+    for name in ("checkpoint_every", "log_every"):
+        if (value := getattr(options, name)) < 1:
+            raise InputError(f"expected {name} of at least 1, got {value}")
+    if options.keep_checkpoints != "all" and options.keep_checkpoints < 0:
+        raise InputError(f"expected keep_checkpoints of at least 0, or all, got {options.keep_checkpoints}")
+    if options.tensorboard:
+        scalar_writer()  # refuses before anything is loaded
     along = None if options.probe_every is None else TrajectorySettings(options.probe_every, options.probe_share)
     out = options.out or Path("runs") / options.scene.resolve().name
     _require_run(out, options.resume)
@@ -108,47 +153,33 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
         training = Training.start(start, scene.extent(split.train), config)
     training.move(device)
     prepare(training, views)  # refuses what cannot be trained before there is a folder
+    run = Run(out, training, scene, views, held_out, reference, options.keep_checkpoints)
     if not out.parent.exists():
         out.parent.mkdir(parents=True, exist_ok=True)
     with locked(beside(out), f"no other training in {out}"):
         if not options.resume:
             _require_run(out, resume=False)  # another may have been faster
-            _create_run(out, training, reference, keep_start=along is not None)
-        return _run(options, command, training, scene, views, held_out, reference, out, along)
+            run.create(keep_start=along is not None)
+        return _run(run, options, command, along)
 
 
-def _run(
-    options: TrainOptions,
-    command: Sequence[str],
-    training: Training,
-    scene: Scene,
-    views: list[View],
-    held_out: list[View],
-    reference: SceneReference,
-    out: Path,
-    along: TrajectorySettings | None,
-) -> int:
+def _run(run: Run, options: TrainOptions, command: Sequence[str], along: TrajectorySettings | None) -> int:
     """Train to the end and score, in a folder that exists; as `run_training`."""
-    config, console = training.config, Console(stderr=True)
-    camera = views[0].camera
+    training, console = run.training, Console(stderr=True)
     console.print(
-        f"{scene.name}: {len(views)} views to train on, {len(held_out)} held out, {camera.width} x {camera.height} px, "
-        f"{len(training.gaussians)} Gaussians",
-        markup=False,
+        begins(run.scene, run.views, len(run.held_out), training, options.from_ or run.reference.start), **PLAIN
     )
-    begun = None if options.resume else (reference.start, len(training.gaussians))
-    for remark in remarks(scene, _asked(options, scene), config, begun):
+    begun = None if options.resume or options.from_ else (run.reference.start, len(training.gaussians))
+    for remark in remarks(run.scene, _asked(options, run.scene), training.config, begun):
         console.print(remark, **WARNING)
-    trajectory = None if along is None else Trajectory(out, training, views, along)
-    if trajectory and (hopeless := trajectory.hopeless):
-        console.print(hopeless, **WARNING)
-    if code := _follow(training, views, out / CHECKPOINT, reference, options.checkpoint_every, trajectory, console):
+    trajectory = None if along is None else Trajectory(run.out, training, run.views, along)
+    if code := _follow(run, options, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])
         console.print(f"stopped after step {training.step}; to continue: {again}", **PLAIN)
         return code
-    _report(training, views, held_out, out)
-    if trajectory and (skipped := trajectory.skipped):
-        console.print(skipped, **WARNING)
+    report(training, run.views, run.held_out, run.out)
+    if trajectory and (thinned := trajectory.thinned):
+        console.print(thinned, **WARNING)
     return 0
 
 
@@ -213,23 +244,6 @@ def _require_run(out: Path, resume: bool) -> None:
         )
 
 
-def _create_run(out: Path, training: Training, reference: SceneReference, *, keep_start: bool) -> None:
-    """Make the folder with its first checkpoint appear at once.  keep_start: with a copy that stays."""
-    partial = out.absolute().with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed: the lock is ours
-    partial.mkdir()
-    try:
-        save_checkpoint(partial / CHECKPOINT, training, reference)
-        if keep_start:
-            (partial / START).mkdir()
-            deeper = replace(reference, relative=os.path.join(os.pardir, reference.relative))
-            save_checkpoint(partial / START / CHECKPOINT, training, deeper)
-        os.rename(partial, out)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-
-
 def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: str = AGAIN) -> Training:
     """The training of a checkpoint, which must have been started with the same settings on the same views.  remedy: what a
     refusal advises."""
@@ -248,154 +262,23 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: 
     return loaded.training
 
 
-def _follow(
-    training: Training,
-    views: list[View],
-    path: Path,
-    reference: SceneReference,
-    every: int,
-    trajectory: Trajectory | None,
-    console: Console,
-) -> int:
-    """Train to the end with a progress bar and checkpoints; the exit code where a signal ended it, after a checkpoint."""
-    total, spent = training.config.iterations, TrainingTime.read(path.parent)
-    warned = (trajectory.skipped or trajectory.hopeless) if trajectory else ""
-    with interruption() as interrupted, _progress(console) as progress:
-        bar = progress.add_task("training", total=total, completed=training.step, state="")
-        loss = math.nan
-        for done in spent.timed(train(training, views)):
-            loss = done.loss if math.isnan(loss) else loss + SMOOTHING * (done.loss - loss)
-            progress.update(bar, completed=done.step, state=f"loss {loss:.4f} {done.gaussians} Gaussians")
+def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, console: Console) -> int:
+    """Train to the end, with checkpoints; the exit code where a signal ended it, after a checkpoint."""
+    training, spent = run.training, TrainingTime.read(run.out)
+    total = training.config.iterations
+    progress = TrainingProgress(run.out, training, run.views[0], options.log_every, console, options.tensorboard)
+    with interruption() as interrupted, progress:
+        progress.begin(spent.wall)
+        if trajectory:
+            trajectory.before_steps()
+        for done in spent.timed(train(training, run.views)):
+            progress.after_step(done, spent.wall)
             if trajectory:
                 trajectory.after_step(spent.wall)
-                if not warned and (warned := trajectory.skipped):
-                    console.print(f"after step {done.step}: {warned}", **WARNING)
             stop = interrupted.is_set()
-            if stop or done.step % every == 0 or done.step == total:
-                save_checkpoint(path, training, reference)
-                spent.write(path.parent)
-                _write_history(training, path.with_name(HISTORY))
+            due = done.step % options.checkpoint_every == 0 or done.step == total
+            if stop or due:
+                run.save(spent, stays=due)
             if stop:
                 return interrupted.exit_code if done.step < total else 0
     return 0
-
-
-def _write_history(training: Training, path: Path) -> None:
-    if training.method.history:
-        write_atomically(path, pd.DataFrame(training.method.history).to_csv(index=False).encode())
-
-
-class _Rate(ProgressColumn):
-    def render(self, task: Task) -> Text:
-        return Text(f"{task.speed:5.1f} it/s" if task.speed else "  --- it/s")
-
-
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _Rate(),
-        TextColumn("{task.fields[state]}"),
-        TimeRemainingColumn(),
-        console=console,
-        refresh_per_second=4,
-    )
-
-
-def _report(training: Training, views: list[View], held_out: list[View], out: Path) -> None:
-    """Score the views, write renders and metrics, print the table."""
-    config = training.config
-    background = config.background_colour(training.gaussians.flat.dtype)
-    renders, names = out / RENDERS, render_names([view.name for view in held_out])
-
-    def keep(name: str, image: Tensor) -> None:
-        write_atomically(renders / names[name], _png(image))
-
-    console = Console()
-    try:
-        lpips = load_lpips()
-    except MissingPerceptual as error:
-        lpips = None
-        console.print(str(error), **PLAIN)
-    seen = evaluate(training.gaussians, views, background, config.render, lpips=lpips)
-    tested = None
-    if held_out:
-        renders.mkdir(exist_ok=True)
-        tested = evaluate(training.gaussians, held_out, background, config.render, lpips=lpips, on_image=keep)
-    metrics = {
-        "step": training.step,
-        "method": config.method.name,
-        "protocol": config.protocol,
-        "gaussians": len(training.gaussians),
-        "train": _scores(seen),
-        "test": _scores(tested) if tested else None,
-        "seconds": asdict(TrainingTime.read(out)),
-        "provenance": plain(provenance(config.seed, checkpoint=str(out / CHECKPOINT))),
-    }
-    write_atomically(out / METRICS, json_text(metrics).encode())
-    console.print(_table(seen, tested))
-    rendered = (
-        f"renders of the held-out views: {renders}; " if tested else "no view was held out, so nothing was tested; "
-    )
-    for line in (f"{rendered}scores: {out / METRICS}", f"next: landscape probe {shlex.quote(str(out / CHECKPOINT))}"):
-        console.print(line, **PLAIN)
-
-
-def render_name(view: str) -> str:
-    """File name of a view's render: `train/r_3` becomes `train_r_3.png`, `IMG_1.JPG` becomes `IMG_1.png`."""
-    flat = Path(view.replace("/", "_"))
-    return f"{flat.stem if flat.suffix.lower() in IMAGE_SUFFIXES else flat.name}.png"
-
-
-def render_names(views: Sequence[str]) -> dict[str, str]:
-    """`render_name` of each view; those that would be one file, in any case of letters, are told apart by a number.
-
-    >>> render_names(["a/b.png", "a_b.png", "c"])
-    {'a/b.png': 'a_b.png', 'a_b.png': 'a_b-2.png', 'c': 'c.png'}
-    """
-    names: dict[str, str] = {}
-    for view in views:
-        name, taken = render_name(view), {each.lower() for each in names.values()}
-        stem = name.removesuffix(".png")
-        numbered = (f"{stem}-{number}.png" for number in count(2))
-        names[view] = (
-            name if name.lower() not in taken else next(each for each in numbered if each.lower() not in taken)
-        )
-    return names
-
-
-def _png(image: Tensor) -> bytes:
-    pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
-    return buffer.getvalue()
-
-
-def _scores(evaluation: Evaluation) -> dict[str, Any]:
-    def of(scores: ViewScore | Evaluation) -> dict[str, Any]:
-        return {"psnr": scores.psnr, "ssim": scores.ssim, "lpips": scores.lpips}
-
-    return {**of(evaluation), "masked": evaluation.masked, "views": {view.name: of(view) for view in evaluation.views}}
-
-
-def _table(seen: Evaluation, tested: Evaluation | None) -> Table:
-    shown = tested or seen
-    title = "held-out views" if tested else "training views"
-    table = Table("view", title=f"{title}, inside their masks" if shown.masked else title)
-    columns = {"PSNR (dB)": "psnr", "SSIM": "ssim", **({} if shown.lpips is None else {"LPIPS": "lpips"})}
-    for column in columns:
-        table.add_column(column, justify="right")
-
-    def row(name: str, scores: ViewScore | Evaluation, style: str | None = None) -> None:
-        values = [getattr(scores, key) for key in columns.values()]
-        cells = ["" if v is None else f"{v:.{2 if key == 'psnr' else 4}f}" for v, key in zip(values, columns.values())]
-        table.add_row(escape(name), *cells, style=style)
-
-    if tested:
-        for view in tested.views:
-            row(view.name, view)
-        table.add_section()
-        row("mean", tested, "bold")
-    row("mean of the training views" + (", whole" if shown.masked and not seen.masked else ""), seen)
-    return table

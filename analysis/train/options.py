@@ -75,8 +75,16 @@ class TrainOptions:
     """Weight of 1 - SSIM, 0 to 1; the pixel loss has the rest."""
     checkpoint_every: int = 500
     """Steps between checkpoints: what a killed run loses at most."""
+    keep_checkpoints: int | Literal["all"] = 0
+    """How many of these stay, beside the latest in OUT: the newest N, each as OUT/step-K/checkpoint.pt, or all."""
+    log_every: int = 100
+    """Steps between rows of OUT/train.csv: loss and PSNR of the first training view, Gaussians, seconds.
+    Off a terminal, each is a line on stderr too."""
+    tensorboard: FlagCreatePairsOff[bool] = False
+    """Write the rows of train.csv also to OUT/tensorboard, for TensorBoard: pip install -e '.[tensorboard]'."""
     probe_every: Unset[int] = None
-    """Steps between records of traces, both ends of the spectrum and anisotropy in OUT/trajectory.csv.  Default: none."""
+    """Steps between records of traces, both ends of the spectrum and anisotropy in OUT/trajectory.csv.  Default: none.
+    The first, at the start, and the last are always made."""
     probe_share: float = 0.1
-    """Time that these records may take together, as a share of the time of the steps; one that would not fit is skipped.
-    inf: no limit."""
+    """Time that these records may take together, as a share of the time of the steps.
+    One between the first and the last that would not fit is coarser or skipped.  inf: no limit."""

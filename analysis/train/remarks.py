@@ -1,13 +1,23 @@
 """Remarks of `landscape train` before its first step: what was skipped or scaled or is not reached, and a poor start."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from splat.model.typed import leaves
 from splat.scenes.scene import Scene
+from splat.scenes.view import View
 from splat.training.start import Source
-from splat.training.state import TrainConfig
+from splat.training.state import TrainConfig, Training
 
 FEW = 500  # Gaussians at the start; density control adds others near those that are there, so that places without stay empty
+NAMED = 12  # views in the first line
+HOW_IT_STARTS: dict[Source, str] = {
+    "points": "the scene's points",
+    "triangulated": "points triangulated in the training views",
+    "random": "random points",
+    "box": "random points in the box of the scene's points",
+}
 HOW_TO_START: dict[Source, str] = {
     "box": "the published training does so; --start scene begins at the scene's own points",
     "random": "`landscape sfm PHOTOS` makes a scene with points, and --start triangulated finds some in the training views",
@@ -22,6 +32,22 @@ def remarks(scene: Scene, asked: TrainConfig, config: TrainConfig, begun: tuple[
     return [words for words in found if words]
 
 
+def begins(scene: Scene, views: Sequence[View], held_out: int, training: Training, source: Source | Path) -> str:
+    """What a training is about to do, in two lines.  source: a checkpoint where it starts from that."""
+    config, camera, step = training.config, views[0].camera, training.step
+    names = [view.name for view in views]
+    if len(names) > NAMED:
+        names = [*names[: NAMED - 1], "...", names[-1]]
+    gaussians = f"{len(training.gaussians):,} Gaussians"
+    what = source if isinstance(source, Path) else HOW_IT_STARTS[_kind(scene, source)]
+    start = f"after step {step:,}: {gaussians}" if step else f"start: {gaussians} from {what}"
+    return (
+        f"{scene.name}: {len(views)} views to train on ({', '.join(names)}), {held_out} held out, "
+        f"{camera.width} x {camera.height} px\n"
+        f"{start}; {config.method.name}, {config.iterations:,} steps, seed {config.seed}"
+    )
+
+
 def poor_start(scene: Scene, source: Source, gaussians: int) -> str:
     """That a training starts at random or from few points, and what to do, in words; else empty.
 
@@ -30,11 +56,16 @@ def poor_start(scene: Scene, source: Source, gaussians: int) -> str:
     >>> poor_start(scene, "triangulated", 41)
     'it starts from 41 points only, and may leave places empty; take more --views or larger images, or --start random'
     """
-    kind: Source = source if source != "scene" else "random" if scene.points is None else "points"
+    kind = _kind(scene, source)
     if kind in ("random", "box"):
         return f"it starts from {gaussians:,} random points, of which most lie on no surface; {HOW_TO_START[kind]}"
     few = f"it starts from {gaussians:,} points only, and may leave places empty; {HOW_TO_START[kind]}"
     return few if gaussians < FEW else ""
+
+
+def _kind(scene: Scene, source: Source) -> Source:
+    """What "scene" stands for."""
+    return source if source != "scene" else "random" if scene.points is None else "points"
 
 
 def _skipped(scene: Scene) -> str:

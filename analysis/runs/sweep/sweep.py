@@ -13,7 +13,6 @@ number of threads, only the seconds do.
 import fcntl
 import os
 import shlex
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -132,18 +131,21 @@ class _Cells:
                         write_results(self.sweep, self.statuses)
                     self.progress.update()
                     if self.interrupted.is_set():
-                        self._tell(signal.SIGINT, told)
+                        self._tell(told)
             except BaseException:
                 self.interrupted.set()
-                self._tell(signal.SIGTERM, set())
+                self._tell(set())
                 raise
 
-    def _tell(self, what: signal.Signals, told: set[int]) -> None:
-        """Send a signal to every command that has not been told yet; at the second Ctrl-C it would not save."""
+    def _tell(self, told: set[int]) -> None:
+        """Ask every command that has not been told yet to save and end; told twice it would not save.
+
+        By SIGTERM: under nohup the commands inherit that SIGINT is ignored.
+        """
         for process in list(self.running.values()):
             if process.pid not in told:
                 told.add(process.pid)
-                process.send_signal(what)
+                process.terminate()
 
     def _cell(self, cell: Cell) -> Cell:
         """Do what is missing; what fails is noted."""

@@ -23,8 +23,9 @@ from analysis.commands.cli import at_files, main
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import CompareOptions
 from analysis.slice.options import SliceOptions
-from analysis.train.command import planned, render_name
+from analysis.train.command import planned
 from analysis.train.options import TrainOptions
+from analysis.train.scores import render_name
 from splat.losses.reference import psnr
 from splat.model.gaussians import ATTRIBUTES
 from splat.render.render import render
@@ -84,7 +85,8 @@ def refuse(capsys, arguments: list[str], *expected: str) -> None:
 
 
 def test_a_run_leaves_a_checkpoint_renders_and_metrics_that_agree(finished, original):
-    assert sorted(p.name for p in finished.iterdir()) == ["checkpoint.pt", "metrics.json", "seconds.json", "test"]
+    written = ["checkpoint.pt", "metrics.json", "seconds.json", "test", "train.csv"]
+    assert sorted(p.name for p in finished.iterdir()) == written
     loaded = load_checkpoint(finished / "checkpoint.pt")
     assert loaded.training.step == ITERATIONS
     assert loaded.scene.find(finished / "checkpoint.pt") == original.resolve()
@@ -99,6 +101,13 @@ def test_a_run_leaves_a_checkpoint_renders_and_metrics_that_agree(finished, orig
         with Image.open(finished / "test" / render_name(view.name)) as file:
             pixels = np.asarray(file).transpose(2, 0, 1) / 255
         assert np.abs(pixels - image.clamp(0, 1).numpy()).max() <= 0.5 / 255 + 1e-6
+        with Image.open(finished / "test" / "panels" / render_name(view.name)) as file:
+            photograph, beside, error = np.split(np.asarray(file), [28, 56], axis=1)  # 24 pixels and a gap
+        assert np.array_equal(photograph[:, :24].transpose(2, 0, 1), (view.image * 255).round().numpy())
+        assert np.array_equal(beside[:, :24], (pixels * 255).round().transpose(1, 2, 0))
+        mean = (image.clamp(0, 1) - view.image).abs().mean(dim=0)
+        worst, least = (np.unravel_index(place, (18, 24)) for place in (int(mean.argmax()), int(mean.argmin())))
+        assert error.shape == (18, 24, 3) and error[worst].sum() > error[least].sum()
 
 
 def test_renders_are_named_after_their_views():
@@ -115,9 +124,13 @@ def test_the_table_shows_each_held_out_view_and_what_to_do_next(original, tmp_pa
     for name, score in metrics["test"]["views"].items():
         row = next(line for line in captured.out.splitlines() if name in line)
         assert f"{score['psnr']:.2f}" in row and f"{score['ssim']:.4f}" in row
-    assert f"next: landscape probe {out / 'checkpoint.pt'}" in captured.out
-    assert f"renders of the held-out views: {out / 'test'}; scores: {out / 'metrics.json'}" in captured.out
-    assert "3 views to train on" in captured.err and f"{ITERATIONS}/{ITERATIONS}" in captured.err
+    assert f"next: landscape probe {out}\n" in captured.out
+    panels = out / "test" / "panels"
+    assert f"{out / 'test'}, beside photograph and error: {panels}; scores: {out / 'metrics.json'}" in captured.out
+    assert f"step {ITERATIONS} of {ITERATIONS}: " in captured.err
+    names = load_checkpoint(out / "checkpoint.pt").scene.train
+    assert f"3 views to train on ({', '.join(names)}), 1 held out, 24 x 18 px" in captured.err
+    assert "Gaussians from the scene's points; 3dgs, 12 steps, seed 0" in captured.err
 
 
 def test_the_same_command_gives_the_same_checkpoint_bit_for_bit(finished, original):
@@ -281,12 +294,24 @@ def test_a_checkpoint_whose_scene_has_moved_says_so_and_takes_its_folder(scene, 
 
 
 @pytest.mark.parametrize(
-    "wrong", [["trian"], ["train"], ["train", "scene", "--views", "three"], ["train", "scene", "--wings", "2"], []]
+    ("wrong", "page"),
+    [
+        (["train"], "landscape train --help"),
+        (["train", "scene", "--views", "three"], "landscape train --help"),
+        (["slice", "scene", "--wings", "2"], "landscape slice --help"),
+        ([], "landscape --help"),
+    ],
 )
-def test_arguments_that_cannot_be_read_exit_with_2(wrong):
+def test_arguments_that_cannot_be_read_exit_with_2_and_name_their_help(wrong, page, capsys):
     with pytest.raises(SystemExit) as caught:
         main(wrong)
-    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    assert caught.value.code == 2 and page in said and said.count("--help") == 1
+
+
+def test_a_command_that_there_is_not_is_refused_with_the_one_that_was_meant(capsys):
+    assert main(["trian", "scene"]) == 2
+    one_sentence(capsys, "expected a command among sfm, train, ", "got 'trian'; did you mean train?")
 
 
 @pytest.mark.parametrize(

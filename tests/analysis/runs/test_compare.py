@@ -277,7 +277,7 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         "The seed is not the same",
         "The precision is not the same",
         "The probes were run with different settings (those of plain/0, sam/0): eigen.rtol None, 0.5; quick None, True.",
-        "sam/0: the check of symmetry failed",
+        "sam/0: The check of symmetry failed",
         "sam/0 was not scored",
         "sam/0: The search for the smallest eigenvalue ended at its time budget: the end may lie farther out.",
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",

@@ -192,14 +192,20 @@ def test_no_cell_starts_where_one_cannot(folder, no_commands, capsys, old, new, 
     assert no_commands == [] and not (folder / "never").exists()
 
 
-def test_ctrl_c_stops_a_sweep_after_its_cells_have_saved(folder, tmp_path, capsys):
-    run = tmp_path / "still/3dgs/1"
-    thread = when((run / "seconds.json").exists, lambda: os.kill(os.getpid(), signal.SIGINT))
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_stops_a_sweep_stops_its_cells_after_they_have_saved(folder, tmp_path, capsys, number):
+    if number == signal.SIGTERM:  # as under nohup, for the sweep and for its cells
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     before = signal.getsignal(signal.SIGINT)
+    run = tmp_path / "still/3dgs/1"
+    thread = when((run / "seconds.json").exists, lambda: os.kill(os.getpid(), number))
     endless = written(folder, "iterations = 12", "iterations = 1000000")
-    assert main(["sweep", str(endless), "--out", str(tmp_path)]) == 130
-    thread.join()
-    assert signal.getsignal(signal.SIGINT) is before
+    try:
+        assert main(["sweep", str(endless), "--out", str(tmp_path)]) == 128 + number
+        assert signal.getsignal(signal.SIGINT) is before
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        thread.join()
     assert pd.read_csv(tmp_path / "results.csv")["status"].tolist() == ["under way", "to do", "to do", "to do"]
     step = load_checkpoint(run / "checkpoint.pt").training.step
     assert f"stopped after step {step}; to continue: landscape train" in run.with_name("1.log").read_text()

@@ -1,0 +1,147 @@
+"""How a training goes: rows of RUN/train.csv, a line of the terminal for each where no bar is shown, TensorBoard where asked.
+
+RUN/train.csv           a row before the first step, every --log-every steps and after the last; complete lines at any time
+RUN/tensorboard/        with --tensorboard: the same numbers as TensorBoard's scalars
+
+Columns:
+
+step, gaussians    steps made, and the Gaussians after them
+loss, psnr         of the first training view as it would be rendered then: the loss that a step descends, and dB, peak 1
+seconds            that the steps so far took, by the clock, without loading, saving and scoring
+"""
+
+from math import isnan, nan
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from landscape.errors import InputError
+from splat.losses.autograd import view_loss
+from splat.losses.reference import psnr
+from splat.render.render import render
+from splat.scenes.view import View
+from splat.training.checkpoint import write_atomically
+from splat.training.loop import StepResult
+from splat.training.state import Training
+
+LOG, TENSORBOARD = "train.csv", "tensorboard"
+COLUMNS = ("step", "loss", "psnr", "gaussians", "seconds")
+SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
+
+
+class TrainingProgress:
+    """A context manager; rows that an interrupted run left after the training's step are dropped.
+
+    every: steps between rows; scalars: TensorBoard's, for which InputError where it is not installed.
+    """
+
+    def __init__(
+        self, run: Path, training: Training, view: View, every: int, console: Console, tensorboard: bool = False
+    ) -> None:
+        self.training, self.view, self.every, self.console = training, view, every, console
+        self.loss, self.begun = nan, (training.step, 0.0)
+        self.scalars: Any = None
+        if tensorboard:
+            self.scalars = scalar_writer()(str(run / TENSORBOARD), purge_step=training.step + 1)
+        write_atomically(run / LOG, "".join([",".join(COLUMNS) + "\n", *kept_rows(run / LOG, training.step)]).encode())
+        self.file = (run / LOG).open("a", encoding="utf-8", newline="")
+        self.bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            _Rate(),
+            TextColumn("{task.fields[state]}"),
+            TimeRemainingColumn(),
+            console=console,
+            refresh_per_second=4,
+            disable=not console.is_terminal,
+        )
+        total = training.config.iterations
+        self.bar = self.bars.add_task("training", total=total, completed=training.step, state="")
+
+    def __enter__(self) -> "TrainingProgress":
+        self.bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.bars.stop()
+        self.file.close()
+        if self.scalars is not None:
+            self.scalars.close()
+
+    def begin(self, seconds: float) -> None:
+        """seconds: of the steps of an interrupted run."""
+        self.begun = self.training.step, seconds
+        if not self.training.step:
+            self._row(seconds)
+
+    def after_step(self, done: StepResult, seconds: float) -> None:
+        """seconds: of all steps so far."""
+        self.loss = done.loss if isnan(self.loss) else self.loss + SMOOTHING * (done.loss - self.loss)
+        state = f"loss {self.loss:.4f} {done.gaussians} Gaussians"
+        self.bars.update(self.bar, completed=done.step, state=state)
+        if done.step % self.every == 0 or done.step == self.training.config.iterations:
+            self._row(seconds)
+
+    def _row(self, seconds: float) -> None:
+        """Write a row, and say it where there is no bar."""
+        step, total = self.training.step, self.training.config.iterations
+        loss, ratio, gaussians = *scored(self.training, self.view), len(self.training.gaussians)
+        self.file.write(f"{step},{loss!r},{ratio!r},{gaussians},{seconds:.3f}\n")
+        self.file.flush()
+        if self.scalars is not None:
+            for name, value in {"loss": loss, "psnr": ratio, "gaussians": gaussians}.items():
+                self.scalars.add_scalar(name, value, step)
+            self.scalars.flush()
+        if not self.console.is_terminal:
+            steps, time = step - self.begun[0], seconds - self.begun[1]
+            left = f", about {time / steps * (total - step):.0f} s left" if steps and step < total else ""
+            words = (
+                f"step {step} of {total}: loss {loss:.4f}, {ratio:.2f} dB, {gaussians} Gaussians, {seconds:.0f} s{left}"
+            )
+            self.console.print(words, soft_wrap=True, highlight=False)
+
+
+@torch.no_grad()
+def scored(training: Training, view: View) -> tuple[float, float]:
+    """Loss and PSNR, dB, of a view as the training would render it now; changes nothing."""
+    config, gaussians = training.config, training.gaussians
+    background = config.background_colour(gaussians.flat.dtype)
+    image = render(gaussians, view.camera, background, config.render).image
+    loss = view_loss(image, config.loss_against(view.image, gaussians.flat))
+    return float(loss), psnr(image.to(view.image.device), view.image)
+
+
+def scalar_writer() -> Any:
+    """TensorBoard's writer of scalars.  InputError where it is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter  # pyright: ignore[reportPrivateImportUsage]
+    except ImportError as error:
+        raise InputError(
+            f"expected the package tensorboard for --tensorboard ({error}); install it with pip install -e '.[tensorboard]', "
+            f"or leave the option out: {LOG} holds the same numbers"
+        ) from None
+    return SummaryWriter
+
+
+def kept_rows(path: Path, step: int) -> list[str]:
+    """The lines of an earlier run up to a step; a last one that was cut short is left out."""
+    if not path.is_file():
+        return []
+    try:
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True)[1:] if line.endswith("\n")]
+        return [line for line in lines if int(line.split(",")[0]) <= step]
+    except ValueError as error:
+        raise InputError(f"expected the rows of landscape train in {path}, got {error}; remove it") from None
+
+
+class _Rate(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.speed:5.1f} it/s" if task.speed else "  --- it/s")

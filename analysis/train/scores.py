@@ -1,0 +1,158 @@
+"""Scores of a finished training: metrics, renders and panels of the held-out views, and the table of the terminal.
+
+RUN/metrics.json            as in `analysis/train/command.py`
+RUN/test/NAME.png           the held-out views as rendered at the end
+RUN/test/panels/NAME.png    side by side: photograph, render, and the error, which is the mean over the colours of
+                            |render - photograph|: black is 0, the brightest ERROR_SHOWN or more; 0 outside a mask
+"""
+
+import io
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from torch import Tensor
+
+from analysis.records.json_files import json_text, plain
+from analysis.records.provenance import provenance
+from analysis.records.run_files import CHECKPOINT, METRICS
+from analysis.train.training_time import TrainingTime
+from splat.scenes.images import IMAGE_SUFFIXES
+from splat.scenes.view import View
+from splat.training.checkpoint import write_atomically
+from splat.training.score.evaluate import Evaluation, ViewScore, evaluate
+from splat.training.score.perceptual import MissingPerceptual, load_lpips
+from splat.training.state import Training
+
+RENDERS, PANELS = "test", "panels"
+ERROR_SHOWN = 0.25  # of the range of a colour
+GAP = 4  # white pixels between the pictures of a panel
+PLAIN: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}  # paths and names may hold brackets
+
+
+def report(training: Training, views: Sequence[View], held_out: Sequence[View], out: Path) -> None:
+    """Score the views, write renders, panels and metrics, print the table."""
+    config = training.config
+    background = config.background_colour(training.gaussians.flat.dtype)
+    renders, photographs = out / RENDERS, {view.name: view for view in held_out}
+    names = render_names(list(photographs))
+
+    def keep(name: str, image: Tensor) -> None:
+        write_atomically(renders / names[name], _png(pixels(image)))
+        write_atomically(renders / PANELS / names[name], _png(panel(image, photographs[name])))
+
+    console = Console()
+    try:
+        lpips = load_lpips()
+    except MissingPerceptual as error:
+        lpips = None
+        console.print(str(error), **PLAIN)
+    seen = evaluate(training.gaussians, views, background, config.render, lpips=lpips)
+    tested = None
+    if held_out:
+        (renders / PANELS).mkdir(parents=True, exist_ok=True)
+        tested = evaluate(training.gaussians, held_out, background, config.render, lpips=lpips, on_image=keep)
+    metrics = {
+        "step": training.step,
+        "method": config.method.name,
+        "protocol": config.protocol,
+        "gaussians": len(training.gaussians),
+        "train": _scores(seen),
+        "test": _scores(tested) if tested else None,
+        "seconds": asdict(TrainingTime.read(out)),
+        "provenance": plain(provenance(config.seed, checkpoint=str(out / CHECKPOINT))),
+    }
+    write_atomically(out / METRICS, json_text(metrics).encode())
+    console.print(_table(seen, tested))
+    rendered = (
+        f"renders of the held-out views: {renders}, beside photograph and error: {renders / PANELS}; "
+        if tested
+        else "no view was held out, so nothing was tested; "
+    )
+    for line in (f"{rendered}scores: {out / METRICS}", f"next: landscape probe {shlex.quote(str(out))}"):
+        console.print(line, **PLAIN)
+
+
+def render_name(view: str) -> str:
+    """File name of a view's render: `train/r_3` becomes `train_r_3.png`, `IMG_1.JPG` becomes `IMG_1.png`."""
+    flat = Path(view.replace("/", "_"))
+    return f"{flat.stem if flat.suffix.lower() in IMAGE_SUFFIXES else flat.name}.png"
+
+
+def render_names(views: Sequence[str]) -> dict[str, str]:
+    """`render_name` of each view; those that would be one file, in any case of letters, are told apart by a number.
+
+    >>> render_names(["a/b.png", "a_b.png", "c"])
+    {'a/b.png': 'a_b.png', 'a_b.png': 'a_b-2.png', 'c': 'c.png'}
+    """
+    names: dict[str, str] = {}
+    for view in views:
+        name, taken = render_name(view), {each.lower() for each in names.values()}
+        stem = name.removesuffix(".png")
+        numbered = (f"{stem}-{number}.png" for number in count(2))
+        names[view] = (
+            name if name.lower() not in taken else next(each for each in numbered if each.lower() not in taken)
+        )
+    return names
+
+
+def pixels(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    return (image.cpu().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+
+
+def panel(image: Float[Tensor, "3 h w"], view: View) -> UInt8[np.ndarray, "h w3 3"]:
+    """Photograph, render and error side by side."""
+    from matplotlib import colormaps  # half a second of imports
+
+    render = image.clamp(0, 1).to(view.image.device)
+    error = (render - view.image).abs().mean(dim=0)
+    if view.mask is not None:
+        error = torch.where(view.mask, error, 0.0)
+    shown = colormaps["inferno"]((error / ERROR_SHOWN).clamp(0, 1).cpu().numpy(), bytes=True)[..., :3]
+    gap = np.full((shown.shape[0], GAP, 3), 255, np.uint8)
+    return np.concatenate([pixels(view.image), gap, pixels(render), gap, shown], axis=1)
+
+
+def _png(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def _scores(evaluation: Evaluation) -> dict[str, Any]:
+    def of(scores: ViewScore | Evaluation) -> dict[str, Any]:
+        return {"psnr": scores.psnr, "ssim": scores.ssim, "lpips": scores.lpips}
+
+    return {**of(evaluation), "masked": evaluation.masked, "views": {view.name: of(view) for view in evaluation.views}}
+
+
+def _table(seen: Evaluation, tested: Evaluation | None) -> Table:
+    shown = tested or seen
+    title = "held-out views" if tested else "training views"
+    table = Table("view", title=f"{title}, inside their masks" if shown.masked else title)
+    columns = {"PSNR (dB)": "psnr", "SSIM": "ssim", **({} if shown.lpips is None else {"LPIPS": "lpips"})}
+    for column in columns:
+        table.add_column(column, justify="right")
+
+    def row(name: str, scores: ViewScore | Evaluation, style: str | None = None) -> None:
+        values = [getattr(scores, key) for key in columns.values()]
+        cells = ["" if v is None else f"{v:.{2 if key == 'psnr' else 4}f}" for v, key in zip(values, columns.values())]
+        table.add_row(escape(name), *cells, style=style)
+
+    if tested:
+        for view in tested.views:
+            row(view.name, view)
+        table.add_section()
+        row("mean", tested, "bold")
+    row("mean of the training views" + (", whole" if shown.masked and not seen.masked else ""), seen)
+    return table
