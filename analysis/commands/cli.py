@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 
 from analysis.bench.options import BenchOptions
-from analysis.commands.options import ConvertOptions, DemoOptions, SfmOptions
+from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions
 from analysis.console.failures import report
 from analysis.console.interruption import ignored, raising
 from analysis.probe.options import ProbeOptions
@@ -34,6 +34,7 @@ COMMANDS = {
     "sweep": SweepOptions,
     "probe": ProbeOptions,
     "slice": SliceOptions,
+    "map": MapOptions,
     "compare": CompareOptions,
     "claims": ClaimsOptions,
     "convert": ConvertOptions,
@@ -47,6 +48,7 @@ Options = (
     | SweepOptions
     | ProbeOptions
     | SliceOptions
+    | MapOptions
     | CompareOptions
     | ClaimsOptions
     | ConvertOptions
@@ -173,6 +175,13 @@ def run(options: Options, arguments: Sequence[str]) -> int:
             from analysis.slice.command import run_slice
 
             return run_slice(options, ["landscape", *arguments])
+        case MapOptions():
+            from analysis.console.drawing import drawing
+
+            with drawing("maps") as drawn:
+                from analysis.commands.map.command import run_map
+
+                return run_map(options, ["landscape", *arguments], drawn)
         case TrajectoryOptions():
             from analysis.runs.trajectories import run_trajectory
 

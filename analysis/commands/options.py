@@ -1,10 +1,10 @@
-"""Options of `landscape sfm` and `landscape demo`."""
+"""Options of `landscape sfm`, `convert`, `map` and `demo`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from analysis.console.options import ForeignOptions, Unset
 
@@ -34,6 +34,24 @@ class ConvertOptions:
     """What to write.  Default: graphdeco's PLY where OUT ends in .ply, else our own checkpoint."""
     scene: Unset[Path] = None
     """Folder of the scene, for our own checkpoint."""
+    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """Show where a scene is curved: numbers of every Gaussian as PLY and CSV, and as pictures over every training view."""
+
+    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
+    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    shown: Annotated[str, arg(name="field")] = "largest"
+    """The number that pictures, colours and the top of the table are of; any of those in fields.ply.
+    Where RUN/probe holds eigenvectors, also e1 and e_min: the Gaussians' shares of them."""
+    draw: UseAppendAction[tuple[str, ...]] = ()
+    """A training view to draw, by name or by place (0 is the first); may be given again.  Default: all of them."""
+    scene: Unset[Path] = None
+    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    out: Unset[Path] = None
+    """Folder of the results.  Default: map, beside the checkpoint."""
     foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
 
 

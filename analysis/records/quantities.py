@@ -2,10 +2,17 @@
 
 The error is rounded to two significant digits and the value to the same place; without an error a number keeps three
 significant digits.  None, *not determined* in a record, is an en dash.
+
+`Shade` is how numbers of many sizes are written in colours.
 """
 
 import math
 from decimal import Decimal
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from msgspec import Struct
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
@@ -89,3 +96,102 @@ def _fixed(value: float, exponent: int, places: int) -> str:
 def _exponent(value: float) -> int:
     """Of the leading digit after rounding to three digits; 0 for 0."""
     return int(f"{value:.2e}".partition("e")[2])
+
+
+class Shade(Struct, frozen=True, kw_only=True):
+    """A scale of colours for a field: v is shown as t, from `low` to `high`.
+
+    log      t = log10 v, v > 0
+    signed   t = asinh(v / soft), the same reach on both sides of 0 where v has both signs
+    linear   t = v
+    """
+
+    name: str
+    words: str
+    unit: str
+    scale: Literal["log", "signed", "linear"]
+    low: float
+    high: float
+    soft: float = 1.0
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        words: str,
+        unit: str,
+        scale: Literal["log", "signed", "linear"],
+        values: Float[np.ndarray, " n"],
+        weights: Float[np.ndarray, " n"],
+        percentiles: tuple[float, float] = (10.0, 98.0),
+    ) -> "Shade":
+        """The scale whose ends are percentiles of the values, each of which counts by its weight; soft: their median size.
+
+        >>> shade = Shade.of("x", "size", "px", "log", np.array([1.0, 10.0, 1e3]), np.ones(3))
+        >>> shade.low, shade.high, shade.share(np.array([1.0, 1e9, -1.0])).tolist()
+        (0.0, 3.0, [0.0, 1.0, nan])
+        """
+        used = np.isfinite(values) & (weights > 0) & ((values > 0) | (scale != "log"))
+        if not used.any():
+            return cls(name=name, words=words, unit=unit, scale=scale, low=0.0, high=1.0)
+        values, weights = values[used], weights[used]
+        soft = float(_quantiles(np.abs(values), weights, 50.0)) or float(np.abs(values).max()) or 1.0
+        shade = cls(name=name, words=words, unit=unit, scale=scale, low=0.0, high=1.0, soft=soft)
+        low, high = (float(shade.shown(np.array(_quantiles(values, weights, each)))) for each in percentiles)
+        if scale == "signed" and low < 0 < high:
+            low, high = -max(-low, high), max(-low, high)
+        return cls(
+            name=name, words=words, unit=unit, scale=scale, low=low, high=high if high > low else low + 1, soft=soft
+        )
+
+    @property
+    def diverges(self) -> bool:
+        """Whether 0 is in the middle."""
+        return self.scale == "signed" and self.low == -self.high
+
+    def shown(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """t; nan for what has none."""
+        values = np.asarray(values, float)
+        if self.scale == "log":
+            return np.log10(np.where(values > 0, values, np.nan))
+        return np.arcsinh(values / self.soft) if self.scale == "signed" else values
+
+    def share(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """How far t is from `low` to `high`, within [0, 1]; nan for what is not finite."""
+        t = self.shown(values)
+        return np.where(np.isfinite(t), np.clip((t - self.low) / (self.high - self.low), 0, 1), np.nan)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        """(share, text) of round values within the scale; none where it is linear.
+
+        >>> Shade(name="x", words="", unit="", scale="log", low=-0.5, high=2.5).ticks()[1:]
+        [(0.5, '10'), (0.8333333333333334, '100')]
+        """
+        if self.scale == "linear":
+            return []
+        ends = [10.0**t if self.scale == "log" else self.soft * math.sinh(t) for t in (self.low, self.high)]
+        most = max(map(abs, ends))
+        sizes = most if self.scale == "signed" else ends[1]
+        least = ends[0] if self.scale == "log" else self.soft / 3
+        powers = range(math.ceil(math.log10(least)), math.floor(math.log10(sizes)) + 1)
+        values = [10.0**k for k in powers[:: -(-len(powers) // (2 if self.diverges else 4)) or 1]]
+        if len(values) < 2 and self.scale == "log":
+            values = [x * 10.0**k for k in range(math.floor(math.log10(least)), powers.stop + 1) for x in (1, 2, 5)]
+        values = values if self.scale == "log" else [*(-v for v in reversed(values)), 0.0, *values]
+        return [(float(self.share(np.array(v))), _short(v)) for v in values if ends[0] <= v <= ends[1]]
+
+
+def _short(value: float) -> str:
+    """A round number as a label: without places that say nothing."""
+    exponent = _exponent(value)
+    if -2 <= exponent <= 3:
+        return f"{value:g}".replace("-", "−")
+    digit = round(abs(value) / 10.0**exponent)
+    return "−" * (value < 0) + (f"{digit} × " if digit > 1 else "") + power_of_ten(exponent)
+
+
+def _quantiles(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], percent: float) -> float:
+    """The least of the values that, with all smaller ones, has so much of the weight."""
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order][min(np.searchsorted(total, percent / 100 * total[-1]), len(order) - 1)])

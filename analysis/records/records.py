@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Generic, TypeVar, cast
+from typing import Any, BinaryIO, ClassVar, Generic, Protocol, TypeVar, cast
 
 import numpy as np
 from msgspec import UNSET, Struct, field
@@ -154,6 +154,12 @@ class SliceRecord(Struct, kw_only=True):
     arrays: Shapes = {}
 
 
+class Kind(Protocol):
+    """A kind of record: the file by which its folder is known."""
+
+    FILE: ClassVar[str]
+
+
 Data = TypeVar("Data", bound=ProbeRecord | SliceRecord)
 Arrays = dict[str, dict[str, np.ndarray]]
 
@@ -168,7 +174,7 @@ class Record(Generic[Data]):
 
 
 @contextmanager
-def record_folder(folder: str | Path, kind: type[ProbeRecord | SliceRecord] = ProbeRecord) -> Iterator[Path]:
+def record_folder(folder: str | Path, kind: type[Kind] = ProbeRecord) -> Iterator[Path]:
     """A new, empty folder that becomes `folder` when the block ends, all at once; nothing changes if the block fails.
 
     An old record at `folder` is replaced.  Killed at any point, `folder` is the old record, the new one, or (between
@@ -329,7 +335,7 @@ def _why_not_found(folder: Path, command: str, file: str) -> str:
     return f"{expected}{state}; run `landscape {command} CHECKPOINT` first"
 
 
-def require_replaceable(folder: Path, kind: type[ProbeRecord | SliceRecord] = ProbeRecord) -> None:
+def require_replaceable(folder: Path, kind: type[Kind] = ProbeRecord) -> None:
     """Replacing deletes: raise InputError unless folder is absent, empty or an older record of this kind."""
     if folder.is_dir() and any(folder.iterdir()) and not (folder / kind.FILE).is_file():
         raise InputError(

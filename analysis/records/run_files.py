@@ -3,6 +3,7 @@
     RUN/metrics.json      Scores, written by `analysis/train/command.py`
     RUN/seconds.json      Seconds, written by `analysis/train/training_time.py`
     RUN/trajectory.csv    a row for each record along the training, written by `analysis/train/trajectory.py`
+    RUN/map/map.json      MapRecord, written by `landscape map`
     OUT/compare.json      Comparison, written by `landscape compare`
 
 What is damaged is refused by the name of the file, with what to do.  Needs no torch.
@@ -10,12 +11,14 @@ What is damaged is refused by the name of the file, with what to do.  Needs no t
 
 import reprlib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from msgspec import Struct
 
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.json_files import read_json
+from analysis.records.provenance import Provenance
+from analysis.records.quantities import Shade
 from analysis.records.schema import INDICES, Count, Number
 from landscape.errors import InputError
 
@@ -26,7 +29,7 @@ CHECKPOINT, METRICS, SECONDS, RECORDS, COMPARISON = (
     "checkpoint.pt", "metrics.json", "seconds.json", "trajectory.csv", "compare.json",
 )  # fmt: skip
 NO_TIME = "no time"  # how the note of a record of a trajectory begins that was skipped for that
-STATES = ("whole", "cut", "skipped")  # of a record of a trajectory
+STATES = ("whole", "coarse", "cut", "skipped")  # of a record of a trajectory; older ones were cut where time ended them
 TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
 WHOLE = ("step", "gaussians")  # columns of a trajectory
@@ -80,6 +83,33 @@ class Comparison(Struct, kw_only=True):
     runs: dict[str, str]
 
 
+class Panel(Struct, kw_only=True):
+    """A training view that was drawn.  psnr: of its render, dB; file: of its arrays, NAME.npz."""
+
+    name: str
+    file: str
+    psnr: Number
+
+
+class MapRecord(Struct, kw_only=True):
+    """What `landscape map` found.  gaussians, seen: how many, and of these in sight; field: the one that the panels show.
+
+    shades: of the maps, by name; that of "error" is of the mean over the channels of |render - photograph|.
+    """
+
+    COMMAND: ClassVar[str] = "map"
+    FILE: ClassVar[str] = "map.json"
+
+    gaussians: Count
+    seen: Count
+    field: str
+    shades: dict[str, Shade]
+    panels: list[Panel]
+    notes: list[str] = []
+    provenance: Provenance
+    timing: dict[str, float] = {}
+
+
 def read_scores(run: Path) -> Scores:
     remedy = "remove it and repeat the training's command with --resume, which scores again"
     return read_json(run / METRICS, Scores, "the scores of landscape train", remedy)
@@ -88,6 +118,10 @@ def read_scores(run: Path) -> Scores:
 def read_seconds(run: Path) -> Seconds:
     remedy = "remove it: nothing but the time until its last checkpoint is lost"
     return read_json(run / SECONDS, Seconds, "the seconds of a training", remedy)
+
+
+def read_map(folder: Path) -> MapRecord:
+    return read_json(folder / MapRecord.FILE, MapRecord, "a record of `landscape map`", "map again")
 
 
 def read_comparison(folder: Path) -> Comparison:

@@ -31,7 +31,7 @@ from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.probe.command import opened, scene_objective
 from analysis.probe.measurement import evaluation
-from analysis.probe.record import loss_name, provenance_of
+from analysis.probe.record import provenance_of
 from analysis.records.findings import of_slice, resolved
 from analysis.records.provenance import require_seed
 from analysis.records.quantities import measured, quantity
@@ -129,16 +129,16 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
 
 def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list[str]) -> list[Tensor]:
     """Eigenvectors of an interrupted run and of the probe.  notes: is told which of them cannot be read."""
-    kept, found, center = unfinished / "eigenvectors.npy", [], objective.active.flat
+    kept, found = unfinished / "eigenvectors.npy", []
     if kept.is_file():
         try:
             with kept.open("rb") as stream, refusing_damage("eigenvectors", kept, "they were computed again"):
-                found.append(torch.from_numpy(np.load(stream, allow_pickle=False)))
+                vectors = torch.from_numpy(np.load(stream, allow_pickle=False))
+            found.append(vectors.to(objective.active.flat.device))
         except InputError as error:
             notes.append(str(error))
-    name, precision = loss_name(objective.loss_settings), torch.finfo(center.dtype).eps
-    found += recorded_eigenvectors(probe, name, objective.loss(center), precision, notes)
-    return [vectors.to(center.device) for vectors in found]
+    recorded = recorded_eigenvectors(probe, objective, notes)
+    return found if recorded is None else [*found, recorded]
 
 
 def _measure(

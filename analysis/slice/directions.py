@@ -18,11 +18,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isclose
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from analysis.probe.record import loss_name
 from analysis.records.records import ProbeRecord, read_record
 from analysis.slice.options import Along
 from landscape import (
@@ -207,22 +209,25 @@ def largest_eigenvectors(
 
 
 def recorded_eigenvectors(
-    folder: Path, loss: str, value: float, precision: float, notes: list[str]
-) -> list[Float[Tensor, "n k"]]:
-    """Those of the probe recorded in a folder, if any, where its objective is the Hessian of this loss with this value.
+    folder: Path, objective: SceneObjective, notes: list[str], end: Literal["largest", "smallest"] = "largest"
+) -> Float[Tensor, "n k"] | None:
+    """Those of an end of the spectrum in the probe recorded in a folder, if any, where it is of this objective's Hessian.
 
     notes: is told where there is a record that cannot be read.
     """
     if not (folder / ProbeRecord.FILE).is_file():
-        return []
+        return None
     try:
         record = read_record(folder, ProbeRecord)
     except (FileNotFoundError, InputError) as error:
         notes.append(f"eigenvectors were not taken from the probe: {error}")
-        return []
-    about = record.data.objective
-    same = (about.loss, about.operator) == (loss, "hessian") and about.value is not None
-    if not same or not isclose(about.value or 0.0, value, rel_tol=SAME_LOSS * precision):
-        return []
-    vectors = record.arrays.get("eigenvectors", {}).get("largest")
-    return [] if vectors is None else [torch.from_numpy(vectors)]
+        return None
+    about, center = record.data.objective, objective.active.flat
+    same = (about.loss, about.operator) == (loss_name(objective.loss_settings), "hessian") and about.value is not None
+    tolerance = SAME_LOSS * torch.finfo(center.dtype).eps
+    if not same or not isclose(about.value or 0.0, objective.loss(center), rel_tol=tolerance):
+        return None
+    vectors = record.arrays.get("eigenvectors", {}).get(end)
+    if vectors is None or vectors.shape[0] != center.numel() or not vectors.shape[1]:
+        return None
+    return torch.from_numpy(vectors).to(center.device)

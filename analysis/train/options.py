@@ -84,7 +84,8 @@ class TrainOptions:
     tensorboard: FlagCreatePairsOff[bool] = False
     """Write the rows of train.csv also to OUT/tensorboard, for TensorBoard: pip install -e '.[tensorboard]'."""
     probe_every: Unset[int] = None
-    """Steps between records of traces, both ends of the spectrum and anisotropy in OUT/trajectory.csv.  Default: none."""
+    """Steps between records of traces, both ends of the spectrum and anisotropy in OUT/trajectory.csv.  Default: none.
+    The first, at the start, and the last are always made."""
     probe_share: float = 0.1
-    """Time that these records may take together, as a share of the time of the steps; one that would not fit is skipped.
-    inf: no limit."""
+    """Time that these records may take together, as a share of the time of the steps.
+    One between the first and the last that would not fit is coarser or skipped.  inf: no limit."""

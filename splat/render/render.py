@@ -13,6 +13,7 @@ from splat.model.settings import RenderSettings
 from splat.projection.reference import Splats, project
 from splat.raster.reference import rasterize_reference
 from splat.render.autograd import project_by_kernel, rasterize_by_kernel
+from splat.render.forward import background_of
 
 Backend = Literal["kernels", "reference"]
 
@@ -46,12 +47,10 @@ def render(
 
     background: RGB, black where None.  opacity_scale: constant factors of the opacities; may exceed 1, and 0 hides a Gaussian.
     backend: "kernels": those for the device of the Gaussians; "reference": plain torch (slow, any number of derivatives).
-    Raises ValueError where a parameter is not finite.
+    Raises InputError where there is no Gaussian, or a parameter or the background is not finite.
     """
     gaussians.require_finite()
-    if background is None:
-        background = torch.zeros(3)
-    background = background.to(gaussians.flat, non_blocking=True)
+    background = background_of(gaussians, background)
     if backend == "reference":
         splats = _gained(project(gaussians, camera, settings), opacity_scale)
         image, alpha, expected = rasterize_reference(splats, background, camera.width, camera.height, settings)
@@ -70,6 +69,14 @@ def render_depth(
     return _layered_depth(project_by_kernel(gaussians, camera, settings), gaussians, camera, settings)
 
 
+def render_layers(
+    gaussians: Gaussians, camera: Camera, layers: Float[Tensor, "n 3"], settings: RenderSettings = RenderSettings()
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
+    """Three numbers of each Gaussian composited like a colour, on 0, and accumulated alpha."""
+    gaussians.require_finite()
+    return _layered(project_by_kernel(gaussians, camera, settings), layers, camera, settings)
+
+
 def _gained(splats: Splats, opacity_scale: Float[Tensor, " n"] | None) -> Splats:
     if opacity_scale is None:
         return splats
@@ -79,10 +86,18 @@ def _gained(splats: Splats, opacity_scale: Float[Tensor, " n"] | None) -> Splats
 def _layered_depth(
     splats: Splats, gaussians: Gaussians, camera: Camera, settings: RenderSettings
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Depth, which is composited like a colour, with z for red, on black; and alpha."""
+    """Depth, which is composited like a colour, with z for red; and alpha."""
     axis, centre = camera.forward.to(gaussians.flat), camera.centre.to(gaussians.flat)
     z = (gaussians.means - centre) @ axis
-    layers = replace(splats, colours=torch.stack([z, torch.zeros_like(z), torch.zeros_like(z)], dim=1))
-    black = torch.zeros(3, dtype=z.dtype)
-    planes, alpha = rasterize_by_kernel(layers, black, camera.width, camera.height, settings)
+    planes, alpha = _layered(
+        splats, torch.stack([z, torch.zeros_like(z), torch.zeros_like(z)], dim=1), camera, settings
+    )
     return planes[0], alpha
+
+
+def _layered(
+    splats: Splats, layers: Float[Tensor, "n 3"], camera: Camera, settings: RenderSettings
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"]]:
+    """The splats with `layers` for their colours, on black; and alpha."""
+    black = torch.zeros(3, dtype=layers.dtype)
+    return rasterize_by_kernel(replace(splats, colours=layers), black, camera.width, camera.height, settings)

@@ -284,8 +284,6 @@ def restored_training(content: dict[str, Any]) -> Training:
     adam, screen, p, dtype = saved.adam, saved.screen_gradients, saved.flat.numel(), saved.flat.dtype
     gaussians = Gaussians(_numbers("flat", saved.flat, p, dtype), saved.sh_degree)
     n = len(gaussians)
-    if not n:
-        raise InputError("it holds no Gaussian")
     gaussians.require_finite()
     config = _config(saved.config)
     if saved.step > config.iterations:

@@ -1,0 +1,181 @@
+"""`landscape map`: where a checkpoint's loss is curved, as numbers of every Gaussian and as pictures over the training views.
+
+    fields.ply          the Gaussians as 3DGS writes them, and every field (`splat.curvature.fields`) as a property of its
+                        name; nan where no view sees a Gaussian
+    FIELD.ply           the Gaussians in the colours of one field, grey where it has no value; opens in every viewer
+    top.csv             the hundred Gaussians with most of it
+    view-NNN.png        each training view: photograph, render, error, and the field composited with the splats' weights
+    map.json            what the pictures show and where it comes from; view-NNN.npz: the maps, in bytes
+
+Blocks and sights are taken on the CPU.  The ends of a map's scale are percentiles over the Gaussians in sight, by their weight
+in the images.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from analysis.commands.map.files import coloured_ply, fields_ply, top_table
+from analysis.commands.map.pictures import error_shade, view_maps, write_maps
+from analysis.commands.options import MapOptions
+from analysis.console.drawing import Draw
+from analysis.console.stages import Stages
+from analysis.measures.localization import masses
+from analysis.probe.command import opened, scene_objective
+from analysis.probe.record import provenance_of
+from analysis.records.json_files import json_text, plain
+from analysis.records.quantities import Shade, quantity
+from analysis.records.records import record_folder, require_replaceable
+from analysis.records.run_files import MapRecord, Panel
+from analysis.slice.directions import recorded_eigenvectors
+from landscape.errors import InputError, did_you_mean
+from landscape.results import Progress
+from splat.curvature.fields import FIELDS, Field, Values, scene_fields
+from splat.curvature.objective import SceneObjective
+from splat.render.sight import Sight
+from splat.scenes.view import View
+
+ENDS: dict[str, tuple[Literal["largest", "smallest"], str]] = {
+    "e1": ("largest", "share of e₁"),
+    "e_min": ("smallest", "share of e_min"),
+}
+SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Every field of the Gaussians in sight, and what it is; vectors: the eigenvectors that a probe recorded, by name."""
+
+    values: Values
+    kinds: Mapping[str, Field]
+    vectors: Mapping[str, Tensor]
+    sights: Sequence[Sight]
+
+    @property
+    def weight(self) -> np.ndarray:
+        return self.values["weight"].numpy()
+
+    def shade(self, name: str) -> Shade:
+        kind = self.kinds[name]
+        return Shade.of(name, kind.words, kind.unit, kind.scale, self.values[name].numpy(), self.weight)
+
+
+def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
+    """Map the checkpoint; returns the exit code.  command: as typed, for the record; drawn: draws the pictures."""
+    out = options.out or options.checkpoint.parent / "map"
+    known = [*FIELDS, *ENDS]
+    if options.shown not in known:
+        raise InputError(
+            f"expected --field {', '.join(known)}, got {options.shown!r}{did_you_mean(options.shown, known)}"
+        )
+    console, start, notes = Console(stderr=True), perf_counter(), list[str]()
+    require_replaceable(out, MapRecord)
+    stages = Stages(console)
+    with stages.stage("load"):
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
+        objective = scene_objective(checkpoint, scene)
+        chosen = _chosen(options.draw, objective.views)
+    with record_folder(out, MapRecord) as folder, stages:
+        with stages.stage("fields") as report:
+            found = _fields(objective, options.checkpoint.parent / "probe", notes, report)
+        if options.shown not in found.values:
+            raise InputError(
+                f"expected a probe with eigenvectors of this checkpoint in {options.checkpoint.parent / 'probe'} for "
+                f"--field {options.shown}, got none; run landscape probe first"
+            )
+        with stages.stage("maps") as report:
+            shades = {options.shown: found.shade(options.shown)}
+            panels = _write_panels(folder, objective, found, shades, chosen, report)
+        shade, gaussians = shades[options.shown], checkpoint.training.gaussians
+        with stages.stage("files"):
+            (folder / "fields.ply").write_bytes(fields_ply(gaussians, objective.mask, found.values))
+            coloured = coloured_ply(gaussians, objective.mask, shade, found.values[options.shown])
+            (folder / f"{options.shown}.ply").write_bytes(coloured)
+            top = top_table(objective, found.values, options.shown)
+            (folder / "top.csv").write_text(top.to_csv(index=False, float_format="%.6g"), encoding="utf-8")
+        made = provenance_of(0, options.checkpoint, command, options, checkpoint, scene)
+        data = MapRecord(
+            gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
+            notes=notes + checkpoint.assumptions, provenance=made,
+        )  # fmt: skip
+        _write(folder, data)
+        with stages.stage("pictures"):
+            try:
+                data.notes += drawn(folder)
+            except RuntimeError as error:  # the numbers stand without pictures
+                data.notes.append(" ".join(str(error).split()))
+        data.timing = {**stages.timing, "total": perf_counter() - start}
+        _write(folder, data)
+    _conclude(data, top.iloc[0].to_dict(), found.kinds[options.shown], out)
+    return 0
+
+
+def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
+    """Places of the views that are drawn."""
+    places = {view.name: i for i, view in enumerate(views)} | {Path(view.name).name: i for i, view in enumerate(views)}
+    places |= {str(i): i for i in range(len(views))}
+    if unknown := [name for name in names if name not in places]:
+        raise InputError(
+            f"expected --draw of a training view, 0 to {len(views) - 1} or a name such as {views[0].name}, got {unknown[0]!r}"
+        )
+    return sorted({places[name] for name in names}) or [*range(len(views))]
+
+
+def _fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
+    """What the blocks and the views say, and the masses in the eigenvectors of the probe, where it is of this loss here."""
+    values, sights = scene_fields(objective, report)
+    active, vectors, kinds = objective.active, {}, dict(FIELDS)
+    for name, (end, words) in ENDS.items():
+        found = recorded_eigenvectors(probe, objective, notes, end)
+        if found is not None:
+            vectors[name] = found[:, 0]
+            values[name] = masses(found[:, 0], active)
+            kinds[name] = Field(words, "share", "log")
+    return Fields(values, kinds, vectors, sights)
+
+
+def _write_panels(
+    folder: Path,
+    objective: SceneObjective,
+    found: Fields,
+    shades: dict[str, Shade],
+    chosen: Sequence[int],
+    report: Progress,
+) -> list[Panel]:
+    """The maps of the chosen views; the scale of their errors, which all views have in common, is added to the shades."""
+    names, panels = list(shades), []
+    shares = {name: torch.from_numpy(shades[name].share(found.values[name].numpy())) for name in names}
+    shades["error"] = error_shade(objective)
+    for done, index in enumerate(chosen):
+        maps, psnr = view_maps(objective, index, shares, shades["error"])
+        file = f"view-{index:03d}"
+        write_maps(folder / f"{file}.npz", maps)
+        panels.append(Panel(name=objective.views[index].name, file=file, psnr=psnr))
+        report(done + 1, len(chosen), "views")
+    return panels
+
+
+def _write(folder: Path, data: MapRecord) -> None:
+    (folder / data.FILE).write_text(json_text(plain(data)), encoding="utf-8")
+
+
+def _conclude(data: MapRecord, first: Mapping[str, Any], kind: Field, out: Path) -> None:
+    say = Console().print
+    unit = f" {kind.unit}" if kind.unit not in ("share", "1") else ""
+    say(f"{data.seen:,} of {data.gaussians:,} Gaussians are in sight", **SAID)
+    say(
+        f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {quantity(float(first[data.field]))}{unit}",
+        **SAID,
+    )
+    for note in data.notes:
+        say(note, style="yellow", **SAID)
+    pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))[:4]) or "none"
+    more = "" if len(data.panels) <= 4 else ", ..."
+    say(f"pictures: {pictures}{more}; splats: fields.ply, {data.field}.ply; table: top.csv; in {out}", **SAID)

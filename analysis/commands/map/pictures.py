@@ -1,0 +1,74 @@
+"""The maps of one training view: photograph, render, error and fields, in bytes.
+
+A field is composited as a colour is, by how far each Gaussian's value is along its scale: of a pixel the mean over the splats
+by their weights alpha T, without those that have no value.  Errors are |render - photograph|, the mean over the channels.
+"""
+
+from collections.abc import Mapping
+from math import inf, log10
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, UInt8
+from torch import Tensor
+
+from analysis.records.quantities import Shade
+from splat.curvature.objective import SceneObjective
+from splat.model.camera import Camera
+from splat.render.render import render, render_layers
+
+STEPS, NOTHING = 254, 255  # of a byte: the whole scale, and where there is no value
+LEAST = 0.02  # weight of a pixel's splats with a value, below which it has none
+WORST = 0.99  # of the errors: the end of their scale
+
+
+def rendered(objective: SceneObjective, index: int) -> Float[Tensor, "3 h w"]:
+    """A training view as the checkpoint has it, within [0, 1]."""
+    camera = objective.views[index].camera
+    return render(objective.active, camera, objective.background, objective.settings).image.clamp(0, 1)
+
+
+def error_shade(objective: SceneObjective) -> Shade:
+    """From 0 to a high percentile of the errors of a view in the middle."""
+    index = len(objective.views) // 2
+    error = (rendered(objective, index) - objective.views[index].image).abs().mean(dim=0)
+    high = float(np.quantile(error.numpy(), WORST)) or 1.0
+    return Shade(name="error", words="error", unit="of the range of a colour", scale="linear", low=0.0, high=high)
+
+
+def view_maps(
+    objective: SceneObjective, index: int, shares: Mapping[str, Float64[Tensor, " n"]], error_scale: Shade
+) -> tuple[dict[str, UInt8[np.ndarray, "..."]], float]:
+    """photograph, render (h, w, 3), error and the fields (h, w) by name; and the PSNR of the render, dB."""
+    view, image = objective.views[index], rendered(objective, index)
+    difference = image - view.image.to(image)
+    squared = float(difference.double().square().mean())
+    found = {name: _bytes(part).transpose(1, 2, 0) for name, part in (("photograph", view.image), ("render", image))}
+    found["error"] = in_bytes(error_scale.share(difference.abs().mean(dim=0).numpy()))
+    for name, share in shares.items():
+        found[name] = in_bytes(composited(objective, view.camera, share))
+    return found, -10 * log10(squared) if squared else inf
+
+
+def composited(objective: SceneObjective, camera: Camera, share: Float64[Tensor, " n"]) -> Float64[np.ndarray, "h w"]:
+    """The mean of the Gaussians' numbers by their weights in every pixel; nan where those that have one weigh nothing."""
+    known = share.isfinite()
+    layers = torch.stack([share.nan_to_num(), known.double(), torch.zeros_like(share)], dim=1)
+    planes, _ = render_layers(objective.active, camera, layers.to(objective.active.flat), objective.settings)
+    total, weight, _ = planes.double().numpy()
+    return np.where(weight > LEAST, total / np.maximum(weight, LEAST), np.nan)
+
+
+def in_bytes(share: Float64[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """[0, 1] as 0 to STEPS, nan as NOTHING."""
+    return np.where(np.isnan(share), NOTHING, np.round(STEPS * np.clip(np.nan_to_num(share), 0, 1))).astype(np.uint8)
+
+
+def _bytes(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "3 h w"]:
+    return (image.detach().clamp(0, 1) * 255).round().byte().numpy()
+
+
+def write_maps(path: Path, maps: Mapping[str, np.ndarray]) -> None:
+    arrays: dict[str, np.ndarray] = dict(maps)
+    np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,122 @@
+"""`landscape map`: its files hold the fields of every Gaussian, and its pictures the same over the training views."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from analysis.commands.cli import main
+from analysis.commands.map.files import colours
+from analysis.commands.map.pictures import composited
+from analysis.records.quantities import Shade
+from analysis.records.run_files import read_map
+from splat.curvature.fields import FIELDS, scene_fields
+from splat.curvature.objective import SceneObjective
+from splat.model.files.read import read_splats
+from splat.model.files.splat_ply import splat_ply
+from splat.model.harmonics import Y00
+from splat.scenes.scene import load_scene
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from tests.splat.held_scenes import two_views
+from tests.splat.random_scenes import random_gaussians
+from tests.splat.render.test_sight import weights
+
+MADE = synthetic_scene(SyntheticSettings(gaussians=80, views=4, width=24, height=16))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Gaussians with the scene that they were trained on, and their map."""
+    folder = tmp_path_factory.mktemp("mapped")
+    write_transforms_scene(MADE.scene, folder / "scene")
+    unseen = MADE.truth.select(torch.tensor([*range(len(MADE.truth)), 0]))
+    unseen.means[-1] = torch.tensor([0.0, 0.0, -50.0])
+    (folder / "in.ply").write_bytes(splat_ply(unseen, tool="splat-landscape"))
+    assert mapped(folder, "--draw", "0", "--draw", "view_003.png") == 0
+    return folder
+
+
+def read_table(path: Path) -> dict[str, np.ndarray]:
+    names, *rows = csv.reader(path.open())
+    return dict(zip(names, np.array(rows, float).T, strict=True))
+
+
+def mapped(folder: Path, *words: str) -> int:
+    return main(["map", str(folder / "in.ply"), "--scene", str(folder / "scene"), "--views", "all", *words])
+
+
+def test_the_files_hold_every_field_of_every_gaussian(folder):
+    written = read_splats(folder / "map" / "fields.ply")
+    assert torch.equal(written.gaussians.flat, read_splats(folder / "in.ply").gaussians.flat)
+    assert [*written.extra] == [*FIELDS]
+    objective = SceneObjective(
+        MADE.truth, load_scene(folder / "scene").load([f"images/view_00{i}.png" for i in (1, 2, 3)])
+    )
+    fields, _ = scene_fields(objective)
+    for name, column in fields.items():
+        found = written.extra[name]
+        assert np.isnan(found[-1]), name
+        assert found[:-1][objective.mask.numpy()] == pytest.approx(column.numpy(), rel=1e-4, abs=1e-30), name
+    top, largest = read_table(folder / "map" / "top.csv"), written.extra["largest"]
+    first = int(np.nanargmax(largest))
+    assert top["gaussian"][0] == first and np.all(np.diff(top["largest"]) <= 0)
+    assert top["sigma_0"][0] == pytest.approx(written.gaussians.log_scales[first].exp().max().item(), rel=1e-5)
+
+
+def test_a_splat_has_the_colour_of_its_value_and_none_is_grey(folder):
+    shade = read_map(folder / "map").shades["largest"]
+    written = read_splats(folder / "map" / "largest.ply").gaussians
+    values = read_splats(folder / "map" / "fields.ply").extra["largest"]
+    assert written.sh_degree == 0 and written.sh[-1].abs().max() == 0
+    assert np.allclose(0.5 + Y00 * written.sh[:, 0].numpy(), colours(shade, values), atol=1e-6)
+
+
+def test_pictures_are_drawn_of_the_views_that_were_asked_for(folder):
+    record = read_map(folder / "map")
+    assert [panel.file for panel in record.panels] == ["view-000", "view-002"] and not record.notes[3:]
+    for panel in record.panels:
+        with np.load(folder / "map" / f"{panel.file}.npz") as maps:
+            assert maps["photograph"].shape == (16, 24, 3) and maps["largest"].shape == maps["error"].shape == (16, 24)
+        assert Image.open(folder / "map" / f"{panel.file}.png").width > 800
+
+
+def test_a_field_is_composited_with_the_weights_of_the_splats():
+    gaussians = random_gaussians(30, seed=2, logit=0.0, spread=0.6)
+    objective = SceneObjective(gaussians, two_views())
+    share = torch.linspace(0, 1, len(objective.active), dtype=torch.float64)
+    share[::5] = torch.nan
+    camera = objective.views[0].camera
+    w, _ = weights(objective.active, camera, objective.settings)
+    w = w[share.isfinite()]
+    mean = (w * share[share.isfinite(), None, None]).sum(dim=0) / w.sum(dim=0)
+    found = torch.from_numpy(composited(objective, camera, share))
+    assert torch.equal(found.isnan(), w.sum(dim=0) <= 0.02) and not found.isnan().all()
+    assert torch.allclose(found[~found.isnan()], mean[~found.isnan()], atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--field", "larges"], "did you mean largest?"),
+        (["--field", "e1"], "run landscape probe first"),
+        (["--draw", "7"], "0 to 2 or a name"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_drawn_is_refused_and_nothing_is_written(folder, words, said, capsys):
+    assert mapped(folder, *words, "--out", str(folder / "other")) == 2
+    assert said in capsys.readouterr().err and not (folder / "other").exists()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_scale_with_both_signs_has_0_in_its_middle(sign):
+    values = sign * np.array([-1e-3, -1e-4, 0.0, 1e-4, 20.0])
+    shade = Shade.of("x", "", "", "signed", values, np.ones(5), (0.0, 100.0))
+    assert shade.diverges and shade.share(np.array(0.0)) == 0.5
+    assert float(shade.share(values)[4]) == (1 + sign) / 2
+    ticks = {text: place for place, text in shade.ticks()}
+    assert ticks["0"] == 0.5 and len(ticks) > 2 and np.isfinite([*ticks.values()]).all()
