@@ -29,7 +29,7 @@ CHECKPOINT, METRICS, SECONDS, RECORDS, COMPARISON = (
     "checkpoint.pt", "metrics.json", "seconds.json", "trajectory.csv", "compare.json",
 )  # fmt: skip
 NO_TIME = "no time"  # how the note of a record of a trajectory begins that was skipped for that
-STATES = ("whole", "cut", "skipped")  # of a record of a trajectory
+STATES = ("whole", "coarse", "cut", "skipped")  # of a record of a trajectory; older ones were cut where time ended them
 TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy
 ENDS = {"lambda_max": "largest eigenvalue", "lambda_min": "smallest eigenvalue"}
 WHOLE = ("step", "gaussians")  # columns of a trajectory

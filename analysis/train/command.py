@@ -173,15 +173,13 @@ def _run(run: Run, options: TrainOptions, command: Sequence[str], along: Traject
     for remark in remarks(run.scene, _asked(options, run.scene), training.config, begun):
         console.print(remark, **WARNING)
     trajectory = None if along is None else Trajectory(run.out, training, run.views, along)
-    if trajectory and (hopeless := trajectory.hopeless):
-        console.print(hopeless, **WARNING)
     if code := _follow(run, options, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])
         console.print(f"stopped after step {training.step}; to continue: {again}", **PLAIN)
         return code
     report(training, run.views, run.held_out, run.out)
-    if trajectory and (skipped := trajectory.skipped):
-        console.print(skipped, **WARNING)
+    if trajectory and (thinned := trajectory.thinned):
+        console.print(thinned, **WARNING)
     return 0
 
 
@@ -268,16 +266,15 @@ def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, cons
     """Train to the end, with checkpoints; the exit code where a signal ended it, after a checkpoint."""
     training, spent = run.training, TrainingTime.read(run.out)
     total = training.config.iterations
-    warned = (trajectory.skipped or trajectory.hopeless) if trajectory else ""
     progress = TrainingProgress(run.out, training, run.views[0], options.log_every, console, options.tensorboard)
     with interruption() as interrupted, progress:
         progress.begin(spent.wall)
+        if trajectory:
+            trajectory.before_steps()
         for done in spent.timed(train(training, run.views)):
             progress.after_step(done, spent.wall)
             if trajectory:
                 trajectory.after_step(spent.wall)
-                if not warned and (warned := trajectory.skipped):
-                    console.print(f"after step {done.step}: {warned}", **WARNING)
             stop = interrupted.is_set()
             due = done.step % options.checkpoint_every == 0 or done.step == total
             if stop or due:

@@ -3,23 +3,23 @@
 RUN/trajectory.csv            a row for each record, rewritten whole after it (below)
 RUN/start/checkpoint.pt       where the training began, so that its landscape can be looked at too
 
-The operator is the exact Hessian of the training loss over all training views (`splat.curvature.objective`).  Lanczos begins
-at
-the
-directions of single Gaussians (`splat.curvature.block_eigenvectors`), as a probe does; from the last record's
-eigenvectors it takes the
-neighbour of an end for it: on a fern of 300 steps, -0.00234 for -0.00259 in 4 of 4 runs.  Records draw from generators of their
-own, seeded by the run's seed and the step: they change no bit of the training, and do not depend on each other.
+The operator is the exact Hessian of the training loss over all training views (`splat.curvature.objective`).  Traces are exact
+on a CPU, from every Gaussian's own block, and sampled on a GPU.  Lanczos begins at the directions of single Gaussians
+(`splat.curvature.block_eigenvectors`), as a probe does: from the last record's eigenvectors it may take the neighbour of an end
+for it.  Records draw from generators of their own, seeded by the run's seed and the step: they change no bit of the training,
+and do not depend on each other.
 
-Time.  The records together may take `share` of the seconds that the steps have taken so far.  What one does not use is left to
-later ones.  A record that is not expected to fit is skipped; how long it will take is judged by the last one's least work, and
-before the first one by the time of a step.  The numbers depend on the seed alone where no time ran out; with share = inf it
-never does.
+Time.  The first record, before the first step, and the last are always made.  Those between may take, with what these two took
+and the last will take at least, `share` of the seconds that the steps have taken so far; what one does not use is left to later
+ones.  A record is whole where that is expected to fit, else coarse, else it is skipped: along a training that leaves little
+time they become coarser and then thinner.  What a record will take is judged by those before it, and at first by the time that
+a gradient takes.  A record's numbers depend on the seed alone; with share = inf every one is whole.
 
 Columns:
 
 step, gaussians        steps made, and the Gaussians after them
-state, note            "whole"; "cut": time ended it early, the note says where; "skipped": nothing measured, the note says why
+state, note            "whole"; "coarse": traces from a few samples, ends to 10% as far as COARSE_MATVECS products reach, no
+                       density; "skipped": nothing measured, the note says why; older files: "cut", time ended it early
 seconds, time_share    that the record took; all records so far over the training's steps so far
 visible_gaussians, parameters    Gaussians in sight, and active parameters
 matvecs                products H v of the record
@@ -28,16 +28,16 @@ _reason
 lambda_max, lambda_min with _error (residual) and _reason (why it ended)
 literal, saddle, share, effective_rank, mass_quantile    the indices (`landscape.spectrum.anisotropy`), with _low and
 _high; the last
-                       three where there was time for the spectral density
+                       three of whole records, which have a spectral density
 """
 
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from math import inf, isinf
+from math import isinf
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
@@ -64,7 +64,7 @@ from landscape.traces.trace import total_trace
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
-from splat.curvature.traces import exact_traces
+from splat.curvature.traces import LEAST_SAMPLES, block_traces, exact_traces
 from splat.model.gaussians import ATTRIBUTES
 from splat.scenes.view import View
 from splat.training.checkpoint import write_atomically
@@ -72,9 +72,11 @@ from splat.training.state import Training
 
 START = "start"
 Row = dict[str, Any]
-LEAST = 32  # renders with their gradients, for each view, that the least record takes (measured on 8,000 Gaussians)
-FEWEST_MATVECS = 20  # for the largest eigenvalue
-FEWEST_OF_DENSITY = 16  # products that are worth their time
+Level = Literal["coarse", "whole"]
+FEWEST_OF_DENSITY = 16  # products
+COARSE_MATVECS = 24  # products of a coarse record's search for the ends
+# renders with their gradients, for each view, that a record takes (measured on 8,000 Gaussians)
+TYPICAL = {"coarse": 20.0, "whole": 64.0}
 COLUMNS = (
     "step", "gaussians", "state", "note", "seconds", "time_share", "visible_gaussians", "parameters", "matvecs",
     *(f"trace_{name}{key}" for name in ATTRIBUTES for key in ("", "_error", "_low", "_high", "_dim", "_reason")),
@@ -85,7 +87,10 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class TrajectorySettings:
-    """every: steps between records; share: of the time of the steps that the records may take, inf for no limit."""
+    """every: steps between records; share: of the time of the steps that the records may take, inf for no limit.
+
+    traces: where they are sampled.
+    """
 
     every: int
     share: float = 0.1
@@ -102,14 +107,12 @@ class TrajectorySettings:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """One record.  least: seconds of what every record does; short: what time ended early."""
+    """One record; density: None in a coarse one."""
 
     traces: dict[str, TraceEstimate]
     ends: EigenEnds
     density: SpectralDensity | None
     matvecs: int
-    least: float
-    short: tuple[str, ...]
 
     @property
     def indices(self) -> Anisotropy:
@@ -122,73 +125,75 @@ class Trajectory:
     def __init__(self, run: Path, training: Training, views: Sequence[View], settings: TrajectorySettings) -> None:
         self.run, self.training, self.views, self.settings = run, training, views, settings
         self.rows = _read_rows(run / RECORDS, training.step)
-        self.least: tuple[float, int] | None = None  # seconds of the last record's least work, with how many Gaussians
-        _compile(training, views)
+        self.taken: dict[Level, tuple[float, int]] = {}  # seconds of the last record, with how many Gaussians
+        self.pace = _compile(training, views)
+
+    def before_steps(self) -> None:
+        """Record the start, whole where half of what the records may take is expected to do."""
+        if self.training.step == 0 and not self.rows:
+            self._record(self.settings.share * self.pace * self.training.config.iterations / 2, 0.0)
 
     def after_step(self, trained: float) -> None:
         """Record where it is time to.  trained: seconds that the steps so far took."""
         step, last = self.training.step, self.training.config.iterations
         if step % self.settings.every and step != last:
             return
-        spent = sum(row["seconds"] for row in self.rows)
-        allowed = self.settings.share * trained - spent
+        self.pace = trained / step
+        left = self.settings.share * trained - sum(row["seconds"] for row in self.rows)
+        self._record(left if step == last else left - self._expected("coarse"), trained)
+
+    def _record(self, allowed: float, trained: float) -> None:
+        """Add a row and write all."""
+        step, spent = self.training.step, sum(row["seconds"] for row in self.rows)
         row: Row = {"step": step, "gaussians": len(self.training.gaussians), "state": "skipped", "seconds": 0.0}
-        least = self._expected(trained / step)
-        if allowed < least:
+        always, least = step in (0, self.training.config.iterations), self._expected("coarse")
+        if not always and allowed < least:
             row["note"] = f"{NO_TIME}: {least:.2g} s were needed at least, {max(allowed, 0.0):.2g} s were allowed"
         else:
+            level: Level = "whole" if self._expected("whole") <= allowed else "coarse"
             start = perf_counter()
             try:
-                row |= self._recorded(allowed)
+                row |= self._measured(level)
             except InputError as error:  # such as no Gaussian in sight: the training may still find its way
                 row["note"] = str(error)
             row["seconds"] = perf_counter() - start
-        row["time_share"] = (spent + row["seconds"]) / trained
+            if row["state"] == level:
+                self.taken[level] = row["seconds"], len(self.training.gaussians)
+        row["time_share"] = (spent + row["seconds"]) / trained if trained else None
         self.rows.append(row)
         # as objects: a whole number stays one beside a row that has none, as it does in rows read again
         table = pd.DataFrame(self.rows, columns=COLUMNS, dtype=object)
         write_atomically(self.run / RECORDS, table.to_csv(index=False).encode())
 
     @property
-    def skipped(self) -> str:
-        """How many records were skipped, why the last one was, and what to do, as a sentence; empty where none was."""
-        notes = [row["note"] for row in self.rows if row["state"] == "skipped"]
-        if not notes:
+    def thinned(self) -> str:
+        """How many records were skipped or coarse, and what to do, as a sentence; empty where all are whole."""
+        counts = {state: sum(row["state"] == state for row in self.rows) for state in ("skipped", "coarse")}
+        said = " and ".join(f"{count} {state}" for state, count in counts.items() if count)
+        if not said:
             return ""
-        remedy = "; --probe-share inf sets no limit to their time" if notes[-1].startswith(NO_TIME) else ""
-        return f"{len(notes)} of {len(self.rows)} records of the landscape were skipped ({notes[-1]}){remedy}"
+        others = [row["note"] for row in self.rows if row["state"] == "skipped" and not row["note"].startswith(NO_TIME)]
+        why = others[-1] if others else f"they may take {self.settings.share:g} of the time of the steps"
+        remedy = "" if others else "; --probe-share inf sets no limit to their time"
+        return f"of {len(self.rows)} records of the landscape, {said} ({why}){remedy}"
 
-    @property
-    def hopeless(self) -> str:
-        """Before the first record: why every one of this run will be skipped, and what to do; empty where that is not sure.
-
-        The first record's time is that of so many steps, whatever a step takes.
-        """
-        first, last = LEAST * len(self.views) / self.settings.share, self.training.config.iterations
-        if self.rows or last >= first:
-            return ""
-        return (
-            f"every record of the landscape will be skipped: at a share of {self.settings.share:g} of the time of the steps, "
-            f"none fits before step {first:,.0f}, and this run has {last:,}; --probe-share inf sets no limit to their time"
-        )
-
-    def _expected(self, step: float) -> float:
-        """Seconds that the next record takes at least, where a step takes so many."""
+    def _expected(self, level: Level) -> float:
+        """Seconds that a record takes: by the last ones, or by the time of a step and a view."""
         if isinf(self.settings.share):
             return 0.0
-        if self.least is None:
-            return LEAST * len(self.views) * step
-        seconds, gaussians = self.least
-        return seconds * len(self.training.gaussians) / gaussians
+        for known in (level, *TYPICAL):
+            if known in self.taken:
+                seconds, gaussians = self.taken[known]
+                return seconds * TYPICAL[level] / TYPICAL[known] * len(self.training.gaussians) / gaussians
+        return TYPICAL[level] * len(self.views) * self.pace
 
-    def _recorded(self, seconds: float) -> Row:
+    def _measured(self, level: Level) -> Row:
         objective = self.training.config.objective(self.training.gaussians, self.views)
-        found = measure(objective, self._generator(), self.settings, seconds)
-        self.least = found.least, len(self.training.gaussians)
+        found = measure(objective, self._generator(), self.settings, level)
         counts = objective.counts
         return {
-            "state": "cut" if found.short else "whole",
-            "note": f"out of time: {', '.join(found.short)}" if found.short else "",
+            "state": level,
+            "note": "",
             "visible_gaussians": counts.active_gaussians,
             "parameters": counts.active_parameters,
             "matvecs": found.matvecs,
@@ -202,32 +207,28 @@ class Trajectory:
 
 
 def measure(
-    objective: SceneObjective, generator: torch.Generator, settings: TrajectorySettings, seconds: float = inf
+    objective: SceneObjective, generator: torch.Generator, settings: TrajectorySettings, level: Level = "whole"
 ) -> Found:
-    """One record, in about so many seconds, counted from the call."""
-    began, streams = perf_counter(), [spawn(generator) for _ in range(3)]
-
-    def left() -> float:
-        return seconds - (perf_counter() - began)
-
-    hessian = SceneHessian(objective)
+    """One record."""
+    streams = [spawn(generator) for _ in range(3)]
+    hessian, whole = SceneHessian(objective), level == "whole"
     operator = CountingOperator(hessian)
-    traces = exact_traces(objective, streams[0], replace(settings.traces, max_seconds=max(left() / 2, 0.0)))
-    fixed = perf_counter() - began
-    leads = BlockEigenvectors(objective, *objective.approximate_blocks).warm_start()
-    ends = extreme_eigenpairs(operator, streams[1], replace(settings.eigen, max_seconds=max(left(), 0.0)), leads)
-    least = fixed + FEWEST_MATVECS * operator.seconds / operator.matvecs
-    short = [f"trace of {name}" for name, trace in traces.items() if trace.reason == "time budget"]
-    pairs = {"lambda_max": ends.largest, "lambda_min": ends.smallest}
-    short += [name for name, end in pairs.items() if end.reason == "time budget"]
-    matvecs = int(min(settings.density_matvecs, left() * operator.matvecs / operator.seconds))
-    density = None
-    if matvecs < FEWEST_OF_DENSITY:
-        short.append("spectral density")
+    if whole and objective.active.flat.device.type == "cpu":
+        traces = block_traces(objective)
     else:
+        traces = exact_traces(objective, streams[0], settings.traces, samples=None if whole else LEAST_SAMPLES)
+    eigen = settings.eigen
+    if not whole:
+        eigen = replace(eigen, rtol=max(eigen.rtol, 0.1), max_matvecs=min(eigen.max_matvecs, COARSE_MATVECS))
+    leads = BlockEigenvectors(objective, *objective.approximate_blocks).warm_start()
+    ends = extreme_eigenpairs(operator, streams[1], eigen, leads)
+    density = None
+    if whole:
         active, trace = ActiveSpace(hessian.project, hessian.rank), total_trace(traces)
-        density = spectral_density(operator, streams[2], matvecs, active=active, ends=ends, trace=trace)
-    return Found(traces, ends, density, operator.matvecs, least, tuple(short))
+        density = spectral_density(
+            operator, streams[2], settings.density_matvecs, active=active, ends=ends, trace=trace
+        )
+    return Found(traces, ends, density, operator.matvecs)
 
 
 def _columns(found: Found) -> Row:
@@ -259,9 +260,13 @@ def _read_rows(path: Path, step: int) -> list[Row]:
     return [row | {"seconds": float(row["seconds"])} for row in rows if float(row["step"]) <= step]
 
 
-def _compile(training: Training, views: Sequence[View]) -> None:
-    """Compile the kernels of a record, which would count as its time, on a few Gaussians."""
-    seen = training.config.objective(training.gaussians, views).mask.nonzero()[:8, 0]
-    objective = training.config.objective(training.gaussians.select(seen), views)
+def _compile(training: Training, views: Sequence[View]) -> float:
+    """Compile the kernels of a record, which would count as its time, on a few Gaussians; seconds of a view's gradient."""
+    objective = training.config.objective(training.gaussians, views)
+    few = training.config.objective(training.gaussians.select(objective.mask.nonzero()[:8, 0]), views)
     least = TrajectorySettings(1, eigen=EigenSettings(max_matvecs=10), density_matvecs=FEWEST_OF_DENSITY)
-    measure(objective, torch.Generator(training.gaussians.flat.device).manual_seed(0), least)
+    for level in get_args(Level):
+        measure(few, torch.Generator(training.gaussians.flat.device).manual_seed(0), least, level)
+    start = perf_counter()
+    objective.gradient  # noqa: B018 (its time is wanted)
+    return (perf_counter() - start) / len(views)

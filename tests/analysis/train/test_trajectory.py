@@ -9,7 +9,7 @@ import torch
 
 from analysis.commands.cli import main
 from analysis.train import command
-from analysis.train.trajectory import COLUMNS, LEAST, Trajectory, TrajectorySettings, measure
+from analysis.train.trajectory import COLUMNS, TYPICAL, Trajectory, TrajectorySettings, measure
 from landscape import extreme_eigenpairs
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
@@ -70,7 +70,7 @@ def test_probing_changes_no_bit_of_the_training(scene, run):
 def test_a_row_is_written_every_so_many_steps_with_every_column(run):
     table = rows(run)
     assert tuple(table) == COLUMNS
-    assert list(table["step"]) == list(range(EVERY, STEPS + 1, EVERY))
+    assert list(table["step"]) == list(range(0, STEPS + 1, EVERY))
     assert set(table["state"]) == {"whole"}
     assert table["gaussians"].iloc[-1] == len(load_checkpoint(run / "checkpoint.pt").training.gaussians)
     assert sorted(path.name for path in run.glob("*trajectory*")) == ["trajectory.csv"]
@@ -144,65 +144,82 @@ def test_a_run_killed_beside_a_checkpoint_and_resumed_gives_the_same_rows(scene,
         patch.setattr(command, "save_checkpoint", killed)
         with pytest.raises(Killed):
             main(probed(scene, "killed"))
-    assert list(rows(out)["step"]) == [10, 20, 30]  # the last of them is after the checkpoint, of step 20
+    assert list(rows(out)["step"]) == [0, 10, 20, 30]  # the last of them is after the checkpoint, of step 20
     assert main(probed(scene, "killed", "--resume")) == 0
     pd.testing.assert_frame_equal(rows(out).drop(columns=TIMES), rows(run).drop(columns=TIMES), check_exact=True)
     assert (out / "checkpoint.pt").read_bytes() == (run / "checkpoint.pt").read_bytes()
 
 
-def test_what_does_not_fit_is_skipped_and_time_that_ends_a_record_is_said(run, at_the_end, tmp_path):
-    training, views, _ = at_the_end
-    trajectory = Trajectory(tmp_path, training, views, TrajectorySettings(EVERY, 0.1))
-    assert trajectory.skipped == ""
-    trajectory.after_step(1e-3)
-    (row,) = trajectory.rows
-    assert trajectory.skipped.startswith("1 of 1 records of the landscape were skipped (no time: ")
-    assert trajectory.skipped.endswith("0.0001 s were allowed); --probe-share inf sets no limit to their time")
-    assert (
-        row["state"] == "skipped"
-        and row["seconds"] == row["time_share"] == 0
-        and "0.0001 s were allowed" in row["note"]
+def test_exact_traces_are_those_that_samples_estimate(at_the_end):
+    _, _, objective = at_the_end
+    exact, sampled = (
+        measure(objective, torch.Generator().manual_seed(0), TrajectorySettings(EVERY), level).traces
+        for level in ("whole", "coarse")
     )
-    trajectory.least = 0.0, 1
-    trajectory.after_step(1e-3)
-    row = trajectory.rows[-1]
-    assert row["state"] == "cut" and row["note"].startswith("out of time: ") and "lambda_min" in row["note"]
-    assert row["lambda_min_reason"] == "time budget" and row["time_share"] == row["seconds"] / 1e-3
-    trajectory.after_step(1e-3)  # the budget is overdrawn now, whatever a record takes
-    assert trajectory.rows[-1]["state"] == "skipped"
-    trajectory.after_step(1e6)
-    assert trajectory.rows[-1]["state"] == "whole"
-    assert list(rows(tmp_path)["state"]) == ["skipped", "cut", "skipped", "whole"]
-    counts = pd.read_csv(tmp_path / "trajectory.csv", dtype=str)["visible_gaussians"]
-    assert counts.iloc[-1].isdigit()  # beside rows that have none
+    for name in ATTRIBUTES:
+        assert exact[name].reason == "exact" and exact[name].standard_error == 0
+        assert exact[name].dim == sampled[name].dim
+        assert abs(exact[name].value - sampled[name].value) <= 6 * sampled[name].standard_error
 
 
-def warnings(scene, capsys, name: str) -> list[str]:
-    """What a training whose records do not fit says about them."""
-    assert main([*arguments(scene, name), "--probe-every", str(EVERY), "--probe-share", "1e-9"]) == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
-    assert all("--probe-share inf" in line for line in said)
-    count = len(rows(scene.parent / name))
-    assert said[-1].startswith(f"{count} of {count} records of the landscape were skipped")
-    return said[:-1]
-
-
-def test_a_training_says_beforehand_that_no_record_will_fit_and_counts_them_at_the_end(scene, capsys):
-    (before,) = warnings(scene, capsys, "hopeless")
-    assert before.startswith("every record of the landscape will be skipped: at a share of 1e-09")
-
-
-def test_a_training_warns_of_the_first_record_that_it_skips(scene, capsys, monkeypatch):
-    monkeypatch.setattr(Trajectory, "hopeless", "")  # one that may fit, as far as is known
-    (after,) = warnings(scene, capsys, "short")
-    assert after.startswith(f"after step {EVERY}: 1 of 1 records")
-
-
-def test_it_is_known_beforehand_from_which_step_on_a_record_may_fit(at_the_end, tmp_path):
+@pytest.fixture
+def along(at_the_end, tmp_path) -> Trajectory:
+    """The records of a long training with a tenth of its time, at a pace of a second."""
     training, views, _ = at_the_end
-    for share, sure in ((LEAST * len(views) / training.config.iterations, False), (1e-3, True), (float("inf"), False)):
-        trajectory = Trajectory(tmp_path / f"{share}", training, views, TrajectorySettings(EVERY, share))
-        assert bool(trajectory.hopeless) == sure
+    longer = replace(training, config=replace(training.config, iterations=10 * STEPS))
+    trajectory = Trajectory(tmp_path, longer, views, TrajectorySettings(EVERY, 0.1))
+    trajectory.taken = {"coarse": (10.0, len(training.gaussians))}
+    return trajectory
+
+
+WHOLE = 10 * TYPICAL["whole"] / TYPICAL["coarse"]  # seconds that are expected of the fixture's record
+
+
+@pytest.mark.parametrize(
+    ("allowed", "state"), [(19.0, "skipped"), (21.0, "coarse"), (9.9 + WHOLE, "coarse"), (10.1 + WHOLE, "whole")]
+)
+def test_a_record_between_is_as_fine_as_its_time_beside_that_of_the_last(along, allowed, state):
+    along.after_step(10 * allowed)
+    (row,) = along.rows
+    assert row["state"] == state
+    assert (row["note"] == "") == (state != "skipped") and pd.notna(row.get("lambda_max")) == (state != "skipped")
+    assert pd.notna(row.get("effective_rank")) == (state == "whole")
+    if state == "skipped":
+        assert row["note"] == "no time: 10 s were needed at least, 9 s were allowed" and row["seconds"] == 0
+
+
+@pytest.mark.parametrize(("allowed", "state"), [(0.0, "coarse"), (WHOLE - 0.1, "coarse"), (WHOLE + 0.1, "whole")])
+def test_the_last_record_is_made_whatever_time_is_left(along, allowed, state):
+    along.training.config = replace(along.training.config, iterations=along.training.step)
+    along.after_step(10 * allowed)
+    assert [row["state"] for row in along.rows] == [state]
+
+
+@pytest.mark.parametrize(("pace", "state"), [(1e-9, "coarse"), (1e9, "whole")])
+def test_the_first_record_is_made_and_whole_where_half_of_the_time_allows(along, pace, state):
+    along.training.step, along.pace = 0, pace
+    along.before_steps()
+    (row,) = along.rows
+    assert (row["step"], row["state"], row["time_share"]) == (0, state, None)
+    along.before_steps()  # of a run that is resumed
+    assert len(along.rows) == 1
+
+
+def test_what_was_used_is_missing_later_and_whole_numbers_stay_so(along, tmp_path):
+    along.rows = [{"step": 10, "gaussians": 3, "state": "skipped", "note": "", "seconds": 990.0}]
+    along.after_step(1e4)
+    assert along.rows[-1]["state"] == "skipped"
+    along.after_step(1e6)
+    assert along.rows[-1]["state"] == "whole" and along.rows[-1]["time_share"] == pytest.approx(990 / 1e6, rel=1e-2)
+    assert pd.read_csv(tmp_path / "trajectory.csv", dtype=str)["visible_gaussians"].iloc[-1].isdigit()
+
+
+def test_a_training_without_time_for_them_has_its_first_and_last_record_and_says_so(scene, capsys):
+    assert main([*arguments(scene, "short"), "--probe-every", str(EVERY), "--probe-share", "1e-9"]) == 0
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
+    assert said.startswith("of 5 records of the landscape, 3 skipped and 2 coarse (they may take 1e-09 of the time")
+    assert said.endswith("--probe-share inf sets no limit to their time")
+    assert list(rows(scene.parent / "short")["state"]) == ["coarse", *["skipped"] * 3, "coarse"]
 
 
 @pytest.mark.parametrize(("option", "value"), [("--probe-every", "0"), ("--probe-share", "0")])
