@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
 from splat.backend.memory import free_memory
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
@@ -33,11 +34,11 @@ from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.render.forward import rasterize_view, touches
+from splat.render.forward import background_of, rasterize_view, touches
 from splat.scenes.view import View
 
 
-class NothingInSight(ValueError):
+class NothingInSight(InputError):
     """No view sees any of the Gaussians: there is no Hessian."""
 
 
@@ -73,8 +74,8 @@ class SceneObjective:
     active: the Gaussians that touch a pixel of some view, with unit quaternions; L is studied at `active.flat` (p,).  mask:
     which of the given Gaussians they are.  counts: how much was removed.
 
-    Raises NothingInSight where no Gaussian is seen, ValueError where there is no view, a parameter is not finite, or ranks have
-    different Gaussians or settings.
+    Raises NothingInSight where no Gaussian is seen, InputError where there is no view or no Gaussian, a parameter or the
+    background is not finite, or ranks have different Gaussians or settings.
 
     >>> from splat import SyntheticSettings, synthetic_scene
     >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
@@ -96,8 +97,9 @@ class SceneObjective:
         ranks: Ranks = ALONE,
     ):
         if not views:
-            raise ValueError("expected at least one view, got none")
+            raise InputError("expected at least one view, got none")
         gaussians.require_finite()
+        gaussians = gaussians.with_flat(gaussians.flat.detach())
         flat, degree = gaussians.flat, gaussians.sh_degree if sh_degree is None else sh_degree
         setup = (len(gaussians), flat.dtype, degree, loss_settings, background, settings, keep_unseen)
         ranks.require_same("set-up", setup)
@@ -106,7 +108,7 @@ class SceneObjective:
         self._views_of_ranks = [int(count) for count in ranks.gather(torch.tensor(len(views)))]
         # products are repeatable, however the training's steps were made
         self.settings = replace(settings, accumulation="deterministic")
-        self.background = flat.new_zeros(3) if background is None else background.to(flat)
+        self.background = background_of(gaussians, background)
         self._losses = [loss_against(view.image, loss_settings, flat) for view in views]
         used = gaussians.select(torch.arange(len(gaussians)), degree)
         self.mask: Bool[Tensor, " n"] = self._seen(used)

@@ -58,20 +58,22 @@ class Gaussians(Brief):
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
-        each = parameters_per_gaussian(self.sh_degree)
-        if self.flat.ndim != 1 or self.flat.numel() % each:
+        each, flat = parameters_per_gaussian(self.sh_degree), self.flat
+        other = flat.is_nested or flat.layout != torch.strided or flat.is_meta
+        if other or flat.ndim != 1 or flat.numel() % each:
             raise InputError(
-                f"expected a vector of n x {each} parameters at SH degree {self.sh_degree}, got {tuple(self.flat.shape)}"
+                f"expected a vector of n x {each} parameters at SH degree {self.sh_degree}, got "
+                f"{'a tensor that holds its numbers in another way' if other else tuple(flat.shape)}"
             )
 
     @classmethod
     def pack(cls, attributes: Mapping[str, Tensor]) -> "Gaussians":
-        """One flat vector from the five attributes (copies); their shapes are checked against each other."""
+        """One flat vector from the five attributes (copies); InputError where their shapes do not fit each other."""
         n, bands = attributes["sh"].shape[:2]
         degree = isqrt(bands) - 1
         for name, shape in attribute_shapes(n, degree).items():
             if tuple(attributes[name].shape) != shape:
-                raise ValueError(f"expected {name} of shape {shape}, got {tuple(attributes[name].shape)}")
+                raise InputError(f"expected {name} of shape {shape}, got {tuple(attributes[name].shape)}")
         return cls(torch.cat([attributes[name].reshape(-1) for name in ATTRIBUTES]), degree)
 
     def __len__(self) -> int:
@@ -150,10 +152,15 @@ class Gaussians(Brief):
     def require_finite(self) -> None:
         """Raise InputError, with attribute and number, for the first Gaussian without finite image and derivatives.
 
-        Refused are numbers that are not finite, quaternions of length 0, which have no direction, and quaternions and SH whose
-        fourth power leaves the range of the dtype: SSIM's curvature has the fourth power of a colour, and a quaternion's
-        1 / |q|^2 enters twice.  The limit of log_scales depends on the view: `splat.projection.reference.require_sizes`.
+        So too where there is no Gaussian, or numbers of another type than float32 and float64.  Refused are numbers that are
+        not finite, quaternions of length 0, which have no direction, and quaternions and SH whose fourth power leaves the range
+        of the dtype: SSIM's curvature has the fourth power of a colour, and a quaternion's 1 / |q|^2 enters twice.  The limit
+        of log_scales depends on the view: `splat.projection.reference.require_sizes`.
         """
+        if self.flat.dtype not in (torch.float32, torch.float64):
+            raise InputError(f"expected Gaussians in float32 or float64, got {self.flat.dtype}; convert them with .to")
+        if not len(self):
+            raise InputError("expected at least one Gaussian, got none; begin with those of a checkpoint or of a scene")
         sizes = {
             name: value.detach().reshape(len(self), -1).abs().amax(dim=1) for name, value in self.attributes.items()
         }

@@ -7,11 +7,11 @@ that a study can measure their effect on the landscape.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import inf
 from typing import Any, Literal, get_args
 
 from landscape.errors import InputError
 
+LARGEST = 1e18  # of what is multiplied by itself: float32 still holds its square
 Accumulation = Literal["deterministic", "atomic"]
 
 
@@ -56,9 +56,8 @@ class RenderSettings:
             raise InputError(f"expected 0 <= alpha_min < alpha_max = {self.alpha_max}, got {self.alpha_min}")
         if not 0 <= self.transmittance_min < 1:
             raise InputError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
-        finite = 0 <= self.blur < inf and 0 < self.near < inf and 0 < self.fov_clamp < inf
-        if not finite:  # nan fails every comparison
-            raise InputError(f"expected blur >= 0, near > 0, fov_clamp > 0, all finite, got {self}")
+        if not (0 <= self.blur <= LARGEST and 0 < self.near <= LARGEST and 0 < self.fov_clamp <= LARGEST):  # nan fails
+            raise InputError(f"expected blur >= 0, near > 0, fov_clamp > 0, all up to {LARGEST:g}, got {self}")
         if self.contour_sigma is not None and not self.contour_sigma > 0:
             raise InputError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
         if self.accumulation not in get_args(Accumulation):

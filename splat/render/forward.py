@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -26,6 +27,18 @@ def rasterize_view(
     splats = projected(gaussians, lens_of(camera, settings))
     background = background.to(gaussians.flat, non_blocking=True)
     return rasterize(*splats, background, camera.width, camera.height, settings)
+
+
+def background_of(gaussians: Gaussians, colour: Float[Tensor, "3"] | None) -> Float[Tensor, "3"]:
+    """The colour behind the Gaussians, in their type and where they are; black where None.
+
+    InputError where it is not three finite numbers.
+    """
+    if colour is None:
+        return gaussians.flat.new_zeros(3)
+    if colour.shape != (3,) or not colour.isfinite().all():
+        raise InputError(f"expected a background of three finite numbers, red, green and blue, got {colour.tolist()}")
+    return colour.to(gaussians.flat, non_blocking=True)
 
 
 def touches(raster: Raster) -> Bool[Tensor, " n"]:

@@ -13,6 +13,7 @@ from splat.model.settings import RenderSettings
 from splat.projection.reference import Splats, project
 from splat.raster.reference import rasterize_reference
 from splat.render.autograd import project_by_kernel, rasterize_by_kernel
+from splat.render.forward import background_of
 
 Backend = Literal["kernels", "reference"]
 
@@ -46,12 +47,10 @@ def render(
 
     background: RGB, black where None.  opacity_scale: constant factors of the opacities; may exceed 1, and 0 hides a Gaussian.
     backend: "kernels": those for the device of the Gaussians; "reference": plain torch (slow, any number of derivatives).
-    Raises ValueError where a parameter is not finite.
+    Raises InputError where there is no Gaussian, or a parameter or the background is not finite.
     """
     gaussians.require_finite()
-    if background is None:
-        background = torch.zeros(3)
-    background = background.to(gaussians.flat, non_blocking=True)
+    background = background_of(gaussians, background)
     if backend == "reference":
         splats = _gained(project(gaussians, camera, settings), opacity_scale)
         image, alpha, expected = rasterize_reference(splats, background, camera.width, camera.height, settings)

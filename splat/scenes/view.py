@@ -25,7 +25,7 @@ Subset = Literal["train", "test"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class View(Brief):
-    """A camera and its picture.  ValueError where their sizes differ.
+    """A camera and its picture.  InputError where their sizes differ.
 
     alpha: coverage in [0, 1] where the file has an alpha channel.  mask: the pixels that metrics count, where the scene
     has masks.  depth: relative depth or disparity, in any unit, where a folder of depth maps was given.
@@ -46,7 +46,7 @@ class View(Brief):
         size = (self.camera.height, self.camera.width)
         layers = [layer for layer in (self.alpha, self.mask, self.depth) if layer is not None]
         if self.image.shape != (3, *size) or any(layer.shape != size for layer in layers):
-            raise ValueError(
+            raise InputError(
                 f"expected the picture of {self.name!r} to be (3, {size[0]}, {size[1]}) as its camera, got "
                 f"{tuple(self.image.shape)}; resize the picture, or the camera with Camera.resized"
             )
@@ -82,7 +82,7 @@ class Points:
 
     def __post_init__(self) -> None:
         if self.xyz.ndim != 2 or self.xyz.shape[1] != 3 or self.rgb.shape != self.xyz.shape:
-            raise ValueError(
+            raise InputError(
                 f"expected xyz and rgb of shape (n, 3), got {tuple(self.xyz.shape)} and {tuple(self.rgb.shape)}"
             )
         if not bool(torch.isfinite(self.xyz).all()):

@@ -220,17 +220,18 @@ def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:
     return loaded
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
+def load_checkpoint(path: str | Path) -> Checkpoint:
     """Read a checkpoint, its tensors on the CPU.
 
     OSError where there is none or the system does not give it, MemoryError or torch's where memory is short; InputError, which
     says what is wrong with it, where it is damaged or of another kind.
 
-    >>> load_checkpoint(Path("nowhere/checkpoint.pt"))
+    >>> load_checkpoint("nowhere/checkpoint.pt")
     Traceback (most recent call last):
         ...
     FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file
     """
+    path = Path(path)
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
         raise FileNotFoundError(f"{KIND} at {path}, found {found}")
@@ -284,8 +285,6 @@ def restored_training(content: dict[str, Any]) -> Training:
     adam, screen, p, dtype = saved.adam, saved.screen_gradients, saved.flat.numel(), saved.flat.dtype
     gaussians = Gaussians(_numbers("flat", saved.flat, p, dtype), saved.sh_degree)
     n = len(gaussians)
-    if not n:
-        raise InputError("it holds no Gaussian")
     gaussians.require_finite()
     config = _config(saved.config)
     if saved.step > config.iterations:

@@ -106,6 +106,16 @@ def test_a_signal_raises_while_pycolmap_is_imported(tmp_path):
     assert (done.stdout, done.stderr) == ("143\n", "")
 
 
+def test_pictures_are_written_whichever_library_was_imported_first():
+    program = (
+        "import splat.scenes, io, zlib\nfrom PIL import Image\nfile = io.BytesIO()\n"
+        "Image.new('RGB', (50, 50)).save(file, 'png')\nimage = Image.open(file)\nimage.load()\n"
+        "print(image.size, len(zlib.decompress(zlib.compress(bytes(10**6)))))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=100)
+    assert (done.stdout, done.stderr) == ("(50, 50) 1000000\n", "")
+
+
 def test_signals_that_are_ignored_stay_so():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup leaves it
     try:

@@ -23,6 +23,7 @@ from typing import Any
 
 import pandas as pd
 
+from analysis.console.overrides import overridden
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT
@@ -30,7 +31,9 @@ from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
 from landscape.errors import InputError
 from splat.model.typed import leaves
 from splat.training.checkpoint import load_checkpoint
-from splat.training.state import MethodSettings, TrainConfig
+from splat.training.methods.protocols import presets
+from splat.training.start import Source
+from splat.training.state import TrainConfig
 
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
@@ -68,7 +71,7 @@ def row_of(run: Path) -> dict[str, Any]:
     config, row = checkpoint.training.config, {}
     row |= {
         "scene": Path(checkpoint.scene.absolute).name,
-        "method": method_name(config.method, config),
+        "method": method_name(config, checkpoint.scene.start),
         "seed": config.seed,
     }
     row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train)} | metrics_of(run)
@@ -78,17 +81,24 @@ def row_of(run: Path) -> dict[str, Any]:
     return row | probe_of(run) | _more(data) if data.provenance.iteration == checkpoint.training.step else row
 
 
-def method_name(method: MethodSettings, config: TrainConfig) -> str:
-    """The method and what was changed of it; what it scales to the length of the training is not changed.
+def method_name(config: TrainConfig, start: Source = "scene") -> str:
+    """The method, its start and protocol where they are not the usual ones, and what was changed of its settings.
+
+    What a method scales to the length of the training is not changed.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS
-    >>> config = TrainConfig(iterations=500)
-    >>> method_name(StableGS(vsp_weight=0.0, warm_up=50), config), method_name(StableGS(warm_up=3), config)
-    ('stablegs vsp_weight=0', 'stablegs warm_up=3')
+    >>> method_name(TrainConfig(500, method=StableGS(vsp_weight=0.0, warm_up=50))), method_name(TrainConfig(), "dense")
+    ('stablegs vsp_weight=0', '3dgs start=dense')
     """
-    published = leaves(asdict(type(method)().scaled(config).method))
-    changed = [f"{name}={_text(value)}" for name, value in leaves(asdict(method)).items() if value != published[name]]
-    return " ".join([method.name, *changed])
+    name, preset = config.method.name, presets(config.method.name, config.protocol)
+    usual = TrainConfig(iterations=config.iterations, method=type(config.method)())
+    usual = overridden(usual, {key: value for key, value in preset.items() if key != "start"})
+    published = leaves(asdict(usual.method.scaled(usual).method))
+    settings = leaves(asdict(config.method))
+    changed = [f"{key}={_text(value)}" for key, value in settings.items() if value != published[key]]
+    started = [f"start={start}"] if start != preset.get("start", "scene") else []
+    protocol = [f"protocol={config.protocol}"] if preset else []
+    return " ".join([name, *started, *protocol, *changed])
 
 
 def _text(value: Any) -> str:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from landscape.errors import InputError
 from landscape.operators.checks import check_operator
 from splat.backend.memory import free_memory
 from splat.curvature.hessian import SceneHessian, ViewSum
@@ -191,11 +192,15 @@ def test_the_smooth_piece_changes_where_the_order_does_and_only_there():
 
 def test_what_cannot_be_an_objective_is_refused():
     gaussians = random_gaussians(5)
-    with pytest.raises(ValueError, match="expected at least one view, got none"):
+    with pytest.raises(InputError, match="expected at least one view, got none"):
         SceneObjective(gaussians, [], LOSS)
+    with pytest.raises(InputError, match="expected at least one Gaussian, got none"):
+        objective(gaussians.select(torch.arange(0)))
+    with pytest.raises(InputError, match="expected a background of three finite numbers"):
+        SceneObjective(gaussians, two_views(), LOSS, torch.full((3,), float("inf")))
     behind = random_gaussians(5)
     behind.means[:, 2] = -9.0
-    with pytest.raises(ValueError, match="expected Gaussians in sight, got 5 of which no view sees any"):
+    with pytest.raises(InputError, match="expected Gaussians in sight, got 5 of which no view sees any"):
         objective(behind)
     broken = random_gaussians(5, 1)
     broken.sh[4, 1, 2] = float("inf")
@@ -204,6 +209,16 @@ def test_what_cannot_be_an_objective_is_refused():
     H = SceneHessian(objective(gaussians))
     with pytest.raises(ValueError, match=r"use V\[:, None\]"):
         H.apply(torch.zeros(H.dim, dtype=torch.float64))
+
+
+def test_parameters_that_require_a_gradient_are_taken_as_numbers():
+    gaussians, U = random_gaussians(5, 1), None
+    products = []
+    for flat in (gaussians.flat, gaussians.flat.clone().requires_grad_()):
+        H = SceneHessian(objective(gaussians.with_flat(flat)))
+        U = random_like((H.dim, 1), 3)
+        products.append(H.apply(U))
+    assert torch.equal(*products) and not products[1].requires_grad
 
 
 @pytest.mark.parametrize("gauss_newton", [False, True])

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from landscape.errors import InputError
 from splat.model.gaussians import ATTRIBUTES, Gaussians, attribute_shapes, parameters_per_gaussian
 from tests.splat.random_scenes import random_gaussians, random_like
 
@@ -65,6 +66,22 @@ def test_layouts_that_do_not_fit_are_refused():
         Gaussians.pack({**attributes, "quats": attributes["quats"][:4]})
     with pytest.raises(ValueError, match=r"expected sh of shape \(5, 4, 3\), got \(5, 5, 3\)"):
         Gaussians.pack({**attributes, "sh": torch.zeros(5, 5, 3)})
+
+
+def test_vectors_that_do_not_hold_plain_numbers_in_a_row_are_refused():
+    flat = random_gaussians(2, 1).flat
+    wrong = (torch.nested.nested_tensor([flat]), flat.to_sparse(), flat.to("meta"))
+    for other in wrong:
+        with pytest.raises(InputError, match="got a tensor that holds its numbers in another way"):
+            Gaussians(other, 1)
+    for kind in (torch.float16, torch.bfloat16, torch.int64, torch.bool, torch.complex64):
+        with pytest.raises(InputError, match=f"expected Gaussians in float32 or float64, got {kind}"):
+            Gaussians(flat.to(kind), 1).require_finite()
+
+
+def test_no_gaussian_at_all_is_refused_where_it_is_drawn():
+    with pytest.raises(InputError, match="expected at least one Gaussian, got none"):
+        Gaussians(torch.zeros(0), 3).require_finite()
 
 
 @pytest.mark.parametrize("name", ATTRIBUTES)

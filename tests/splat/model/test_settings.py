@@ -30,8 +30,11 @@ def test_smooth_switches_off_every_threshold_that_can_be():
         ({"contour_sigma": 0.0}, "expected contour_sigma > 0 or None, got 0.0"),
         ({"alpha_max": float("nan")}, "expected 0 < alpha_max < 1"),
         ({"blur": float("nan")}, "expected blur >= 0"),
-        ({"near": float("inf")}, "all finite"),
+        ({"near": float("inf")}, "all up to 1e.18, got .*near=inf"),
         ({"contour_sigma": float("nan")}, "expected contour_sigma > 0 or None, got nan"),
+        ({"blur": 1e308}, "up to 1e.18, got .*blur=1e.308"),
+        ({"near": 1e39}, "up to 1e.18"),
+        ({"fov_clamp": 1e300}, "up to 1e.18"),
         ({"accumulation": "fast"}, "expected accumulation 'deterministic' or 'atomic', got 'fast'"),
     ],
 )

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import SMOOTH, RenderSettings
@@ -57,7 +58,7 @@ def test_kernels_and_plain_torch_agree_to_the_second_derivative(size, settings):
 
 SWITCHES = {
     "gradient_through_cap": (False, True), "alpha_min": (0.0, 1 / 255), "transmittance_min": (0.0, 1e-4),
-    "contour_sigma": (None, 3.0),
+    "contour_sigma": (None, 3.0), "alpha_max": (0.99, 0.6), "blur": (0.3, 0.0), "fov_clamp": (1.3, 0.1), "near": (0.2, 3.0),
 }  # fmt: skip
 
 
@@ -157,6 +158,16 @@ def test_order_within_the_set_does_not_matter_unless_depths_are_equal():
     )
     one, other = (render(twins.select(torch.tensor(order)), facing).image for order in ([0, 1], [1, 0]))
     assert (one - other).abs().max() > 0.01  # the first of the set is in front
+
+
+@pytest.mark.parametrize("backend", ["kernels", "reference"])
+def test_nothing_to_draw_and_backgrounds_that_are_no_colour_are_refused(backend):
+    gaussians, camera = random_gaussians(2), random_camera(16, 12)
+    with pytest.raises(InputError, match="expected at least one Gaussian, got none"):
+        render(gaussians.select(torch.arange(0)), camera, backend=backend)
+    for colour in (torch.zeros(2), torch.zeros(3, 1), torch.tensor([0.0, float("nan"), 1.0])):
+        with pytest.raises(InputError, match="expected a background of three finite numbers"):
+            render(gaussians, camera, colour, backend=backend)
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logits", "sh"])

@@ -337,7 +337,7 @@ def test_parameters_that_are_not_finite_are_refused_by_name(path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"flat": torch.zeros(0)}, "it holds no Gaussian"),
+        ({"flat": torch.zeros(0)}, "expected at least one Gaussian, got none"),
         ({"flat": torch.zeros(14, dtype=torch.float16)}, "'flat' is torch.float16"),
         ({"flat": torch.ones(1).expand(23 * 10**12)}, "does not hold its numbers one by one"),
         ({"flat": torch.zeros(23, device="meta")}, "does not hold its numbers one by one"),
