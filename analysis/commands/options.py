@@ -48,6 +48,8 @@ class MapOptions:
     Where RUN/probe holds eigenvectors, also e1 and e_min: the Gaussians' shares of them."""
     draw: UseAppendAction[tuple[str, ...]] = ()
     """A training view to draw, by name or by place (0 is the first); may be given again.  Default: all of them."""
+    seed: int = 0
+    """Seed of the pairs of neighbours whose swap is rendered."""
     scene: Unset[Path] = None
     """Folder of the scene: where it has moved since the training, or of another tool's file."""
     out: Unset[Path] = None
