@@ -17,7 +17,7 @@ from msgspec import Struct
 
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.json_files import read_json
-from analysis.records.provenance import Provenance
+from analysis.records.provenance import Machine, Provenance
 from analysis.records.quantities import Shade
 from analysis.records.schema import INDICES, Count, Number
 from landscape.errors import InputError
@@ -59,6 +59,14 @@ class Clock(Struct, kw_only=True):
     threads: Number = None
 
 
+class Made(Struct, kw_only=True):
+    """When, where and with which code, as in `Provenance`."""
+
+    created: str = ""
+    machine: Machine | None = None
+    commit: str | None = None
+
+
 class Scores(Struct, kw_only=True):
     """What a training came to; test: None without held-out views."""
 
@@ -66,6 +74,7 @@ class Scores(Struct, kw_only=True):
     train: ViewScores | None = None
     test: ViewScores | None = None
     seconds: Clock | None = None
+    provenance: Made | None = None
 
 
 class Seconds(Struct, kw_only=True):

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
+from landscape.results import Brief
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.settings import current_settings
@@ -50,8 +51,8 @@ LATER = {
 REMEDY = "take another copy of the file, or train anew"
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
+@dataclass(frozen=True, eq=False, repr=False)
+class Checkpoint(Brief):
     """A training as it was saved, the scene that it belongs to, and the version of torch that wrote it.
 
     origin: of another tool's file, what was assumed (`foreign_training`).

@@ -2,7 +2,8 @@
 
     scene, method, seed         where the row belongs; method: its name and the settings that were changed, as in
                                 "stablegs vsp_weight=0"
-    steps, views                of the training; how many views it was trained on
+    steps, views, size          of the training; how many views it was trained on, and of how many pixels
+    date, machine, commit       when and where it was scored, and with which code
     psnr, ssim, ...             as in a sweep's results.csv (`analysis.runs.sweep.sweep_results`): scores, Gaussians, seconds,
                                 threads, traces, ends of the spectrum and indices, those of the probe where the run has one
     lambda_second               the second largest eigenvalue
@@ -26,7 +27,7 @@ import pandas as pd
 from analysis.console.overrides import overridden
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
-from analysis.records.run_files import CHECKPOINT
+from analysis.records.run_files import CHECKPOINT, Made, read_scores
 from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
 from landscape.errors import InputError
 from splat.model.typed import leaves
@@ -74,11 +75,18 @@ def row_of(run: Path) -> dict[str, Any]:
         "method": method_name(config, checkpoint.scene.start),
         "seed": config.seed,
     }
-    row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train)} | metrics_of(run)
+    sizes = sorted({f"{width} x {height}" for width, height in checkpoint.scene.sizes})
+    row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train), "size": ", ".join(sizes)}
+    row |= metrics_of(run) | _made(run)
     if not (run / PROBE / ProbeRecord.FILE).is_file():
         return row
     data = read_record(run / PROBE, ProbeRecord).data
     return row | probe_of(run) | _more(data) if data.provenance.iteration == checkpoint.training.step else row
+
+
+def _made(run: Path) -> dict[str, str]:
+    made = read_scores(run).provenance or Made()
+    return {"date": made.created[:10], "machine": made.machine.cpu if made.machine else "", "commit": made.commit or ""}
 
 
 def method_name(config: TrainConfig, start: Source = "scene") -> str:
