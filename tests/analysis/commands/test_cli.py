@@ -434,11 +434,13 @@ def test_a_run_stands_for_its_checkpoint_and_a_checkpoint_for_its_run(tmp_path):
         ProbeOptions(run),
         SliceOptions(tmp_path / "none", (run,)),
         BenchOptions(run),
+        TrainOptions(tmp_path, from_=run),
         CompareOptions((run, run / "checkpoint.pt")),
     )
-    assert [at_files(options) for options in named] == [*named[:3], CompareOptions((run, run))]
+    assert [at_files(options) for options in named] == [*named[:4], CompareOptions((run, run))]
     (run / "checkpoint.pt").touch()
-    probe, line, bench, _ = (at_files(options) for options in named)
+    probe, line, bench, train, _ = (at_files(options) for options in named)
+    assert train == TrainOptions(tmp_path, from_=run / "checkpoint.pt")
     assert probe == ProbeOptions(run / "checkpoint.pt") and bench == BenchOptions(run / "checkpoint.pt")
     assert line == SliceOptions(tmp_path / "none", (run / "checkpoint.pt",))
 
