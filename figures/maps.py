@@ -156,7 +156,7 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
         whole = sheet.show(0, 0, maps["view"], f"Photograph, {literal(end.view.rpartition('/')[2])}")
         whole.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BLACK, linewidth=1.0))
         part = sheet.show(
-            0, 1, maps["photograph"], f"Carriers: {', '.join(percent(each.share) for each in end.carriers)}"
+            0, 1, maps["photograph"], f"Share of it: {', '.join(percent(each.share) for each in end.carriers)}"
         )
         for axes, shift in ((whole, (0, 0)), (part, (left, top))):
             for carrier in end.carriers:
@@ -203,7 +203,7 @@ def _draw(folder: Path, suffix: str, record: MapRecord, job: tuple[str, str]) ->
     else:
         panel = next(panel for panel in record.panels if panel.file == file)
         figure = draw(maps, panel, record) if kind == "view" else draw_fragility(maps, panel.place, record)
-    return save(figure, folder / f"{file.replace('view', kind)}.{suffix}")
+    return save(figure, folder / f"{file.replace('view', kind)}.{suffix}", compression=2)
 
 
 def main() -> None:

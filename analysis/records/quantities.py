@@ -61,7 +61,7 @@ def percent(share: float) -> str:
     """
     if 0 < share < 0.0005:
         return "less than 0.1%"
-    return f"{share:.1%}" if 0 < share < 0.01 or 0.99 < share < 1 else f"{share:.0%}"
+    return f"{share:.1%}" if 0 < share < 0.01 or 0.99 < share < 0.9995 else f"{share:.0%}"
 
 
 def limits(low: float | None, high: float | None) -> tuple[str, str]:
@@ -175,6 +175,10 @@ class Shade(Struct, frozen=True, kw_only=True):
             return np.log10(np.where(values > 0, values, np.nan))
         return np.arcsinh(values / self.soft) if self.scale == "signed" else values
 
+    def value(self, t: float) -> float:
+        """The inverse of `shown`."""
+        return 10.0**t if self.scale == "log" else self.soft * math.sinh(t) if self.scale == "signed" else t
+
     def share(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """How far t is from `low` to `high`, within [0, 1]; nan for what is not finite."""
         t = self.shown(values)
@@ -192,7 +196,7 @@ class Shade(Struct, frozen=True, kw_only=True):
         """
         if self.scale == "linear":
             return []
-        ends = [10.0**t if self.scale == "log" else self.soft * math.sinh(t) for t in (self.low, self.high)]
+        ends = [self.value(t) for t in (self.low, self.high)]
         most = max(map(abs, ends))
         sizes = most if self.scale == "signed" else ends[1]
         least = ends[0] if self.scale == "log" else self.soft / 3

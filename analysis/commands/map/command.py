@@ -85,7 +85,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         chosen = _chosen(options.draw, objective.views)
     with record_folder(out, MapRecord) as folder, stages:
         with stages.stage("fields") as report:
-            found = _fields(objective, options.checkpoint.parent / "probe", notes, report)
+            found = measured_fields(objective, options.checkpoint.parent / "probe", notes, report)
         if options.shown not in found.values:
             raise InputError(
                 f"expected a probe with eigenvectors of this checkpoint in {options.checkpoint.parent / 'probe'} for "
@@ -135,7 +135,7 @@ def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
     return sorted({places[name] for name in names}) or [*range(len(views))]
 
 
-def _fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
+def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
     """What the blocks and the views say, and the masses in the eigenvectors of the probe, where it is of this loss here."""
     values, sights = scene_fields(objective, report)
     ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, objective, notes)

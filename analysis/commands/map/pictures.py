@@ -17,16 +17,17 @@ from analysis.measures.steepest import in_bytes
 from analysis.records.quantities import Shade, share_in_bytes
 from splat.curvature.objective import SceneObjective
 from splat.model.camera import Camera
+from splat.model.gaussians import Gaussians
 from splat.render.render import render, render_layers
 
 LEAST = 0.02  # weight of a pixel's splats with a value, below which it has none
 WORST = 0.99  # of the errors: the end of their scale
 
 
-def rendered(objective: SceneObjective, index: int) -> Float[Tensor, "3 h w"]:
-    """A training view as the checkpoint has it, within [0, 1]."""
+def rendered(objective: SceneObjective, index: int, gaussians: Gaussians | None = None) -> Float[Tensor, "3 h w"]:
+    """A training view as the checkpoint has it, or other Gaussians, within [0, 1]."""
     camera = objective.views[index].camera
-    return render(objective.active, camera, objective.background, objective.settings).image.clamp(0, 1)
+    return render(gaussians or objective.active, camera, objective.background, objective.settings).image.clamp(0, 1)
 
 
 def error_shade(objective: SceneObjective) -> Shade:
