@@ -40,6 +40,7 @@ from splat.backend.device import device_named
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
+from splat.scenes.view import digests
 from splat.training.checkpoint import Checkpoint, open_checkpoint
 from splat.training.origin.foreign import Foreign
 
@@ -84,7 +85,8 @@ def _run(
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True, markup=False)
     told = (
-        f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {settings} "
+        f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} "
+        f"{digests(scene.select(checkpoint.scene.train))} {settings} "
         f"{options.seed} {device} {versions()}"
     )
     deadline = begun + limit - DRAWING
