@@ -24,6 +24,7 @@ from analysis.console.kept import kept_stages
 from analysis.console.options import ForeignOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
+from analysis.measures.memory import telling_needs
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
@@ -91,7 +92,12 @@ def _run(
     )
     deadline = begun + limit - DRAWING
     # a folder that is being written by another command, or cannot be, is noticed before anything is measured
-    with record_folder(out) if writes else nullcontext() as folder, stages, _kept(unfinished, command, console):
+    with (
+        record_folder(out) if writes else nullcontext() as folder,
+        stages,
+        _kept(unfinished, command, console),
+        telling_needs(objective),
+    ):
         generator = torch.Generator(device).manual_seed(options.seed)
         found = measure(objective, settings, generator, stages, None if ranks else unfinished, told, deadline)
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)

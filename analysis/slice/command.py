@@ -29,6 +29,7 @@ from torch import Tensor
 
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
+from analysis.measures.memory import telling_needs
 from analysis.probe.command import opened, scene_objective
 from analysis.probe.measurement import evaluation
 from analysis.probe.record import provenance_of
@@ -79,7 +80,7 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         others = [_other_end(checkpoint, path) for path in options.others]
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
     # a folder that is being written by another command, or cannot be, is noticed before anything is rendered
-    with record_folder(out, SliceRecord) as folder, stages:
+    with record_folder(out, SliceRecord) as folder, stages, telling_needs(objective):
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:
