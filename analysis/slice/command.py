@@ -46,7 +46,7 @@ from analysis.slice.directions import (
     axis_of,
     cosine,
     find_directions,
-    recorded_eigenvectors,
+    recorded_probe,
 )
 from analysis.slice.options import SliceOptions
 from analysis.slice.record import Found, slice_arrays, slice_record
@@ -138,8 +138,10 @@ def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list
             found.append(vectors.to(objective.active.flat.device))
         except InputError as error:
             notes.append(str(error))
-    recorded = recorded_eigenvectors(probe, objective, notes)
-    return found if recorded is None else [*found, recorded]
+    if recorded := recorded_probe(probe, objective, notes):
+        vectors = torch.from_numpy(recorded.arrays["eigenvectors"]["largest"])
+        found.append(vectors.to(objective.active.flat.device))
+    return found
 
 
 def _measure(

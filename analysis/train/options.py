@@ -31,11 +31,12 @@ class TrainOptions:
     """Divide width and height of the images by this factor, 1 or more, by averaging."""
     strict_frames: FlagCreatePairsOff[bool] = False
     """Refuse a transforms.json that lists frames without an image, instead of skipping these."""
-    start: Unset[Literal["scene", "points", "triangulated", "random", "box"]] = None
+    start: Unset[Literal["scene", "points", "triangulated", "dense", "random", "box"]] = None
     """What the Gaussians start from.  Default: scene, or that of the --protocol.
     scene: points where there are any, else random.
     points: the points of the scene's files that at least two training views see.
     triangulated: points found in the training views alone, given their poses.
+    dense: a point for most of what two training views show, by a plane sweep.
     random: random points in the volume that the training views have in common.
     box: random points in the box of the scene's points."""
     from_: Annotated[Unset[Path], arg(name="from")] = None

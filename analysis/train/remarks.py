@@ -22,6 +22,7 @@ HOW_TO_START: dict[Source, str] = {
     "box": "the published training does so; --start scene begins at the scene's own points",
     "random": "`landscape sfm PHOTOS` makes a scene with points, and --start triangulated finds some in the training views",
     "triangulated": "take more --views or larger images, or --start random",
+    "dense": "take more --views or larger images, or --start random",
     "points": "take more --views, or --start triangulated or random",
 }
 

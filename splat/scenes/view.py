@@ -19,13 +19,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.results import Brief
 from splat.model.camera import Camera
 
 Subset = Literal["train", "test"]
 
 
-@dataclass(frozen=True, eq=False)
-class View:
+@dataclass(frozen=True, eq=False, repr=False)
+class View(Brief):
     """A camera and its picture.  InputError where their sizes differ.
 
     alpha: coverage in [0, 1] where the file has an alpha channel.  mask: the pixels that metrics count, where the scene

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
+from landscape.results import Brief
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.settings import current_settings
@@ -50,8 +51,8 @@ LATER = {
 REMEDY = "take another copy of the file, or train anew"
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
+@dataclass(frozen=True, eq=False, repr=False)
+class Checkpoint(Brief):
     """A training as it was saved, the scene that it belongs to, and the version of torch that wrote it.
 
     origin: of another tool's file, what was assumed (`foreign_training`).
@@ -220,17 +221,18 @@ def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:
     return loaded
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
+def load_checkpoint(path: str | Path) -> Checkpoint:
     """Read a checkpoint, its tensors on the CPU.
 
     OSError where there is none or the system does not give it, MemoryError or torch's where memory is short; InputError, which
     says what is wrong with it, where it is damaged or of another kind.
 
-    >>> load_checkpoint(Path("nowhere/checkpoint.pt"))
+    >>> load_checkpoint("nowhere/checkpoint.pt")
     Traceback (most recent call last):
         ...
     FileNotFoundError: expected a checkpoint written by landscape train at nowhere/checkpoint.pt, found no such file
     """
+    path = Path(path)
     if not path.is_file():
         found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
         raise FileNotFoundError(f"{KIND} at {path}, found {found}")

@@ -3,6 +3,7 @@
 points      points: the scene's, from structure from motion, those seen by at least two of the training views.  All of
                 the scene's photographs helped to place them, the test views too
             triangulated: from the training views alone, their poses given (`splat/scenes/sfm/triangulation.py`)
+            dense: from the training views alone, by a plane sweep (`splat/scenes/sfm/plane_sweep.py`)
             random: a random pixel of a random training view at a depth uniform between near and far, kept where at
                 least two views see it and no view is transparent there (alpha 0), in that pixel's colour.  near, far:
                 the scene files' depth range, else half and one and a half times the camera's distance to the place that
@@ -35,10 +36,11 @@ from splat.model.capture import common_target
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.scenes.scene import Scene
+from splat.scenes.sfm.plane_sweep import dense_points
 from splat.scenes.sfm.triangulation import triangulated_points
 from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
 
-Source = Literal["scene", "points", "triangulated", "random", "box"]
+Source = Literal["scene", "points", "triangulated", "dense", "random", "box"]
 OPACITY = 0.1
 NEIGHBOURS = 3
 SMALLEST_SCALE = sqrt(1e-7)  # of the median scale: for points that all but coincide with three others
@@ -71,9 +73,11 @@ def initial_gaussians(
         return gaussians_from_points(points_in_box(scene.points, generator), views, sh_degree, seen_by=0)
     if source == "triangulated":
         return gaussians_from_points(triangulated_points(views), views, sh_degree)
-    if source != "random" and scene.points is not None:
+    if source in ("scene", "points") and scene.points is not None:
         return gaussians_from_points(scene.points, views, sh_degree)
-    ranges = [frame.depth_range for frame in scene.select([view.name for view in views])]
+    ranges = depth_ranges(views, [frame.depth_range for frame in scene.select([view.name for view in views])])
+    if source == "dense":
+        return gaussians_from_points(dense_points(views, [near for near, _ in ranges]), views, sh_degree)
     points = points_in_common_volume(views, random_points, generator, ranges)
     return gaussians_from_points(points, views, sh_degree)
 
@@ -133,20 +137,17 @@ def points_in_box(points: Points, generator: torch.Generator) -> Points:
     return Points(corner + BOX_SHARE * sides * places, torch.full((n, 3), 0.5))
 
 
-def points_in_common_volume(
-    views: Sequence[View],
-    n: int,
-    generator: torch.Generator,
-    depth_ranges: Sequence[tuple[float, float] | None] | None = None,
-) -> Points:
-    """n random points that SEEN_BY of the views see, and none as transparent.
+def depth_ranges(views: Sequence[View], given: Sequence[tuple[float, float] | None]) -> list[tuple[float, float]]:
+    """The least and greatest z of what each view shows, world units: as given, else by where the cameras look."""
+    return [own or _range_around_target(views, view.camera) for view, own in zip(views, given, strict=True)]
 
-    depth_ranges: (near, far) of each view, world units; None derives it from where the cameras look.
-    """
+
+def points_in_common_volume(
+    views: Sequence[View], n: int, generator: torch.Generator, ranges: Sequence[tuple[float, float]]
+) -> Points:
+    """n random points that SEEN_BY of the views see, and none as transparent.  ranges: see `depth_ranges`."""
     if n < 1:
         raise InputError(f"expected at least 1 random point, got {n}")
-    given = depth_ranges or [None] * len(views)
-    ranges = [own or _range_around_target(views, view.camera) for view, own in zip(views, given, strict=True)]
     needed, kept, draws = min(SEEN_BY, len(views)), [], 0
     while (found := sum(len(xyz) for xyz, _ in kept)) < n:
         if draws >= MAX_DRAWS * n:
@@ -195,7 +196,7 @@ def _range_around_target(views: Sequence[View], camera: Camera) -> tuple[float, 
     """Depths round the point that is nearest to all optical axes."""
     if len(views) == 1:
         raise InputError(
-            "expected at least 2 training views for random points, got 1: one alone does not say how far away the scene is; "
+            "expected at least 2 training views, got 1: one alone does not say how far away the scene is; "
             "take more views, or start from points (COLMAP), or give depth ranges (poses_bounds.npy)"
         )
     target = common_target([view.camera for view in views])

@@ -2,7 +2,8 @@
 
     scene, method, seed         where the row belongs; method: its name and the settings that were changed, as in
                                 "stablegs vsp_weight=0"
-    steps, views                of the training; how many views it was trained on
+    steps, views, size          of the training; how many views it was trained on, and of how many pixels
+    date, machine, commit       when and where it was scored, and with which code
     psnr, ssim, ...             as in a sweep's results.csv (`analysis.runs.sweep.sweep_results`): scores, Gaussians, seconds,
                                 threads, traces, ends of the spectrum and indices, those of the probe where the run has one
     lambda_second               the second largest eigenvalue
@@ -23,14 +24,17 @@ from typing import Any
 
 import pandas as pd
 
+from analysis.console.overrides import overridden
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
-from analysis.records.run_files import CHECKPOINT
+from analysis.records.run_files import CHECKPOINT, Made, read_scores
 from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
 from landscape.errors import InputError
 from splat.model.typed import leaves
 from splat.training.checkpoint import load_checkpoint
-from splat.training.state import MethodSettings, TrainConfig
+from splat.training.methods.protocols import presets
+from splat.training.start import Source
+from splat.training.state import TrainConfig
 
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
@@ -68,27 +72,41 @@ def row_of(run: Path) -> dict[str, Any]:
     config, row = checkpoint.training.config, {}
     row |= {
         "scene": Path(checkpoint.scene.absolute).name,
-        "method": method_name(config.method, config),
+        "method": method_name(config, checkpoint.scene.start),
         "seed": config.seed,
     }
-    row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train)} | metrics_of(run)
+    sizes = sorted({f"{width} x {height}" for width, height in checkpoint.scene.sizes})
+    row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train), "size": ", ".join(sizes)}
+    row |= metrics_of(run) | _made(run)
     if not (run / PROBE / ProbeRecord.FILE).is_file():
         return row
     data = read_record(run / PROBE, ProbeRecord).data
     return row | probe_of(run) | _more(data) if data.provenance.iteration == checkpoint.training.step else row
 
 
-def method_name(method: MethodSettings, config: TrainConfig) -> str:
-    """The method and what was changed of it; what it scales to the length of the training is not changed.
+def _made(run: Path) -> dict[str, str]:
+    made = read_scores(run).provenance or Made()
+    return {"date": made.created[:10], "machine": made.machine.cpu if made.machine else "", "commit": made.commit or ""}
+
+
+def method_name(config: TrainConfig, start: Source = "scene") -> str:
+    """The method, its start and protocol where they are not the usual ones, and what was changed of its settings.
+
+    What a method scales to the length of the training is not changed.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS
-    >>> config = TrainConfig(iterations=500)
-    >>> method_name(StableGS(vsp_weight=0.0, warm_up=50), config), method_name(StableGS(warm_up=3), config)
-    ('stablegs vsp_weight=0', 'stablegs warm_up=3')
+    >>> method_name(TrainConfig(500, method=StableGS(vsp_weight=0.0, warm_up=50))), method_name(TrainConfig(), "dense")
+    ('stablegs vsp_weight=0', '3dgs start=dense')
     """
-    published = leaves(asdict(type(method)().scaled(config).method))
-    changed = [f"{name}={_text(value)}" for name, value in leaves(asdict(method)).items() if value != published[name]]
-    return " ".join([method.name, *changed])
+    name, preset = config.method.name, presets(config.method.name, config.protocol)
+    usual = TrainConfig(iterations=config.iterations, method=type(config.method)())
+    usual = overridden(usual, {key: value for key, value in preset.items() if key != "start"})
+    published = leaves(asdict(usual.method.scaled(usual).method))
+    settings = leaves(asdict(config.method))
+    changed = [f"{key}={_text(value)}" for key, value in settings.items() if value != published[key]]
+    started = [f"start={start}"] if start != preset.get("start", "scene") else []
+    protocol = [f"protocol={config.protocol}"] if preset else []
+    return " ".join([name, *started, *protocol, *changed])
 
 
 def _text(value: Any) -> str:

@@ -15,6 +15,7 @@ from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_A
 from analysis.runs.claims.study import method_name, study
 from analysis.runs.sweep.sweep_file import read_sweep
 from splat.training.methods.methods import METHODS
+from splat.training.methods.protocols import presets
 from splat.training.state import TrainConfig
 
 LARGER = ("literal", "saddle", "share", "mass_quantile")  # the more anisotropic
@@ -147,11 +148,27 @@ def test_a_table_of_something_else_and_a_run_named_twice_are_refused(tmp_path, c
         assert "expected" in capsys.readouterr().err
 
 
+def test_a_protocol_is_named_and_not_its_settings():
+    config = TrainConfig(3000, protocol="llff", method=METHODS["fsgs"]())
+    config = overridden(config, presets("fsgs", "llff"))
+    config = config.method.scaled(config)
+    assert method_name(config) == "fsgs protocol=llff"
+    assert method_name(overridden(config, {"neighbours": "4"})) == "fsgs protocol=llff neighbours=4"
+
+
 def test_the_study_in_the_repository_decides_every_statement():
     names = set()
     for cell in read_sweep(Path(__file__).parents[3] / "notebooks" / "study.toml").cells:
         config = TrainConfig(iterations=cell.steps, method=METHODS[cell.training.method]())
         config = overridden(config, assignments(cell.training.set))
-        names.add(method_name(config.method, config))
-    needed = {"3dgs", "stablegs", "stablegs viewpoints=one", ATTRIBUTES_ALONE, VIEWPOINTS_ALONE}
+        names.add(method_name(config, cell.training.start or "scene"))
+    needed = {
+        "3dgs",
+        "stablegs",
+        "3dgs start=dense",
+        "stablegs start=dense",
+        "stablegs viewpoints=one",
+        ATTRIBUTES_ALONE,
+        VIEWPOINTS_ALONE,
+    }
     assert needed | {AXIS.format(name) for name in ATTRIBUTES} <= names

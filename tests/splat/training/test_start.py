@@ -19,6 +19,7 @@ from splat.scenes.splits import split_scene
 from splat.scenes.view import Frame, Points, View, inside_image
 from splat.training.start import (
     Source,
+    depth_ranges,
     gaussians_from_points,
     initial_gaussians,
     points_in_box,
@@ -129,9 +130,13 @@ def test_too_few_points_are_refused_with_their_number() -> None:
         gaussians_from_points(few, views())
 
 
+def ranges_of(seen: list[View]) -> list[tuple[float, float]]:
+    return depth_ranges(seen, [None] * len(seen))
+
+
 def test_random_points_lie_where_two_views_see_them_in_a_pixels_colour() -> None:
     chosen = views()
-    points = points_in_common_volume(chosen, 500, torch.Generator().manual_seed(0))
+    points = points_in_common_volume(chosen, 500, torch.Generator().manual_seed(0), ranges_of(chosen))
     assert len(points) == 500
     # half and one and a half times the distance to the origin, where all look
     inside = torch.stack([inside_image(view.camera, points.xyz, (2.0, 6.0)) for view in chosen], dim=1)
@@ -152,7 +157,7 @@ def test_random_points_keep_out_of_what_a_view_shows_as_transparent() -> None:
     for view in views():
         v, u = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(32) + 0.5, indexing="ij")
         seen.append(replace(view, alpha=((u - 16).square() + (v - 12).square() < 6**2).float()))
-    points = points_in_common_volume(seen, 300, torch.Generator().manual_seed(0)).xyz
+    points = points_in_common_volume(seen, 300, torch.Generator().manual_seed(0), ranges_of(seen)).xyz
     for view in seen:
         x, y, z = ((points - view.camera.centre) @ view.camera.rotation.T).unbind(-1)
         at = torch.stack([40 * x / z + 16, 40 * y / z + 12], dim=1)
@@ -171,7 +176,8 @@ def test_random_depths_are_uniform_between_near_and_far() -> None:
 
 def test_the_generator_decides_the_points() -> None:
     first, again, other = (
-        points_in_common_volume(views(), 50, torch.Generator().manual_seed(seed)).xyz for seed in (1, 1, 2)
+        points_in_common_volume(views(), 50, torch.Generator().manual_seed(seed), ranges_of(views())).xyz
+        for seed in (1, 1, 2)
     )
     assert torch.equal(first, again) and not torch.equal(first, other)
 
@@ -197,16 +203,14 @@ def test_a_box_of_random_points_begins_at_the_twentieth_coordinate(monkeypatch: 
 
 def test_parallel_cameras_need_a_depth_range() -> None:
     with pytest.raises(ValueError, match="parallel or diverging"):
-        points_in_common_volume(views(parallel=True), 10, torch.Generator())
+        ranges_of(views(parallel=True))
     ranges = [(3.0, 5.0)] * 3
     assert len(points_in_common_volume(views(parallel=True), 10, torch.Generator(), ranges)) == 10
 
 
 def test_one_view_alone_needs_a_depth_range_and_says_so() -> None:
-    with pytest.raises(
-        ValueError, match=r"at least 2 training views for random points, got 1: .*; take more views, or"
-    ) as caught:
-        points_in_common_volume(views((0,)), 10, torch.Generator())
+    with pytest.raises(ValueError, match=r"at least 2 training views, got 1: .*; take more views, or") as caught:
+        ranges_of(views((0,)))
     assert "parallel" not in str(caught.value)
     assert len(points_in_common_volume(views((0,)), 10, torch.Generator(), [(3.0, 5.0)])) == 10
 
@@ -275,5 +279,9 @@ def test_the_source_of_the_points_can_be_chosen(monkeypatch: pytest.MonkeyPatch)
     triangulated = gaussians_from_points(elsewhere, views()).flat
     for scene in (with_points, without):
         assert torch.equal(start(scene, "triangulated"), triangulated)
+    monkeypatch.setattr(
+        "splat.training.start.dense_points", lambda chosen, near: elsewhere if near == [3.0] * 3 else None
+    )
+    assert torch.equal(start(with_points, "dense"), triangulated)
     with pytest.raises(ValueError, match="scene with points, s has none; start from triangulated or random ones"):
         start(without, "points")
