@@ -49,6 +49,19 @@ def read_array(file: BinaryIO) -> np.ndarray:
         raise InputError(f"no array of numbers ({error})") from error
 
 
+def inside(folder: Path, name: str) -> Path:
+    """The file of this name in a folder.  InputError where a name of someone else's file leads out of it."""
+    path = folder / name
+    by_name = Path(os.path.abspath(path)).is_relative_to(
+        os.path.abspath(folder)
+    )  # links in it may lead where they will
+    if not by_name and not path.resolve().is_relative_to(folder.resolve()):
+        raise InputError(
+            f"expected names of files in {folder}, got {name!r}, which leads out of it; move the file there"
+        )
+    return path
+
+
 @contextmanager
 def locked(path: Path, what: str) -> Iterator[int]:
     """Hold the file at `path`, made for this and removed in the end; gives its descriptor, with which a child holds it too.
