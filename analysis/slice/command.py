@@ -58,6 +58,7 @@ from splat.backend.device import device_named
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
+from splat.model.untrusted import read_array
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
@@ -134,7 +135,7 @@ def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list
     if kept.is_file():
         try:
             with kept.open("rb") as stream, refusing_damage("eigenvectors", kept, "they were computed again"):
-                vectors = torch.from_numpy(np.load(stream, allow_pickle=False))
+                vectors = torch.from_numpy(read_array(stream))
             found.append(vectors.to(objective.active.flat.device))
         except InputError as error:
             notes.append(str(error))

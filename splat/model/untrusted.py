@@ -9,6 +9,7 @@ import os
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from math import prod
 from pathlib import Path
 from typing import BinaryIO
@@ -30,15 +31,28 @@ def require_modest(archive: zipfile.ZipFile) -> None:
         raise InputError(f"it promises {held:,} bytes in a file of {size:,}")
 
 
+def require_held(file: BinaryIO, size: int) -> np.dtype:
+    """The type of an array that `numpy.save` wrote into so many bytes, without the array.
+
+    ValueError, or whatever NumPy raises, where the header is none, or promises more than there is, for which NumPy would ask
+    memory at once.
+    """
+    version = np.lib.format.read_magic(file)
+    start = file.read(2 if version == (1, 0) else 4)
+    length = int.from_bytes(start, "little")
+    if length > size:
+        raise ValueError(f"it promises a header of {length:,} bytes in {size:,}")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = read(BytesIO(start + file.read(length)))
+    if min(shape, default=0) < 0 or prod(shape) * kind.itemsize > size:
+        raise ValueError(f"it promises {kind} of shape {shape} in {size:,} bytes")
+    return kind
+
+
 def read_array(file: BinaryIO) -> np.ndarray:
     """Real numbers that `numpy.save` wrote.  InputError where the file has others, none, or fewer than it promises."""
-    size = os.fstat(file.fileno()).st_size
     try:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, kind = read(file)
-        if min(shape, default=0) < 0 or prod(shape) * kind.itemsize > size:
-            raise ValueError(f"it promises {kind} of shape {shape} in {size:,} bytes")
+        kind = require_held(file, os.fstat(file.fileno()).st_size)
         if kind.kind not in "fiu":
             raise InputError(f"an array of {kind}, not of real numbers")
         file.seek(0)

@@ -62,11 +62,11 @@ def test_a_probe_in_little_memory_says_what_it_needs_and_what_would_fit(tmp_path
     assert main(["train", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--iterations", "1"]) == 0
     program = (
         "import resource, sys\nimport psutil\nimport analysis.probe.command as command\n"
-        "from analysis.commands.cli import main\nmade = command.scene_objective\n"
-        "def limited(*given, **more):\n    found = made(*given, **more)\n    found.linearized\n"
+        "from analysis.commands.cli import main\nmeasure = command.measure\n"
+        "def limited(objective, *more):\n    objective.linearized\n"
         "    limit = psutil.Process().memory_info().vms + 2**20\n"
-        "    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))\n    return found\n"
-        "command.scene_objective = limited\nsys.exit(main(sys.argv[1:]))"
+        "    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))\n    return measure(objective, *more)\n"
+        "command.measure = limited\nsys.exit(main(sys.argv[1:]))"
     )
     words = ["probe", str(tmp_path / "run/checkpoint.pt"), "--quick"]
     done = subprocess.run([sys.executable, "-c", program, *words], cwd=ROOT, capture_output=True, text=True)
