@@ -13,6 +13,7 @@ from analysis.commands.map.files import colours
 from analysis.commands.map.pictures import composited
 from analysis.records.quantities import Shade
 from analysis.records.run_files import read_map
+from analysis.runs.claims.study import row_of
 from splat.curvature.fields import FIELDS, scene_fields
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import read_splats
@@ -82,6 +83,21 @@ def test_pictures_are_drawn_of_the_views_that_were_asked_for(folder):
         with np.load(folder / "map" / f"{panel.file}.npz") as maps:
             assert maps["photograph"].shape == (16, 24, 3) and maps["largest"].shape == maps["error"].shape == (16, 24)
         assert Image.open(folder / "map" / f"{panel.file}.png").width > 800
+
+
+def test_claims_read_what_the_map_of_a_run_found(folder):
+    words = [
+        str(folder / "in.ply"),
+        str(folder / "run" / "checkpoint.pt"),
+        "--scene",
+        str(folder / "scene"),
+        "--views",
+        "all",
+    ]
+    assert main(["convert", *words]) == 0 and main(["map", str(folder / "run"), "--draw", "0"]) == 0
+    found = row_of(folder / "run")["opacity_one_view"]
+    assert found == read_map(folder / "run" / "map").fragility.opacity_one_view and -1 <= found <= 1
+    assert found == read_map(folder / "map").fragility.opacity_one_view
 
 
 def test_a_field_is_composited_with_the_weights_of_the_splats():
