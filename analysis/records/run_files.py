@@ -53,11 +53,13 @@ class ViewScores(Struct, kw_only=True):
 
 
 class Clock(Struct, kw_only=True):
-    """Seconds by the clock and of all processors together; threads that a kernel might use, None where that changed."""
+    """Seconds by the clock and of all processors together; threads that a kernel might use, None where that changed; peak:
+    the most bytes of memory that the process held."""
 
     wall: Number = None
     cpu: Number = None
     threads: Number = None
+    peak: Number = None
 
 
 class Made(Struct, kw_only=True):
@@ -85,6 +87,7 @@ class Seconds(Struct, kw_only=True):
     wall: float
     cpu: float
     threads: int | None = None
+    peak: int | None = None
 
 
 class Comparison(Struct, kw_only=True):

@@ -11,7 +11,7 @@
     needles, needle_count       share of the steepest eigenvector's squared mass on Gaussians with kappa above 100, and share of
                                 the visible Gaussians that these are
     opacity_one_view            rank correlation of a Gaussian's curvature in opacity with the share of its weight that one view
-                                alone sees, where `landscape map` has found it
+                                sees; where `landscape map` has been run
     hutchinson_ATTRIBUTE        the least relative standard error that ten Gaussian samples of the block's trace can have,
                                 sqrt(2 / (10 r)), r the upper end of the block's effective rank; where families were measured
 
@@ -29,7 +29,7 @@ import pandas as pd
 from analysis.console.overrides import overridden
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
-from analysis.records.run_files import CHECKPOINT, MAP, Made, MapRecord, read_map, read_scores
+from analysis.records.run_files import CHECKPOINT, Made, MapRecord, read_map, read_scores
 from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
 from landscape.errors import InputError
 from splat.model.typed import leaves
@@ -79,11 +79,7 @@ def row_of(run: Path) -> dict[str, Any]:
     }
     sizes = sorted({f"{width} x {height}" for width, height in checkpoint.scene.sizes})
     row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train), "size": ", ".join(sizes)}
-    row |= metrics_of(run) | _made(run)
-    if (run / MAP / MapRecord.FILE).is_file():
-        found = read_map(run / MAP)
-        if found.provenance.iteration == checkpoint.training.step:
-            row["opacity_one_view"] = _number(found.fragility.opacity_one_view)
+    row |= metrics_of(run) | _made(run) | _of_map(run)
     if not (run / PROBE / ProbeRecord.FILE).is_file():
         return row
     data = read_record(run / PROBE, ProbeRecord).data
@@ -93,6 +89,12 @@ def row_of(run: Path) -> dict[str, Any]:
 def _made(run: Path) -> dict[str, str]:
     made = read_scores(run).provenance or Made()
     return {"date": made.created[:10], "machine": made.machine.cpu if made.machine else "", "commit": made.commit or ""}
+
+
+def _of_map(run: Path) -> dict[str, float]:
+    if not (run / MapRecord.COMMAND / MapRecord.FILE).is_file():
+        return {}
+    return {"opacity_one_view": _number(read_map(run / MapRecord.COMMAND).fragility.opacity_one_view)}
 
 
 def method_name(config: TrainConfig, start: Source = "scene") -> str:

@@ -125,6 +125,19 @@ def test_what_predicts_the_score_is_found_and_noise_is_not():
     assert (found.loc["lambda_min", "high"] > 0).all()
 
 
+def test_a_map_of_a_run_adds_what_one_view_sees(tmp_path, monkeypatch):
+    from types import SimpleNamespace
+
+    from analysis.runs.claims import study as module
+
+    found = SimpleNamespace(fragility=SimpleNamespace(opacity_one_view=0.25))
+    monkeypatch.setattr(module, "read_map", lambda folder: found if folder == tmp_path / "map" else None)
+    assert module._of_map(tmp_path) == {}
+    (tmp_path / "map").mkdir()
+    (tmp_path / "map" / "map.json").touch()
+    assert module._of_map(tmp_path) == {"opacity_one_view": 0.25}
+
+
 def test_the_command_reads_a_table_and_draws(tmp_path, capsys):
     made_up(PAPER).to_csv(tmp_path / "study.csv", index=False)
     assert main(["claims", str(tmp_path / "study.csv")]) == 0
