@@ -153,6 +153,15 @@ def at_files(options: Options) -> Options:
 
 def run(options: Options, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand."""
+    if isinstance(options, TrainOptions | ProbeOptions | SliceOptions | MapOptions | DemoOptions):
+        from analysis.commands.compiling import compiling_is_said
+
+        with compiling_is_said(Console(stderr=True)):
+            return _run(options, arguments)
+    return _run(options, arguments)
+
+
+def _run(options: Options, arguments: Sequence[str]) -> int:
     match options:
         case SfmOptions():
             from analysis.commands.sfm import run_sfm

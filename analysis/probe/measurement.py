@@ -74,7 +74,7 @@ LEFT_OUT = {
 }
 MOST_AT_ONCE = 4  # start vectors
 # what a stage takes on two real scenes, as products with MOST_AT_ONCE vectors and as renders of all views
-TYPICAL = {"traces": (12, 0), "eigenvalues": (10, 0), "slice": (0, 180), "depth": (2, 50)}
+TYPICAL: dict[str, tuple[int, int]] = {"traces": (12, 0), "eigenvalues": (10, 0), "slice": (0, 180), "depth": (2, 50)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +222,10 @@ def _seconds_of_product(hessian: SceneHessian) -> float:
 def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str, float]:
     """Seconds that every stage is expected to take, from those of a product and of a render."""
     work = dict(TYPICAL)
+    if settings.trace_samples:
+        work["traces"] = (settings.trace_samples // 2, 0)
+    if not settings.slice_plane:
+        work["slice"] = (0, 2 * settings.slice_points)
     if settings.density_matvecs:
         work["density"] = (settings.density_matvecs // MOST_AT_ONCE, 0)
     if settings.power_apart:

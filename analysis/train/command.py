@@ -38,7 +38,7 @@ from analysis.train.scores import PLAIN, report
 from analysis.train.source import from_checkpoint
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
-from landscape.errors import InputError
+from landscape.errors import InputError, did_you_mean
 from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
 from splat.model.typed import leaves, typed
@@ -208,7 +208,8 @@ def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
 def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
     red, green, blue = scene.background.tolist()
     if options.method not in METHODS:
-        raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}")
+        meant = did_you_mean(options.method, METHODS)
+        raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}{meant}")
     config = TrainConfig(
         iterations=TrainConfig.iterations if options.iterations is None else options.iterations,
         seed=options.seed,

@@ -233,14 +233,24 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     if not path.is_file():
-        found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
-        raise FileNotFoundError(f"{KIND} at {path}, found {found}")
+        raise FileNotFoundError(f"{KIND} at {path}, found {_instead(path)}")
     with path.open("rb") as file:  # one file throughout: a training may replace it meanwhile
         content = _read(file, path)
     try:
         return _checkpoint(content)
     except InputError as error:
         raise InputError(f"{KIND}, got {path}: {error}; {REMEDY}") from error
+
+
+def _instead(path: Path) -> str:
+    """What there is in place of a checkpoint, and what to name."""
+    if not path.is_dir():
+        return "no such file"
+    if (inside := path / "checkpoint.pt").is_file():
+        return f"a folder; name the {inside} in it"
+    if runs := sorted(path.glob("*/checkpoint.pt")):
+        return f"a folder of {len(runs)} runs; name one of them, such as {runs[0].parent}"
+    return "a folder without one; name the run that landscape train wrote, its --out"
 
 
 def _read(file: BinaryIO, path: Path) -> Any:
