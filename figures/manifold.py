@@ -114,8 +114,6 @@ def landscape_of(run: Path) -> Plane:
 
 
 def _record_of(run: Path) -> Record:
-    if not (run / CHECKPOINT).is_file():
-        raise FileNotFoundError(f"expected a run of `landscape train` in {run}, found no {CHECKPOINT} there")
     for name, kind in SLICES:
         if (run / name / kind.FILE).is_file():
             found = read_record(run / name, kind)
@@ -126,6 +124,8 @@ def _record_of(run: Path) -> Record:
                 )
             if found.data.slice is None or found.data.slice.is_resolved:
                 return found
+    if not (run / CHECKPOINT).is_file():
+        raise FileNotFoundError(f"expected a run of `landscape train` in {run}, found no {CHECKPOINT} there")
     raise FileNotFoundError(
         f"expected a slice of {run} in {' or '.join(str(run / name) for name, _ in SLICES)}, with a surface, "
         f"found none; {_slice(run)}"
@@ -134,7 +134,8 @@ def _record_of(run: Path) -> Record:
 
 def start_of(run: Path) -> Plane:
     """Landscape of where a run began."""
-    if not (run / START / CHECKPOINT).is_file():
+    recorded = any((run / START / name / kind.FILE).is_file() for name, kind in SLICES)
+    if not recorded and not (run / START / CHECKPOINT).is_file():
         raise FileNotFoundError(
             f"expected the start of the run in {run / START / CHECKPOINT}, found none; train anew with --probe-every, "
             f"which keeps it, then {_slice(run / START)}"
