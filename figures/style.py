@@ -78,14 +78,17 @@ def new_figure(height: float, width: float = COLUMN) -> Figure:
     return Figure(figsize=(width, height), layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.05))
 
 
-def save(figure: Figure, path: str | Path) -> Path:
-    """Write the figure (PNG, PDF or SVG by its suffix) so that `path` is the old file or the whole new one."""
+def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:
+    """Write the figure (PNG, PDF or SVG by its suffix) so that `path` is the old file or the whole new one.
+
+    compression: of a PNG, 0 to 9; of photographs a low one takes a fifth of the time for a few percent more bytes.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
     with style():
         if path.suffix == ".png":  # the same bytes as savefig's, which draws twice: once for the layout alone
-            FigureCanvasAgg(figure).print_png(temporary)
+            FigureCanvasAgg(figure).print_png(temporary, pil_kwargs={"compress_level": compression})
         else:
             figure.savefig(temporary)
     temporary.replace(path)

@@ -12,8 +12,10 @@ Every estimator returns a frozen dataclass: each number with its error, and the 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from math import isfinite
+from pathlib import Path
+from textwrap import fill
 from typing import Any, Literal
 
 from jaxtyping import Float64
@@ -25,6 +27,7 @@ StopReason = Literal[
 ]
 Sign = Literal["positive", "negative", "zero", "undetermined"]
 Number = float | None
+LINE, SHORT = 100, 60  # characters of a line, and of a list in it
 
 Progress = Callable[[int, int, str], None]
 """progress(done, most, state): units of work done, the largest possible number of them, the estimate so far in words."""
@@ -50,6 +53,33 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     return finite_or_none(value) if isinstance(value, float) else value
+
+
+class Brief:
+    """A dataclass, made with repr=False, that fits on three lines of a terminal: of large parts their kind and shape."""
+
+    def __repr__(self) -> str:
+        parts = [f"{field.name}={_brief(getattr(self, field.name))}" for field in fields(self)]  # pyright: ignore[reportArgumentType]
+        text = f"{type(self).__name__}({', '.join(parts)})"
+        return fill(text, LINE, max_lines=3, placeholder=" ...", subsequent_indent="  ", break_on_hyphens=False)
+
+
+def _brief(value: Any) -> str:
+    """
+    >>> import torch
+    >>> _brief(torch.zeros(3, 4)), _brief([1, 2]), _brief(Bracket(2.0, 1.5, 3.0)), _brief(Path("runs"))
+    ('float32 3 x 4', '[1, 2]', '2 in [1.5, 3]', "'runs'")
+    """
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')} {' x '.join(map(str, value.shape)) or 'scalar'}"
+    if isinstance(value, Bracket):
+        return str(value)
+    if isinstance(value, str | Path):
+        return repr(str(value))
+    if isinstance(value, list | tuple | dict):
+        text = repr(value) if all(isinstance(item, str | int | float) for item in value) else ""
+        return text if 0 < len(text) <= SHORT else f"{type(value).__name__} of {len(value)}"
+    return repr(value) if value is None or isinstance(value, str | bool | int | float) else type(value).__name__
 
 
 def t_quantile(freedom: float, confidence: float) -> float:

@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 
 from analysis.bench.options import BenchOptions
-from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions
+from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions, ViewOptions
 from analysis.console.failures import report
 from analysis.console.interruption import ignored, raising
 from analysis.probe.options import ProbeOptions
@@ -35,6 +35,7 @@ COMMANDS = {
     "probe": ProbeOptions,
     "slice": SliceOptions,
     "map": MapOptions,
+    "view": ViewOptions,
     "compare": CompareOptions,
     "claims": ClaimsOptions,
     "convert": ConvertOptions,
@@ -49,6 +50,7 @@ Options = (
     | ProbeOptions
     | SliceOptions
     | MapOptions
+    | ViewOptions
     | CompareOptions
     | ClaimsOptions
     | ConvertOptions
@@ -138,7 +140,7 @@ def _parsed(arguments: Sequence[str]) -> Options:
 def at_files(options: Options) -> Options:
     """A run folder stands for its checkpoint where one is asked for, and a checkpoint for its run."""
     changes: dict[str, object] = {}
-    for name in ("checkpoint", "subject"):
+    for name in ("checkpoint", "subject", "from_"):
         path = getattr(options, name, None)
         if isinstance(path, Path) and (path / CHECKPOINT).is_file():
             changes[name] = path / CHECKPOINT
@@ -151,6 +153,15 @@ def at_files(options: Options) -> Options:
 
 def run(options: Options, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand."""
+    if isinstance(options, TrainOptions | ProbeOptions | SliceOptions | MapOptions | DemoOptions):
+        from analysis.commands.compiling import compiling_is_said
+
+        with compiling_is_said(Console(stderr=True)):
+            return _run(options, arguments)
+    return _run(options, arguments)
+
+
+def _run(options: Options, arguments: Sequence[str]) -> int:
     match options:
         case SfmOptions():
             from analysis.commands.sfm import run_sfm
@@ -182,6 +193,10 @@ def run(options: Options, arguments: Sequence[str]) -> int:
                 from analysis.commands.map.command import run_map
 
                 return run_map(options, ["landscape", *arguments], drawn)
+        case ViewOptions():
+            from analysis.commands.view import run_view
+
+            return run_view(options)
         case TrajectoryOptions():
             from analysis.runs.trajectories import run_trajectory
 

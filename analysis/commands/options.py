@@ -1,4 +1,4 @@
-"""Options of `landscape sfm`, `convert`, `map` and `demo`."""
+"""Options of `landscape sfm`, `convert`, `map`, `view` and `demo`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,10 +48,31 @@ class MapOptions:
     Where RUN/probe holds eigenvectors, also e1 and e_min: the Gaussians' shares of them."""
     draw: UseAppendAction[tuple[str, ...]] = ()
     """A training view to draw, by name or by place (0 is the first); may be given again.  Default: all of them."""
+    seed: int = 0
+    """Seed of the pairs of neighbours whose swap is rendered."""
     scene: Unset[Path] = None
     """Folder of the scene: where it has moved since the training, or of another tool's file."""
     out: Unset[Path] = None
     """Folder of the results.  Default: map, beside the checkpoint."""
+    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Show a scene in the browser in the colours of any field of its Gaussians, and follow the steepest directions."""
+
+    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
+    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    shown: Annotated[str, arg(name="field")] = "largest"
+    """What colours the splats at first: a field as of landscape map, or appearance."""
+    port: int = 8080
+    """Where the page is served; the next free one where it is taken."""
+    host: str = "127.0.0.1"
+    """Who may open the page; 0.0.0.0: everybody who reaches this machine."""
+    html: Unset[Path] = None
+    """Write a page that needs no server to this file instead: splats in the field's colours and cameras, without controls."""
+    scene: Unset[Path] = None
+    """Folder of the scene: where it has moved since the training, or of another tool's file."""
     foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
 
 

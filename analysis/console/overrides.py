@@ -48,13 +48,18 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
             key, value = "render.accumulation", current_settings({"sums": value})["accumulation"]
         path = key.split(".")
         if path[0] not in own + _settable(type(config.method)):
-            raise InputError(
-                f"expected a setting of the training ({', '.join(_names(config))}) or of the method {config.method.name} "
-                f"({', '.join(_names(config.method)) or 'which has none'}), got {key!r}"
-                + did_you_mean(key, [*_names(config), *_names(config.method)])
-            )
+            raise InputError(_unknown(key, config))
         config = _changed(config, path if path[0] in own else ["method", *path], value, key)
     return config
+
+
+def _unknown(key: str, config: TrainConfig) -> str:
+    """The setting that was meant, then all."""
+    common, own, method = _names(config), _names(config.method), config.method.name
+    return (
+        f"expected a setting of the training or of the method {method}, got {key!r}{did_you_mean(key, [*common, *own])} "
+        f"(of the training: {', '.join(common)}; of {method}: {', '.join(own) or 'none'})"
+    )
 
 
 def _names(settings: TrainConfig | MethodSettings) -> list[str]:

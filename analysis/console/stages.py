@@ -19,6 +19,17 @@ NOW_AND_THEN = 15.0  # seconds between lines off a terminal
 STRAYS = 4.0  # by which a plan may be wrong
 
 
+def pace(done: int, seconds: float) -> str:
+    """How fast it goes, in words; empty where that is not known yet.
+
+    >>> pace(20, 10.0), pace(1, 130.0), pace(0, 5.0)
+    (', 2 a second', ', 130 s each', '')
+    """
+    if not done or seconds <= 1:
+        return ""
+    return f", {done / seconds:.2g} a second" if done >= seconds else f", {seconds / done:.3g} s each"
+
+
 class Stages:
     """A context manager; `stage(name)` is one too, and gives what the estimators call with their progress.
 
@@ -63,8 +74,7 @@ class Stages:
 
         def report(done: int, most: int, state: str) -> None:
             spent = perf_counter() - start
-            rate = f", {done / spent:.2g} a second" if done and spent > 1 else ""
-            words = f"{done} of at most {most}{rate}{self.left(name, spent)}"
+            words = f"{done} of at most {most}{pace(done, spent)}{self.left(name, spent)}"
             self._progress.update(task, completed=done, total=most, state=f"{words}; {state}")
             if perf_counter() - self._said > NOW_AND_THEN:
                 self._say(f"{name}: {words}")

@@ -74,7 +74,7 @@ LEFT_OUT = {
 }
 MOST_AT_ONCE = 4  # start vectors
 # what a stage takes on two real scenes, as products with MOST_AT_ONCE vectors and as renders of all views
-TYPICAL = {"traces": (12, 0), "eigenvalues": (10, 0), "slice": (0, 180), "depth": (2, 50)}
+TYPICAL: dict[str, tuple[int, int]] = {"traces": (12, 0), "eigenvalues": (10, 0), "slice": (0, 180), "depth": (2, 50)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +222,10 @@ def _seconds_of_product(hessian: SceneHessian) -> float:
 def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str, float]:
     """Seconds that every stage is expected to take, from those of a product and of a render."""
     work = dict(TYPICAL)
+    if settings.trace_samples:
+        work["traces"] = (settings.trace_samples // 2, 0)
+    if not settings.slice_plane:
+        work["slice"] = (0, 2 * settings.slice_points)
     if settings.density_matvecs:
         work["density"] = (settings.density_matvecs // MOST_AT_ONCE, 0)
     if settings.power_apart:
@@ -241,10 +245,11 @@ def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Prog
 def _ends(at: _Point, seconds: float, generator: torch.Generator, report: Progress, notes: list[str]) -> EigenEnds:
     """In the time that there is, with a basis that memory has room for."""
     eigen, memory = at.settings.eigen, at.settings.memory
-    basis = basis_within(eigen, vectors_within(at.operator, memory))
+    basis = basis_within(eigen, vectors_within(at.objective, memory))
     if basis < eigen.basis:
         notes.append(
-            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB"
+            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB and half of "
+            "what was free"
         )
     start = BlockEigenvectors(at.objective, *at.objective.approximate_blocks).warm_start()
     eigen = replace(eigen, max_seconds=seconds, basis=basis)
@@ -261,7 +266,7 @@ def _spectrum(
 ) -> Spectrum:
     """In runs that memory has room for."""
     settings, iterates = at.settings, []
-    room = vectors_within(at.operator, settings.memory)
+    room = vectors_within(at.objective, settings.memory)
     batch = MOST_AT_ONCE if room > FEWEST_STEPS * MOST_AT_ONCE else 1
     longest = room // (batch + 1)
     if longest < FEWEST_STEPS:

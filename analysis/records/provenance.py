@@ -1,8 +1,9 @@
-"""Where numbers come from: the time, the seed, the versions of the packages, the machine.  Needs no torch, no git."""
+"""Where numbers come from: the time, the seed, the versions of the packages, the commit, the machine.  Needs no torch."""
 
 import importlib.metadata
 import os
 import platform
+import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,8 @@ class Machine(Struct, kw_only=True):
 class Provenance(Struct, kw_only=True):
     """Where the numbers come from.  versions: of Python and packages, None for what is not installed.
 
-    origin: of another tool's file, what was assumed.
+    commit: of the checkout that the code lies in, ending in + where files differ from it; None without git or outside of one.
+    origin: of another tool's file, what was assumed.  photographs: what tells the file of each view from any other.
     other: the checkpoint at the other end of a line.  settings: of the command; families: those of the families.
     """
 
@@ -35,12 +37,14 @@ class Provenance(Struct, kw_only=True):
     seed: int
     versions: dict[str, str | None]
     machine: Machine
+    commit: Maybe[str | None] = UNSET
     checkpoint: Maybe[str] = UNSET
     origin: Maybe[dict[str, Any]] = UNSET
     other: Maybe[str | None] = UNSET
     scene: Maybe[str] = UNSET
     scene_folder: Maybe[str] = UNSET
     views: Maybe[list[str] | None] = UNSET
+    photographs: Maybe[list[str] | None] = UNSET
     iteration: Maybe[int] = UNSET
     dtype: Maybe[str] = UNSET
     threads: Maybe[int] = UNSET
@@ -58,7 +62,7 @@ def require_seed(seed: int) -> None:
 def provenance(seed: int, *, lanes: int | None = None, **more: Any) -> Provenance:
     """Of now and here.  lanes: as in `Machine`; more: the other fields of `Provenance`."""
     created = datetime.now(UTC).isoformat(timespec="seconds")
-    return Provenance(created=created, seed=seed, versions=versions(), machine=machine(lanes), **more)
+    return Provenance(created=created, seed=seed, versions=versions(), machine=machine(lanes), commit=commit(), **more)
 
 
 def versions() -> dict[str, str | None]:
@@ -70,6 +74,24 @@ def versions() -> dict[str, str | None]:
         except importlib.metadata.PackageNotFoundError:
             found[package] = None
     return found
+
+
+def commit() -> str | None:
+    """That of the checkout with this code; see `Provenance`."""
+    command = [
+        "git",
+        "-C",
+        str(Path(__file__).parent),
+        "describe",
+        "--always",
+        "--abbrev=12",
+        "--exclude=*",
+        "--dirty=+",
+    ]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=5).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 def machine(lanes: int | None = None) -> Machine:

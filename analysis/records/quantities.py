@@ -11,12 +11,13 @@ from decimal import Decimal
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from msgspec import Struct
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
 FINEST = 10  # significant digits
+BYTES, NOTHING = 254, 255  # of a scale in bytes: its end, and what has no value
 SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}  # of metrics.json
 PLACES = {"psnr": 2, "ssim": 4, "lpips": 4}
 
@@ -50,6 +51,17 @@ def measured(value: float | None, error: float | None) -> str:
     ('5.00 ± ?', '5.00', '–')
     """
     return quantity(value, math.inf if error is None else error)
+
+
+def percent(share: float) -> str:
+    """A share as a percentage, with a place more where it is small or nearly all.
+
+    >>> percent(0.314), percent(0.0031), percent(0.9987), percent(1.0), percent(0.0), percent(1e-5)
+    ('31%', '0.3%', '99.9%', '100%', '0%', 'less than 0.1%')
+    """
+    if 0 < share < 0.0005:
+        return "less than 0.1%"
+    return f"{share:.1%}" if 0 < share < 0.01 or 0.99 < share < 0.9995 else f"{share:.0%}"
 
 
 def limits(low: float | None, high: float | None) -> tuple[str, str]:
@@ -147,7 +159,14 @@ class Shade(Struct, frozen=True, kw_only=True):
     @property
     def diverges(self) -> bool:
         """Whether 0 is in the middle."""
-        return self.scale == "signed" and self.low == -self.high
+        return self.low == -self.high
+
+    @property
+    def colours(self) -> str:
+        """Name of the map of matplotlib, which colour-blind eyes tell apart; what is fragile or wrong is bright."""
+        if self.diverges:
+            return "PuOr_r"
+        return {"error": "magma", "order_gap": "cividis_r"}.get(self.name, "cividis")
 
     def shown(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """t; nan for what has none."""
@@ -156,10 +175,18 @@ class Shade(Struct, frozen=True, kw_only=True):
             return np.log10(np.where(values > 0, values, np.nan))
         return np.arcsinh(values / self.soft) if self.scale == "signed" else values
 
+    def value(self, t: float) -> float:
+        """The inverse of `shown`."""
+        return 10.0**t if self.scale == "log" else self.soft * math.sinh(t) if self.scale == "signed" else t
+
     def share(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """How far t is from `low` to `high`, within [0, 1]; nan for what is not finite."""
         t = self.shown(values)
         return np.where(np.isfinite(t), np.clip((t - self.low) / (self.high - self.low), 0, 1), np.nan)
+
+    def bytes(self, values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+        """`share` in bytes, see `share_in_bytes`."""
+        return share_in_bytes(self.share(values))
 
     def ticks(self) -> list[tuple[float, str]]:
         """(share, text) of round values within the scale; none where it is linear.
@@ -169,7 +196,7 @@ class Shade(Struct, frozen=True, kw_only=True):
         """
         if self.scale == "linear":
             return []
-        ends = [10.0**t if self.scale == "log" else self.soft * math.sinh(t) for t in (self.low, self.high)]
+        ends = [self.value(t) for t in (self.low, self.high)]
         most = max(map(abs, ends))
         sizes = most if self.scale == "signed" else ends[1]
         least = ends[0] if self.scale == "log" else self.soft / 3
@@ -179,6 +206,15 @@ class Shade(Struct, frozen=True, kw_only=True):
             values = [x * 10.0**k for k in range(math.floor(math.log10(least)), powers.stop + 1) for x in (1, 2, 5)]
         values = values if self.scale == "log" else [*(-v for v in reversed(values)), 0.0, *values]
         return [(float(self.share(np.array(v))), _short(v)) for v in values if ends[0] <= v <= ends[1]]
+
+
+def share_in_bytes(share: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+    """[0, 1] as 0 to BYTES, nan as NOTHING.
+
+    >>> share_in_bytes(np.array([0.0, 0.5, 1.0, np.nan])).tolist()
+    [0, 127, 254, 255]
+    """
+    return np.where(np.isnan(share), NOTHING, np.round(BYTES * np.clip(np.nan_to_num(share), 0, 1))).astype(np.uint8)
 
 
 def _short(value: float) -> str:

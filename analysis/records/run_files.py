@@ -17,7 +17,7 @@ from msgspec import Struct
 
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.json_files import read_json
-from analysis.records.provenance import Provenance
+from analysis.records.provenance import Machine, Provenance
 from analysis.records.quantities import Shade
 from analysis.records.schema import INDICES, Count, Number
 from landscape.errors import InputError
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 CHECKPOINT, METRICS, SECONDS, RECORDS, COMPARISON = (
     "checkpoint.pt", "metrics.json", "seconds.json", "trajectory.csv", "compare.json",
 )  # fmt: skip
+MAP = "map"  # RUN/map, a folder of `landscape map`
 NO_TIME = "no time"  # how the note of a record of a trajectory begins that was skipped for that
 STATES = ("whole", "coarse", "cut", "skipped")  # of a record of a trajectory; older ones were cut where time ended them
 TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy
@@ -52,11 +53,21 @@ class ViewScores(Struct, kw_only=True):
 
 
 class Clock(Struct, kw_only=True):
-    """Seconds by the clock and of all processors together; threads that a kernel might use, None where that changed."""
+    """Seconds by the clock and of all processors together; threads that a kernel might use, None where that changed; peak:
+    the most bytes of memory that the process held."""
 
     wall: Number = None
     cpu: Number = None
     threads: Number = None
+    peak: Number = None
+
+
+class Made(Struct, kw_only=True):
+    """When, where and with which code, as in `Provenance`."""
+
+    created: str = ""
+    machine: Machine | None = None
+    commit: str | None = None
 
 
 class Scores(Struct, kw_only=True):
@@ -66,6 +77,7 @@ class Scores(Struct, kw_only=True):
     train: ViewScores | None = None
     test: ViewScores | None = None
     seconds: Clock | None = None
+    provenance: Made | None = None
 
 
 class Seconds(Struct, kw_only=True):
@@ -75,6 +87,7 @@ class Seconds(Struct, kw_only=True):
     wall: float
     cpu: float
     threads: int | None = None
+    peak: int | None = None
 
 
 class Comparison(Struct, kw_only=True):
@@ -84,17 +97,94 @@ class Comparison(Struct, kw_only=True):
 
 
 class Panel(Struct, kw_only=True):
-    """A training view that was drawn.  psnr: of its render, dB; file: of its arrays, NAME.npz."""
+    """A training view that was drawn.  place: among all of them; psnr: of its render, dB; file: of its arrays, NAME.npz."""
 
     name: str
+    place: Count
     file: str
     psnr: Number
+
+
+class Carrier(Struct, kw_only=True):
+    """A Gaussian that carries a part of an eigenvector v.
+
+    gaussian: its number among all of the checkpoint.  share: of |v|^2; attributes: shares of |v|^2 in its own parameters.
+    sigmas: standard deviations, world units, the largest first.  aspect: of its splat in the picture, with the blur.  views:
+    that see it; one_view: share of its weight in one of them.  outline: of its splat at two standard deviations in the picture:
+    centre x, y, half axes (px), and the first axis' angle from +x towards +y (radians).
+    """
+
+    gaussian: Count
+    share: float
+    attributes: dict[str, float]
+    sigmas: list[float]
+    aspect: float
+    opacity: float
+    views: Count
+    one_view: float
+    outline: list[float]
+
+
+class Steepest(Struct, kw_only=True):
+    """An eigenvector of one end of the spectrum, shown where it acts.
+
+    curvature: its eigenvalue.  participation: over how many Gaussians it is spread.  view: in which the first of the carriers
+    weighs most; crop: left, top, right, bottom of the part that is shown, px.  step: along the unit vector; losses: at -step,
+    0, +step.  difference: scale of render(+step) - render(-step).  file: of the pictures, NAME.npz.
+    """
+
+    name: str
+    curvature: float
+    participation: float
+    carriers: list[Carrier]
+    view: str
+    crop: list[Count]
+    step: float
+    losses: list[float]
+    difference: Shade
+    file: str
+    sentence: str
+
+
+class Swaps(Struct, kw_only=True):
+    """What happens when a Gaussian changes places with the one next in front of it, on its ray.
+
+    lengths: of ways along the ray, px.  share: of the pairs that such a way swaps, by view and length; pairs: in each view.
+    jump: the mean |change of the mean loss| where a pair of the sample swaps, with its standard error; sampled: how many.
+    """
+
+    lengths: list[float]
+    share: list[list[float]]
+    pairs: list[Count]
+    jump: Number
+    jump_error: Number
+    sampled: Count
+
+
+class Fragility(Struct, kw_only=True):
+    """The three axes (`analysis.measures.fragility`).  Shares are of the Gaussians in sight, but for those that are of a trace.
+
+    condition: percentile -> condition number.  needles: share that are; needles_steepest: share of the steepest hundredth in an
+    attribute that are; needles_trace: share of that attribute's curvature that they hold.  one_view: share that one view alone
+    sees, one_view_trace: share of opacity's curvature on these, opacity_one_view: rank correlation of a Gaussian's curvature in
+    opacity with the share of its weight that one view alone sees; None where all have the same.
+    """
+
+    swaps: Swaps
+    condition: dict[str, float]
+    needles: float
+    needles_steepest: dict[str, float]
+    needles_trace: dict[str, float]
+    one_view: float
+    one_view_trace: Number
+    opacity_one_view: Number
 
 
 class MapRecord(Struct, kw_only=True):
     """What `landscape map` found.  gaussians, seen: how many, and of these in sight; field: the one that the panels show.
 
     shades: of the maps, by name; that of "error" is of the mean over the channels of |render - photograph|.
+    sentences: what the map says.  steepest: the ends of the spectrum, where a probe has found them.
     """
 
     COMMAND: ClassVar[str] = "map"
@@ -105,6 +195,9 @@ class MapRecord(Struct, kw_only=True):
     field: str
     shades: dict[str, Shade]
     panels: list[Panel]
+    sentences: list[str] = []
+    steepest: list[Steepest] = []
+    fragility: Fragility
     notes: list[str] = []
     provenance: Provenance
     timing: dict[str, float] = {}

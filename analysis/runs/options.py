@@ -14,10 +14,22 @@ class SweepOptions:
     """Train every method with every seed on every scene, and give mean and standard deviation over the seeds.
 
     What is done already is kept: a sweep that was stopped or killed continues when it is run again.
+    Each run lies in OUT/SCENE/METHOD/SEED; results.csv has a row for each, summary.csv means and deviations.
     """
 
     file: Annotated[Positional[Path], arg(metavar="SWEEP.toml")]
-    """The methods, seeds, scenes and settings; an example is in the README."""
+    """The methods, seeds, scenes and settings, with paths relative to the file:
+    out = "runs/sweep"
+    seeds = [0, 1, 2]
+    iterations = 3000  # any option of train, here for all, below for a scene or a method
+    [probe]  # probe every run; options of probe
+    [scenes.fern]
+    path = "data/fern"
+    views = 3
+    [methods.3dgs]
+    [methods."asp only"]
+    method = "stablegs"
+    set = { vsp_weight = 0 }"""
     out: Unset[Path] = None
     """Folder of the runs and tables.  Default: the file's."""
     jobs: int = 1

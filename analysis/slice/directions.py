@@ -18,14 +18,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isclose
 from pathlib import Path
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from analysis.probe.record import loss_name
-from analysis.records.records import ProbeRecord, read_record
+from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.slice.options import Along
 from landscape import (
     EigenSettings,
@@ -208,10 +207,8 @@ def largest_eigenvectors(
     return pairs.vectors, pairs.residuals.tolist()
 
 
-def recorded_eigenvectors(
-    folder: Path, objective: SceneObjective, notes: list[str], end: Literal["largest", "smallest"] = "largest"
-) -> Float[Tensor, "n k"] | None:
-    """Those of an end of the spectrum in the probe recorded in a folder, if any, where it is of this objective's Hessian.
+def recorded_probe(folder: Path, objective: SceneObjective, notes: list[str]) -> Record[ProbeRecord] | None:
+    """The probe recorded in a folder, if any, where it is of this objective's Hessian and has its eigenvectors.
 
     notes: is told where there is a record that cannot be read.
     """
@@ -227,7 +224,4 @@ def recorded_eigenvectors(
     tolerance = SAME_LOSS * torch.finfo(center.dtype).eps
     if not same or not isclose(about.value or 0.0, objective.loss(center), rel_tol=tolerance):
         return None
-    vectors = record.arrays.get("eigenvectors", {}).get(end)
-    if vectors is None or vectors.shape[0] != center.numel() or not vectors.shape[1]:
-        return None
-    return torch.from_numpy(vectors).to(center.device)
+    return record if "largest" in record.arrays.get("eigenvectors", {}) else None

@@ -38,7 +38,7 @@ from analysis.train.scores import PLAIN, report
 from analysis.train.source import from_checkpoint
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
-from landscape.errors import InputError
+from landscape.errors import InputError, did_you_mean
 from splat.backend.device import device_named
 from splat.losses.reference import LossSettings
 from splat.model.typed import leaves, typed
@@ -208,7 +208,8 @@ def _config(options: TrainOptions, scene: Scene) -> TrainConfig:
 def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
     red, green, blue = scene.background.tolist()
     if options.method not in METHODS:
-        raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}")
+        meant = did_you_mean(options.method, METHODS)
+        raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}{meant}")
     config = TrainConfig(
         iterations=TrainConfig.iterations if options.iterations is None else options.iterations,
         seed=options.seed,
@@ -248,17 +249,18 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: 
     """The training of a checkpoint, which must have been started with the same settings on the same views.  remedy: what a
     refusal advises."""
     loaded = load_checkpoint(path)
-    asked = {**leaves(asdict(config)), **leaves(asdict(replace(reference, absolute="", relative="")))}
-    saved = {
-        **leaves(asdict(loaded.training.config)),
-        **leaves(asdict(replace(loaded.scene, absolute="", relative=""))),
-    }
+
+    def settings(of: TrainConfig, scene: SceneReference) -> dict[str, Any]:
+        return leaves(asdict(of)) | leaves(asdict(replace(scene, absolute="", relative="", photographs=None)))
+
+    asked, saved = settings(config, reference), settings(loaded.training.config, loaded.scene)
     for key, value in saved.items():
         if asked[key] != value:
             raise InputError(
                 f"expected the settings that the run in {path.parent} was started with, {key} = {value}, got "
                 f"{asked[key]}; {remedy}"
             )
+    loaded.scene.require_photographs(reference.photographs, Path(reference.absolute))
     return loaded.training
 
 

@@ -18,7 +18,9 @@ class TrainOptions:
     out: Unset[Path] = None
     """Folder of the run, which must not exist yet.  Default: runs/NAME, NAME that of the scene's folder."""
     views: Unset[int | Literal["all"]] = None
-    """Number of training views, chosen by the scene's protocol (see the README).
+    """Number of training views, by the protocol of the data set.
+    Every eighth image is held out, and the training views are spread evenly over the others (LLFF, Mip-NeRF 360).
+    Blender: the usual eight; DTU: views 25, 22, 28, ... of pixelNeRF (with --downscale 4).
     all: every view that is not held out; of DTU the protocol's 9.
     Default: 8 for Blender, else 3."""
     iterations: Unset[int] = None
@@ -45,7 +47,7 @@ class TrainOptions:
     """Whose conventions another tool's file of --from follows, see landscape probe.  Default: what the file says."""
     masks: Unset[Path] = None
     """Folder of object masks, named after the images; the scores are taken inside them.
-    Default: mask or masks in the scene, or what its files name."""
+    Default: mask or masks in the scene, or what its files name (nerfstudio's mask_path, DTU's idrmasks)."""
     depths: Unset[Path] = None
     """Folder of relative depth maps for the training views, NAME.npy or 16-bit NAME.png, for methods that use depth."""
     method: str = "3dgs"

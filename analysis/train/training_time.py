@@ -1,14 +1,17 @@
-"""Time of a training: in its steps alone, over resumes, without loading, saving and scoring.
+"""Time of a training: in its steps alone, over resumes, without loading, saving and scoring; and its peak memory.
 
-RUN/seconds.json    {"step", "wall", "cpu", "threads"}, written after every checkpoint: seconds by the clock and of all
-                    processors together up to that step, and the threads that a kernel might use; null where a resume
-                    changed them.  A kernel that has to be compiled first counts in
+RUN/seconds.json    {"step", "wall", "cpu", "threads", "peak"}, written after every checkpoint: seconds by the clock and of
+                    all processors together up to that step, the threads that a kernel might use (null where a resume
+                    changed them), and the most bytes that the process held until then, loading too (of a GPU's none).
+                    A kernel that has to be compiled first counts in
 """
 
 import json
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from time import perf_counter, process_time
 
 import torch
@@ -26,6 +29,7 @@ class TrainingTime:
     wall: float = 0.0
     cpu: float = 0.0
     threads: int | None = 1
+    peak: int | None = None
 
     @classmethod
     def read(cls, run: Path) -> "TrainingTime":
@@ -33,9 +37,11 @@ class TrainingTime:
         if not (run / SECONDS).is_file():
             return cls()
         found = read_seconds(run)
-        return cls(found.step, found.wall, found.cpu, found.threads)
+        return cls(found.step, found.wall, found.cpu, found.threads, found.peak)
 
     def write(self, run: Path) -> None:
+        unit = 1 if sys.platform == "darwin" else 1024
+        self.peak = max(self.peak or 0, unit * getrusage(RUSAGE_SELF).ru_maxrss)
         write_atomically(run / SECONDS, (json.dumps(asdict(self)) + "\n").encode())
 
     def timed(self, steps: Iterable[StepResult]) -> Iterator[StepResult]:

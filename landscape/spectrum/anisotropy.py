@@ -24,14 +24,14 @@ import torch
 
 from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
-from landscape.results import Bracket
+from landscape.results import Bracket, Brief
 from landscape.spectrum.absolute_sum import absolute_sum
 from landscape.spectrum.quantiles import absolute_quantile
 from landscape.spectrum.rules import SpectralDensity
 
 
-@dataclass(frozen=True)
-class Anisotropy:
+@dataclass(frozen=True, repr=False)
+class Anisotropy(Brief):
     """The index family of `landscape.spectrum.anisotropy`: how unequal the curvatures are.  None: the density it needs
     was not given.
     """

@@ -18,7 +18,7 @@ from landscape.eigen.pairs import EigenEnds
 from landscape.errors import InputError
 from landscape.operators.operator import RestrictedOperator, SymmetricOperator
 from landscape.probes import spawn
-from landscape.results import Progress
+from landscape.results import Brief, Progress
 from landscape.spectrum.anisotropy import Anisotropy, anisotropy
 from landscape.spectrum.density import ActiveSpace, spectral_density
 from landscape.spectrum.rules import SpectralDensity
@@ -39,8 +39,8 @@ class FamilySettings:
     batch: int = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Lead:
+@dataclass(frozen=True, eq=False, repr=False)
+class Lead(Brief):
     """What is known of a part beforehand.
 
     start: vectors in which the search for both ends begins (`extreme_eigenpairs`).  trace: its value and standard error.
@@ -50,8 +50,8 @@ class Lead:
     trace: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Family:
+@dataclass(frozen=True, eq=False, repr=False)
+class Family(Brief):
     """The indices with what they are derived from.  rank: rows of the operator less the dimension of a known null space."""
 
     rank: int

@@ -29,7 +29,7 @@ from landscape.errors import InputError
 from landscape.linalg import group_sums
 from landscape.operators.operator import SymmetricOperator, product, products
 from landscape.probes import draw_probes
-from landscape.results import Progress
+from landscape.results import Brief, Progress
 from landscape.traces.choice import WORSE, outside_sketch
 from landscape.traces.hutchinson import joined
 from landscape.traces.sketched import added_directions
@@ -40,8 +40,8 @@ FEWEST = 4  # test vectors of a sketch
 SQUARED = 1e-140, 1e140  # numbers whose squares, and sums of them, are floats with all their digits
 
 
-@dataclass(frozen=True, eq=False)
-class GroupSums:
+@dataclass(frozen=True, eq=False, repr=False)
+class GroupSums(Brief):
     """sum |H_rr| over the rows of each group, with its standard error.
 
     bias: the mean excess of `values` that noise causes (see the top of this module); it is not subtracted.
@@ -52,8 +52,8 @@ class GroupSums:
     bias: Float64[Tensor, " groups"]
 
 
-@dataclass(frozen=True, eq=False)
-class DiagonalEstimate:
+@dataclass(frozen=True, eq=False, repr=False)
+class DiagonalEstimate(Brief):
     """diag H.  samples: one column for each test vector, with the mean `values`.
 
     matvecs: products used.  method: "signs" or "sketch".

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from landscape.results import Brief
 from splat.model.gaussians import Gaussians
 
 GEOMETRY_COLUMNS = {
@@ -12,8 +13,8 @@ GEOMETRY_COLUMNS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class PerGaussianBlocks:
+@dataclass(frozen=True, eq=False, repr=False)
+class PerGaussianBlocks(Brief):
     """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH."""
 
     geometry: Float[Tensor, "n 11 11"]

@@ -13,10 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.results import Brief
 
 
-@dataclass(frozen=True)
-class Camera:
+@dataclass(frozen=True, repr=False)
+class Camera(Brief):
     """rotation: world to camera, float64; centre: camera centre in world units, float64; the rest in pixels.
 
     InputError where the rotation is none, or a number is not finite or, but for centre and principal point, not positive.

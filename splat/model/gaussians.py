@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.results import Brief
 
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
@@ -39,8 +40,8 @@ def parameters_per_gaussian(sh_degree: int) -> int:
     return 11 + 3 * (sh_degree + 1) ** 2
 
 
-@dataclass(frozen=True, eq=False)
-class Gaussians:
+@dataclass(frozen=True, eq=False, repr=False)
+class Gaussians(Brief):
     """n Gaussians over one flat vector of n (11 + 3 (sh_degree + 1)^2) stored parameters.
 
     InputError where sh_degree or the length of the vector cannot be.

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.results import Brief
 from splat.model.camera import Camera
 from splat.scenes.formats.colmap import MODEL_FOLDERS, find_model, read_colmap
 from splat.scenes.formats.dtu import is_dtu, mask_folder, read_dtu
@@ -33,8 +34,8 @@ from splat.scenes.view import Frame, Points, View
 Kind = Literal["colmap", "llff", "blender", "transforms", "dtu", "synthetic"]
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene(Brief):
     """Frames sorted by name (Blender: in the order of its files), points if any, and the background colour.
 
     skipped: names of frames that the scene's file lists without an image.

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.results import Brief
 from splat.model.camera import Camera, look_at
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
@@ -56,8 +57,8 @@ class SyntheticSettings:
             raise InputError(f"expected 0 < arc < 150, 0 < point_share <= 1 and point_noise >= 0, got {self}")
 
 
-@dataclass(frozen=True, eq=False)
-class SyntheticScene:
+@dataclass(frozen=True, eq=False, repr=False)
+class SyntheticScene(Brief):
     """The scene as a loader would give it, and the Gaussians that it was rendered from."""
 
     scene: Scene

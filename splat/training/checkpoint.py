@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from landscape.errors import InputError, lacks_memory
+from landscape.results import Brief
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.settings import current_settings
@@ -50,8 +51,8 @@ LATER = {
 REMEDY = "take another copy of the file, or train anew"
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
+@dataclass(frozen=True, eq=False, repr=False)
+class Checkpoint(Brief):
     """A training as it was saved, the scene that it belongs to, and the version of torch that wrote it.
 
     origin: of another tool's file, what was assumed (`foreign_training`).
@@ -77,7 +78,8 @@ class Checkpoint:
         chosen = set(spread_views(scene.select(self.scene.train), count))
         kept = [i for i, name in enumerate(self.scene.train) if name in chosen]
         train, sizes = [self.scene.train[i] for i in kept], [self.scene.sizes[i] for i in kept]
-        return replace(self, scene=replace(self.scene, train=train, sizes=sizes))
+        known = self.scene.photographs and [self.scene.photographs[i] for i in kept]
+        return replace(self, scene=replace(self.scene, train=train, sizes=sizes, photographs=known))
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
         """The scene that this checkpoint, read from path, belongs to, see `SceneReference.load`."""
@@ -232,14 +234,24 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     if not path.is_file():
-        found = f"a folder; name the {path / 'checkpoint.pt'} in it" if path.is_dir() else "no such file"
-        raise FileNotFoundError(f"{KIND} at {path}, found {found}")
+        raise FileNotFoundError(f"{KIND} at {path}, found {_instead(path)}")
     with path.open("rb") as file:  # one file throughout: a training may replace it meanwhile
         content = _read(file, path)
     try:
         return _checkpoint(content)
     except InputError as error:
         raise InputError(f"{KIND}, got {path}: {error}; {REMEDY}") from error
+
+
+def _instead(path: Path) -> str:
+    """What there is in place of a checkpoint, and what to name."""
+    if not path.is_dir():
+        return "no such file"
+    if (inside := path / "checkpoint.pt").is_file():
+        return f"a folder; name the {inside} in it"
+    if runs := sorted(path.glob("*/checkpoint.pt")):
+        return f"a folder of {len(runs)} runs; name one of them, such as {runs[0].parent}"
+    return "a folder without one; name the run that landscape train wrote, its --out"
 
 
 def _read(file: BinaryIO, path: Path) -> Any:
@@ -271,8 +283,10 @@ def _checkpoint(content: Any) -> Checkpoint:
         plain, config = ThreeDGS(), typed(dict[str, Any], content.get("config"), "config")
         content = {**content, "config": {**config, "method": asdict(plain)}, "regularizer": plain.create(0).state()}
     training, scene = restored_training(content), file.scene
-    if len(scene.sizes) != len(scene.train):
-        raise InputError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
+    for each in ("sizes", "photographs"):
+        found = getattr(scene, each)
+        if found is not None and len(found) != len(scene.train):
+            raise InputError(f"it has {len(found)} {each} for {len(scene.train)} training views")
     if not all(index < len(scene.train) for index in training.order):
         raise InputError(f"its order does not index its {len(scene.train)} training views")
     return Checkpoint(training, scene, file.torch)

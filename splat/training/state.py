@@ -18,6 +18,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
+from landscape.results import Brief
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import Clamped, loss_against
 from splat.losses.protocols import ViewLoss
@@ -220,8 +221,8 @@ class TrainConfig(Settings):
         )
 
 
-@dataclass(eq=False)
-class Training:
+@dataclass(eq=False, repr=False)
+class Training(Brief):
     """A training under way: all that its next step depends on.
 
     extent: radius of the training cameras, world units (`splat/scenes/scene.py`).  step: steps made so far.

@@ -1,13 +1,17 @@
 import json
+from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from math import inf, nan
 
 import pytest
 import torch
+from torch import Tensor
 
+import landscape
+import splat
 from landscape.eigen.eigen import extreme_eigenpairs
 from landscape.eigen.power import power_ends
 from landscape.operators.checks import check_operator
-from landscape.results import Bracket, standard_deviation
+from landscape.results import Bracket, Brief, standard_deviation
 from landscape.slices.refinement import SliceSettings
 from landscape.slices.slices import evaluate_slice
 from landscape.spectrum.anisotropy import anisotropy
@@ -64,3 +68,31 @@ def test_results_are_shown_in_three_lines():
     ):
         lines = repr(result).splitlines()
         assert len(lines) == 3 and max(map(len, lines)) <= 120 and words in lines[0]
+
+
+@dataclass(frozen=True, repr=False)
+class Much(Brief):
+    tensor: Tensor
+    names: tuple[str, ...]
+    inside: object
+    bracket: Bracket
+
+
+def test_a_result_fits_on_three_lines_however_much_it_holds():
+    many = tuple(f"view-{i:03d}" for i in range(100))
+    much = Much(
+        torch.zeros(1000, 7), many, Much(torch.zeros(2), ("a",), None, Bracket(1.0, 0.5, 2.0)), Bracket(2.0, 1.0, 3.0)
+    )
+    assert repr(much) == "Much(tensor=float32 1000 x 7, names=tuple of 100, inside=Much, bracket=2 in [1, 3])"
+    assert "names=('a',), inside=None" in repr(much.inside)
+    wide = make_dataclass("Wide", [(f"field_number_{i}", int) for i in range(99)], bases=(Brief,), repr=False)
+    said = repr(wide(*range(99)))
+    assert said.count("\n") == 2 and said.endswith(" ...") and max(map(len, said.splitlines())) <= 100
+
+
+def test_no_public_record_prints_its_tensors():
+    records = [getattr(package, name) for package in (landscape, splat) for name in package.__all__]
+    records = [each for each in records if isinstance(each, type) and is_dataclass(each)]
+    holding = [each for each in records if any("Tensor" in str(field.type) for field in fields(each))]
+    generated = [each.__name__ for each in holding if hasattr(each.__repr__, "__wrapped__")]  # by `dataclass`
+    assert len(holding) > 10 and generated == ["ActiveSpace"]  # a function and a number

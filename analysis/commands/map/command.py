@@ -5,7 +5,9 @@
     FIELD.ply           the Gaussians in the colours of one field, grey where it has no value; opens in every viewer
     top.csv             the hundred Gaussians with most of it
     view-NNN.png        each training view: photograph, render, error, and the field composited with the splats' weights
-    map.json            what the pictures show and where it comes from; view-NNN.npz: the maps, in bytes
+    fragility-NNN.png   each training view: where it is fragile in position, conditioning and opacity
+    steepest-*.png      with a probe beside the checkpoint: the Gaussians that carry both ends of the spectrum
+    map.json            what the pictures show and where it comes from; NAME.npz: the pictures' maps, in bytes
 
 Blocks and sights are taken on the CPU.  The ends of a map's scale are percentiles over the Gaussians in sight, by their weight
 in the images.
@@ -15,26 +17,27 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from rich.console import Console
-from torch import Tensor
 
 from analysis.commands.map.files import coloured_ply, fields_ply, top_table
 from analysis.commands.map.pictures import error_shade, view_maps, write_maps
 from analysis.commands.options import MapOptions
 from analysis.console.drawing import Draw
 from analysis.console.stages import Stages
+from analysis.measures.fragility import fragility, fragility_sentences
 from analysis.measures.localization import masses
+from analysis.measures.steepest import End, steepest
 from analysis.probe.command import opened, scene_objective
 from analysis.probe.record import provenance_of
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import Shade, quantity
 from analysis.records.records import record_folder, require_replaceable
-from analysis.records.run_files import MapRecord, Panel
-from analysis.slice.directions import recorded_eigenvectors
+from analysis.records.run_files import MAP, MapRecord, Panel, Steepest
+from analysis.slice.directions import recorded_probe
 from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
 from splat.curvature.fields import FIELDS, Field, Values, scene_fields
@@ -42,20 +45,19 @@ from splat.curvature.objective import SceneObjective
 from splat.render.sight import Sight
 from splat.scenes.view import View
 
-ENDS: dict[str, tuple[Literal["largest", "smallest"], str]] = {
-    "e1": ("largest", "share of e₁"),
-    "e_min": ("smallest", "share of e_min"),
-}
+ENDS = {"e1": "share of e₁", "e_min": "share of e_min"}
+AXES = ("order_gap", "condition", "one_view")  # of fragility
+PROBE = "probe"
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """Every field of the Gaussians in sight, and what it is; vectors: the eigenvectors that a probe recorded, by name."""
+    """Every field of the Gaussians in sight, and what it is; ends: of the spectrum that a probe recorded, by name."""
 
     values: Values
     kinds: Mapping[str, Field]
-    vectors: Mapping[str, Tensor]
+    ends: Mapping[str, End]
     sights: Sequence[Sight]
 
     @property
@@ -69,7 +71,7 @@ class Fields:
 
 def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
     """Map the checkpoint; returns the exit code.  command: as typed, for the record; drawn: draws the pictures."""
-    out = options.out or options.checkpoint.parent / "map"
+    out = options.out or options.checkpoint.parent / MAP
     known = [*FIELDS, *ENDS]
     if options.shown not in known:
         raise InputError(
@@ -84,15 +86,20 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         chosen = _chosen(options.draw, objective.views)
     with record_folder(out, MapRecord) as folder, stages:
         with stages.stage("fields") as report:
-            found = _fields(objective, options.checkpoint.parent / "probe", notes, report)
+            found = measured_fields(objective, options.checkpoint.parent / PROBE, notes, report)
         if options.shown not in found.values:
             raise InputError(
                 f"expected a probe with eigenvectors of this checkpoint in {options.checkpoint.parent / 'probe'} for "
                 f"--field {options.shown}, got none; run landscape probe first"
             )
         with stages.stage("maps") as report:
-            shades = {options.shown: found.shade(options.shown)}
+            shades = {name: found.shade(name) for name in dict.fromkeys((options.shown, *AXES))}
             panels = _write_panels(folder, objective, found, shades, chosen, report)
+        with stages.stage("fragility") as report:
+            generator = torch.Generator().manual_seed(options.seed)
+            fragile = fragility(objective, found.values, found.sights, generator, report)
+        with stages.stage("steepest") as report:
+            shown = _write_ends(folder, objective, found, report)
         shade, gaussians = shades[options.shown], checkpoint.training.gaussians
         with stages.stage("files"):
             (folder / "fields.ply").write_bytes(fields_ply(gaussians, objective.mask, found.values))
@@ -100,9 +107,10 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
             (folder / f"{options.shown}.ply").write_bytes(coloured)
             top = top_table(objective, found.values, options.shown)
             (folder / "top.csv").write_text(top.to_csv(index=False, float_format="%.6g"), encoding="utf-8")
-        made = provenance_of(0, options.checkpoint, command, options, checkpoint, scene)
+        made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
         data = MapRecord(
             gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
+            sentences=[each.sentence for each in shown] + fragility_sentences(fragile), steepest=shown, fragility=fragile,
             notes=notes + checkpoint.assumptions, provenance=made,
         )  # fmt: skip
         _write(folder, data)
@@ -113,6 +121,10 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
                 data.notes.append(" ".join(str(error).split()))
         data.timing = {**stages.timing, "total": perf_counter() - start}
         _write(folder, data)
+    if found.ends:
+        from analysis.records.report import write_report  # a quarter of a second of imports
+
+        write_report(options.checkpoint.parent / PROBE)  # its page has the map's pictures too
     _conclude(data, top.iloc[0].to_dict(), found.kinds[options.shown], out)
     return 0
 
@@ -128,17 +140,25 @@ def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
     return sorted({places[name] for name in names}) or [*range(len(views))]
 
 
-def _fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
+def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
     """What the blocks and the views say, and the masses in the eigenvectors of the probe, where it is of this loss here."""
     values, sights = scene_fields(objective, report)
-    active, vectors, kinds = objective.active, {}, dict(FIELDS)
-    for name, (end, words) in ENDS.items():
-        found = recorded_eigenvectors(probe, objective, notes, end)
-        if found is not None:
-            vectors[name] = found[:, 0]
-            values[name] = masses(found[:, 0], active)
-            kinds[name] = Field(words, "share", "log")
-    return Fields(values, kinds, vectors, sights)
+    ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, objective, notes)
+    if recorded is not None:
+        about, vectors = recorded.data.eigenvalues, recorded.arrays["eigenvectors"]
+        known = {
+            "e1": ("largest", about.max, "the steepest direction"),
+            "e_min": ("smallest", about.min, "the other end"),
+        }
+        for name, (group, end, title) in known.items():
+            if group in vectors and vectors[group].shape[1] and end.value:
+                title = "the most negative direction" if end.value < 0 else title
+                ends[name] = End(
+                    ENDS[name][len("share of ") :], title, torch.from_numpy(vectors[group][:, 0]), end.value
+                )
+                values[name] = masses(ends[name].vector, objective.active)
+                kinds[name] = Field(ENDS[name], "share", "log")
+    return Fields(values, kinds, ends, sights)
 
 
 def _write_panels(
@@ -157,9 +177,20 @@ def _write_panels(
         maps, psnr = view_maps(objective, index, shares, shades["error"])
         file = f"view-{index:03d}"
         write_maps(folder / f"{file}.npz", maps)
-        panels.append(Panel(name=objective.views[index].name, file=file, psnr=psnr))
+        panels.append(Panel(name=objective.views[index].name, place=index, file=file, psnr=psnr))
         report(done + 1, len(chosen), "views")
     return panels
+
+
+def _write_ends(folder: Path, objective: SceneObjective, found: Fields, report: Progress) -> list[Steepest]:
+    """The ends of the spectrum that are known, with their pictures."""
+    shown = []
+    for done, (name, end) in enumerate(found.ends.items()):
+        one, pictures = steepest(objective, end, found.values, found.sights, f"steepest-{name}")
+        write_maps(folder / f"{one.file}.npz", pictures)
+        shown.append(one)
+        report(done + 1, len(found.ends), "directions")
+    return shown
 
 
 def _write(folder: Path, data: MapRecord) -> None:
@@ -170,6 +201,10 @@ def _conclude(data: MapRecord, first: Mapping[str, Any], kind: Field, out: Path)
     say = Console().print
     unit = f" {kind.unit}" if kind.unit not in ("share", "1") else ""
     say(f"{data.seen:,} of {data.gaussians:,} Gaussians are in sight", **SAID)
+    for text in data.sentences:
+        say(text, **SAID)
+    if not data.steepest:
+        say("for the Gaussians that carry the steepest directions: landscape probe, then map again", **SAID)
     say(
         f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {quantity(float(first[data.field]))}{unit}",
         **SAID,

@@ -15,7 +15,6 @@ from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 
 TOP = 100
-SEQUENTIAL, DIVERGING = "cividis", "PuOr_r"  # both tell apart for colour-blind eyes
 NOTHING = 0.5  # grey of what has no value
 
 
@@ -39,7 +38,7 @@ def coloured_ply(gaussians: Gaussians, seen: Bool[Tensor, " n"], shade: Shade, v
 def colours(shade: Shade, values: np.ndarray) -> np.ndarray:
     """(n, 3) in [0, 1], float32."""
     share = shade.share(values)
-    found = colormaps[DIVERGING if shade.diverges else SEQUENTIAL](np.nan_to_num(share))[:, :3].astype(np.float32)
+    found = colormaps[shade.colours](np.nan_to_num(share))[:, :3].astype(np.float32)
     found[np.isnan(share)] = NOTHING
     return found
 

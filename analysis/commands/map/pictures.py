@@ -13,20 +13,21 @@ import torch
 from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
-from analysis.records.quantities import Shade
+from analysis.measures.steepest import in_bytes
+from analysis.records.quantities import Shade, share_in_bytes
 from splat.curvature.objective import SceneObjective
 from splat.model.camera import Camera
+from splat.model.gaussians import Gaussians
 from splat.render.render import render, render_layers
 
-STEPS, NOTHING = 254, 255  # of a byte: the whole scale, and where there is no value
 LEAST = 0.02  # weight of a pixel's splats with a value, below which it has none
 WORST = 0.99  # of the errors: the end of their scale
 
 
-def rendered(objective: SceneObjective, index: int) -> Float[Tensor, "3 h w"]:
-    """A training view as the checkpoint has it, within [0, 1]."""
+def rendered(objective: SceneObjective, index: int, gaussians: Gaussians | None = None) -> Float[Tensor, "3 h w"]:
+    """A training view as the checkpoint has it, or other Gaussians, within [0, 1]."""
     camera = objective.views[index].camera
-    return render(objective.active, camera, objective.background, objective.settings).image.clamp(0, 1)
+    return render(gaussians or objective.active, camera, objective.background, objective.settings).image.clamp(0, 1)
 
 
 def error_shade(objective: SceneObjective) -> Shade:
@@ -44,10 +45,10 @@ def view_maps(
     view, image = objective.views[index], rendered(objective, index)
     difference = image - view.image.to(image)
     squared = float(difference.double().square().mean())
-    found = {name: _bytes(part).transpose(1, 2, 0) for name, part in (("photograph", view.image), ("render", image))}
-    found["error"] = in_bytes(error_scale.share(difference.abs().mean(dim=0).numpy()))
+    found = {name: in_bytes(part).transpose(1, 2, 0) for name, part in (("photograph", view.image), ("render", image))}
+    found["error"] = error_scale.bytes(difference.abs().mean(dim=0).numpy())
     for name, share in shares.items():
-        found[name] = in_bytes(composited(objective, view.camera, share))
+        found[name] = share_in_bytes(composited(objective, view.camera, share))
     return found, -10 * log10(squared) if squared else inf
 
 
@@ -58,15 +59,6 @@ def composited(objective: SceneObjective, camera: Camera, share: Float64[Tensor,
     planes, _ = render_layers(objective.active, camera, layers.to(objective.active.flat), objective.settings)
     total, weight, _ = planes.double().numpy()
     return np.where(weight > LEAST, total / np.maximum(weight, LEAST), np.nan)
-
-
-def in_bytes(share: Float64[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """[0, 1] as 0 to STEPS, nan as NOTHING."""
-    return np.where(np.isnan(share), NOTHING, np.round(STEPS * np.clip(np.nan_to_num(share), 0, 1))).astype(np.uint8)
-
-
-def _bytes(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "3 h w"]:
-    return (image.detach().clamp(0, 1) * 255).round().byte().numpy()
 
 
 def write_maps(path: Path, maps: Mapping[str, np.ndarray]) -> None:

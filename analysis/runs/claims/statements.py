@@ -184,14 +184,18 @@ def cost(rows: pd.DataFrame) -> Judgement:
     verdict: Verdict = "holds" if every else "holds in part" if one else "cannot be tested here"
     if every is False and not one:
         verdict = "does not hold"
-    size = ratio_effect("Gaussians, StableGS / 3DGS", log_ratios(rows, "gaussians"), None)
+    size, memory = (
+        ratio_effect(f"{what}, StableGS / 3DGS", log_ratios(rows, name), None)
+        for what, name in (("Gaussians", "gaussians"), ("peak memory", "peak_memory"))
+    )
     finding = (
         f"Processor time over that of 3DGS: {effects[0].interval.text()} with a probed viewpoint for each view, the paper's "
-        f"way, {effects[1].interval.text()} with one. Rendering costs by the number of Gaussians: {size.interval.text()}."
+        f"way, {effects[1].interval.text()} with one. Rendering costs by the number of Gaussians: {size.interval.text()}. "
+        f"Peak memory: {memory.interval.text()}."
     )
     return Judgement(
         8, "Training takes 1.3 times as long as 3DGS; rendering costs nothing more.", "Sec. 4.3", verdict, finding,
-        (*effects, size),
+        (*effects, size, memory),
     )  # fmt: skip
 
 

@@ -2,13 +2,21 @@
 
     scene, method, seed         where the row belongs; method: its name and the settings that were changed, as in
                                 "stablegs vsp_weight=0"
-    steps, views                of the training; how many views it was trained on
+    steps, views, size          of the training; how many views it was trained on, and of how many pixels
+    date, machine, commit       when and where it was scored, and with which code
     psnr, ssim, ...             as in a sweep's results.csv (`analysis.runs.sweep.sweep_results`): scores, Gaussians, seconds,
                                 threads, traces, ends of the spectrum and indices, those of the probe where the run has one
     lambda_second               the second largest eigenvalue
     depth_gradient              the root mean square gradient of the positions along the rays, over that across them
     needles, needle_count       share of the steepest eigenvector's squared mass on Gaussians with kappa above 100, and share of
                                 the visible Gaussians that these are
+    one_gaussian                share of the steepest eigenvector's squared mass on a single Gaussian
+    INDEX_scene, INDEX_optimiser   the indices in units of the scene's size or of the optimiser's steps, where the families were
+                                measured in these
+    finite_curvature            curvature along the steepest eigenvector seen by steps as long as Adam's first: the root of the
+                                mean of the squared learning rates of its attributes, weighted with its mass
+    opacity_one_view            rank correlation of a Gaussian's curvature in opacity with the share of its weight that one view
+                                sees; where `landscape map` has been run
     hutchinson_ATTRIBUTE        the least relative standard error that ten Gaussian samples of the block's trace can have,
                                 sqrt(2 / (10 r)), r the upper end of the block's effective rank; where families were measured
 
@@ -17,23 +25,24 @@ A number that a run does not have is empty.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from math import nan, sqrt
+from math import log, nan, sqrt
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from msgspec import structs
 
 from analysis.console.overrides import overridden
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
-from analysis.records.run_files import CHECKPOINT
+from analysis.records.run_files import CHECKPOINT, Made, MapRecord, read_map, read_scores
 from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
 from landscape.errors import InputError
 from splat.model.typed import leaves
 from splat.training.checkpoint import load_checkpoint
 from splat.training.methods.protocols import presets
 from splat.training.start import Source
-from splat.training.state import TrainConfig
+from splat.training.state import LearningRates, TrainConfig
 
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
@@ -74,11 +83,28 @@ def row_of(run: Path) -> dict[str, Any]:
         "method": method_name(config, checkpoint.scene.start),
         "seed": config.seed,
     }
-    row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train)} | metrics_of(run)
+    sizes = sorted({f"{width} x {height}" for width, height in checkpoint.scene.sizes})
+    row |= {"steps": checkpoint.training.step, "views": len(checkpoint.scene.train), "size": ", ".join(sizes)}
+    row |= metrics_of(run) | _made(run) | _of_map(run)
     if not (run / PROBE / ProbeRecord.FILE).is_file():
         return row
     data = read_record(run / PROBE, ProbeRecord).data
-    return row | probe_of(run) | _more(data) if data.provenance.iteration == checkpoint.training.step else row
+    return (
+        row | probe_of(run) | _more(data, config.rates, checkpoint.training.extent)
+        if data.provenance.iteration == checkpoint.training.step
+        else row
+    )
+
+
+def _made(run: Path) -> dict[str, str]:
+    made = read_scores(run).provenance or Made()
+    return {"date": made.created[:10], "machine": made.machine.cpu if made.machine else "", "commit": made.commit or ""}
+
+
+def _of_map(run: Path) -> dict[str, float]:
+    if not (run / MapRecord.COMMAND / MapRecord.FILE).is_file():
+        return {}
+    return {"opacity_one_view": _number(read_map(run / MapRecord.COMMAND).fragility.opacity_one_view)}
 
 
 def method_name(config: TrainConfig, start: Source = "scene") -> str:
@@ -107,15 +133,32 @@ def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _more(data: ProbeRecord) -> dict[str, float]:
-    """What the statements need beside the columns of a sweep."""
+def _more(data: ProbeRecord, rates: LearningRates, extent: float) -> dict[str, float]:
+    """What the statements and predictors need beside the columns of a sweep."""
     second, lives = data.eigenvalues.second, data.eigenvalues.max.lives_on
     row = {"lambda_second": _number(second and second.value)}
     if data.depth:
         row["depth_gradient"] = _number(data.depth.gradient_ratio)
     if lives:
         row |= {"needles": lives.needles, "needle_count": lives.needle_count / max(data.counts.visible_gaussians, 1)}
+        row |= {"one_gaussian": lives.heaviest[0][1] if lives.heaviest else nan}
+        row |= _finite(data, lives.attributes, rates, extent)
+    for family in data.families or ():
+        if (family.operator, family.block, family.split) == ("hessian", "all", False) and family.metric != "parameters":
+            indices = {name: index for name, index in structs.asdict(family.indices).items() if index}
+            row |= {f"{name}_{family.metric}": _number(index.value) for name, index in indices.items()}
     return row | _hutchinson(data)
+
+
+def _finite(data: ProbeRecord, shares: Mapping[str, float], rates: LearningRates, extent: float) -> dict[str, float]:
+    """The curvature at the step nearest to the length of Adam's."""
+    if not data.finite_probe:
+        return {}
+    lengths = asdict(rates) | {"means": rates.position * extent, "sh": rates.sh_constant}
+    length = sqrt(sum(share * lengths[name] ** 2 for name, share in shares.items()))
+    steps, curvatures = data.finite_probe.steps, data.finite_probe.curvatures
+    nearest = min(range(len(steps)), key=lambda i: abs(log(steps[i] / length)))
+    return {"finite_curvature": _number(curvatures[nearest])}
 
 
 def _hutchinson(data: ProbeRecord) -> dict[str, float]:

@@ -90,7 +90,9 @@ class Sweep:
 def read_sweep(file: Path, out: Path | None = None, probe: bool = False) -> Sweep:
     """The sweep in a file; out and probe go before what the file says.  ValueError names the key that is wrong."""
     if not file.is_file():
-        raise FileNotFoundError(f"expected a sweep in TOML at {file}, found no such file; the README has an example")
+        raise FileNotFoundError(
+            f"expected a sweep in TOML at {file}, found no such file; landscape sweep --help has an example"
+        )
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -2,12 +2,12 @@
 
 OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or "to do"); of what has been trained: psnr (dB),
                   ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads (that
-                  its steps might use; none where a resume changed them); wall_ratio, cpu_ratio: over the seconds of the
-                  first method, of the same scene and seed, the wall's only at the same number of threads; where it was probed,
-                  trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error (standard error or residual), of the latter
-                  also the _reason why the search ended ("... budget": the end may lie farther out), and the anisotropy
-                  indices with _low and _high, without value where one of these is unbounded; with the split control,
-                  split_INDEX: its factor on the index
+                  its steps might use; none where a resume changed them), peak_memory (bytes of the process); wall_ratio,
+                  cpu_ratio: over the seconds of the first method, of the same scene and seed, the wall's only at the same
+                  number of threads; where it was probed, trace_ATTRIBUTE, lambda_max, lambda_min, each with its _error
+                  (standard error or residual), of the latter also the _reason why the search ended ("... budget": the end
+                  may lie farther out), and the anisotropy indices with _low and _high, without value where one of these is
+                  unbounded; with the split control, split_INDEX: its factor on the index
 OUT/summary.csv   scene, method, and of every number its _mean, its sample standard deviation _std and the count _n
 """
 
@@ -101,6 +101,7 @@ def metrics_of(run: Path) -> dict[str, float]:
         "wall_seconds": _number(clock.wall),
         "cpu_seconds": _number(clock.cpu),
         "threads": clock.threads or math.nan,
+        "peak_memory": _number(clock.peak),
     }
     return row | {"gaussians": found.gaussians} | seconds
 

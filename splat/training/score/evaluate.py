@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from landscape.results import Brief
 from splat.losses.reference import psnr, ssim
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -34,8 +35,8 @@ class ViewScore:
     lpips: float | None = None
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Evaluation(Brief):
     """Scores of every view, and their means, which papers report.  masked: whether only pixels inside masks count."""
 
     views: tuple[ViewScore, ...]

@@ -406,7 +406,7 @@ def test_the_steps_of_a_protocol_are_taken_unless_others_are_given(original):
     ("options", "message"),
     [
         (("--method", "sam", "--protocol", "llff"), "expected a method with a published training for llff (cor-gs, "),
-        (("--set", "protocol=llff"), "expected a setting of the training (iterations, "),
+        (("--set", "protocol=llff"), "(of the training: iterations, "),
     ],
 )
 def test_a_protocol_that_a_method_lacks_and_one_by_set_are_refused(original, tmp_path, capsys, options, message):
@@ -422,8 +422,9 @@ def test_a_method_and_its_settings_are_named_on_the_command_line(original, tmp_p
     history = pd.read_csv(out / "history.csv")
     assert set(history["attribute"]) == set(ATTRIBUTES) and min(history["step"].tolist()) == 3
     capsys.readouterr()
-    assert main(arguments(original, tmp_path / "other", "--method", "magic")) == 2
-    assert "expected a method among 3dgs, stablegs" in capsys.readouterr().err
+    assert main(arguments(original, tmp_path / "other", "--method", "stablgs")) == 2
+    said = capsys.readouterr().err
+    assert "expected a method among 3dgs, stablegs" in said and "got 'stablgs'; did you mean stablegs?" in said
     assert not (tmp_path / "other").exists()
 
 
@@ -434,11 +435,13 @@ def test_a_run_stands_for_its_checkpoint_and_a_checkpoint_for_its_run(tmp_path):
         ProbeOptions(run),
         SliceOptions(tmp_path / "none", (run,)),
         BenchOptions(run),
+        TrainOptions(tmp_path, from_=run),
         CompareOptions((run, run / "checkpoint.pt")),
     )
-    assert [at_files(options) for options in named] == [*named[:3], CompareOptions((run, run))]
+    assert [at_files(options) for options in named] == [*named[:4], CompareOptions((run, run))]
     (run / "checkpoint.pt").touch()
-    probe, line, bench, _ = (at_files(options) for options in named)
+    probe, line, bench, train, _ = (at_files(options) for options in named)
+    assert train == TrainOptions(tmp_path, from_=run / "checkpoint.pt")
     assert probe == ProbeOptions(run / "checkpoint.pt") and bench == BenchOptions(run / "checkpoint.pt")
     assert line == SliceOptions(tmp_path / "none", (run / "checkpoint.pt",))
 

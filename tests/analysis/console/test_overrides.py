@@ -44,10 +44,11 @@ def test_each_type_is_read_from_text_and_from_a_plain_value():
         (
             "warmup",
             "1",
-            "of the training .* or of the method stablegs .*warm_up.*, got 'warmup'; did you mean warm_up.$",
+            r"the method stablegs, got 'warmup'; did you mean warm_up\? \(of the training: .*; of stablegs: warm_up, ",
         ),
         ("probe.gama", "1", "expected a setting among .*gamma.*, got 'gama' in 'probe.gama'; did you mean gamma"),
         ("name", "sam", "expected a setting of the training"),
+        ("teapot", "1", r"or of the method stablegs, got 'teapot' \(of the training: iterations, "),
         ("densify", "1", "name of a single setting, as in densify.enabled"),
         ("seed.x", "1", "'seed' to be the last name"),
         ("warm_up", "1.5", "expected a whole number for warm_up, got '1.5'"),
@@ -68,7 +69,7 @@ def test_what_does_not_fit_is_refused_with_what_was_expected(key, value, message
 
 
 def test_a_method_without_settings_is_said_to_have_none():
-    with pytest.raises(ValueError, match=r"or of the method 3dgs \(which has none\), got 'vsp_weight'"):
+    with pytest.raises(ValueError, match=r"or of the method 3dgs, got 'vsp_weight'.*; of 3dgs: none\)"):
         overridden(TrainConfig(), {"vsp_weight": 0})
 
 

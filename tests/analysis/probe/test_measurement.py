@@ -8,7 +8,7 @@ import torch
 from analysis.bench.accuracy.cases import splat_cases
 from analysis.console.stages import Stages
 from analysis.probe import measurement
-from analysis.probe.measurement import measure
+from analysis.probe.measurement import _plan, measure
 from analysis.probe.settings import ProbeSettings
 from landscape import EigenSettings, TraceSettings, extreme_eigenpairs
 from landscape.eigen.power import power_iteration
@@ -108,3 +108,9 @@ def test_the_paper_s_power_iteration_is_read_from_the_density_without_products()
     ):
         assert abs(float(mine.values - true.values)) < 1e-9 * size and mine.reason == true.reason
         assert abs(float(mine.residuals - true.residuals)) < 1e-8 * size
+
+
+def test_a_quick_probe_is_expected_to_take_what_it_makes_alone():
+    whole, quick = (_plan(settings, 1.0, 10.0) for settings in (ProbeSettings(), ProbeSettings.quick()))
+    assert set(whole) - set(quick) == {"density", "finite probe", "depth"}
+    assert quick["slice"] == 2 * 21 * 10 < whole["slice"] and quick["traces"] == 2 < whole["traces"]

@@ -105,6 +105,15 @@ def test_a_training_continued_with_other_threads_has_none_of_its_own(monkeypatch
         assert spent.threads == said
 
 
+def test_peak_memory_is_kept_and_never_falls(tmp_path):
+    spent = TrainingTime()
+    spent.write(tmp_path)
+    held = TrainingTime.read(tmp_path).peak
+    assert held is not None and 2**26 < held < 2**40  # bytes of a process with torch, not their 1024th part
+    TrainingTime(peak=2**50).write(tmp_path)
+    assert TrainingTime.read(tmp_path).peak == 2**50
+
+
 def test_no_cell_of_the_tables_is_wrapped_or_cut_in_80_columns():
     names = ["psnr", "ssim", "lpips", "gaussians", "wall_ratio", "cpu_ratio", "trace_means", "trace_sh", "lambda_max"]
     sizes = {"psnr": 20.0, "ssim": 0.6, "lpips": 0.3, "wall_ratio": 3.4, "cpu_ratio": 3.4}

@@ -1,0 +1,265 @@
+"""`landscape view`: the splat in the browser, by viser, in the colours of any field of its Gaussians.
+
+    field       what colours the splats; the ends of its scale, and which splats are shown, are percentiles
+    cameras     the training views, with their photographs; the chosen one is rendered by our own renderer
+    click       the splat with most weight in the pixel there, again by our own renderer, and its numbers
+    e₁, e₂      steps along the steepest directions of a probe beside the checkpoint: splats, render and loss there
+
+viser's covariances are float16, so the scene is moved and scaled until its Gaussians lie within RADIUS.  Its colours are those
+of the constant band.
+"""
+
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from threading import Event, Lock
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib import colormaps
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from analysis.commands.map.command import Fields, measured_fields
+from analysis.commands.map.files import colours
+from analysis.commands.map.pictures import rendered
+from analysis.commands.options import ViewOptions
+from analysis.console.stages import Stages
+from analysis.measures.steepest import in_bytes
+from analysis.probe.command import opened, scene_objective
+from analysis.records.quantities import Shade, percent, quantity
+from analysis.slice.directions import RISE, UNITS, recorded_probe
+from landscape import curvature_reach
+from landscape.errors import InputError
+from splat.curvature.objective import SceneObjective
+from splat.model.camera import Camera, look_at
+from splat.model.gaussians import Gaussians
+from splat.model.harmonics import Y00
+from splat.projection.reference import rotation_matrices
+from splat.render.sight import sight
+from splat.training.checkpoint import write_atomically
+
+APPEARANCE = "appearance"
+RADIUS, WITHIN = 20.0, 0.95  # viser's units, and the share of the Gaussians that lies within
+LARGEST = 6e4  # of a covariance, just below the end of float16
+NARROW = 2000.0  # focal length of a click's pixel, px
+
+
+def run_view(options: ViewOptions) -> int:
+    """Show the checkpoint until Ctrl-C, or write a page; returns the exit code."""
+    viser = _viser()
+    console = Console(stderr=True)
+    stages = Stages(console)
+    with stages.stage("load"):
+        folder = options.checkpoint.parent
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, folder / "view")
+        objective = scene_objective(checkpoint, scene)
+    try:
+        server = viser.ViserServer(host=options.host, port=options.port, label="splat-landscape", verbose=False)
+    except OSError as error:
+        raise InputError(f"expected a free --port, got {options.port} ({error}); choose another") from error
+    try:
+        viewer = Viewer(server, objective)
+        if options.html is None:
+            console.print(f"open http://{options.host}:{server.get_port()}; Ctrl-C ends it", highlight=False)
+        notes: list[str] = []
+        with stages, stages.stage("fields") as report:
+            viewer.add_fields(measured_fields(objective, folder / "probe", notes, report), options.shown)
+        for note in notes:
+            console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        if options.html is not None:
+            write_atomically(options.html, server.scene.as_html().encode())
+            console.print(f"written: {options.html}", highlight=False, markup=False, soft_wrap=True)
+            return 0
+        viewer.add_steps(steepest_directions(objective, folder / "probe"))
+        Event().wait()
+    except KeyboardInterrupt:
+        console.print("ended", highlight=False)
+    finally:
+        server.stop()
+    return 0
+
+
+def _viser() -> Any:
+    try:
+        return import_module("viser")
+    except ImportError as error:
+        raise InputError(
+            f"expected the package viser, which shows a scene in the browser, got none ({error}); pip install -e '.[view]'"
+        ) from None
+
+
+def steepest_directions(objective: SceneObjective, probe: Path) -> dict[str, tuple[Tensor, float]]:
+    """Unit vectors of the two largest eigenvalues in a probe, if any, and how far they may be followed."""
+    recorded = recorded_probe(probe, objective, [])
+    if recorded is None:
+        return {}
+    ends, vectors = recorded.data.eigenvalues, recorded.arrays["eigenvectors"]["largest"]
+    values = {"e₁": ends.max.value, "e₂": ends.second.value if ends.second else None}
+    rise = RISE * objective.loss(objective.active.flat)
+    return {
+        name: (torch.from_numpy(vectors[:, i]), curvature_reach(value, rise, UNITS))
+        for i, (name, value) in enumerate(values.items())
+        if value and i < vectors.shape[1]
+    }
+
+
+class Frame:
+    """viser's coordinates: (x - centre) scale."""
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        means = gaussians.means.double()
+        self.centre = means.median(dim=0).values
+        distance = np.quantile((means - self.centre).norm(dim=1).numpy(), WITHIN)
+        self.scale = RADIUS / max(float(distance), 1e-12)
+
+    def place(self, points: Tensor) -> np.ndarray:
+        return ((points.double() - self.centre) * self.scale).numpy()
+
+    def back(self, point: Any) -> Tensor:
+        return torch.tensor(point, dtype=torch.float64) / self.scale + self.centre
+
+    def splats(self, gaussians: Gaussians) -> dict[str, np.ndarray]:
+        """centers and covariances, float32, that float16 can hold."""
+        quats = gaussians.quats.double()
+        axes = rotation_matrices(quats) * (gaussians.log_scales.double().exp() * self.scale)[:, None, :]
+        covariances = (axes @ axes.mT).clamp(-LARGEST, LARGEST)
+        return {"centers": self.place(gaussians.means).astype(np.float32), "covariances": covariances.float().numpy()}
+
+
+class Viewer:
+    """The page of one scene."""
+
+    def __init__(self, server: Any, objective: SceneObjective) -> None:
+        self.server, self.objective, self.frame = server, objective, Frame(objective.active)
+        self.fields: Fields | None = None
+        self.steps: Mapping[str, tuple[Tensor, float]] = {}
+        self.sliders: dict[str, Any] = {}
+        self._drawing = Lock()  # callbacks come from several threads
+        active = objective.active
+        self.plain = (0.5 + Y00 * active.sh[:, 0]).clamp(0, 1).float().numpy()
+        self.opacities = active.opacity_logits.sigmoid().float().numpy()[:, None]
+        self.splats = server.scene.add_gaussian_splats(
+            "/splats", **self.frame.splats(active), rgbs=self.plain, opacities=self.opacities
+        )
+        self._add_cameras()
+        gui = server.gui
+        self.field = gui.add_dropdown("field", (APPEARANCE,), hint="what colours the splats")
+        self.scale = gui.add_multi_slider("scale, percentiles", 0.0, 100.0, 0.5, (10.0, 98.0))
+        self.shown = gui.add_multi_slider("show, percentiles", 0.0, 100.0, 0.5, (0.0, 100.0))
+        self.legend = gui.add_html("")
+        for control in (self.field, self.scale, self.shown):
+            control.on_update(lambda _: self.recolour())
+        self.numbers = gui.add_markdown("Click a splat for its numbers.")
+        self.view = gui.add_dropdown("training view", tuple(view.name for view in objective.views))
+        self.render = gui.add_image(self._image(active), label="render")
+        self.loss = gui.add_markdown(f"loss {quantity(objective.loss(active.flat))}")
+        self.view.on_update(lambda _: self.step())
+        server.scene.on_click()(lambda event: self.click(event.ray_origin, event.ray_direction))
+
+    def _add_cameras(self) -> None:
+        views, scene = self.objective.views, self.server.scene
+        down = torch.stack([view.camera.rotation[1] for view in views]).mean(dim=0)
+        scene.set_up_direction(tuple((-down).tolist()))
+        for view in views:
+            camera = view.camera
+            turn = Rotation.from_matrix(camera.rotation.T.numpy()).as_quat(scalar_first=True)
+            step = -(-max(camera.width, camera.height) // 256)  # small photographs load at once
+            photograph = in_bytes(view.image).transpose(1, 2, 0)[::step, ::step]
+            scene.add_camera_frustum(
+                f"/cameras/{view.name}", fov=2 * float(np.arctan(camera.height / 2 / camera.fy)),
+                aspect=camera.width / camera.height, scale=RADIUS / 20, image=photograph,
+                wxyz=turn, position=self.frame.place(camera.centre),
+            )  # fmt: skip
+        first = views[0].camera
+        start = self.server.initial_camera
+        start.position = tuple(self.frame.place(first.centre).tolist())
+        start.look_at = tuple((self.frame.place(first.centre) + RADIUS * first.forward.numpy()).tolist())
+
+    def add_fields(self, fields: Fields, shown: str) -> None:
+        """The drop-down's further entries, once they are measured."""
+        self.fields = fields
+        self.field.options = (APPEARANCE, *fields.kinds)
+        if shown not in self.field.options:
+            raise InputError(f"expected --field {', '.join(self.field.options)}, got {shown!r}")
+        self.field.value = shown
+        self.recolour()
+
+    def add_steps(self, steps: Mapping[str, tuple[Tensor, float]]) -> None:
+        """A slider for each direction, in curvature units."""
+        self.steps = steps
+        for name in steps:
+            self.sliders[name] = self.server.gui.add_slider(f"step along {name}", -UNITS, UNITS, UNITS / 30, 0.0)
+            self.sliders[name].on_update(lambda _: self.step())
+
+    def recolour(self) -> None:
+        """The splats' colours, which of them are shown, and the legend."""
+        name = self.field.value
+        if self.fields is None or name == APPEARANCE:
+            self.splats.rgbs, self.splats.opacities, self.legend.content = self.plain, self.opacities, ""
+            return
+        kind, values = self.fields.kinds[name], self.fields.values[name].numpy()
+        ends = (float(self.scale.value[0]), float(self.scale.value[1]))
+        shade = Shade.of(name, kind.words, kind.unit, kind.scale, values, self.fields.weight, ends)
+        known = values[np.isfinite(values)]
+        low, high = np.percentile(known, self.shown.value) if len(known) else (0.0, 0.0)
+        everything = tuple(self.shown.value) == (0, 100)
+        inside = np.ones(len(values), bool) if everything else (values >= low) & (values <= high)
+        self.splats.rgbs = colours(shade, values)
+        self.splats.opacities = self.opacities * inside[:, None]
+        self.legend.content = legend(shade)
+
+    def step(self) -> None:
+        """The splats, the render of the chosen view and the loss where the sliders are."""
+        with self._drawing:
+            flat, active = self.objective.active.flat.clone(), self.objective.active
+            for name, (vector, reach) in self.steps.items():
+                flat += self.sliders[name].value / UNITS * reach * vector.to(flat)
+            there = active.with_flat(flat)
+            self.splats.set_gaussians(
+                **self.frame.splats(there), rgbs=self.splats.rgbs.copy(), opacities=self.splats.opacities.copy()
+            )
+            self.render.image = self._image(there)
+            self.loss.content = f"loss {quantity(self.objective.loss(flat))}"
+
+    def _image(self, gaussians: Gaussians) -> np.ndarray:
+        return in_bytes(rendered(self.objective, self._place(), gaussians)).transpose(1, 2, 0)
+
+    def _place(self) -> int:
+        return [view.name for view in self.objective.views].index(self.view.value)
+
+    def click(self, origin: Any, direction: Any) -> None:
+        """The numbers of the splat at a ray, in viser's coordinates."""
+        found = heaviest_on_ray(self.objective, self.frame.back(origin), torch.tensor(direction, dtype=torch.float64))
+        self.numbers.content = "Nothing there." if found is None else self.told(*found)
+
+    def told(self, gaussian: int, share: float) -> str:
+        """A Gaussian in sight, and its share of the pixel."""
+        number = int(self.objective.mask.nonzero()[gaussian, 0])
+        lines = [f"**Gaussian {number:,}**, {percent(share)} of this pixel", ""]
+        for name, kind in self.fields.kinds.items() if self.fields else ():
+            assert self.fields is not None
+            lines.append(f"- {kind.words}: {quantity(float(self.fields.values[name][gaussian]))} {kind.unit}")
+        return "\n".join(lines)
+
+
+def heaviest_on_ray(objective: SceneObjective, origin: Tensor, direction: Tensor) -> tuple[int, float] | None:
+    """The Gaussian with most weight in the pixel of a camera of one pixel along a ray, and this weight; None: there is none."""
+    aside = torch.eye(3, dtype=torch.float64)[int(direction.abs().argmin())]
+    camera = Camera(look_at(origin, origin + direction, aside), origin, NARROW, NARROW, 0.5, 0.5, 1, 1)
+    weight = sight(objective.active, camera, objective.settings).weight
+    best = int(weight.argmax())
+    return (best, float(weight[best])) if weight[best] > 0 else None
+
+
+def legend(shade: Shade) -> str:
+    """The scale of colours with its ends."""
+    stops = [colormaps[shade.colours](x)[:3] for x in np.linspace(0, 1, 9)]
+    gradient = ", ".join(f"rgb({', '.join(str(round(255 * c)) for c in stop)})" for stop in stops)
+    return (
+        f'<div style="padding:0 1em;font-size:.85em">{shade.words}, {shade.unit}<div style="height:.8em;background:'
+        f'linear-gradient(to right, {gradient})"></div><div style="display:flex;justify-content:space-between"><span>'
+        f"{quantity(shade.value(shade.low))}</span><span>{quantity(shade.value(shade.high))}</span></div></div>"
+    )

@@ -1,0 +1,177 @@
+"""An eigenvector of the loss shown where it acts: the Gaussians that carry it, in the view where they weigh most.
+
+    mass       of Gaussian i in a unit vector v: the sum of v^2 over its parameters; carriers have at least LEAST of it
+    step       sqrt(2 RISE L / |lambda|): by its curvature alone the loss L changes by RISE L
+    renders    at -step, 0 and +step along v, all Gaussians moved at once, in the part of the view around the first carrier
+
+The sentence names the attribute in which the first carrier has most of its mass.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, UInt8
+from torch import Tensor
+
+from analysis.measures.localization import mass_shares, masses, participation
+from analysis.records.quantities import Shade
+from analysis.records.run_files import Carrier, Steepest
+from landscape import curvature_reach
+from splat.curvature.fields import Values
+from splat.curvature.objective import SceneObjective
+from splat.projection.dispatch import projected
+from splat.projection.formulas import lens_of
+from splat.projection.reference import NEEDLE
+from splat.render.render import render
+from splat.render.sight import Sight
+from splat.scenes.view import View
+
+LEAST, MOST = 0.05, 5  # share of a carrier; how many at most
+RISE = 0.01  # of the loss, at the step
+SIGMAS = 2.0  # of an outline
+ROOM, SMALLEST, LARGEST = 1.3, 8, 2  # around an outline; a crop is between 1 / SMALLEST and 1 / LARGEST of its view
+WORDS = {"means": "moves", "log_scales": "stretches", "quats": "turns", "opacity_logits": "fades", "sh": "recolours"}
+PLACES = (
+    ("in the upper left", "at the top", "in the upper right"),
+    ("at the left", "in the middle", "at the right"),
+    ("in the lower left", "at the bottom", "in the lower right"),
+)
+Pictures = dict[str, UInt8[np.ndarray, "..."]]
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """An end of the spectrum: unit vector and eigenvalue; title: in words, as in "the steepest direction"."""
+
+    name: str
+    title: str
+    vector: Float[Tensor, " p"]
+    curvature: float
+
+
+def steepest(
+    objective: SceneObjective, end: End, values: Values, sights: Sequence[Sight], file: str
+) -> tuple[Steepest, Pictures]:
+    """Where an eigenvector acts, and its pictures: view, photograph, minus, zero, plus (h, w, 3), difference (h, w), in bytes.
+
+    values, sights: of the objective's fields.  file: the pictures' name.
+    """
+    mass = masses(end.vector, objective.active)
+    mass = mass / mass.sum()
+    order = mass.argsort(descending=True, stable=True)[:MOST].tolist()
+    chosen = [i for i in order if mass[i] >= LEAST] or order[:1]
+    index = int(torch.stack([sight.weight[chosen[0]] for sight in sights]).argmax())
+    view = objective.views[index]
+    carriers = [_carrier(objective, view, end, values, mass, i) for i in chosen]
+    crop = crop_around(carriers[0].outline, view.camera.width, view.camera.height)
+    rise = RISE * objective.loss(objective.active.flat)
+    step = curvature_reach(end.curvature, rise)
+    steps = {
+        name: objective.active.flat + sign * step * end.vector
+        for name, sign in (("minus", -1), ("zero", 0), ("plus", 1))
+    }
+    losses = [objective.loss(flat) for flat in steps.values()]
+    pictures, difference = _pictures(objective, view, steps, crop)
+    found = Steepest(
+        name=end.name, curvature=end.curvature, participation=participation(mass), carriers=carriers, view=view.name,
+        crop=list(crop), step=step, losses=losses, difference=difference, file=file,
+        sentence=sentence(end, carriers, participation(mass), view, len(objective.views)),
+    )  # fmt: skip
+    return found, pictures
+
+
+def _carrier(
+    objective: SceneObjective, view: View, end: End, values: Values, mass: Float64[Tensor, " n"], i: int
+) -> Carrier:
+    active = objective.active
+    own = active.with_flat(end.vector).select(torch.tensor([i]))
+    shares = mass_shares(own.flat, own.blocks)
+    splats, _, _ = projected(active.select(torch.tensor([i])), lens_of(view.camera, objective.settings))
+    outline = outline_of(splats[0].double())
+    return Carrier(
+        gaussian=int(objective.mask.nonzero()[i, 0]),
+        share=float(mass[i]),
+        attributes={name: float(mass[i]) * share for name, share in shares.items()},
+        sigmas=active.log_scales[i].double().exp().sort(descending=True).values.tolist(),
+        aspect=outline[2] / outline[3],
+        opacity=float(active.opacity_logits[i].sigmoid()),
+        views=int(values["views"][i]),
+        one_view=float(values["one_view"][i]),
+        outline=outline,
+    )
+
+
+def outline_of(splat: Float64[Tensor, "9"]) -> list[float]:
+    """Centre x, y, half axes at SIGMAS standard deviations, px, and the angle of the longer one.
+
+    >>> outline_of(torch.tensor([5.0, 6.0, 0.25, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
+    [5.0, 6.0, 4.0, 2.0, 0.0]
+    """
+    x, y, a, b, c = splat[:5].tolist()
+    values, vectors = np.linalg.eigh(np.array([[a, b], [b, c]]))  # ascending: the longer axis first
+    long, short = SIGMAS / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    axis = vectors[:, 0] * (1 if vectors[0, 0] >= 0 else -1)
+    return [x, y, float(long), float(short), float(np.arctan2(axis[1], axis[0]))]
+
+
+def crop_around(outline: Sequence[float], width: int, height: int) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of a part of a picture, of the picture's shape, that has an outline in its middle.
+
+    >>> crop_around([10.0, 90.0, 3.0, 1.0, 0.0], 160, 120)
+    (0, 82, 20, 97)
+    """
+    x, y, long, short, angle = outline
+    reach = [
+        np.hypot(long * np.cos(angle), short * np.sin(angle)),
+        np.hypot(long * np.sin(angle), short * np.cos(angle)),
+    ]
+    share = min(max(2 * ROOM * max(reach[0] / width, reach[1] / height), 1 / SMALLEST), 1 / LARGEST)
+    wide, tall = max(round(share * width), 1), max(round(share * height), 1)
+    left = min(max(round(x - wide / 2), 0), width - wide)
+    top = min(max(round(y - tall / 2), 0), height - tall)
+    return left, top, left + wide, top + tall
+
+
+def _pictures(
+    objective: SceneObjective, view: View, steps: dict[str, Tensor], crop: Sequence[int]
+) -> tuple[Pictures, Shade]:
+    left, top, right, bottom = crop
+    images = {
+        name: render(objective.active.with_flat(flat), view.camera, objective.background, objective.settings).image
+        for name, flat in steps.items()
+    }
+    parts = {name: image[:, top:bottom, left:right] for name, image in images.items()}
+    change = (parts["plus"] - parts["minus"]).mean(dim=0).double().numpy()
+    reach = float(np.abs(change).max()) or 1.0
+    words = "render at +step less that at −step"
+    shade = Shade(
+        name="difference", words=words, unit="of the range of a colour", scale="linear", low=-reach, high=reach
+    )
+    parts |= {"view": view.image, "photograph": view.image[:, top:bottom, left:right]}
+    pictures = {name: in_bytes(part).transpose(1, 2, 0) for name, part in parts.items()}
+    return pictures | {"difference": shade.bytes(change)}, shade
+
+
+def in_bytes(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "3 h w"]:
+    """An image, clamped to [0, 1]."""
+    return (image.detach().clamp(0, 1) * 255).round().byte().numpy()
+
+
+def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, count: int) -> str:
+    """What the first carrier is, and how much of the vector it has.  spread: the participation; count: of views."""
+    first = carriers[0]
+    name, share = max(first.attributes.items(), key=lambda item: item[1])
+    kind = f"a needle of {first.aspect:.0f} : 1" if first.aspect**2 > NEEDLE else f"a splat of {first.aspect:.1f} : 1"
+    x, y = first.outline[0] / view.camera.width, first.outline[1] / view.camera.height
+    row, column = (min(max(int(3 * each), 0), 2) for each in (y, x))
+    some = "both" if count == 2 else f"all {count}"
+    seen = "one view" if first.views == 1 else f"{some if first.views == count else f'{first.views} of {count}'} views"
+    if first.views > 1 and first.one_view >= 0.9:
+        seen += f", one of which has {first.one_view:.0%} of its weight"
+    alone = "" if share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
+    return (
+        f"{share:.0%} of {end.name}, {end.title}, {WORDS[name]} Gaussian {first.gaussian:,}, {kind} "
+        f"{PLACES[row][column]} of {view.name.rpartition('/')[2]}, seen by {seen}{alone}."
+    )

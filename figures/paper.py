@@ -1,0 +1,239 @@
+"""Figures and tables of the study, from its stored results: `python -m figures.paper [RESULTS] [--out OUT]`.
+
+RESULTS/study.csv           the trainings, as `landscape claims` writes them; by default those in notebooks/results
+RESULTS/trajectories.csv    the records along some of them, as `landscape trajectory` writes them, where there are any
+RESULTS/3dgs, stablegs      the records of one training each (probe or slice, test renders), where there are any
+
+OUT/claims, predictors      the effects behind the verdicts, and what goes with the score (`figures.claims`)
+OUT/budget                  after Fig. 8: PSNR on held-out views against the time of a training
+OUT/axes                    after Tables 2 and 4: what the axes of StableGS's probes gain, alone and together
+OUT/index                   after Fig. 7: the anisotropy index over the steps, with the band of the seeds
+OUT/fig1                    the paper's Fig. 1 of these two (`figures.fig1`)
+OUT/captions.md             a caption for each, and the nine verdicts, written from the numbers
+
+Each figure as PNG and PDF.  A cell of the study that was not run is named where its number would be.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from analysis.records.run_files import read_trajectory
+from analysis.runs.claims.effects import BASE, SCORE, STABLE, Interval, gains, log_ratios, numbers
+from analysis.runs.claims.predictors import predictors
+from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
+from figures import fig1
+from figures.claims import draw_claims, draw_predictors
+from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
+
+RESULTS = Path(__file__).parents[1] / "notebooks" / "results"
+PAIR = (BASE, STABLE)
+BUDGET = 1.3  # the paper's time of StableGS over that of 3DGS, Sec. 4.3
+VIEWPOINTS = {"occlusion": "edge_rotation", "interpolation": "interpolation", "parallax": "parallax"}
+ONLY = {  # one way to move a viewpoint, beside the probes of attributes
+    name: " ".join([STABLE, *(f"viewpoint.{other}=False" for other in VIEWPOINTS.values() if other != key)])
+    for name, key in VIEWPOINTS.items()
+}
+# the paper's gains over 3DGS on LLFF with three views, dB: Tables 2, 4 and 6
+AXES: tuple[tuple[str, str, float | None], ...] = (
+    ("all probes", STABLE, 4.73),
+    ("attributes", ATTRIBUTES_ALONE, 2.92),
+    ("  positions", AXIS.format("means"), 2.46),
+    ("  opacities", AXIS.format("opacity_logits"), 1.39),
+    ("  rotations", AXIS.format("quats"), None),
+    ("  scales", AXIS.format("log_scales"), None),
+    ("  colours", AXIS.format("sh"), None),
+    ("viewpoints", VIEWPOINTS_ALONE, 2.29),
+    ("attributes + occlusion", ONLY["occlusion"], 3.41),
+    ("attributes + interpolation", ONLY["interpolation"], 3.16),
+    ("attributes + parallax", ONLY["parallax"], 2.97),
+)
+
+
+def make(results: Path, out: Path) -> Iterator[Path]:
+    """Draw everything; gives each file when it is there.  FileNotFoundError where there is no study."""
+    table = results / "study.csv"
+    if not table.is_file():
+        raise FileNotFoundError(f"expected study.csv in {results}, as landscape claims writes it, found none")
+    rows = pd.read_csv(table)
+    drawn = {
+        "claims": draw_claims(effect_table(judgements(rows))),
+        "predictors": draw_predictors(predictors(rows)),
+        "budget": draw_budget(rows),
+        "axes": draw_axes(rows),
+    }
+    if (results / "trajectories.csv").is_file():
+        drawn["index"] = draw_index(read_trajectory(results / "trajectories.csv"))
+    if all((results / name).is_dir() for name in PAIR):
+        drawn["fig1"] = fig1.draw([results / name for name in PAIR])
+    for name, figure in drawn.items():
+        for suffix in ("png", "pdf"):
+            yield save(figure, out / f"{name}.{suffix}")
+    (out / "captions.md").write_text(captions(rows), encoding="utf-8")
+    yield out / "captions.md"
+
+
+def captions(rows: pd.DataFrame) -> str:
+    """Captions, trainings and verdicts as Markdown, from the numbers."""
+    words = {
+        "claims": "Effects with their 95% intervals over seeds; diamond: the paper's size.",
+        "predictors": _of_predictors(predictors(rows)),
+        "budget": _of_budget(rows),
+        "axes": _of_axes(rows),
+        "fig1": "The loss along the two steepest eigenvectors, and a view held out, of one training of each method.",
+        "index": "The literal index |λmax / λmin| over the steps; line: median, band: all seeds.",
+    }
+    lines = [f"**{name}.** {caption}" for name, caption in words.items()] + [_trainings(rows)]
+    lines += [f"{each.number}. {each.statement} **{each.verdict}.** {each.finding}" for each in judgements(rows)]
+    return "\n\n".join(lines) + "\n"
+
+
+def draw_budget(rows: pd.DataFrame) -> Figure:
+    """A dot for each seed, a cross of 95% intervals for each method."""
+    with style():
+        figure = new_figure(3.2, 5.0)
+        axes = figure.add_subplot()
+        axes.set_xscale("log")
+        axes.axvline(BUDGET, color=UNDETERMINED, linewidth=0.8, linestyle="--")
+        axes.annotate(
+            f"{BUDGET} ×, the paper's StableGS", (BUDGET, 0.02), xycoords=("data", "axes fraction"), rotation=90,
+            xytext=(3, 0), textcoords="offset points", color=UNDETERMINED, va="bottom",
+        )  # fmt: skip
+        places = []
+        for method in _methods(rows):
+            time, score = _time(rows, method), numbers(rows, SCORE, method)
+            colour = VERMILION if method.startswith(STABLE) else BLUE
+            axes.plot(time.reindex(score.index), score, ".", color=colour, markersize=3, alpha=0.5)
+            x, y = Interval.of(list(np.log(time))).exp(), Interval.of(score)
+            if y.n >= 2:
+                axes.hlines(y.value, x.low, x.high, color=colour, linewidth=1)
+                axes.vlines(x.value, y.low, y.high, color=colour, linewidth=1)
+            places.append((y.value, x.value, method, colour))
+        axes.set(xlabel="processor time over that of 3DGS (×)", ylabel="PSNR on held-out views (dB)")
+        axes.grid(True)
+        _label(axes, places)
+    return figure
+
+
+def _label(axes: Axes, places: list[tuple[float, float, str, str]]) -> None:
+    """Names in a column right of the axes, each joined to its point, in the order of the points."""
+    low, high = axes.get_ylim()
+    for at, (y, x, name, colour) in zip(np.linspace(0.02, 0.98, len(places)), sorted(places), strict=True):
+        height = at if len(places) > 1 else (y - low) / (high - low)
+        axes.annotate(
+            literal(name), (x, y), xytext=(1.03, height), textcoords="axes fraction", va="center", color=colour,
+            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.4, "shrinkB": 2}, annotation_clip=False,
+        )  # fmt: skip
+
+
+def draw_axes(rows: pd.DataFrame) -> Figure:
+    """A row for each axis: the gain over 3DGS with its interval, and the paper's."""
+    with style():
+        figure = new_figure(0.6 + 0.17 * len(AXES), 4.6)
+        axes = figure.add_subplot()
+        for place, (_, method, claimed) in zip(range(len(AXES))[::-1], AXES):
+            gain = Interval.of(gains(rows, method))
+            if gain.n >= 2:
+                axes.hlines(place, gain.low, gain.high, color=BLUE, linewidth=1.2)
+            if gain.n:
+                axes.plot(gain.value, place, "o", color=BLUE, markersize=3.5)
+            else:
+                axes.annotate(
+                    "not run", (0, place), xytext=(4, 0), textcoords="offset points", va="center", color=UNDETERMINED
+                )
+            if claimed is not None:
+                axes.plot(claimed, place, "D", color=VERMILION, markersize=3.5, markerfacecolor="white")
+        axes.axvline(0, color="0.5", linewidth=0.6)
+        axes.set_yticks(range(len(AXES))[::-1], [name for name, *_ in AXES])
+        axes.set_xlabel("PSNR over 3DGS (dB), with its 95% interval over seeds; diamond: the paper")
+        axes.grid(True, axis="x")
+    return figure
+
+
+def draw_index(along: pd.DataFrame) -> Figure:
+    """The median of each method's seeds, and the band from the least to the largest."""
+    known = pd.DataFrame(along[along["literal"].notna()])
+    methods = known["run"].astype(str).str.split("/").str[0]
+    with style():
+        figure = new_figure(2.6)
+        axes = figure.add_subplot()
+        axes.set_yscale("log")
+        for method, colour in zip(dict.fromkeys(methods), RUNS):
+            part = pd.DataFrame(known[methods == method])
+            steps = sorted(set(part["step"]))
+            values = [np.abs(part.loc[part["step"] == step, "literal"].to_numpy(float)) for step in steps]
+            low, middle, high = ([float(of(each)) for each in values] for of in (np.min, np.median, np.max))
+            axes.fill_between(steps, low, high, color=colour, alpha=0.25, linewidth=0)
+            axes.plot(steps, middle, "-o", color=colour, markersize=2, label=literal(method))
+        axes.set(xlabel="step", ylabel="|λmax / λmin|")
+        axes.grid(True)
+        axes.legend()
+    return figure
+
+
+def _methods(rows: pd.DataFrame) -> list[str]:
+    return [method for method in dict.fromkeys(rows["method"]) if len(_time(rows, method))]
+
+
+def _time(rows: pd.DataFrame, method: str) -> pd.Series:
+    """Processor time over that of 3DGS with the same seed."""
+    return pd.Series(np.exp(log_ratios(rows, "cpu_seconds", method)))
+
+
+def _of_predictors(related: pd.DataFrame) -> str:
+    decided = pd.DataFrame(related[(related["kind"] == "all") & ((related["low"] > 0) | (related["high"] < 0))])
+    best = sorted(decided.to_dict("records"), key=lambda row: -abs(row["rho"]))[:3]
+    if not best:
+        return "No quantity has a rank correlation with PSNR on held-out views whose interval excludes 0."
+    words = [f"{row['quantity']} ({row['rho']:+.2f}, {row['low']:+.2f} to {row['high']:+.2f})" for row in best]
+    return f"Over all runs PSNR on held-out views goes most with {', '.join(words)}; correlation is not cause."
+
+
+def _of_budget(rows: pd.DataFrame) -> str:
+    scores = {method: Interval.of(numbers(rows, SCORE, method)) for method in _methods(rows)}
+    if BASE not in scores:
+        return "3DGS was not run."
+    best = max(scores, key=lambda method: scores[method].value)
+    times = {name: Interval.of(list(np.log(_time(rows, name)))).exp() for name in (best, STABLE) if name in scores}
+    words = [f"{name} {scores[name].text(' dB')} in {time.text(' times')} its time" for name, time in times.items()]
+    return f"3DGS scores {scores[BASE].text(' dB')}; {'; '.join(words)}."
+
+
+def _of_axes(rows: pd.DataFrame) -> str:
+    known = {name.strip(): Interval.of(gains(rows, method)) for name, method, _ in AXES}
+    missing = [name for name, gain in known.items() if not gain.n]
+    words = [f"{name} {gain.text(' dB')}" for name, gain in known.items() if gain.n]
+    return "; ".join(words or ["no axis was run"]) + (f". Not run: {', '.join(missing)}." if missing else ".")
+
+
+def _trainings(rows: pd.DataFrame) -> str:
+    """What was trained, where and when."""
+    names = [name for name in ("scene", "views", "steps", "size", "machine", "commit", "date") if name in rows]
+    values = {name: ", ".join(dict.fromkeys(rows[name].dropna().astype(str))) for name in names}
+    return f"{len(rows)} trainings. " + " ".join(f"{name.capitalize()}: {value}." for name, value in values.items())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`python -m figures.paper [RESULTS] [--out OUT]`"""
+    parser = argparse.ArgumentParser(description="Draw the figures of the study from its stored results.")
+    parser.add_argument("results", type=Path, nargs="?", default=RESULTS, help="folder with study.csv")
+    parser.add_argument("--out", type=Path, default=Path("runs/paper"), help="folder of the figures")
+    options = parser.parse_args(arguments)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        for path in make(options.results, options.out):
+            print(path)
+    except (FileNotFoundError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,103 @@
+"""`landscape view`: what the page is given is what the scene has, and its controls do what they say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from analysis.commands import view
+from analysis.commands.cli import main
+from analysis.commands.map.command import measured_fields
+from analysis.commands.map.files import colours
+from analysis.commands.map.pictures import rendered
+from splat.curvature.objective import SceneObjective
+from splat.projection.reference import rotation_matrices
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from tests.splat.render.test_sight import weights
+
+MADE = synthetic_scene(SyntheticSettings(gaussians=150, views=2, width=32, height=24))
+
+
+@pytest.fixture(scope="module")
+def objective() -> SceneObjective:
+    return SceneObjective(MADE.truth, MADE.scene.load())
+
+
+@pytest.fixture
+def viewer(objective):
+    viser = pytest.importorskip("viser", reason="needs viser; pip install -e '.[view]'")
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield view.Viewer(server, objective)
+    server.stop()
+
+
+def test_without_viser_it_says_what_to_install(monkeypatch, capsys):
+    def missing(_: str):
+        raise ImportError("No module named 'viser'")
+
+    monkeypatch.setattr(view, "import_module", missing)
+    assert main(["view", "nowhere.pt"]) == 2
+    assert "pip install -e '.[view]'" in capsys.readouterr().err
+
+
+def test_float16_holds_the_scaled_splats(objective):
+    gaussians = objective.active.with_flat(objective.active.flat.clone())
+    gaussians.means[:] = gaussians.means * 1e-4 + 7  # far from the origin, and small
+    gaussians.log_scales[:] += np.log(1e-4)
+    frame = view.Frame(gaussians)
+    found = frame.splats(gaussians)
+    axes = rotation_matrices(gaussians.quats.double()) * gaussians.log_scales.double().exp()[:, None, :] * frame.scale
+    exact = (axes @ axes.mT).numpy()
+    held = found["covariances"].astype(np.float16).astype(np.float64)
+    assert np.linalg.norm(held - exact, axis=(1, 2)) == pytest.approx(
+        0, abs=0.01 * np.linalg.norm(exact, axis=(1, 2)).min()
+    )
+    assert np.quantile(np.linalg.norm(found["centers"], axis=1), view.WITHIN) == pytest.approx(view.RADIUS)
+    assert torch.allclose(frame.back(found["centers"][3]).float(), gaussians.means[3], atol=1e-6)
+
+
+def test_a_click_finds_the_splat_with_most_weight(objective):
+    camera, hits = objective.views[0].camera, 0
+    w, _ = weights(objective.active, camera, objective.settings)
+    for row, column in ((5, 6), (12, 16), (18, 25), (20, 10)):
+        inside = torch.tensor([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1.0])
+        found = view.heaviest_on_ray(objective, camera.centre, inside.double() @ camera.rotation)
+        hits += found is not None and found[0] in w[:, row, column].topk(2).indices.tolist()
+    assert hits >= 3  # the pixel of a click is smaller, and has another blur
+    assert view.heaviest_on_ray(objective, camera.centre, -camera.forward) is None
+
+
+def test_the_controls_colour_hide_and_step(viewer, objective):
+    fields = measured_fields(objective, Path("nowhere"), [], lambda *_: None)
+    viewer.add_fields(fields, "largest")
+    values = fields.values["largest"].numpy()
+    expected = colours(fields.shade("largest"), values)
+    assert np.abs(viewer.splats.rgbs / 255 - expected).max() < 0.01
+    assert "largest curvature" in viewer.legend.content
+    viewer.shown.value = (90.0, 100.0)
+    viewer.recolour()
+    assert (viewer.splats.opacities[:, 0] > 0).mean() == pytest.approx(0.1, abs=0.02)
+    assert values[viewer.splats.opacities[:, 0] > 0].min() >= np.percentile(values, 90)
+    direction = torch.zeros_like(objective.active.flat)
+    direction[objective.blocks["sh"]] = 1.0
+    viewer.add_steps({"e₁": (direction, 0.05)})
+    viewer.sliders["e₁"].value = view.UNITS  # all the way
+    viewer.step()
+    there = objective.active.with_flat(objective.active.flat + 0.05 * direction)
+    expected_image = view.in_bytes(rendered(objective, 0, there)).transpose(1, 2, 0)
+    assert np.array_equal(viewer.render.image, expected_image)
+    assert f"{view.quantity(objective.loss(there.flat))}" in viewer.loss.content
+    viewer.click(*_ray(viewer, objective))
+    assert "Gaussian" in viewer.numbers.content and "largest curvature" in viewer.numbers.content
+
+
+def _ray(viewer: view.Viewer, objective: SceneObjective) -> tuple[list[float], list[float]]:
+    camera = objective.views[0].camera
+    return viewer.frame.place(camera.centre).tolist(), camera.forward.tolist()
+
+
+def test_a_page_needs_no_network(viewer):
+    page = viewer.server.scene.as_html()
+    assert "__VISER_EMBED_DATA__" in page and len(page) < 20e6
+    assert 'src="http' not in page and 'href="http' not in page

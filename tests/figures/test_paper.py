@@ -1,0 +1,62 @@
+"""The figures of a stored study: all are there, as PNG and PDF, and their captions say what the numbers say."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from figures.paper import AXES, captions, draw_axes, draw_budget, draw_index, main
+from tests.analysis.runs.test_claims import OTHERWISE, PAPER, made_up
+
+NAMES = ("claims", "predictors", "budget", "axes")
+
+
+def test_every_figure_is_made_from_the_table_alone(tmp_path, capsys):
+    made_up(PAPER).to_csv(tmp_path / "study.csv", index=False)
+    assert main([str(tmp_path), "--out", str(tmp_path / "out")]) == 0
+    wanted = {f"{name}.{suffix}" for name in NAMES for suffix in ("png", "pdf")} | {"captions.md"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == wanted
+    assert len(capsys.readouterr().out.splitlines()) == len(wanted)
+
+
+def test_captions_change_with_the_numbers():
+    ours, other = captions(made_up(PAPER)), captions(made_up(OTHERWISE))
+    assert ours.count("**holds.**") == 9 and other.count("**does not hold.**") == 9
+    assert "Not run: attributes + occlusion, attributes + interpolation, attributes + parallax" in ours
+
+
+def test_an_axis_that_was_not_run_says_so_where_its_number_would_be():
+    rows = made_up(PAPER)
+    axes = draw_axes(rows).axes[0]
+    words = [text.get_text() for text in axes.texts]
+    assert words == ["not run"] * 3  # the viewpoints of Table 4
+    gains = [float(np.ravel(line.get_xdata())[0]) for line in axes.lines if line.get_marker() == "o"]
+    assert len(gains) == len(AXES) - 3 and gains[0] == pytest.approx(PAPER["psnr"], abs=0.1)
+
+
+def test_the_budget_shows_each_seed_and_the_mean_of_each_method():
+    rows = made_up(PAPER)
+    axes = draw_budget(rows).axes[0]
+    methods = list(dict.fromkeys(rows["method"]))
+    mean = {method: rows.loc[rows["method"] == method, "psnr"].mean() for method in methods}
+    assert [text.get_text() for text in axes.texts[1:]] == sorted(methods, key=mean.__getitem__)
+    dots = [line for line in axes.lines if line.get_marker() == "."]
+    assert len(dots) == len(methods) and all(len(np.ravel(line.get_xdata())) == 3 for line in dots)
+
+
+def test_the_index_over_the_steps_has_the_band_of_all_seeds():
+    steps = [0, 100, 200]
+    along = pd.DataFrame(
+        {"run": f"{method}/{seed}", "step": step, "literal": -(2.0 + seed) * (step + 1)}
+        for method in ("3dgs", "stablegs")
+        for seed in (0, 1)
+        for step in steps
+    )
+    axes = draw_index(along).axes[0]
+    assert [list(np.ravel(line.get_ydata())) for line in axes.lines] == [[2.5, 252.5, 502.5]] * 2
+    heights = np.asarray(axes.collections[0].get_paths()[0].vertices)[:, 1]
+    assert heights.min() == 2.0 and heights.max() == 3.0 * 201
+
+
+def test_a_folder_without_a_study_is_refused_in_a_sentence(tmp_path, capsys):
+    assert main([str(tmp_path)]) == 2
+    assert "expected study.csv" in capsys.readouterr().err
