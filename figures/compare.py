@@ -40,6 +40,7 @@ from figures.style import (
     style,
     unit_suffix,
 )
+from landscape.errors import InputError
 
 Records = Mapping[str, Record[ProbeRecord]]
 LINES = ("-", "--", ":")  # once the colours are used up
@@ -90,7 +91,7 @@ def _draw_trace(axes: Axes, trace: Trace | None, y: float, colour: str) -> None:
 def draw_densities(records: Records) -> Figure:
     """Both sides of 0 on the same axes."""
     if not any("nodes" in record.arrays.get("spectrum", {}) for record in records.values()):
-        raise ValueError("expected a spectral density in at least one record, got none")
+        raise InputError("expected a spectral density in at least one record, got none")
     with style():
         figure = new_figure(2.6, 2 * COLUMN)
         panels, ends = figure.subplots(1, 2, sharey=True), []

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, Record
 from figures.style import BLUE, new_figure, script, style
+from landscape.errors import InputError
 
 BROADENING = 0.01
 POINTS = 2000
@@ -65,10 +66,10 @@ def smooth_density(
 
 
 def draw(record: Record[ProbeRecord]) -> Figure:
-    """The density of one record.  Raises ValueError where none was recorded."""
+    """The density of one record.  Raises InputError where none was recorded."""
     arrays = record.arrays.get("spectrum", {})
     if "nodes" not in arrays:
-        raise ValueError(f"expected a spectral density in {record.folder}, got a record without; probe without --quick")
+        raise InputError(f"expected a spectral density in {record.folder}, got a record without; probe without --quick")
     return draw_density(_OfRecord(arrays["nodes"], arrays["weights"]))
 
 

@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from figures.fig7 import command_line, names_of, read_all
 from figures.manifold import Scale, contours, landscape_of, require_same_function, section, surface
 from figures.style import BLACK, RUNS, literal, new_figure, style
+from landscape.errors import InputError
 
 RENDERS = "test"
 WIDTH = 4.8  # inches
@@ -28,7 +29,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     landscapes = found[:2]
     require_same_function(runs)
     if not (common := found[2] & found[3]):
-        raise ValueError(
+        raise InputError(
             f"expected a view that both {runs[0]} and {runs[1]} have rendered, found none; train on one scene"
         )
     view = min(common)

@@ -21,6 +21,7 @@ from analysis.records.run_files import RECORDS, read_trajectory
 from figures.manifold import Scale, landscape_of, require_same_function, section, start_of, surface
 from figures.style import BLUE, RUNS, literal, new_figure, save, style
 from figures.trajectory import index_over_steps, marker_words, step_ticks
+from landscape.errors import InputError
 
 PAGE = 6.9  # inches
 BEGINNING = "start"
@@ -68,10 +69,10 @@ def draw(runs: Sequence[Path]) -> Figure:
 def names_of(runs: Sequence[Path]) -> list[str]:
     """Names of the folders; those of their parents where the folders have the same name, as with a sweep's METHOD/SEED."""
     if len(runs) != 2:
-        raise ValueError(f"expected two runs, of 3DGS and of StableGS, got {len(runs)}")
+        raise InputError(f"expected two runs, of 3DGS and of StableGS, got {len(runs)}")
     first, second = (run.resolve() for run in runs)
     if first == second:
-        raise ValueError(f"expected two different runs, got {runs[0]} twice")
+        raise InputError(f"expected two different runs, got {runs[0]} twice")
     while first.name == second.name:
         first, second = first.parent, second.parent
     return [first.name, second.name]
@@ -86,7 +87,7 @@ def read_all(*reads: Callable[[], Any]) -> list[Any]:
         except (FileNotFoundError, ValueError) as error:
             missing.append(str(error))
     if missing:
-        raise ValueError("; and ".join(missing))
+        raise InputError("; and ".join(missing))
     return found
 
 
@@ -97,7 +98,7 @@ def _measured(run: Path, name: str) -> pd.DataFrame:
     table = read_trajectory(run / RECORDS)
     table = pd.DataFrame(table[table["state"] != "skipped"]).assign(run=name)
     if table.empty:
-        raise ValueError(f"expected records in {run / RECORDS}, all were skipped; train with a larger --probe-share")
+        raise InputError(f"expected records in {run / RECORDS}, all were skipped; train with a larger --probe-share")
     return table
 
 

@@ -22,6 +22,7 @@ from analysis.records.records import ProbeRecord, Record, SliceRecord, read_reco
 from analysis.records.run_files import CHECKPOINT
 from figures.plane import Plane, plane
 from figures.style import BLACK, FIELD_MAP, MISSING, exponent_of, literal, unit_suffix
+from landscape.errors import InputError
 
 START = "start"
 INNER = 0.65  # of the reach of a surface: no tick farther out
@@ -88,7 +89,7 @@ def through_centre(landscape: Plane, axis: int) -> tuple[np.ndarray, np.ma.Maske
 
 
 def require_same_function(runs: Sequence[Path]) -> None:
-    """ValueError where the runs' landscapes are those of different functions; what an older record lacks is not compared."""
+    """InputError where the runs' landscapes are those of different functions; what an older record lacks is not compared."""
     records = {run: _record_of(run).data for run in runs}
     for key, what in FUNCTION.items():
         found = {
@@ -98,7 +99,7 @@ def require_same_function(runs: Sequence[Path]) -> None:
         for run, value in known.items():
             first, of_first = next(iter(known.items()))
             if value != of_first:
-                raise ValueError(
+                raise InputError(
                     f"expected runs with the same {what}, as their landscapes are not comparable else, got {of_first} in "
                     f"{first} and {value} in {run}; draw them apart"
                 )
@@ -113,18 +114,18 @@ def landscape_of(run: Path) -> Plane:
 
 
 def _record_of(run: Path) -> Record:
-    if not (run / CHECKPOINT).is_file():
-        raise FileNotFoundError(f"expected a run of `landscape train` in {run}, found no {CHECKPOINT} there")
     for name, kind in SLICES:
         if (run / name / kind.FILE).is_file():
             found = read_record(run / name, kind)
             directions = found.data.slice.directions if found.data.slice else ()
             if tuple(direction.name for direction in directions) != NAMES:
-                raise ValueError(
+                raise InputError(
                     f"expected a slice along {' and '.join(NAMES)} in {run / name}, got others; {_slice(run)}"
                 )
             if found.data.slice is None or found.data.slice.is_resolved:
                 return found
+    if not (run / CHECKPOINT).is_file():
+        raise FileNotFoundError(f"expected a run of `landscape train` in {run}, found no {CHECKPOINT} there")
     raise FileNotFoundError(
         f"expected a slice of {run} in {' or '.join(str(run / name) for name, _ in SLICES)}, with a surface, "
         f"found none; {_slice(run)}"
@@ -133,7 +134,8 @@ def _record_of(run: Path) -> Record:
 
 def start_of(run: Path) -> Plane:
     """Landscape of where a run began."""
-    if not (run / START / CHECKPOINT).is_file():
+    recorded = any((run / START / name / kind.FILE).is_file() for name, kind in SLICES)
+    if not recorded and not (run / START / CHECKPOINT).is_file():
         raise FileNotFoundError(
             f"expected the start of the run in {run / START / CHECKPOINT}, found none; train anew with --probe-every, "
             f"which keeps it, then {_slice(run / START)}"

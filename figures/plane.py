@@ -16,6 +16,7 @@ from analysis.records.findings import unresolved
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
 from figures.style import exponent_of, literal, unit_suffix
+from landscape.errors import InputError
 
 TRUE_PROPORTIONS = 2.5  # ranges whose ratio is below this are drawn to the same scale
 
@@ -91,16 +92,16 @@ class Plane:
 
 
 def plane(record: Record) -> Plane:
-    """The slice of a record.  Raises ValueError where none was recorded, or none of its points is finite."""
+    """The slice of a record.  Raises InputError where none was recorded, or none of its points is finite."""
     about = record.data.slice
     if about is None or "slice" not in record.arrays:
-        raise ValueError(f"expected a recorded slice in {record.folder / 'slice.npz'}, got none; probe with a slice")
+        raise InputError(f"expected a recorded slice in {record.folder / 'slice.npz'}, got none; probe with a slice")
     arrays = record.arrays["slice"]
     if "y" not in arrays:
-        raise ValueError(f"expected a slice over a plane in {record.folder / 'slice.npz'}, got one along a line")
+        raise InputError(f"expected a slice over a plane in {record.folder / 'slice.npz'}, got one along a line")
     changes = [arrays[name] - about.center_loss for name in ("loss", "model") if name in arrays]
     if not np.isfinite(changes[0]).any():
-        raise ValueError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
+        raise InputError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
     exponent = exponent_of(changes[0])
     masked = [np.ma.masked_invalid(change / 10.0**exponent) for change in changes]
     common = exponent_of(arrays["x"], arrays["y"])

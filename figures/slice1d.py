@@ -21,19 +21,20 @@ from analysis.records.schema import FiniteProbe, Slice
 from figures.plane import Direction, direction
 from figures.slice2d import CROSSED, RENDERED
 from figures.style import BLACK, BLUE, VERMILION, exponent_of, new_figure, script, style, unit_suffix
+from landscape.errors import InputError
 
 DOT = {"markersize": 5}
 SHORT = 0.25  # of a value: a bar within which it sets the limits
 
 
 def draw(record: Record) -> Figure:
-    """The slice along a line.  Raises ValueError where none was recorded, or none of its points is finite."""
+    """The slice along a line.  Raises InputError where none was recorded, or none of its points is finite."""
     about = record.data.slice
     if about is None or len(about.directions) != 1 or "slice" not in record.arrays:
-        raise ValueError(f"expected a slice along a line in {record.folder}, got none; slice with --dimension 1")
+        raise InputError(f"expected a slice along a line in {record.folder}, got none; slice with --dimension 1")
     arrays, probe = record.arrays["slice"], record.data.finite_probe
     if not np.isfinite(arrays["loss"]).any():
-        raise ValueError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
+        raise InputError(f"expected finite losses in {record.folder / 'slice.npz'}, got none")
     along = direction(about.directions[0], arrays["x"], exponent_of(arrays["x"]))
     with style():
         figure = new_figure(2.6 if probe is None else 5.0)

@@ -18,6 +18,7 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 from analysis.records.quantities import measured, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, script, style
+from landscape.errors import InputError
 
 DECADES = 5  # shown on either side of 0
 CONVERGED = 0.1  # residual over |value|
@@ -26,9 +27,9 @@ CURVATURE: dict[str, Any] = {"color": VERMILION, "linewidth": 0.7}
 
 
 def draw(record: Record[ProbeRecord]) -> Figure:
-    """The spectrum of one record.  Raises ValueError where no spectrum was recorded."""
+    """The spectrum of one record.  Raises InputError where no spectrum was recorded."""
     if "spectrum" not in record.arrays:
-        raise ValueError(f"expected the arrays ritz_values and residuals in {record.folder / 'spectrum.npz'}, got none")
+        raise InputError(f"expected the arrays ritz_values and residuals in {record.folder / 'spectrum.npz'}, got none")
     arrays = record.arrays["spectrum"]
     order = np.argsort(arrays["ritz_values"])
     values, residuals = arrays["ritz_values"][order], arrays["residuals"][order]

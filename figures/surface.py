@@ -28,6 +28,7 @@ from figures import render_surface
 from figures.plane import Direction, Plane, plane
 from figures.render_surface import Box
 from figures.style import BLACK, FIELD_MAP, VERMILION, new_figure, script, style
+from landscape.errors import InputError
 
 RENDERER = [sys.executable, str(Path(render_surface.__file__))]
 TIME_LIMIT = 120  # seconds for one picture
@@ -40,10 +41,10 @@ class RendererMissing(UserWarning):
 
 
 def draw(record: Record) -> Figure:
-    """The slice of one record as a surface.  Raises ValueError where none was recorded, or too few points are renders."""
+    """The slice of one record as a surface.  Raises InputError where none was recorded, or too few points are renders."""
     field = plane(record)
     if field.unresolved:
-        raise ValueError(f"expected a plane that is known between its axes; {field.unresolved}")
+        raise InputError(f"expected a plane that is known between its axes; {field.unresolved}")
     low, high = float(field.change.min()), float(field.change.max())
     span = high - low if high > low else 1.0
     ticks = np.asarray(MaxNLocator(5).tick_values(low, low + span))

@@ -24,6 +24,7 @@ from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.quantities import power_of_ten
 from analysis.records.run_files import ENDS, read_trajectory
 from figures.style import BLACK, RUNS, exponent_of, literal, new_figure, save, style, unit_suffix  # fmt: skip
+from landscape.errors import InputError
 
 INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
 UNITS = "traces, eigenvalues: loss per squared parameter unit"
@@ -35,11 +36,11 @@ APART = 0.03  # of a panel's width, between the bars of two runs at the same ste
 def draw(table: pd.DataFrame) -> Figure:
     """table: rows of `analysis/train/trajectory.py`, with the name of the run that each belongs to as "run".
 
-    Raises ValueError where nothing was measured.
+    Raises InputError where nothing was measured.
     """
     measured = pd.DataFrame(table[table["state"] != "skipped"])
     if measured["lambda_max"].dropna().empty:
-        raise ValueError(
+        raise InputError(
             "expected at least one record that was not skipped, got none; train with a larger --probe-share"
         )
     runs = {str(name): RUNS[i % len(RUNS)] for i, name in enumerate(table["run"].unique())}

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 from contextlib import redirect_stdout
 from functools import cache
 from io import StringIO
@@ -14,6 +15,7 @@ from figures.style import RUNS
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+COMMANDS = ("quick_start",)  # prints what commands say, which depends on the packages and the window that they find
 
 
 def cells(path: Path) -> list[str]:
@@ -64,6 +66,14 @@ def test_the_comparison_trains_both_methods_and_gives_every_trace_with_its_error
     assert not (len(stable.gaussians) == len(plain.gaussians) and stable.gaussians.flat.equal(plain.gaussians.flat))
 
 
+def test_the_quick_start_leaves_what_it_shows():
+    """A report, a slice and a map of the run that it trained; a command that fails is no silent cell."""
+    printed, names = story("quick_start")
+    run = names["WORK"] / "run"
+    assert all((run / file).is_file() for file in ("probe/report.html", "slice-gradient-1d/slice1d.png", "map/top.csv"))
+    assert "held-out views" in printed and "curvature" in printed
+
+
 def test_the_profiles_have_the_colours_and_names_of_the_figures():
     _, names = story("stablegs_vs_3dgs")
     lines = names["axes"].lines
@@ -72,9 +82,27 @@ def test_the_profiles_have_the_colours_and_names_of_the_figures():
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_uses_public_names_only_and_keeps_no_outputs(path):
+def test_a_notebook_uses_public_names_only(path):
     for node in ast.walk(ast.parse("\n".join(cells(path)))):
         name = node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
         assert not name.startswith("_") or name == "__init__", name
         assert not (isinstance(node, ast.ImportFrom) and any(alias.name.startswith("_") for alias in node.names))
-    assert all(not cell.get("outputs") for cell in json.loads(path.read_text(encoding="utf-8"))["cells"])
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_keeps_the_outputs_of_its_cells_as_they_are_and_small(path):
+    """Run in order without an error, with the words that its cells print today; pictures of at most 100 kB."""
+    found = [cell for cell in json.loads(path.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
+    outputs = [output for cell in found for output in cell["outputs"]]
+    assert [cell["execution_count"] for cell in found] == list(range(1, len(found) + 1))
+    assert all(output["output_type"] != "error" and output.get("name") != "stderr" for output in outputs)
+    pictures = [len(output["data"]["image/png"]) * 3 / 4 for output in outputs if "image/png" in output.get("data", {})]
+    assert pictures and max(pictures) <= 100_000 and path.stat().st_size <= 400_000
+    if path.stem not in COMMANDS:
+        stored = "".join(text for output in outputs for text in output.get("text", []))
+        assert words(stored) == words(story(path.stem)[0])
+
+
+def words(text: str) -> list[str]:
+    """What is said, but for the numbers, which rounding on another processor may change."""
+    return re.findall(r"[A-Za-z]{3,}", text)

@@ -240,7 +240,7 @@ def _of_operator(
         if name != WHOLE and name not in spaces:  # an attribute without parameters, or wholly null
             continue
         report(done, len(names), name)
-        settings = _fitted(operator, options, allowed, each, notes)
+        settings = _fitted(hessian.objective, options, allowed, each, notes)
 
         def say(_: int, __: int, state: str, done: int = done) -> None:
             report(done, len(names), state)
@@ -290,11 +290,11 @@ def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: Scene
 
 
 def _fitted(
-    operator: SymmetricOperator, options: FamilyOptions, seconds: float, each: float, notes: list[str]
+    objective: SceneObjective, options: FamilyOptions, seconds: float, each: float, notes: list[str]
 ) -> FamilySettings:
     """The budget, as far as time and memory allow it.  each: seconds of a product with as many vectors as a batch has."""
     settings, eigen = options.family, options.family.eigen
-    room = vectors_within(operator, options.memory)
+    room = vectors_within(objective, options.memory)
     basis = basis_within(eigen, room)
     if basis < eigen.basis:
         notes.append(f"the families' Lanczos kept {basis} vectors instead of {eigen.basis}, to stay within memory")

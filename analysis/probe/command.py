@@ -24,6 +24,7 @@ from analysis.console.kept import kept_stages
 from analysis.console.options import ForeignOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
+from analysis.measures.memory import telling_needs
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
@@ -40,6 +41,7 @@ from splat.backend.device import device_named
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
+from splat.scenes.view import digests
 from splat.training.checkpoint import Checkpoint, open_checkpoint
 from splat.training.origin.foreign import Foreign
 
@@ -84,12 +86,18 @@ def _run(
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True, markup=False)
     told = (
-        f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {settings} "
+        f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} "
+        f"{digests(scene.select(checkpoint.scene.train))} {settings} "
         f"{options.seed} {device} {versions()}"
     )
     deadline = begun + limit - DRAWING
     # a folder that is being written by another command, or cannot be, is noticed before anything is measured
-    with record_folder(out) if writes else nullcontext() as folder, stages, _kept(unfinished, command, console):
+    with (
+        record_folder(out) if writes else nullcontext() as folder,
+        stages,
+        _kept(unfinished, command, console),
+        telling_needs(objective),
+    ):
         generator = torch.Generator(device).manual_seed(options.seed)
         found = measure(objective, settings, generator, stages, None if ranks else unfinished, told, deadline)
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)

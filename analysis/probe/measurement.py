@@ -255,10 +255,11 @@ def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Prog
 def _ends(at: _Point, seconds: float, generator: torch.Generator, report: Progress, notes: list[str]) -> EigenEnds:
     """In the time that there is, with a basis that memory has room for."""
     eigen, memory = at.settings.eigen, at.settings.memory
-    basis = basis_within(eigen, vectors_within(at.operator, memory))
+    basis = basis_within(eigen, vectors_within(at.objective, memory))
     if basis < eigen.basis:
         notes.append(
-            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB"
+            f"the search for the ends kept {basis} vectors instead of {eigen.basis}, to stay within {memory:g} GiB and half of "
+            "what was free"
         )
     start = BlockEigenvectors(at.objective, *at.objective.approximate_blocks).warm_start()
     eigen = replace(eigen, max_seconds=seconds, basis=basis)
@@ -275,7 +276,7 @@ def _spectrum(
 ) -> Spectrum:
     """In runs that memory has room for."""
     settings, iterates = at.settings, []
-    room = vectors_within(at.operator, settings.memory)
+    room = vectors_within(at.objective, settings.memory)
     batch = MOST_AT_ONCE if room > FEWEST_STEPS * MOST_AT_ONCE else 1
     longest = room // (batch + 1)
     if longest < FEWEST_STEPS:

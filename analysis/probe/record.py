@@ -27,6 +27,7 @@ from splat.curvature.objective import ActiveCounts, SceneObjective
 from splat.curvature.traces import curvature_scale
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
+from splat.scenes.view import digests
 from splat.training.checkpoint import Checkpoint
 
 NAMES = ("e₁", "e₂")  # of the slice's directions
@@ -95,6 +96,7 @@ def provenance_of(
         scene=scene.name,
         scene_folder=str(scene.root),
         views=list(checkpoint.scene.train),
+        photographs=digests(scene.select(checkpoint.scene.train)),
         iteration=checkpoint.training.step,
         dtype=str(checkpoint.training.gaussians.flat.dtype).removeprefix("torch."),
         threads=torch.get_num_threads(),

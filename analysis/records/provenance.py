@@ -29,7 +29,7 @@ class Provenance(Struct, kw_only=True):
     """Where the numbers come from.  versions: of Python and packages, None for what is not installed.
 
     commit: of the checkout that the code lies in, ending in + where files differ from it; None without git or outside of one.
-    origin: of another tool's file, what was assumed.
+    origin: of another tool's file, what was assumed.  photographs: what tells the file of each view from any other.
     other: the checkpoint at the other end of a line.  settings: of the command; families: those of the families.
     """
 
@@ -44,6 +44,7 @@ class Provenance(Struct, kw_only=True):
     scene: Maybe[str] = UNSET
     scene_folder: Maybe[str] = UNSET
     views: Maybe[list[str] | None] = UNSET
+    photographs: Maybe[list[str] | None] = UNSET
     iteration: Maybe[int] = UNSET
     dtype: Maybe[str] = UNSET
     threads: Maybe[int] = UNSET

@@ -26,7 +26,7 @@ from analysis.records.json_files import decoded, encoded, fitted, json_text, pla
 from analysis.records.provenance import Provenance
 from analysis.records.schema import Count, Maybe, Number
 from landscape.errors import InputError
-from splat.model.untrusted import beside, locked, require_modest
+from splat.model.untrusted import beside, locked, require_held, require_modest
 
 ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
@@ -284,6 +284,10 @@ def _archive(stream: BinaryIO) -> Any:
     """The arrays of an .npz, read when they are asked for."""
     with zipfile.ZipFile(stream) as archive:
         require_modest(archive)
+        for member in archive.infolist():
+            if member.filename.endswith(".npy"):
+                with archive.open(member) as file:
+                    require_held(cast(BinaryIO, file), member.file_size)
     stream.seek(0)
     return np.load(stream, allow_pickle=False)
 

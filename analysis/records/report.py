@@ -6,6 +6,7 @@ to a network.  Text from the record is escaped.
 
 import base64
 import gzip
+import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,12 +16,14 @@ import jinja2
 import numpy as np
 import plotly.graph_objects as go
 import plotly.io
+from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from analysis.records.findings import attribute_name, findings, headline, is_open
 from analysis.records.json_files import plain
 from analysis.records.quantities import limits, measured, quantity
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
+from analysis.records.run_files import MAP, MapRecord, read_map
 from analysis.records.schema import INDICES
 from analysis.records.tables import family_lines
 
@@ -80,6 +83,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         findings=findings(record.data),
         views=views_in(record),
         pictures=pictures_in(record.folder, PICTURES),
+        where=where(record),
         families=family_lines(record.data),
         indices=INDICES,
         surface=surface,
@@ -118,6 +122,38 @@ def views_in(record: Record[ProbeRecord]) -> list[dict[str, str]]:
         for name, photograph, render in pairs
         if photograph.is_file() and render.is_file()
     ]
+
+
+def where(record: Record[ProbeRecord]) -> dict[str, Any]:
+    """Sentences and pictures, as JPEG, of the map beside the record that was made of the same step of the training, if any."""
+    folder = record.folder.parent / MAP
+    if not (folder / MapRecord.FILE).is_file():
+        return {}
+    found = read_map(folder)
+    if plain(found.provenance).get("iteration") != plain(record.data.provenance).get("iteration"):
+        return {}
+    beneath = "the Gaussians that carry it, outlined, and what a step along it does."
+    shown = [(end.file, f"{end.name}: {beneath}", end.sentence) for end in found.steepest]
+    for panel in found.panels[:1]:
+        words = (
+            f"{panel.name}: photograph, render, error, and {found.shades[found.field].words} of the Gaussians there."
+        )
+        axes = f"{panel.name}: where it is fragile in position, conditioning and opacity."
+        shown.append((panel.file, words, words))
+        shown.append((panel.file.replace("view", "fragility"), axes, " ".join(found.sentences[len(found.steepest) :])))
+    pictures = [
+        {"caption": caption, "words": words, "uri": _as_jpeg(folder / f"{name}.png")}
+        for name, caption, words in shown
+        if (folder / f"{name}.png").is_file()
+    ]
+    return {"sentences": found.sentences, "pictures": pictures}
+
+
+def _as_jpeg(path: Path) -> str:
+    """A picture, mostly of photographs, in a quarter of its bytes."""
+    content = io.BytesIO()
+    Image.open(path).convert("RGB").save(content, "JPEG", quality=88)
+    return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
 def _uri(path: Path, kind: str) -> str:

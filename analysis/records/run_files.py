@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 CHECKPOINT, METRICS, SECONDS, RECORDS, COMPARISON = (
     "checkpoint.pt", "metrics.json", "seconds.json", "trajectory.csv", "compare.json",
 )  # fmt: skip
+MAP = "map"  # RUN/map, a folder of `landscape map`
 NO_TIME = "no time"  # how the note of a record of a trajectory begins that was skipped for that
 STATES = ("whole", "coarse", "cut", "skipped")  # of a record of a trajectory; older ones were cut where time ended them
 TRAJECTORY_INDICES = INDICES[:4]  # of the anisotropy

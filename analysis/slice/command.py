@@ -29,6 +29,7 @@ from torch import Tensor
 
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
+from analysis.measures.memory import telling_needs
 from analysis.probe.command import opened, scene_objective
 from analysis.probe.measurement import evaluation
 from analysis.probe.record import provenance_of
@@ -57,6 +58,7 @@ from splat.backend.device import device_named
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
+from splat.model.untrusted import read_array
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
@@ -79,7 +81,7 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         others = [_other_end(checkpoint, path) for path in options.others]
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
     # a folder that is being written by another command, or cannot be, is noticed before anything is rendered
-    with record_folder(out, SliceRecord) as folder, stages:
+    with record_folder(out, SliceRecord) as folder, stages, telling_needs(objective):
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:
@@ -133,7 +135,7 @@ def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list
     if kept.is_file():
         try:
             with kept.open("rb") as stream, refusing_damage("eigenvectors", kept, "they were computed again"):
-                vectors = torch.from_numpy(np.load(stream, allow_pickle=False))
+                vectors = torch.from_numpy(read_array(stream))
             found.append(vectors.to(objective.active.flat.device))
         except InputError as error:
             notes.append(str(error))

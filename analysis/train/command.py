@@ -249,17 +249,18 @@ def resumed(path: Path, config: TrainConfig, reference: SceneReference, remedy: 
     """The training of a checkpoint, which must have been started with the same settings on the same views.  remedy: what a
     refusal advises."""
     loaded = load_checkpoint(path)
-    asked = {**leaves(asdict(config)), **leaves(asdict(replace(reference, absolute="", relative="")))}
-    saved = {
-        **leaves(asdict(loaded.training.config)),
-        **leaves(asdict(replace(loaded.scene, absolute="", relative=""))),
-    }
+
+    def settings(of: TrainConfig, scene: SceneReference) -> dict[str, Any]:
+        return leaves(asdict(of)) | leaves(asdict(replace(scene, absolute="", relative="", photographs=None)))
+
+    asked, saved = settings(config, reference), settings(loaded.training.config, loaded.scene)
     for key, value in saved.items():
         if asked[key] != value:
             raise InputError(
                 f"expected the settings that the run in {path.parent} was started with, {key} = {value}, got "
                 f"{asked[key]}; {remedy}"
             )
+    loaded.scene.require_photographs(reference.photographs, Path(reference.absolute))
     return loaded.training
 
 

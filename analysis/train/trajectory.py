@@ -31,7 +31,6 @@ _high; the last
                        three of whole records, which have a spectral density
 """
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import isinf
@@ -250,14 +249,13 @@ def _columns(found: Found) -> Row:
 
 
 def _read_rows(path: Path, step: int) -> list[Row]:
-    """Those up to a step."""
+    """Those up to a step, as text, which is written back to the same bits."""
     if not path.is_file():
         return []
-    read_trajectory(path)  # which refuses a damaged one
-    with path.open(encoding="utf-8", newline="") as stream:
-        # as text, which is written back to the same bits
-        rows: list[Row] = [dict(row) for row in csv.DictReader(stream)]
-    return [row | {"seconds": float(row["seconds"])} for row in rows if float(row["step"]) <= step]
+    table, text = read_trajectory(path), pd.read_csv(path, dtype=str, na_filter=False)
+    rows: list[Row] = [dict(zip(text, row, strict=True)) for row in text.itertuples(index=False)]
+    kept = zip(rows, table["step"], table["seconds"], strict=True)
+    return [row | {"seconds": float(seconds)} for row, at, seconds in kept if at <= step]
 
 
 def _compile(training: Training, views: Sequence[View]) -> float:

@@ -188,12 +188,15 @@ class KeptViews:
     linearize: makes the view of an index; count: how many views; memory: bytes for views and the workspace of a product with
     VECTORS vectors.  The first view is made here, always kept, and stands for the size of all.  Memory decides how many views
     are kept and nothing else, so that results do not depend on it.
+
+    first: the first view.
     """
 
     def __init__(self, linearize: Callable[[int], LinearizedView], count: int, memory: int):
         first = linearize(0)
         more = (memory - first.bytes - first.workspace(VECTORS)) // first.bytes
         self.kept = 1 + min(max(more, 0), count - 1)
+        self.first = first
         self._linearize, self._count, self._views = linearize, count, {0: first}
 
     def __len__(self) -> int:
@@ -210,4 +213,4 @@ class KeptViews:
 
     def workspace(self, vectors: int) -> int:
         """Bytes that a product with so many vectors takes at a time in the first view."""
-        return self._views[0].workspace(min(vectors, VECTORS))
+        return self.first.workspace(min(vectors, VECTORS))

@@ -9,6 +9,7 @@ import os
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from math import prod
 from pathlib import Path
 from typing import BinaryIO
@@ -30,15 +31,28 @@ def require_modest(archive: zipfile.ZipFile) -> None:
         raise InputError(f"it promises {held:,} bytes in a file of {size:,}")
 
 
+def require_held(file: BinaryIO, size: int) -> np.dtype:
+    """The type of an array that `numpy.save` wrote into so many bytes, without the array.
+
+    ValueError, or whatever NumPy raises, where the header is none, or promises more than there is, for which NumPy would ask
+    memory at once.
+    """
+    version = np.lib.format.read_magic(file)
+    start = file.read(2 if version == (1, 0) else 4)
+    length = int.from_bytes(start, "little")
+    if length > size:
+        raise ValueError(f"it promises a header of {length:,} bytes in {size:,}")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = read(BytesIO(start + file.read(length)))
+    if min(shape, default=0) < 0 or prod(shape) * kind.itemsize > size:
+        raise ValueError(f"it promises {kind} of shape {shape} in {size:,} bytes")
+    return kind
+
+
 def read_array(file: BinaryIO) -> np.ndarray:
     """Real numbers that `numpy.save` wrote.  InputError where the file has others, none, or fewer than it promises."""
-    size = os.fstat(file.fileno()).st_size
     try:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, kind = read(file)
-        if min(shape, default=0) < 0 or prod(shape) * kind.itemsize > size:
-            raise ValueError(f"it promises {kind} of shape {shape} in {size:,} bytes")
+        kind = require_held(file, os.fstat(file.fileno()).st_size)
         if kind.kind not in "fiu":
             raise InputError(f"an array of {kind}, not of real numbers")
         file.seek(0)
@@ -47,6 +61,19 @@ def read_array(file: BinaryIO) -> np.ndarray:
         raise
     except Exception as error:  # NumPy has Python read the header, whose errors are of many kinds
         raise InputError(f"no array of numbers ({error})") from error
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The file of this name in a folder.  InputError where a name of someone else's file leads out of it."""
+    path = folder / name
+    by_name = Path(os.path.abspath(path)).is_relative_to(
+        os.path.abspath(folder)
+    )  # links in it may lead where they will
+    if not by_name and not path.resolve().is_relative_to(folder.resolve()):
+        raise InputError(
+            f"expected names of files in {folder}, got {name!r}, which leads out of it; move the file there"
+        )
+    return path
 
 
 @contextmanager

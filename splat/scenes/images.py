@@ -132,7 +132,8 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
         raise InputError(f"the camera of image {photo.name!r} cannot be: {error}") from error
     camera = full.resized(width, height)
     warp = partial(_warp, lens, pinhole, (width, height))
-    return Frame(photo.name, camera, partial(_view, photo, camera, warp, background), photo.subset, photo.depth_range)
+    view = partial(_view, photo, camera, warp, background)
+    return Frame(photo.name, camera, view, photo.subset, photo.depth_range, photo.path)
 
 
 def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> pycolmap.Camera:

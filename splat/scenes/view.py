@@ -10,6 +10,8 @@ background where the file has an alpha channel.  World units and axes are those 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -57,7 +59,7 @@ class Frame:
     """A posed picture that `view()` reads.
 
     subset: the part that the scene's own files assign it to.  depth_range: nearest and farthest depth of the scene
-    content, world units.  None where the files do not say.
+    content, world units.  None where the files do not say.  path: of the picture, None where it is not on disk.
     """
 
     name: str
@@ -65,6 +67,15 @@ class Frame:
     view: Callable[[], View]
     subset: Subset | None = None
     depth_range: tuple[float, float] | None = None
+    path: Path | None = None
+
+
+def digests(frames: Sequence[Frame]) -> list[str] | None:
+    """What tells each picture's file from any other, by its bytes; None where one is not on disk."""
+    paths = [frame.path for frame in frames if frame.path is not None]
+    if len(paths) < len(frames):
+        return None
+    return [blake2b(path.read_bytes(), digest_size=8).hexdigest() for path in paths]
 
 
 @dataclass(frozen=True, eq=False)

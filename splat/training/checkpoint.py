@@ -78,7 +78,8 @@ class Checkpoint(Brief):
         chosen = set(spread_views(scene.select(self.scene.train), count))
         kept = [i for i, name in enumerate(self.scene.train) if name in chosen]
         train, sizes = [self.scene.train[i] for i in kept], [self.scene.sizes[i] for i in kept]
-        return replace(self, scene=replace(self.scene, train=train, sizes=sizes))
+        known = self.scene.photographs and [self.scene.photographs[i] for i in kept]
+        return replace(self, scene=replace(self.scene, train=train, sizes=sizes, photographs=known))
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
         """The scene that this checkpoint, read from path, belongs to, see `SceneReference.load`."""
@@ -282,8 +283,10 @@ def _checkpoint(content: Any) -> Checkpoint:
         plain, config = ThreeDGS(), typed(dict[str, Any], content.get("config"), "config")
         content = {**content, "config": {**config, "method": asdict(plain)}, "regularizer": plain.create(0).state()}
     training, scene = restored_training(content), file.scene
-    if len(scene.sizes) != len(scene.train):
-        raise InputError(f"it has {len(scene.sizes)} sizes for {len(scene.train)} training views")
+    for each in ("sizes", "photographs"):
+        found = getattr(scene, each)
+        if found is not None and len(found) != len(scene.train):
+            raise InputError(f"it has {len(found)} {each} for {len(scene.train)} training views")
     if not all(index < len(scene.train) for index in training.order):
         raise InputError(f"its order does not index its {len(scene.train)} training views")
     return Checkpoint(training, scene, file.torch)

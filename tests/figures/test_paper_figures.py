@@ -49,6 +49,12 @@ def test_everything_stays_inside_the_page(runs, module):
     assert drawn.x1 <= figure.get_figwidth() + POINT and drawn.y1 <= figure.get_figheight() + POINT
 
 
+def test_stored_records_need_no_checkpoint(runs):
+    for checkpoint in runs[0].parents[1].rglob("checkpoint.pt"):
+        checkpoint.unlink()
+    assert len(fig1.draw(runs).axes) == 9
+
+
 def test_contours_have_the_ticks_of_the_sections(runs):
     for run, reach in zip(runs, (0.0532, 0.1005), strict=True):
         record = read_record(run / "slice-eigenvectors-2d")

@@ -174,9 +174,9 @@ def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_pa
     done = started(["train", str(scene), "--out", str(tmp_path / "new")], preexec_fn=limited(4096))
     said = done.communicate()[1]
     assert done.returncode == 74 and str(tmp_path) in said and "Traceback" not in said, said
-    done = started(
-        ["probe", str(run / "checkpoint.pt"), "--out", str(tmp_path / "probe"), "--quick"], preexec_fn=limited(8192)
-    )
+    quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
+    assert main([*quick, str(run / "first")]) == 0  # compiles what is not yet
+    done = started([*quick, str(tmp_path / "probe")], preexec_fn=limited(8192))
     said = done.communicate()[1]
     assert done.returncode == 74 and str(tmp_path / ".probe.unfinished/") in said and "Traceback" not in said, said
     assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]  # from where it goes on
@@ -215,6 +215,15 @@ def test_a_cut_file_of_a_kernel_is_compiled_anew(tmp_path):
             check=True,
         ).stdout
 
+    full = subprocess.run(
+        [sys.executable, str(tmp_path / "small.py")],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        preexec_fn=limited(100),
+    )
+    assert "File too large" in full.stderr and str(tmp_path / "cache") in full.stderr.splitlines()[-1]
     assert ran() == "8.0\n"
     for suffix in ("nbi", "nbc"):
         for file in (tmp_path / "cache").rglob(f"small.twice-*.{suffix}"):

@@ -36,7 +36,7 @@ from analysis.probe.record import provenance_of
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import Shade, quantity
 from analysis.records.records import record_folder, require_replaceable
-from analysis.records.run_files import MapRecord, Panel, Steepest
+from analysis.records.run_files import MAP, MapRecord, Panel, Steepest
 from analysis.slice.directions import recorded_probe
 from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
@@ -47,6 +47,7 @@ from splat.scenes.view import View
 
 ENDS = {"e1": "share of e₁", "e_min": "share of e_min"}
 AXES = ("order_gap", "condition", "one_view")  # of fragility
+PROBE = "probe"
 SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 
 
@@ -70,7 +71,7 @@ class Fields:
 
 def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
     """Map the checkpoint; returns the exit code.  command: as typed, for the record; drawn: draws the pictures."""
-    out = options.out or options.checkpoint.parent / "map"
+    out = options.out or options.checkpoint.parent / MAP
     known = [*FIELDS, *ENDS]
     if options.shown not in known:
         raise InputError(
@@ -85,7 +86,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         chosen = _chosen(options.draw, objective.views)
     with record_folder(out, MapRecord) as folder, stages:
         with stages.stage("fields") as report:
-            found = measured_fields(objective, options.checkpoint.parent / "probe", notes, report)
+            found = measured_fields(objective, options.checkpoint.parent / PROBE, notes, report)
         if options.shown not in found.values:
             raise InputError(
                 f"expected a probe with eigenvectors of this checkpoint in {options.checkpoint.parent / 'probe'} for "
@@ -120,6 +121,10 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
                 data.notes.append(" ".join(str(error).split()))
         data.timing = {**stages.timing, "total": perf_counter() - start}
         _write(folder, data)
+    if found.ends:
+        from analysis.records.report import write_report  # a quarter of a second of imports
+
+        write_report(options.checkpoint.parent / PROBE)  # its page has the map's pictures too
     _conclude(data, top.iloc[0].to_dict(), found.kinds[options.shown], out)
     return 0
 

@@ -20,7 +20,8 @@ from analysis.runs.claims.effects import SCORE
 
 QUANTITIES = (
     "train_psnr", "gaussians", *(f"trace_{name}" for name in ATTRIBUTES), "lambda_max", "lambda_second", "lambda_min", *INDICES,
-    "depth_gradient", "needles",
+    *(f"{name}_{metric}" for metric in ("scene", "optimiser") for name in INDICES),
+    "finite_curvature", "depth_gradient", "needles", "one_gaussian", "opacity_one_view",
 )  # fmt: skip
 DRAWS, LIMITS, LEAST = 2000, (0.025, 0.975), 5
 

@@ -10,6 +10,11 @@
     depth_gradient              the root mean square gradient of the positions along the rays, over that across them
     needles, needle_count       share of the steepest eigenvector's squared mass on Gaussians with kappa above 100, and share of
                                 the visible Gaussians that these are
+    one_gaussian                share of the steepest eigenvector's squared mass on a single Gaussian
+    INDEX_scene, INDEX_optimiser   the indices in units of the scene's size or of the optimiser's steps, where the families were
+                                measured in these
+    finite_curvature            curvature along the steepest eigenvector seen by steps as long as Adam's first: the root of the
+                                mean of the squared learning rates of its attributes, weighted with its mass
     opacity_one_view            rank correlation of a Gaussian's curvature in opacity with the share of its weight that one view
                                 sees; where `landscape map` has been run
     hutchinson_ATTRIBUTE        the least relative standard error that ten Gaussian samples of the block's trace can have,
@@ -20,11 +25,12 @@ A number that a run does not have is empty.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from math import nan, sqrt
+from math import log, nan, sqrt
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from msgspec import structs
 
 from analysis.console.overrides import overridden
 from analysis.records.findings import ATTRIBUTES
@@ -36,7 +42,7 @@ from splat.model.typed import leaves
 from splat.training.checkpoint import load_checkpoint
 from splat.training.methods.protocols import presets
 from splat.training.start import Source
-from splat.training.state import TrainConfig
+from splat.training.state import LearningRates, TrainConfig
 
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
@@ -83,7 +89,11 @@ def row_of(run: Path) -> dict[str, Any]:
     if not (run / PROBE / ProbeRecord.FILE).is_file():
         return row
     data = read_record(run / PROBE, ProbeRecord).data
-    return row | probe_of(run) | _more(data) if data.provenance.iteration == checkpoint.training.step else row
+    return (
+        row | probe_of(run) | _more(data, config.rates, checkpoint.training.extent)
+        if data.provenance.iteration == checkpoint.training.step
+        else row
+    )
 
 
 def _made(run: Path) -> dict[str, str]:
@@ -123,15 +133,32 @@ def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _more(data: ProbeRecord) -> dict[str, float]:
-    """What the statements need beside the columns of a sweep."""
+def _more(data: ProbeRecord, rates: LearningRates, extent: float) -> dict[str, float]:
+    """What the statements and predictors need beside the columns of a sweep."""
     second, lives = data.eigenvalues.second, data.eigenvalues.max.lives_on
     row = {"lambda_second": _number(second and second.value)}
     if data.depth:
         row["depth_gradient"] = _number(data.depth.gradient_ratio)
     if lives:
         row |= {"needles": lives.needles, "needle_count": lives.needle_count / max(data.counts.visible_gaussians, 1)}
+        row |= {"one_gaussian": lives.heaviest[0][1] if lives.heaviest else nan}
+        row |= _finite(data, lives.attributes, rates, extent)
+    for family in data.families or ():
+        if (family.operator, family.block, family.split) == ("hessian", "all", False) and family.metric != "parameters":
+            indices = {name: index for name, index in structs.asdict(family.indices).items() if index}
+            row |= {f"{name}_{family.metric}": _number(index.value) for name, index in indices.items()}
     return row | _hutchinson(data)
+
+
+def _finite(data: ProbeRecord, shares: Mapping[str, float], rates: LearningRates, extent: float) -> dict[str, float]:
+    """The curvature at the step nearest to the length of Adam's."""
+    if not data.finite_probe:
+        return {}
+    lengths = asdict(rates) | {"means": rates.position * extent, "sh": rates.sh_constant}
+    length = sqrt(sum(share * lengths[name] ** 2 for name, share in shares.items()))
+    steps, curvatures = data.finite_probe.steps, data.finite_probe.curvatures
+    nearest = min(range(len(steps)), key=lambda i: abs(log(steps[i] / length)))
+    return {"finite_curvature": _number(curvatures[nearest])}
 
 
 def _hutchinson(data: ProbeRecord) -> dict[str, float]:

@@ -80,15 +80,22 @@ def keep_kernels(register_bits: int) -> None:
 
 
 class _CacheFile(caching.IndexDataCacheFile):
-    """Numba's, but for three things.
+    """Numba's, but for four things.
 
     A damaged file, such as one that a full disk cut, counts as missing: its kernel is compiled anew.  Files have names of their
     own, as two processes that compile at a time would give one name to two kernels.  Dates of sources do not count: the folder
-    is named after their content.
+    is named after their content.  The error of a full disk says which file it is.
     """
 
     def __init__(self, cache_path: str, filename_base: str, source_stamp: object) -> None:
         super().__init__(cache_path, filename_base, None)
+
+    def save(self, key: Any, data: Any) -> None:
+        try:
+            super().save(key, data)
+        except OSError as error:
+            error.filename = error.filename or self._index_path
+            raise
 
     def _data_name(self, number: int) -> str:
         return f"{super()._data_name(number).removesuffix('.nbc')}.{uuid4().hex[:8]}.nbc"

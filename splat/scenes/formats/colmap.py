@@ -13,6 +13,7 @@ import pycolmap
 import torch
 
 from landscape.errors import InputError, lacks_memory
+from splat.model.untrusted import inside
 from splat.scenes.images import Photo, image_files, image_folder
 from splat.scenes.view import Points
 
@@ -110,12 +111,12 @@ def _paths(names: list[str], folder: Path) -> list[Path]:
     and other tools change the suffix (IMG_1.JPG to IMG_1.png); both count where no file has the model's own name.
     """
     if any((folder / name).is_file() for name in names):
-        return [folder / name for name in names]
+        return [inside(folder, name) for name in names]
     files = image_files(folder)
     if len(files) == len(names) and all(re.fullmatch(r"image\d+", path.stem) for path in files):
         return files
     by_stem = {path.stem: path for path in files}
-    return [by_stem.get(Path(name).stem, folder / name) for name in names]
+    return [by_stem.get(Path(name).stem) or inside(folder, name) for name in names]
 
 
 def points_of(reconstruction: pycolmap.Reconstruction, posed: list[pycolmap.Image]) -> Points | None:

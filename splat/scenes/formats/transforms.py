@@ -29,6 +29,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from splat.model.files.ply import read_header, read_rows
+from splat.model.untrusted import inside
 from splat.scenes.images import (
     PINHOLE_MODELS,
     UNDISTORTED_HERE,
@@ -64,14 +65,14 @@ def read_transforms(
     frames skipped."""
     data = _load(path)
     data["frames"].sort(key=lambda frame: frame["file_path"])
-    paths = [_image_path(root, frame["file_path"]) for frame in data["frames"]]
-    if images is not None or (not any(p.is_file() for p in paths) and not (root / "images").exists()):
+    paths = [] if images is not None else [_image_path(root, frame["file_path"]) for frame in data["frames"]]
+    if not any(p.is_file() for p in paths) and (images is not None or not (root / "images").exists()):
         folder = image_folder(root, images)
         paths = [_image_path(folder, Path(frame["file_path"]).name) for frame in data["frames"]]
     photos, skipped = _photos(path, data, paths, None, strict)
     points = None
     if cloud := _file(data, "ply_file_path", path):
-        points = read_points(root / cloud, tuple(_name(frame) for frame in data["frames"]))
+        points = read_points(inside(root, cloud), tuple(_name(frame) for frame in data["frames"]))
     return photos, points, data.get("background"), skipped
 
 
@@ -91,7 +92,7 @@ def _load(path: Path) -> dict[str, Any]:
 
 def _image_path(folder: Path, file_path: str) -> Path:
     """The file itself or, as Blender's exporter leaves the suffix away, the file with a suffix."""
-    path = folder / file_path
+    path = inside(folder, file_path)
     candidates = [path] + [path.with_name(path.name + suffix) for suffix in (".png", ".jpg", ".jpeg")]
     return next((candidate for candidate in candidates if candidate.is_file()), path)
 
@@ -118,7 +119,9 @@ def _photos(
         rotation, centre = _pose(frame["transform_matrix"], name, path)
         lens = _lens({**shared, **frame}, image_header(image)[0], name, path)
         mask = _file(frame, "mask_path", path)
-        photos.append(Photo(name, image, lens, rotation, centre, subset, mask=path.parent / mask if mask else None))
+        photos.append(
+            Photo(name, image, lens, rotation, centre, subset, mask=inside(path.parent, mask) if mask else None)
+        )
     return photos, skipped
 
 

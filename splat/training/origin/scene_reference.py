@@ -1,12 +1,14 @@
 """Where the scene of a training lies, and how to load it as it was."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from landscape.errors import InputError
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split
+from splat.scenes.view import digests
 from splat.training.origin.frames import posed
 from splat.training.start import Source
 
@@ -19,7 +21,7 @@ class SceneReference:
     it, where one was named; downscale: the factor by which its images were reduced further.  train, test: names of the views;
     sizes: (width, height) of the training views, px.  start: what the Gaussians started from (`splat/training/start.py`);
     depths: the folder of depth maps, where one was named.  similarity, centred: as `posed` takes them, where another tool
-    trained in another world.  Older files have none of these.
+    trained in another world.  photographs: `digests` of the training views.  Older files have none of these.
     """
 
     absolute: str
@@ -33,6 +35,7 @@ class SceneReference:
     depths: str | None = None
     similarity: list[list[float]] | None = None
     centred: bool = False
+    photographs: list[str] | None = None
 
     @classmethod
     def to(
@@ -56,6 +59,7 @@ class SceneReference:
             sizes=[[frame.camera.width, frame.camera.height] for frame in scene.select(split.train)],
             start=start,
             depths=None if depths is None else str(depths.resolve()),
+            photographs=digests(scene.select(split.train)),
         )
 
     def find(self, checkpoint: Path) -> Path:
@@ -74,7 +78,7 @@ class SceneReference:
 
         `load(...).load(self.train)` then gives the training views.  A COLMAP model's points, from which the Gaussians
         started, are not read again.  FileNotFoundError where there is no such folder; InputError where the scene lacks a view
-        or has one of another size.
+        or has another photograph of it.
         """
         there = self.find(checkpoint) if folder is None else folder
         try:
@@ -93,4 +97,14 @@ class SceneReference:
                     f"expected view {frame.name!r} of {there} at {size[0]} x {size[1]} px, as in the training, got "
                     f"{frame.camera.width} x {frame.camera.height}; its images have changed, restore them or train anew"
                 )
+        self.require_photographs(digests(scene.select(self.train)), there)
         return posed(scene, self.similarity, centred=self.centred)
+
+    def require_photographs(self, found: Sequence[str] | None, folder: Path) -> None:
+        """InputError where the photographs of the training views are others than they were, as far as that is known."""
+        changed = [name for name, was, now in zip(self.train, self.photographs or (), found or ()) if was != now]
+        if changed:
+            raise InputError(
+                f"expected the photographs of {folder} as they were in the training, got another file for {changed[0]!r} "
+                f"({len(changed)} of {len(self.train)} training views have one); restore them or train anew"
+            )

@@ -84,6 +84,20 @@ def test_pictures_are_drawn_of_the_views_that_were_asked_for(folder):
         assert Image.open(folder / "map" / f"{panel.file}.png").width > 800
 
 
+def test_a_run_folder_is_mapped_like_the_file_it_was_made_of(folder):
+    words = [
+        str(folder / "in.ply"),
+        str(folder / "run" / "checkpoint.pt"),
+        "--scene",
+        str(folder / "scene"),
+        "--views",
+        "all",
+    ]
+    assert main(["convert", *words]) == 0 and main(["map", str(folder / "run"), "--draw", "0"]) == 0
+    found, before = (read_map(path / "map") for path in (folder / "run", folder))
+    assert (found.fragility, found.shades, found.sentences) == (before.fragility, before.shades, before.sentences)
+
+
 def test_a_field_is_composited_with_the_weights_of_the_splats():
     gaussians = random_gaussians(30, seed=2, logit=0.0, spread=0.6)
     objective = SceneObjective(gaussians, two_views())

@@ -1,3 +1,4 @@
+import json
 import math
 import re
 import shutil
@@ -105,6 +106,30 @@ def with_views(folder, names):
                 Image.new("RGB", (8, 6), (level, 40 * index, 0)).save(partial / kind.format(index))
         write_report(partial)
     return folder / "report.html"
+
+
+@pytest.mark.parametrize("step", [None, 10], ids=["of this step", "of another step"])
+def test_the_map_beside_the_record_says_where(tmp_path, step):
+    data, arrays = synthetic()
+    data["provenance"]["iteration"] = 10
+    made = data["provenance"] | {"iteration": 10 if step is None else 20}
+    shade = {"name": "largest", "words": "largest <curvature>", "unit": "1", "scale": "log", "low": 0.0, "high": 1.0}
+    swaps = {"lengths": [1.0], "share": [[0.5]], "pairs": [4], "jump": None, "jump_error": None, "sampled": 0}
+    axes = {"condition": {"50": 2.0}, "needles": 0.1, "needles_steepest": {}, "needles_trace": {}, "one_view": 0.2}
+    axes |= {"swaps": swaps, "one_view_trace": None, "opacity_one_view": None}
+    found = {"gaussians": 5, "seen": 4, "field": "largest", "shades": {"largest": shade}, "fragility": axes}
+    found |= {"panels": [{"name": "a.png", "place": 0, "file": "view-000", "psnr": 20.0}], "provenance": made}
+    found["sentences"] = ["Position: half of all pairs."]
+    (tmp_path / "map").mkdir()
+    (tmp_path / "map" / "map.json").write_text(json.dumps(found))
+    for name in ("view-000.png", "fragility-000.png"):
+        Image.new("RGB", (8, 6)).save(tmp_path / "map" / name)
+    with record_folder(tmp_path / "probe") as partial:
+        write_record(partial, probe_of(data), arrays)
+    text = write_report(tmp_path / "probe").read_text(encoding="utf-8")
+    assert (text.count("Position: half of all pairs.") == 2) == (step is None)  # said, and told of its picture
+    assert text.count("data:image/jpeg") == (2 if step is None else 0)
+    assert ("largest &lt;curvature&gt; of the Gaussians" in text) == (step is None)
 
 
 def test_photograph_and_render_of_the_training_views_come_first(tmp_path):

@@ -5,18 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from analysis.commands.cli import main
 from analysis.console.overrides import assignments, overridden
 from analysis.records.findings import ATTRIBUTES
+from analysis.records.records import ProbeRecord, read_record
 from analysis.runs.claims.effects import Interval
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, judgements
-from analysis.runs.claims.study import method_name, study
+from analysis.runs.claims.study import _more, method_name, study
 from analysis.runs.sweep.sweep_file import read_sweep
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
-from splat.training.state import TrainConfig
+from splat.training.state import LearningRates, TrainConfig
+from tests.recorded import synthetic, written
 
 LARGER = ("literal", "saddle", "share", "mass_quantile")  # the more anisotropic
 STABLE, ALONE = "stablegs", "stablegs vsp_weight=0"
@@ -123,6 +126,22 @@ def test_what_predicts_the_score_is_found_and_noise_is_not():
     assert (found.loc["lambda_max", "high"] < 0).all()
     assert (found.loc["lambda_min", "low"] < 0).all()
     assert (found.loc["lambda_min", "high"] > 0).all()
+
+
+@pytest.mark.parametrize(("attribute", "extent", "seen"), [("quats", 2.0, 2.0), ("means", 60.0, 3.0)])
+def test_a_row_has_the_curvature_that_adams_steps_see(tmp_path, attribute, extent, seen):
+    data, arrays = synthetic()
+    data["eigenvalues"]["max"]["lives_on"] = {
+        "attributes": {attribute: 1.0}, "participation": 1.1, "needles": 0.9, "needle_count": 3, "heaviest": [[4, 0.8]],
+    }  # fmt: skip
+    data["finite_probe"] = {
+        "steps": [1e-4, 1.1e-3, 1e-2], "curvatures": [1.0, 2.0, 3.0], "round_off": [0.0] * 3, "truncation": [0.0] * 3,
+        "crossed": [False] * 3, "infinitesimal": 1.0, "best": 0,
+    }  # fmt: skip
+    written(tmp_path / "probe", data, arrays)
+    row = _more(read_record(tmp_path / "probe", ProbeRecord).data, LearningRates(), extent)
+    assert row["finite_curvature"] == seen  # steps of 1e-3, and of 60 * 1.6e-4
+    assert row["one_gaussian"] == 0.8
 
 
 def test_a_map_of_a_run_adds_what_one_view_sees(tmp_path, monkeypatch):

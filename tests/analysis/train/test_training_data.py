@@ -14,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from analysis.commands.cli import main
+from analysis.records.records import read_record
 from analysis.train.command import planned
 from analysis.train.options import TrainOptions
 from analysis.train.remarks import _not_reached, poor_start
@@ -210,3 +211,24 @@ def test_a_run_resumes_with_the_depth_maps_that_it_was_started_with(original, tm
     assert train(original, tmp_path / "run", "--depths", str(tmp_path / "depth"), "--resume") == 0
     assert train(original, tmp_path / "run", "--depths", str(tmp_path / "other"), "--resume") == 2
     assert f"depths = {tmp_path / 'depth'}, got {tmp_path / 'other'}" in capsys.readouterr().err
+
+
+def test_photographs_that_were_replaced_are_noticed_by_probe_and_resume(original, tmp_path, capsys):
+    scene, out = tmp_path / "scene", tmp_path / "run"
+    shutil.copytree(original, scene)
+    assert train(scene, out) == train(scene, out, "--resume") == 0
+    name = load_checkpoint(out / "checkpoint.pt").scene.train[1]
+    with Image.open(scene / name) as image:
+        pixels = np.array(image)
+    pixels[3, 4] ^= 1
+    Image.fromarray(pixels).save(scene / name)
+    probe = ["probe", str(out / "checkpoint.pt"), "--quick"]
+    assert train(scene, out, "--resume") == main(probe) == 2
+    said = capsys.readouterr().err
+    assert said.count(f"got another file for '{name}' (1 of 3 training views have one)") == 2
+    content = torch.load(out / "checkpoint.pt", weights_only=True)
+    del content["scene"]["photographs"]  # as older files, which do not know them
+    torch.save(content, out / "checkpoint.pt")
+    assert train(scene, out, "--resume") == main(probe) == 0
+    seen = read_record(out / "probe-quick").data.provenance.photographs
+    assert isinstance(seen, list) and len(set(seen)) == 3

@@ -171,12 +171,16 @@ def test_what_cannot_be_rendered_is_refused_in_a_sentence(tmp_path, content, mes
 
 
 class Trap:
+    def __init__(self, touched: Path):
+        self.touched = touched
+
     def __reduce__(self):
-        return (Path.touch, (Path("/tmp/foreign-checkpoint-ran-code"),))
+        return (Path.touch, (self.touched,))
 
 
 def test_a_file_that_would_run_code_is_refused(tmp_path):
-    path = stored(tmp_path, "ckpt.pt", written.saved({"step": 1, "splats": Trap()}))
+    touched = tmp_path / "ran-code"
+    path = stored(tmp_path, "ckpt.pt", written.saved({"step": 1, "splats": Trap(touched)}))
     with pytest.raises(InputError, match="more than tensors"):
         read_splats(path)
-    assert not Path("/tmp/foreign-checkpoint-ran-code").exists()
+    assert not touched.exists()

@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from landscape.errors import InputError
 from splat.scenes.formats.colmap import SMALLEST_RECORD
 from splat.scenes.scene import load_scene
 from splat.scenes.view import pixel_coordinates
@@ -30,6 +31,19 @@ def test_colmap_cameras_points_and_tracks_come_back(tmp_path: Path, text: bool, 
     np.testing.assert_array_equal((scene.points.rgb.numpy()[order] * 255).round(), RGB[wanted])
     seen = [sorted(scene.points.observations[scene.points.observations[:, 0] == p, 1].tolist()) for p in order]  # type: ignore[index]
     assert seen == [list(SEEN[p]) for p in wanted]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_names_that_lead_out_of_the_folder_of_images_are_refused(tmp_path: Path, there: bool) -> None:
+    folders.write_colmap(tmp_path / "s", text=True, at=".")
+    (tmp_path / "s/images" / NAMES[0]).rename(tmp_path / "s" / NAMES[0])
+    images = tmp_path / "s/images.txt"
+    images.write_text(images.read_text().replace(NAMES[0], f"../{NAMES[0]}"))
+    if not there:  # where no file has its own name, others are looked for by their stem
+        for name in NAMES[1:]:
+            (tmp_path / "s/images" / name).rename(tmp_path / "s/images" / f"_{name}")
+    with pytest.raises(InputError, match="which leads out of it"):
+        load_scene(tmp_path / "s")
 
 
 def test_without_its_points_a_colmap_scene_is_the_same_else(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from landscape.errors import InputError
 from splat.scenes.formats.transforms import read_points
 from splat.scenes.scene import load_scene
 from splat.scenes.view import pixel_coordinates
@@ -24,6 +25,25 @@ def test_transforms_cameras_come_back_sorted_by_name(tmp_path: Path) -> None:
     assert scene.kind == "transforms" and scene.names == tuple(f"images/{name}" for name in NAMES)
     require_poses(scene)
     assert intrinsics(scene) == [(*FOCAL, *CENTRE, *SIZE)] * 3
+
+
+@pytest.mark.parametrize("key", ["file_path", "mask_path", "ply_file_path"])
+@pytest.mark.parametrize("up", ["..", "images/../..", "absolute"])
+def test_names_that_lead_out_of_the_scenes_folder_are_refused(tmp_path: Path, key: str, up: str) -> None:
+    scene = tmp_path / "scene"
+    folders.write_transforms(scene)
+    (scene / "images" / NAMES[0]).rename(tmp_path / NAMES[0])
+    name = str(tmp_path / NAMES[0]) if up == "absolute" else f"{up}/{NAMES[0]}"
+    content = json.loads((scene / "transforms.json").read_text())
+    (content if key == "ply_file_path" else content["frames"][1])[key] = name
+    (scene / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="which leads out of it"):
+        load_scene(scene)
+    if key == "file_path":
+        (scene / "images" / "b").symlink_to(tmp_path / NAMES[0])  # which whoever unpacked the scene has made
+        content["frames"][1][key] = "images/b"
+        (scene / "transforms.json").write_text(json.dumps(content))
+        assert load_scene(scene).names == ("images/b", f"images/{NAMES[2]}")
 
 
 def test_intrinsics_of_a_frame_win_over_those_at_the_top(tmp_path: Path) -> None:

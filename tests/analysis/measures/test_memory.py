@@ -1,0 +1,76 @@
+"""How many vectors fit, and what a command says where memory runs out."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from analysis.commands.cli import main
+from analysis.measures import memory
+from analysis.measures.memory import GIB, MIB, telling_needs, vectors_within
+from splat.curvature.objective import SceneObjective
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def objective() -> SceneObjective:
+    made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=64, height=48))
+    return SceneObjective(made.truth, made.scene.load())
+
+
+def free(monkeypatch, amount: float) -> None:
+    monkeypatch.setattr(memory, "free_memory", lambda _: int(amount))
+
+
+def test_vectors_are_those_of_the_budget_and_of_half_of_what_is_free(objective, monkeypatch):
+    each = objective.active.flat.numel() * 4
+    free(monkeypatch, 100 * each)
+    assert vectors_within(objective, 1.0) == 50 and vectors_within(objective, 10 * each / GIB) == 10
+
+
+def test_what_products_take_is_told_where_memory_runs_out(objective, monkeypatch):
+    flat = objective.active.flat
+    kept, n = objective.linearized, len(objective.active)
+    pixels, vectors = kept.first.bytes + kept.workspace(8), 12 * flat.nbytes
+
+    def said(error: Exception) -> str:
+        with pytest.raises(MemoryError) as raised, telling_needs(objective):
+            raise error
+        return str(raised.value)
+
+    free(monkeypatch, pixels / 2)  # of which half may be pixels: a quarter of them fits
+    words = said(MemoryError())
+    assert (
+        f"64 x 48 px with {n} Gaussians in sight take {pixels / MIB:,.0f} MiB, 12 vectors of {flat.numel():,}" in words
+    )
+    assert words.endswith("pictures of 32 x 24 px would fit (--downscale 2)")
+    free(monkeypatch, vectors)
+    assert said(RuntimeError("can't allocate memory")).endswith(f"about {n // 2} Gaussians would fit")
+    del vars(objective)["linearized"]
+    assert said(MemoryError()).endswith(f"takes more than the {vectors / MIB:,.0f} MiB that were free")
+    with pytest.raises(RuntimeError, match="another"), telling_needs(objective):
+        raise RuntimeError("another")
+
+
+def test_a_probe_in_little_memory_says_what_it_needs_and_what_would_fit(tmp_path):
+    made = synthetic_scene(SyntheticSettings(gaussians=60, views=5, width=200, height=150))
+    write_transforms_scene(made.scene, tmp_path / "scene")
+    assert main(["train", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--iterations", "1"]) == 0
+    program = (
+        "import resource, sys\nimport psutil\nimport analysis.probe.command as command\n"
+        "from analysis.commands.cli import main\nmeasure = command.measure\n"
+        "def limited(objective, *more):\n    objective.linearized\n"
+        "    limit = psutil.Process().memory_info().vms + 2**20\n"
+        "    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))\n    return measure(objective, *more)\n"
+        "command.measure = limited\nsys.exit(main(sys.argv[1:]))"
+    )
+    words = ["probe", str(tmp_path / "run/checkpoint.pt"), "--quick"]
+    done = subprocess.run([sys.executable, "-c", program, *words], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 71 and "Traceback" not in done.stderr, done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("landscape: memory ran out") and "200 x 150 px" in last and "would fit" in last, last
+    assert not (tmp_path / "run/probe-quick").exists()

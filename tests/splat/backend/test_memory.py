@@ -1,0 +1,68 @@
+"""Free memory within the limits of the process and of its control groups."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from splat.backend import memory
+from splat.backend.memory import free_memory
+
+CPU = torch.device("cpu")
+ROOT = Path(__file__).parents[3]
+MIB = 2**20
+
+
+@pytest.mark.parametrize("kind", ["RLIMIT_AS", "RLIMIT_DATA"])
+def test_a_limit_of_the_process_is_honoured(kind):
+    program = (
+        f"import resource, torch\nfrom splat.backend.memory import free_memory\n"
+        f"used = {{'RLIMIT_AS': 'VmSize', 'RLIMIT_DATA': 'VmData'}}['{kind}']\n"
+        f"of = lambda: 1024 * int(open('/proc/self/status').read().partition(used + ':')[2].split()[0])\n"
+        f"limit = of() + {300 * MIB}\nresource.setrlimit(resource.{kind}, (limit, limit))\n"
+        f"kept = bytearray({100 * MIB})\nprint(free_memory(torch.device('cpu')), limit - of())"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    free, expected = map(int, done.stdout.split())
+    assert abs(free - expected) < 16 * MIB and 150 * MIB < free < 220 * MIB
+
+
+def group(folder: Path, limit: str, usage: int, version: int, cached: int = 0) -> None:
+    """Of the files that the system gives of a control group, those that are read."""
+    _, most, used = memory.VERSIONS[version]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / most).write_text(f"{limit}\n")
+    (folder / used).write_text(f"{usage}\n")
+    word = "total_inactive_file" if version == 1 else "inactive_file"
+    (folder / "memory.stat").write_text(f"anon 1\n{word} {cached}\n")
+
+
+@pytest.fixture(params=[1, 2])
+def version(request, tmp_path, monkeypatch) -> int:
+    monkeypatch.setattr(memory, "GROUPS", tmp_path / "cgroup")
+    monkeypatch.setattr(memory, "GROUP", tmp_path / "own")
+    (tmp_path / "own").write_text("5:memory:/job/step\n1:cpu:/other\n" if request.param == 1 else "0::/job/step\n")
+    return request.param
+
+
+def test_the_tightest_group_decides_and_what_caches_files_can_be_had(version, tmp_path):
+    top = tmp_path / "cgroup" / memory.VERSIONS[version][0]
+    group(top / "job/step", "max" if version == 2 else str(2**63 - 4096), 50 * MIB, version)
+    assert free_memory(CPU) > 1000 * MIB  # no limit
+    group(top / "job/step", str(80 * MIB), 50 * MIB, version)
+    assert free_memory(CPU) == 30 * MIB
+    group(top / "job", str(60 * MIB), 55 * MIB, version, cached=10 * MIB)
+    assert free_memory(CPU) == 15 * MIB
+    group(top, str(50 * MIB), 70 * MIB, version)
+    assert free_memory(CPU) == 0
+
+
+def test_what_cannot_be_read_of_a_group_limits_nothing(version, tmp_path):
+    top = tmp_path / "cgroup" / memory.VERSIONS[version][0] / "job"
+    group(top, "12 apples", 5, version)
+    assert free_memory(CPU) > 1000 * MIB
+    group(top, str(40 * MIB), 5 * MIB, version)
+    (top / "memory.stat").unlink()
+    assert free_memory(CPU) == 35 * MIB
