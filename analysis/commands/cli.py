@@ -140,7 +140,7 @@ def _parsed(arguments: Sequence[str]) -> Options:
 def at_files(options: Options) -> Options:
     """A run folder stands for its checkpoint where one is asked for, and a checkpoint for its run."""
     changes: dict[str, object] = {}
-    for name in ("checkpoint", "subject", "from_"):
+    for name in ("checkpoint", "subject", "from_", "source"):
         path = getattr(options, name, None)
         if isinstance(path, Path) and (path / CHECKPOINT).is_file():
             changes[name] = path / CHECKPOINT

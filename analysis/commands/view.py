@@ -160,23 +160,24 @@ class Viewer:
         server.scene.on_click()(lambda event: self.click(event.ray_origin, event.ray_direction))
 
     def _add_cameras(self) -> None:
-        views, scene = self.objective.views, self.server.scene
-        down = torch.stack([view.camera.rotation[1] for view in views]).mean(dim=0)
+        """The training views, and where the page's own camera starts: behind them."""
+        cameras, scene = [view.camera for view in self.objective.views], self.server.scene
+        down, forward = (torch.stack([camera.rotation[i] for camera in cameras]).mean(dim=0).numpy() for i in (1, 2))
         scene.set_up_direction(tuple((-down).tolist()))
-        for view in views:
-            camera = view.camera
+        places = np.stack([self.frame.place(camera.centre) for camera in cameras])
+        apart = np.linalg.norm(places - places.mean(axis=0), axis=1).max() or RADIUS / 10
+        for view, camera, place in zip(self.objective.views, cameras, places, strict=True):
             turn = Rotation.from_matrix(camera.rotation.T.numpy()).as_quat(scalar_first=True)
             step = -(-max(camera.width, camera.height) // 256)  # small photographs load at once
-            photograph = in_bytes(view.image).transpose(1, 2, 0)[::step, ::step]
             scene.add_camera_frustum(
                 f"/cameras/{view.name}", fov=2 * float(np.arctan(camera.height / 2 / camera.fy)),
-                aspect=camera.width / camera.height, scale=RADIUS / 20, image=photograph,
-                wxyz=turn, position=self.frame.place(camera.centre),
+                aspect=camera.width / camera.height, scale=apart / 5,
+                image=in_bytes(view.image).transpose(1, 2, 0)[::step, ::step],
+                wxyz=turn, position=place, thickness=1.0, thickness_units="screen",
             )  # fmt: skip
-        first = views[0].camera
         start = self.server.initial_camera
-        start.position = tuple(self.frame.place(first.centre).tolist())
-        start.look_at = tuple((self.frame.place(first.centre) + RADIUS * first.forward.numpy()).tolist())
+        start.position = tuple((places.mean(axis=0) - 2 * apart * forward).tolist())
+        start.look_at = tuple((places.mean(axis=0) + RADIUS * forward).tolist())
 
     def add_fields(self, fields: Fields, shown: str) -> None:
         """The drop-down's further entries, once they are measured."""

@@ -2,7 +2,8 @@
 
     linearise           every view's derivatives, each Gaussian's own block of H, a first render
     checks              symmetry, round-off, finiteness of H; H v against differences of the float64 gradient
-    traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled
+    traces              of each attribute's block: exact, but for the coupling of pixels by SSIM, which is sampled where that
+                        is cheaper
     eigenvalues         the two largest and the smallest; the search begins at `splat.curvature.block_eigenvectors`
     slice               the plane of the two largest eigenvalues' vectors: true renders where needed, interpolated elsewhere
     density *           stochastic Lanczos quadrature, for sums and quantiles of |lambda|; its first runs hold the iterates of
@@ -63,7 +64,7 @@ from splat.backend.device import by_triton
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
-from splat.curvature.traces import exact_traces
+from splat.curvature.traces import block_traces, exact_traces
 
 STAGES = ("traces", "eigenvalues", "slice", "density", "power iteration", "finite probe", "depth")
 # what is said of a stage that was not asked for
@@ -73,6 +74,7 @@ LEFT_OUT = {
     "depth": "positions along and across the rays were left out",
 }
 MOST_AT_ONCE = 4  # start vectors
+MOST_SAMPLES = 64  # of a trace, beyond which its exact value takes less
 # what a stage takes on two real scenes, as products with MOST_AT_ONCE vectors and as renders of all views
 TYPICAL: dict[str, tuple[int, int]] = {"traces": (12, 0), "eigenvalues": (10, 0), "slice": (0, 180), "depth": (2, 50)}
 
@@ -238,8 +240,16 @@ def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str
 
 
 def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Progress) -> dict[str, TraceEstimate]:
-    allowed = replace(at.settings.traces, max_seconds=seconds)
-    return exact_traces(at.objective, generator, allowed, report, samples=at.settings.trace_samples)
+    """To their accuracy; on a CPU those that MOST_SAMPLES do not bring there are summed over the exact blocks instead."""
+    allowed, samples = replace(at.settings.traces, max_seconds=seconds), at.settings.trace_samples
+    if samples or by_triton(at.objective.active.flat):
+        return exact_traces(at.objective, generator, allowed, report, samples=samples)
+    few = replace(allowed, max_probes=min(allowed.max_probes, MOST_SAMPLES))
+    found = exact_traces(at.objective, generator, few, report)
+    if not (still := [name for name, trace in found.items() if trace.reason == "matvec budget"]):
+        return found
+    exact = block_traces(at.objective)
+    return {name: exact[name] if name in still else trace for name, trace in found.items()}
 
 
 def _ends(at: _Point, seconds: float, generator: torch.Generator, report: Progress, notes: list[str]) -> EigenEnds:

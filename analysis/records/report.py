@@ -132,14 +132,18 @@ def where(record: Record[ProbeRecord]) -> dict[str, Any]:
     found = read_map(folder)
     if plain(found.provenance).get("iteration") != plain(record.data.provenance).get("iteration"):
         return {}
-    captions = {end.file: end.sentence for end in found.steepest}
+    beneath = "the Gaussians that carry it, outlined, and what a step along it does."
+    shown = [(end.file, f"{end.name}: {beneath}", end.sentence) for end in found.steepest]
     for panel in found.panels[:1]:
-        words = found.shades[found.field].words
-        captions[panel.file] = f"{panel.name}: photograph, render, error, and {words} of the Gaussians there."
-        captions[panel.file.replace("view", "fragility")] = " ".join(found.sentences[len(found.steepest) :])
+        words = (
+            f"{panel.name}: photograph, render, error, and {found.shades[found.field].words} of the Gaussians there."
+        )
+        axes = f"{panel.name}: where it is fragile in position, conditioning and opacity."
+        shown.append((panel.file, words, words))
+        shown.append((panel.file.replace("view", "fragility"), axes, " ".join(found.sentences[len(found.steepest) :])))
     pictures = [
-        {"caption": caption, "uri": _as_jpeg(folder / f"{name}.png")}
-        for name, caption in captions.items()
+        {"caption": caption, "words": words, "uri": _as_jpeg(folder / f"{name}.png")}
+        for name, caption, words in shown
         if (folder / f"{name}.png").is_file()
     ]
     return {"sentences": found.sentences, "pictures": pictures}

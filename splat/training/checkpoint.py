@@ -250,7 +250,7 @@ def _instead(path: Path) -> str:
     if (inside := path / "checkpoint.pt").is_file():
         return f"a folder; name the {inside} in it"
     if runs := sorted(path.glob("*/checkpoint.pt")):
-        return f"a folder of {len(runs)} runs; name one of them, such as {runs[0].parent}"
+        return f"a folder of runs; name one of them, such as {runs[0].parent}"
     return "a folder without one; name the run that landscape train wrote, its --out"
 
 

@@ -20,6 +20,7 @@ from PIL import Image
 
 from analysis.bench.options import BenchOptions
 from analysis.commands.cli import at_files, main
+from analysis.commands.options import ConvertOptions
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import CompareOptions
 from analysis.slice.options import SliceOptions
@@ -436,12 +437,14 @@ def test_a_run_stands_for_its_checkpoint_and_a_checkpoint_for_its_run(tmp_path):
         SliceOptions(tmp_path / "none", (run,)),
         BenchOptions(run),
         TrainOptions(tmp_path, from_=run),
+        ConvertOptions(run, tmp_path / "out.ply"),
         CompareOptions((run, run / "checkpoint.pt")),
     )
-    assert [at_files(options) for options in named] == [*named[:4], CompareOptions((run, run))]
+    assert [at_files(options) for options in named] == [*named[:5], CompareOptions((run, run))]
     (run / "checkpoint.pt").touch()
-    probe, line, bench, train, _ = (at_files(options) for options in named)
+    probe, line, bench, train, convert, _ = (at_files(options) for options in named)
     assert train == TrainOptions(tmp_path, from_=run / "checkpoint.pt")
+    assert convert == ConvertOptions(run / "checkpoint.pt", tmp_path / "out.ply")
     assert probe == ProbeOptions(run / "checkpoint.pt") and bench == BenchOptions(run / "checkpoint.pt")
     assert line == SliceOptions(tmp_path / "none", (run / "checkpoint.pt",))
 

@@ -15,6 +15,7 @@ from landscape.eigen.power import power_iteration
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
+from splat.curvature.traces import block_traces
 from splat.losses.reference import LossSettings
 from tests.splat.held_scenes import BACKGROUND, two_views
 from tests.splat.random_scenes import random_gaussians
@@ -114,3 +115,15 @@ def test_a_quick_probe_is_expected_to_take_what_it_makes_alone():
     whole, quick = (_plan(settings, 1.0, 10.0) for settings in (ProbeSettings(), ProbeSettings.quick()))
     assert set(whole) - set(quick) == {"density", "finite probe", "depth"}
     assert quick["slice"] == 2 * 21 * 10 < whole["slice"] and quick["traces"] == 2 < whole["traces"]
+
+
+def test_traces_that_samples_do_not_resolve_are_exact():
+    objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
+    few = replace(ProbeSettings.quick(), slice_points=5, trace_samples=None)
+    for rtol, reason in ((1e-9, "exact"), (1e3, "tolerance")):
+        settings = replace(few, traces=TraceSettings(rtol=rtol, max_probes=2048))
+        found = measure(objective, settings, torch.Generator().manual_seed(0), Stages()).traces
+        assert {trace.reason for trace in found.values()} == {reason}
+        for name, exact in block_traces(objective).items():
+            assert found[name].value == exact.value or reason == "tolerance"
+            assert abs(found[name].value - exact.value) <= 6 * found[name].standard_error

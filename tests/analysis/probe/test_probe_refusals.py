@@ -40,7 +40,7 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys):
     path = copy / "checkpoint.pt"
     refused(capsys, [str(path)], "expected a checkpoint", "found no such file")
     refused(capsys, [str(copy)], "found a folder without one; name the run that landscape train wrote")
-    refused(capsys, [str(run.parent)], "found a folder of ", f" runs; name one of them, such as {run}")
+    refused(capsys, [str(run.parent)], f"found a folder of runs; name one of them, such as {run}")
     path.write_bytes(b"not a checkpoint")
     refused(capsys, [str(path)], "not one or is damaged")
     shutil.copy(run / "checkpoint.pt", path)

@@ -127,9 +127,7 @@ def test_the_map_beside_the_record_says_where(tmp_path, step):
     with record_folder(tmp_path / "probe") as partial:
         write_record(partial, probe_of(data), arrays)
     text = write_report(tmp_path / "probe").read_text(encoding="utf-8")
-    assert (Page(text).text.count("Position: half of all pairs.") == 2) == (
-        step is None
-    )  # said, and beneath its picture
+    assert (text.count("Position: half of all pairs.") == 2) == (step is None)  # said, and told of its picture
     assert text.count("data:image/jpeg") == (2 if step is None else 0)
     assert ("largest &lt;curvature&gt; of the Gaussians" in text) == (step is None)
 
