@@ -6,6 +6,7 @@ import re
 from contextlib import redirect_stdout
 from functools import cache
 from io import StringIO
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
@@ -89,7 +90,7 @@ def test_what_moves_the_index_does_so_as_the_notebook_says():
     dims, ranks, _ = zip(*names["counts"])
     assert dims[-1] > 2 * ranks[-1] and ranks[-1] == ranks[-2]  # three views tell no more of colour
     sizes = [row[1] for row in names["rows"]]
-    assert all(1.5 < before / after < 3 for before, after in zip(sizes, sizes[1:]))  # lambda_max at every split
+    assert all(1.5 < before / after < 3 for before, after in pairwise(sizes))  # lambda_max at every split
     first, *_, last = names["stretched"]
     assert first[2] < first[1] and last[2] > last[1] and abs(last[1] / first[1] - 1) < 0.1  # the needle took lambda_min
     assert names["kinked"] < 0.1 * max(names["rounded"])
