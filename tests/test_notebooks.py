@@ -6,6 +6,7 @@ import re
 from contextlib import redirect_stdout
 from functools import cache
 from io import StringIO
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
@@ -74,6 +75,27 @@ def test_the_quick_start_leaves_what_it_shows():
     assert "held-out views" in printed and "curvature" in printed
 
 
+def test_error_bars_cover_in_run_time_against_error():
+    """19 of 20 intervals for a trace at least, but for two standard deviations; the sketch wins where products are many."""
+    _, names = story("run_time_against_error")
+    covered, runs = names["covered"], len(names["SEEDS"]) * len(names["covered"])
+    assert sum(covered.values()) >= 0.95 * runs - 2 * (0.95 * 0.05 * runs) ** 0.5
+    assert names["errors"]["xtrace", 96] < names["errors"]["hutch++", 96] < names["errors"]["hutchinson", 96]
+    assert abs(names["blocks"] / names["truth"] - 1) < 1e-10
+    assert all(count >= 18 for count in names["within"])  # of sum |lambda|
+
+
+def test_what_moves_the_index_does_so_as_the_notebook_says():
+    _, names = story("what_the_index_measures")
+    dims, ranks, _ = zip(*names["counts"])
+    assert dims[-1] > 2 * ranks[-1] and ranks[-1] == ranks[-2]  # three views tell no more of colour
+    sizes = [row[1] for row in names["rows"]]
+    assert all(1.5 < before / after < 3 for before, after in pairwise(sizes))  # lambda_max at every split
+    first, *_, last = names["stretched"]
+    assert first[2] < first[1] and last[2] > last[1] and abs(last[1] / first[1] - 1) < 0.1  # the needle took lambda_min
+    assert names["kinked"] < 0.1 * max(names["rounded"])
+
+
 def test_the_profiles_have_the_colours_and_names_of_the_figures():
     _, names = story("stablegs_vs_3dgs")
     lines = names["axes"].lines
@@ -91,7 +113,10 @@ def test_a_notebook_uses_public_names_only(path):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_keeps_the_outputs_of_its_cells_as_they_are_and_small(path):
-    """Run in order without an error, with the words that its cells print today; pictures of at most 100 kB."""
+    """Run in order without an error, with the words that its cells print today; pictures of at most 100 kB.
+
+    `jupyter nbconvert --to notebook --execute --inplace notebooks/NAME.ipynb` stores them anew.
+    """
     found = [cell for cell in json.loads(path.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
     outputs = [output for cell in found for output in cell["outputs"]]
     assert [cell["execution_count"] for cell in found] == list(range(1, len(found) + 1))
