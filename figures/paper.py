@@ -23,9 +23,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from analysis.records.run_files import read_trajectory
-from analysis.runs.claims.effects import BASE, SCORE, STABLE, Interval, gains, log_ratios, numbers
+from analysis.runs.claims.effects import BASE, LEAST, SCORE, STABLE, Interval, gains, log_ratios, numbers
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
 from figures import fig1
@@ -34,6 +35,7 @@ from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figu
 
 RESULTS = Path(__file__).parents[1] / "notebooks" / "results"
 PAIR = (BASE, STABLE)
+LINE = 0.065  # of the height of the axes, between names
 BUDGET = 1.3  # the paper's time of StableGS over that of 3DGS, Sec. 4.3
 VIEWPOINTS = {"occlusion": "edge_rotation", "interpolation": "interpolation", "parallax": "parallax"}
 ONLY = {  # one way to move a viewpoint, beside the probes of attributes
@@ -75,12 +77,12 @@ def make(results: Path, out: Path) -> Iterator[Path]:
     for name, figure in drawn.items():
         for suffix in ("png", "pdf"):
             yield save(figure, out / f"{name}.{suffix}")
-    (out / "captions.md").write_text(captions(rows), encoding="utf-8")
+    (out / "captions.md").write_text(captions(rows, list(drawn)), encoding="utf-8")
     yield out / "captions.md"
 
 
-def captions(rows: pd.DataFrame) -> str:
-    """Captions, trainings and verdicts as Markdown, from the numbers."""
+def captions(rows: pd.DataFrame, drawn: Sequence[str]) -> str:
+    """Captions of what was drawn, trainings and verdicts as Markdown, from the numbers."""
     words = {
         "claims": "Effects with their 95% intervals over seeds; diamond: the paper's size.",
         "predictors": _of_predictors(predictors(rows)),
@@ -89,7 +91,7 @@ def captions(rows: pd.DataFrame) -> str:
         "fig1": "The loss along the two steepest eigenvectors, and a view held out, of one training of each method.",
         "index": "The literal index |λmax / λmin| over the steps; line: median, band: all seeds.",
     }
-    lines = [f"**{name}.** {caption}" for name, caption in words.items()] + [_trainings(rows)]
+    lines = [f"**{name}.** {caption}" for name, caption in words.items() if name in drawn] + [_trainings(rows)]
     lines += [f"{each.number}. {each.statement} **{each.verdict}.** {each.finding}" for each in judgements(rows)]
     return "\n\n".join(lines) + "\n"
 
@@ -111,10 +113,13 @@ def draw_budget(rows: pd.DataFrame) -> Figure:
             colour = VERMILION if method.startswith(STABLE) else BLUE
             axes.plot(time.reindex(score.index), score, ".", color=colour, markersize=3, alpha=0.5)
             x, y = Interval.of(list(np.log(time))).exp(), Interval.of(score)
-            if y.n >= 2:
+            if y.n >= LEAST:  # two seeds bound next to nothing
                 axes.hlines(y.value, x.low, x.high, color=colour, linewidth=1)
                 axes.vlines(x.value, y.low, y.high, color=colour, linewidth=1)
             places.append((y.value, x.value, method, colour))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set(xlabel="processor time over that of 3DGS (×)", ylabel="PSNR on held-out views (dB)")
         axes.grid(True)
         _label(axes, places)
@@ -122,13 +127,15 @@ def draw_budget(rows: pd.DataFrame) -> Figure:
 
 
 def _label(axes: Axes, places: list[tuple[float, float, str, str]]) -> None:
-    """Names in a column right of the axes, each joined to its point, in the order of the points."""
+    """Names right of the axes, as high as their points where there is room, each joined to its own."""
     low, high = axes.get_ylim()
-    for at, (y, x, name, colour) in zip(np.linspace(0.02, 0.98, len(places)), sorted(places), strict=True):
-        height = at if len(places) > 1 else (y - low) / (high - low)
+    heights: list[float] = []
+    for y, x, name, colour in sorted(places):
+        heights.append(max([(y - low) / (high - low), *(height + LINE for height in heights[-1:])]))
         axes.annotate(
-            literal(name), (x, y), xytext=(1.03, height), textcoords="axes fraction", va="center", color=colour,
-            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.4, "shrinkB": 2}, annotation_clip=False,
+            literal(name), (x, y), xytext=(1.03, heights[-1] - LINE * len(places) / 3), textcoords="axes fraction", va="center",
+            ha="left", color=colour, annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": "0.75", "linewidth": 0.4, "shrinkB": 2, "relpos": (0, 0.5)},
         )  # fmt: skip
 
 
@@ -151,7 +158,7 @@ def draw_axes(rows: pd.DataFrame) -> Figure:
                 axes.plot(claimed, place, "D", color=VERMILION, markersize=3.5, markerfacecolor="white")
         axes.axvline(0, color="0.5", linewidth=0.6)
         axes.set_yticks(range(len(AXES))[::-1], [name for name, *_ in AXES])
-        axes.set_xlabel("PSNR over 3DGS (dB), with its 95% interval over seeds; diamond: the paper")
+        axes.set_xlabel("PSNR over 3DGS (dB); diamond: the paper")
         axes.grid(True, axis="x")
     return figure
 
