@@ -2,13 +2,11 @@
 
 RESULTS/study.csv           the trainings, as `landscape claims` writes them; by default those in notebooks/results
 RESULTS/trajectories.csv    the records along some of them, as `landscape trajectory` writes them, where there are any
-RESULTS/3dgs, stablegs      the records of one training each (probe or slice, test renders), where there are any
 
 OUT/claims, predictors      the effects behind the verdicts, and what goes with the score (`figures.claims`)
 OUT/budget                  after Fig. 8: PSNR on held-out views against the time of a training
 OUT/axes                    after Tables 2 and 4: what the axes of StableGS's probes gain, alone and together
 OUT/index                   after Fig. 7: the anisotropy index over the steps, with the band of the seeds
-OUT/fig1                    the paper's Fig. 1 of these two (`figures.fig1`)
 OUT/captions.md             a caption for each, and the nine verdicts, written from the numbers
 
 Each figure as PNG and PDF.  A cell of the study that was not run is named where its number would be.
@@ -29,12 +27,10 @@ from analysis.records.run_files import read_trajectory
 from analysis.runs.claims.effects import BASE, LEAST, SCORE, STABLE, Interval, gains, log_ratios, numbers
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
-from figures import fig1
 from figures.claims import draw_claims, draw_predictors
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
 
 RESULTS = Path(__file__).parents[1] / "notebooks" / "results"
-PAIR = (BASE, STABLE)
 LINE = 0.065  # of the height of the axes, between names
 BUDGET = 1.3  # the paper's time of StableGS over that of 3DGS, Sec. 4.3
 VIEWPOINTS = {"occlusion": "edge_rotation", "interpolation": "interpolation", "parallax": "parallax"}
@@ -72,8 +68,6 @@ def make(results: Path, out: Path) -> Iterator[Path]:
     }
     if (results / "trajectories.csv").is_file():
         drawn["index"] = draw_index(read_trajectory(results / "trajectories.csv"))
-    if all((results / name).is_dir() for name in PAIR):
-        drawn["fig1"] = fig1.draw([results / name for name in PAIR])
     for name, figure in drawn.items():
         for suffix in ("png", "pdf"):
             yield save(figure, out / f"{name}.{suffix}")
@@ -88,7 +82,6 @@ def captions(rows: pd.DataFrame, drawn: Sequence[str]) -> str:
         "predictors": _of_predictors(predictors(rows)),
         "budget": _of_budget(rows),
         "axes": _of_axes(rows),
-        "fig1": "The loss along the two steepest eigenvectors, and a view held out, of one training of each method.",
         "index": "The literal index |λmax / λmin| over the steps; line: median, band: all seeds.",
     }
     lines = [f"**{name}.** {caption}" for name, caption in words.items() if name in drawn] + [_trainings(rows)]

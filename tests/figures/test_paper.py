@@ -21,7 +21,7 @@ def test_every_figure_is_made_from_the_table_alone(tmp_path, capsys):
 def test_captions_change_with_the_numbers():
     ours, other = captions(made_up(PAPER), NAMES), captions(made_up(OTHERWISE), NAMES)
     assert ours.count("**holds.**") == 9 and other.count("**does not hold.**") == 9
-    assert "**fig1.**" not in ours  # not drawn
+    assert "**index.**" not in ours  # not drawn
     assert "Not run: attributes + occlusion, attributes + interpolation, attributes + parallax" in ours
 
 
