@@ -59,7 +59,7 @@ class Gaussians(Brief):
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"expected sh_degree 0, 1, 2 or 3, got {self.sh_degree}")
         each, flat = parameters_per_gaussian(self.sh_degree), self.flat
-        other = flat.is_nested or flat.layout != torch.strided or flat.is_meta
+        other = flat.is_nested or flat.layout != torch.strided
         if other or flat.ndim != 1 or flat.numel() % each:
             raise InputError(
                 f"expected a vector of n x {each} parameters at SH degree {self.sh_degree}, got "

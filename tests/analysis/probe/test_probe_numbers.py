@@ -33,7 +33,8 @@ def test_traces_are_within_four_standard_errors_of_the_dense_hessian(record, den
         each = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 3 * objective.active.sh.shape[1]}
         assert trace.dim == len(objective.active) * each[name]
         assert trace.tau == math.sqrt(max(trace.value, 0) / trace.dim)
-        assert record.arrays["traces"][name].mean() == pytest.approx(trace.value, rel=1e-12)
+        samples = record.arrays["traces"][name]  # none of an exact trace
+        assert not len(samples) or samples.mean() == pytest.approx(trace.value, rel=1e-12)
 
 
 def test_eigenvalues_are_those_of_the_dense_hessian_within_their_residuals(record, dense):

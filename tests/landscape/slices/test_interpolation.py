@@ -18,7 +18,8 @@ def test_on_the_axes_and_where_it_is_known_the_interpolant_is_the_function():
     given = known(grid, values, [30, 111])
     found, at = grid(given), np.isfinite(given)
     assert at.reshape(21, 19)[10].all() and at.reshape(21, 19)[:, 6].all() and at.sum() == 21 + 18 + 16 + 2
-    assert abs(found - values)[at].max() < 1e-12 and np.isfinite(found).all()
+    # round-off, as the solve of the spline amplifies it
+    assert abs(found - values)[at].max() < 1e-11 and np.isfinite(found).all()
 
 
 @pytest.mark.parametrize("step", [1e-2, 1e-4])

@@ -180,7 +180,7 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("vsp_weight = 0", "vsp_wait = 0", "still/asp only/1: expected a setting of .*vsp_weight.*, got 'vsp_wait'"),
+        ("vsp_weight = 0", "vsp_wait = 0", "still/asp only/1: expected a setting of .*'vsp_wait'.* vsp_weight"),
         ('method = "stablegs"', 'method = "magic"', "still/asp only/1: expected a method among .*, got 'magic'"),
         ("views = 3", "views = 30", "still/3dgs/1: .*at most 4 training views.*got 30"),
         ('path = "still"', 'path = "gone"', "still/3dgs/1: .*gone"),
