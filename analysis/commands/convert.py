@@ -1,10 +1,13 @@
-"""`landscape convert`: Gaussians from one tool's file to another's."""
+"""`landscape convert`: Gaussians from one tool's file to another's, or depth maps of their scene's views."""
 
 import os
 from collections.abc import Mapping
 from dataclasses import replace
+from io import BytesIO
+from pathlib import PurePosixPath
 
 import numpy as np
+import torch
 from rich.console import Console
 
 from analysis.commands.options import ConvertOptions
@@ -15,9 +18,11 @@ from splat.model.files.splat_file import SplatFile
 from splat.model.files.splat_ply import splat_ply
 from splat.model.files.tensor_files import gsplat_bytes
 from splat.model.settings import RenderSettings
+from splat.render.render import render_depth
 from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
 
 OURS = "splat-landscape"
+FAINT = 0.01  # of alpha: what is less covered is as far as the farthest that is not
 
 
 def run_convert(options: ConvertOptions) -> int:
@@ -26,7 +31,9 @@ def run_convert(options: ConvertOptions) -> int:
         raise FileExistsError(f"expected a new file to write, but {options.out} exists; choose another")
     to = options.to or ("graphdeco" if options.out.suffix.lower() == ".ply" else "own")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    notes = _to_own(options) if to == "own" else _to_tool(options, to)
+    notes = (
+        _to_own(options) if to == "own" else _to_depths(options) if to == "depths" else _to_tool(options, to)
+    )
     console = Console(stderr=True)
     for note in notes:
         console.print(note, style="yellow", soft_wrap=True, highlight=False, markup=False)
@@ -58,6 +65,24 @@ def _to_tool(options: ConvertOptions, to: str) -> list[str]:
     write_atomically(options.out, content)
     kept = [f"with {', '.join(extra)}"] if extra else []
     return [f"{len(found.gaussians)} Gaussians", *kept, *found.notes]
+
+
+def _to_depths(options: ConvertOptions) -> list[str]:
+    """Expected depth of every view of the scene, held out or not, as NAME.npy; of alpha 1 by division."""
+    checkpoint, scene = opened(options.source, options.scene, options.foreign, options.out)
+    training = checkpoint.training
+    views = scene.load([frame.name for frame in scene.frames])
+    with torch.no_grad():
+        for view in views:
+            depth, alpha = render_depth(training.gaussians, view.camera, training.config.render)
+            if not (seen := alpha > FAINT).any():
+                raise InputError(f"expected Gaussians in sight of every view, got none in {view.name}; name another file")
+            content, depth = BytesIO(), depth / alpha.clamp_min(FAINT)
+            np.save(content, torch.where(seen, depth, depth[seen].max()).float().numpy())
+            path = options.out / PurePosixPath(view.name).with_suffix(".npy")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, content.getvalue())
+    return [f"depth of {len(views)} views: landscape train {scene.root} --method fsgs --depths {options.out} --set depths=depth"]
 
 
 def _own(options: ConvertOptions) -> SplatFile:

@@ -24,16 +24,17 @@ class ConvertOptions:
     """Convert Gaussians between tools: read whatever probe reads; write a PLY as 3DGS does, a gsplat checkpoint, or our own.
 
     Numbers of 32 bits stay the same bits.  Our own needs the scene, and is what compare, train and bench take.
+    depths writes what the Gaussians show of the scene's views as depth maps, which train takes with --depths.
     """
 
     source: Annotated[Positional[Path], arg(metavar="IN")]
     """The file to read."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
-    """The file to write, which must not exist yet."""
-    to: Unset[Literal["graphdeco", "gsplat", "own"]] = None
+    """The file to write, of depths the folder, which must not exist yet."""
+    to: Unset[Literal["graphdeco", "gsplat", "own", "depths"]] = None
     """What to write.  Default: graphdeco's PLY where OUT ends in .ply, else our own checkpoint."""
     scene: Unset[Path] = None
-    """Folder of the scene, for our own checkpoint."""
+    """Folder of the scene, for our own checkpoint or depths of another tool's file."""
     foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
 
 

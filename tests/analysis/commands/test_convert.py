@@ -9,6 +9,8 @@ import torch
 from analysis.commands.cli import main
 from analysis.records.records import read_record
 from splat.model.files.read import read_splats
+from splat.render.render import render_depth
+from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
@@ -82,3 +84,13 @@ def test_a_training_starts_from_another_tools_gaussians_with_its_renderer(folder
     moved = (training.gaussians.means - MADE.truth.means).abs().max()
     assert 0 < moved < 0.01 * training.extent
     assert main([*common, "--set", "render.near=0.1", "--out", str(folder / "other")]) == 2
+
+
+def test_depths_of_every_view_are_those_of_its_pixels_and_train_reads_them(folder):
+    assert convert(folder / "in.ply", folder / "depths", "--to", "depths", "--scene", folder / "scene") == 0
+    loaded = load_scene(folder / "scene", depths=folder / "depths").load()
+    for view, truth in zip(loaded, MADE.scene.load(), strict=True):
+        depth, alpha = render_depth(MADE.truth, truth.camera)
+        assert view.depth is not None and (alpha > 0.5).any()
+        assert torch.allclose(view.depth.squeeze()[alpha > 0.5], (depth / alpha)[alpha > 0.5], rtol=1e-5)
+        assert (view.depth.squeeze()[alpha < 0.01] == view.depth.max()).all()
