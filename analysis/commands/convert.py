@@ -31,9 +31,7 @@ def run_convert(options: ConvertOptions) -> int:
         raise FileExistsError(f"expected a new file to write, but {options.out} exists; choose another")
     to = options.to or ("graphdeco" if options.out.suffix.lower() == ".ply" else "own")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    notes = (
-        _to_own(options) if to == "own" else _to_depths(options) if to == "depths" else _to_tool(options, to)
-    )
+    notes = _to_own(options) if to == "own" else _to_depths(options) if to == "depths" else _to_tool(options, to)
     console = Console(stderr=True)
     for note in notes:
         console.print(note, style="yellow", soft_wrap=True, highlight=False, markup=False)
@@ -76,13 +74,17 @@ def _to_depths(options: ConvertOptions) -> list[str]:
         for view in views:
             depth, alpha = render_depth(training.gaussians, view.camera, training.config.render)
             if not (seen := alpha > FAINT).any():
-                raise InputError(f"expected Gaussians in sight of every view, got none in {view.name}; name another file")
+                raise InputError(
+                    f"expected Gaussians in sight of every view, got none in {view.name}; name another file"
+                )
             content, depth = BytesIO(), depth / alpha.clamp_min(FAINT)
             np.save(content, torch.where(seen, depth, depth[seen].max()).float().numpy())
             path = options.out / PurePosixPath(view.name).with_suffix(".npy")
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, content.getvalue())
-    return [f"depth of {len(views)} views: landscape train {scene.root} --method fsgs --depths {options.out} --set depths=depth"]
+    return [
+        f"depth of {len(views)} views: landscape train {scene.root} --method fsgs --depths {options.out} --set depths=depth"
+    ]
 
 
 def _own(options: ConvertOptions) -> SplatFile:

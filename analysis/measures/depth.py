@@ -58,8 +58,7 @@ class DepthSplit:
     @cached_property
     def gradient_ratio(self) -> float:
         """Ratio of the root mean squares; nan without a lateral gradient."""
-        depth, lateral = self.components.square().sum(dim=0).tolist()
-        return (LATERAL_DIRECTIONS * depth / lateral) ** 0.5 if lateral > 0 else nan
+        return _ratio(self.components)
 
     @cached_property
     def median_ratio(self) -> float:
@@ -106,6 +105,22 @@ class DepthRises:
             {name: finite_or_none(column[i]) for name, column in columns.items()} for i in range(len(self.steps))
         ]
         return [convert({"pixels": step, **row}, Rise) for step, row in zip(self.steps, numbers, strict=True)]
+
+
+def _ratio(components: Float64[Tensor, "pairs 2"]) -> float:
+    depth, lateral = components.square().sum(dim=0).tolist()
+    return (LATERAL_DIRECTIONS * depth / lateral) ** 0.5 if lateral > 0 else nan
+
+
+def gradient_ratio(objective: SceneObjective) -> float:
+    """`DepthSplit.gradient_ratio` alone, of one gradient for each view."""
+    rays = (rays_of(objective, index) for index in range(len(objective.views)))
+    rows = objective.blocks["means"]
+    parts = [
+        along_and_across(view.gradient[rows].view(-1, 3), ray)
+        for view, ray in zip(objective.linearized, rays, strict=True)
+    ]
+    return _ratio(objective.gather_rows(torch.stack(parts, dim=1)).flatten(0, 1).double())
 
 
 def measure_depth(

@@ -16,6 +16,7 @@ import torch
 from scipy.stats import spearmanr
 from torch import Tensor
 
+from analysis.measures.depth import gradient_ratio
 from analysis.records.quantities import measured, percent, quantity
 from analysis.records.run_files import Fragility, Swaps
 from landscape.results import Progress, finite_or_none
@@ -54,6 +55,7 @@ def fragility(
         one_view=share_of(torch.ones_like(condition), alone),
         one_view_trace=finite_or_none(share_of(values["trace_opacity_logits"].abs(), alone)),
         opacity_one_view=finite_or_none(opacity_one_view(values)),
+        depth_gradient=finite_or_none(gradient_ratio(objective)),
     )
 
 
@@ -119,6 +121,8 @@ def fragility_sentences(found: Fragility) -> list[str]:
             f"Position: 1 px of way along the ray changes the order of {spread} of the neighbouring pairs of a view"
         )
         position += f"; at a swap the loss jumps by {measured(moved.jump, moved.jump_error)}." if moved.sampled else "."
+    if found.depth_gradient is not None:
+        position += f" The gradient along the rays is {quantity(found.depth_gradient)} times that across them."
     rotation, scale = (percent(found.needles_steepest[name]) for name in ATTRIBUTES)
     conditioning = (
         f"Conditioning: {percent(found.needles)} of the Gaussians are needles (condition above {NEEDLE:.0f}; half are above "

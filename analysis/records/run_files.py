@@ -167,7 +167,8 @@ class Fragility(Struct, kw_only=True):
     condition: percentile -> condition number.  needles: share that are; needles_steepest: share of the steepest hundredth in an
     attribute that are; needles_trace: share of that attribute's curvature that they hold.  one_view: share that one view alone
     sees, one_view_trace: share of opacity's curvature on these, opacity_one_view: rank correlation of a Gaussian's curvature in
-    opacity with the share of its weight that one view alone sees; None where all have the same.
+    opacity with the share of its weight that one view alone sees; None where all have the same.  depth_gradient: of the
+    positions' gradient along the rays over one direction across them (`analysis.measures.depth`).
     """
 
     swaps: Swaps
@@ -178,6 +179,7 @@ class Fragility(Struct, kw_only=True):
     one_view: float
     one_view_trace: Number
     opacity_one_view: Number
+    depth_gradient: Number = None
 
 
 class MapRecord(Struct, kw_only=True):

@@ -32,6 +32,8 @@ class SweepOptions:
     set = { vsp_weight = 0 }"""
     out: Unset[Path] = None
     """Folder of the runs and tables.  Default: the file's."""
+    only: UseAppendAction[tuple[str, ...]] = ()
+    """Run these cells alone, by SCENE/METHOD/SEED or the beginning of it, such as fern/3dgs; may be repeated."""
     jobs: int = 1
     """Runs at once, each on its share of the processors."""
     probe: FlagCreatePairsOff[bool] = False

@@ -1,7 +1,8 @@
 """Effects of a study's methods, their intervals over seeds, and the verdict that an interval allows.
 
 An effect is an average over trainings, or over pairs of a scene and a seed that both methods have, with Student's 95% interval;
-ratios are averaged as logarithms.  The verdict compares the interval with no effect and with the size that the paper states:
+ratios are averaged as logarithms, a cell that was trained on
+several machines counts once.  The verdict compares the interval with no effect and with the size that the paper states:
 
     interval                                  verdict
     beyond no effect, reaches the size        holds
@@ -25,6 +26,8 @@ Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested h
 LEAST, CONFIDENCE = 3, 0.95
 BASE, STABLE = "3dgs", "stablegs"
 SCORE = "psnr"
+PAIR = ("scene", "seed")
+SURROUNDINGS = ("machine", "threads")  # without which times do not compare
 
 
 @dataclass(frozen=True)
@@ -100,13 +103,14 @@ def decide(effect: Effect) -> Verdict:
     return "cannot be tested here" if reaches else "does not hold"
 
 
-def numbers(rows: pd.DataFrame, name: str, method: str | None = None) -> pd.Series:
-    """A quantity of all runs, or of one method's, by scene and seed; none where no run has it."""
+def numbers(rows: pd.DataFrame, name: str, method: str | None = None, keys: Sequence[str] = PAIR) -> pd.Series:
+    """A quantity of all runs, or of one method's, by scene and seed, the mean of those alike; none where no run has it."""
     part = rows if method is None else rows[rows["method"] == method]
-    if name not in part:
-        return pd.Series(dtype=float)
-    found = pd.Series(part[name].to_numpy(float), pd.MultiIndex.from_frame(pd.DataFrame(part[["scene", "seed"]])))
-    return found[np.isfinite(found)]
+    values = part[name].to_numpy(float) if name in part else np.full(len(part), np.nan)
+    found = pd.Series(values, pd.MultiIndex.from_frame(pd.DataFrame(part[list(keys)])))
+    if method is None:
+        return found[np.isfinite(found)]
+    return pd.Series(found[np.isfinite(found)].groupby(level=list(keys)).mean())
 
 
 def gains(rows: pd.DataFrame, method: str) -> pd.Series:
@@ -115,9 +119,10 @@ def gains(rows: pd.DataFrame, method: str) -> pd.Series:
 
 
 def log_ratios(rows: pd.DataFrame, name: str, method: str = STABLE) -> pd.Series:
-    """ln of the magnitude over that of 3DGS, by scene and seed."""
-    found = (numbers(rows, name, method) / numbers(rows, name, BASE)).dropna().abs()
-    return pd.Series(np.log(found[found > 0]))
+    """ln of the magnitude over that of 3DGS, by scene and seed; of times, only of trainings in the same surroundings."""
+    keys = [*PAIR, *(key for key in SURROUNDINGS if key in rows and name.endswith("_seconds"))]
+    found = (numbers(rows, name, method, keys) / numbers(rows, name, BASE, keys)).dropna().abs()
+    return pd.Series(pd.Series(np.log(found[found > 0])).groupby(level=list(PAIR)).mean())
 
 
 def ratio_effect(name: str, logarithms: pd.Series, claimed: float | None) -> Effect:

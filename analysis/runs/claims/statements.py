@@ -25,6 +25,7 @@ from analysis.runs.claims.effects import (
     numbers,
     ratio_effect,
 )  # fmt: skip
+from analysis.runs.claims.study import STRETCHED
 
 ATTRIBUTES_ALONE, VIEWPOINTS_ALONE = "stablegs vsp_weight=0", "stablegs asp_weight=0"
 AXIS = ATTRIBUTES_ALONE + " probe.attributes={}"
@@ -79,15 +80,23 @@ def depth(rows: pd.DataFrame) -> Judgement:
 
 
 def needles(rows: pd.DataFrame) -> Judgement:
-    share, number = (Interval.of(numbers(rows, name, BASE)) for name in ("needles", "needle_count"))
-    effect = Effect(
-        "share of the steepest eigenvector on needles", share, max(number.value, 0.0) if number.n else 0.0, 0.5
-    )
-    finding = f"Of the steepest eigenvector's mass {share.text()} is on Gaussians with a condition number above 100, which are "
-    finding += f"{number.text()} of those in sight. More than half counts as dominant; measured on the whole Hessian."
+    """By the curvature of both attributes; where no map has these, by the steepest eigenvector of the whole Hessian."""
+    number = Interval.of(numbers(rows, "needle_count", BASE))
+    null = number.value if number.n else 0.0
+    blocks = {f"share of the curvature of {attribute_name(name)} on needles": f"needles_{name}" for name in STRETCHED}
+    columns = {words: name for words, name in blocks.items() if len(numbers(rows, name, BASE))}
+    columns["share of the steepest eigenvector on needles"] = "needles"
+    effects = tuple(Effect(words, Interval.of(numbers(rows, name, BASE)), null, 0.5) for words, name in columns.items())
+    verdicts = [decide(effect) for effect in effects][: len(STRETCHED) if len(effects) > len(STRETCHED) else 1]
+    verdict = verdicts[0] if len(set(verdicts)) == 1 else "holds in part"
+    if "cannot be tested here" in verdicts:
+        verdict = "cannot be tested here"
+    words = "; ".join(f"{effect.name}: {effect.interval.text()}" for effect in effects)
+    finding = f"Needles, Gaussians with a condition number above 100, are {number.text()} of those in sight; {words}. "
+    finding += "More than half counts as dominant."
     return Judgement(
         3, "Gaussians with a condition number above 100 dominate the high curvature of rotation and scale.", "Sec. 3.2",
-        decide(effect), finding, (effect,),
+        verdict, finding, effects,
     )  # fmt: skip
 
 

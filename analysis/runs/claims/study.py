@@ -7,7 +7,10 @@
     psnr, ssim, ...             as in a sweep's results.csv (`analysis.runs.sweep.sweep_results`): scores, Gaussians, seconds,
                                 threads, traces, ends of the spectrum and indices, those of the probe where the run has one
     lambda_second               the second largest eigenvalue
-    depth_gradient              the root mean square gradient of the positions along the rays, over that across them
+    depth_gradient              the root mean square gradient of the positions along the rays, over that across them; where
+                                `landscape map` has been run, or a probe without --quick
+    needles_quats, needles_log_scales   share of that attribute's trace, each Gaussian's in magnitude, on Gaussians with kappa
+                                above 100; where `landscape map` has been run
     needles, needle_count       share of the steepest eigenvector's squared mass on Gaussians with kappa above 100, and share of
                                 the visible Gaussians that these are
     one_gaussian                share of the steepest eigenvector's squared mass on a single Gaussian
@@ -47,20 +50,21 @@ from splat.training.state import LearningRates, TrainConfig
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
 SAMPLES = 10  # the paper's B
+STRETCHED = ("quats", "log_scales")  # what needles are said to dominate
 
 
 def study(paths: Sequence[Path]) -> pd.DataFrame:
     """The rows of all paths: folders that hold runs at any depth, and tables that were written as FILE.
 
-    InputError where there is no run, or one twice.
+    InputError where there is no run, or one twice on one machine.
     """
     tables = [pd.read_csv(path) if path.is_file() else pd.DataFrame(map(row_of, _runs(path))) for path in paths]
     for path, table in zip(paths, tables, strict=True):
         if missing := [key for key in KEYS if key not in table]:
             raise InputError(f"expected the table of a study in {path}, got one without the column {missing[0]}")
     rows = pd.concat(tables, ignore_index=True)
-    if rows.duplicated(list(KEYS)).any():
-        twice = rows[rows.duplicated(list(KEYS))].iloc[0]
+    if (again := rows.duplicated([*KEYS, *(key for key in ("machine",) if key in rows)])).any():
+        twice = rows[again].iloc[0]
         raise InputError(
             f"expected every run once, got {twice['method']} with seed {twice['seed']} of {twice['scene']} twice"
         )
@@ -104,13 +108,16 @@ def _made(run: Path) -> dict[str, str]:
 def _of_map(run: Path) -> dict[str, float]:
     if not (run / MapRecord.COMMAND / MapRecord.FILE).is_file():
         return {}
-    return {"opacity_one_view": _number(read_map(run / MapRecord.COMMAND).fragility.opacity_one_view)}
+    found = read_map(run / MapRecord.COMMAND).fragility
+    row = {f"needles_{name}": found.needles_trace.get(name, nan) for name in STRETCHED}
+    row |= {"needle_count": found.needles, "depth_gradient": _number(found.depth_gradient)}
+    return row | {"opacity_one_view": _number(found.opacity_one_view)}
 
 
 def method_name(config: TrainConfig, start: Source = "scene") -> str:
     """The method, its start and protocol where they are not the usual ones, and what was changed of its settings.
 
-    What a method scales to the length of the training is not changed.
+    What a method scales to the length of the training is not changed, nor what is said of the files that it is given.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS
     >>> method_name(TrainConfig(500, method=StableGS(vsp_weight=0.0, warm_up=50))), method_name(TrainConfig(), "dense")
@@ -121,7 +128,9 @@ def method_name(config: TrainConfig, start: Source = "scene") -> str:
     usual = overridden(usual, {key: value for key, value in preset.items() if key != "start"})
     published = leaves(asdict(usual.method.scaled(usual).method))
     settings = leaves(asdict(config.method))
-    changed = [f"{key}={_text(value)}" for key, value in settings.items() if value != published[key]]
+    changed = [
+        f"{key}={_text(value)}" for key, value in settings.items() if value != published[key] and key != "depths"
+    ]
     started = [f"start={start}"] if start != preset.get("start", "scene") else []
     protocol = [f"protocol={config.protocol}"] if preset else []
     return " ".join([name, *started, *protocol, *changed])

@@ -15,7 +15,7 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,6 +23,7 @@ from pathlib import Path
 from threading import Event
 from time import monotonic
 
+import pandas as pd
 from rich.console import Console
 
 from analysis.console.drawing import module_environment
@@ -50,13 +51,24 @@ def run_sweep(options: SweepOptions) -> int:
     """Run what is missing; returns the exit code."""
     if options.jobs < 1:
         raise InputError(f"expected at least 1 job, got {options.jobs}")
-    sweep = read_sweep(options.file, options.out, options.probe)
+    whole = read_sweep(options.file, options.out, options.probe)
+    sweep = only(whole, options.only)
     to_do = {cell.name: missing(cell, sweep) for cell in sweep.cells}
     sweep.out.mkdir(parents=True, exist_ok=True)
     with locked(sweep.out) as lock, interruption() as interrupted:
-        cells = _Cells(sweep, to_do, options.jobs, interrupted, lock)
+        cells = _Cells(sweep, to_do, options.jobs, interrupted, lock, whole)
         cells.run()
     return _conclude(cells, interrupted.exit_code)
+
+
+def only(sweep: Sweep, names: Sequence[str]) -> Sweep:
+    """The cells whose names begin with one of these, part by part; all where none is named."""
+    chosen = {name: [cell for cell in sweep.cells if f"{cell.name}/".startswith(f"{name}/")] for name in names}
+    if unknown := [name for name, cells in chosen.items() if not cells]:
+        known = list(dict.fromkeys(cell.name.rsplit("/", 1)[0] for cell in sweep.cells))
+        raise InputError(f"expected --only {', '.join(known)}, or with /SEED, got {unknown[0]}")
+    wanted = {cell.name for cells in chosen.values() for cell in cells}
+    return replace(sweep, cells=tuple(cell for cell in sweep.cells if not names or cell.name in wanted))
 
 
 def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
@@ -99,9 +111,18 @@ def locked(out: Path) -> Iterator[int]:
 
 
 class _Cells:
-    """The cells under way.  to_do: by a cell's name; failed: what to say about those that failed."""
+    """The cells under way.  to_do: by a cell's name; whole: also those not asked for; failed: what to say of whom."""
 
-    def __init__(self, sweep: Sweep, to_do: dict[str, list[Stage]], jobs: int, interrupted: Event, lock: int) -> None:
+    def __init__(
+        self,
+        sweep: Sweep,
+        to_do: dict[str, list[Stage]],
+        jobs: int,
+        interrupted: Event,
+        lock: int,
+        whole: Sweep | None = None,
+    ) -> None:
+        self.whole = whole or sweep
         self.sweep, self.to_do, self.jobs, self.interrupted, self.lock = sweep, to_do, jobs, interrupted, lock
         self.failed: dict[str, str] = {}
         self.running: dict[str, subprocess.Popen[bytes]] = {}
@@ -112,13 +133,18 @@ class _Cells:
         def status(cell: Cell) -> str:
             if cell.name in self.failed:
                 return "failed"
-            return "done" if not self.to_do[cell.name] else "under way" if cell.out.exists() else "to do"
+            done = not self.to_do[cell.name] if cell.name in self.to_do else (cell.out / METRICS).is_file()
+            return "done" if done else "under way" if cell.out.exists() else "to do"
 
-        return {cell.name: status(cell) for cell in self.sweep.cells}
+        return {cell.name: status(cell) for cell in self.whole.cells}
+
+    def write(self) -> pd.DataFrame:
+        """The tables of all cells, those too that are not asked for."""
+        return write_results(self.whole, self.statuses)
 
     def run(self) -> None:
         """All that is missing, so many cells at once, until it is done or Ctrl-C stopped it."""
-        write_results(self.sweep, self.statuses)  # a file that is damaged is refused before hours are spent
+        self.write()  # a file that is damaged is refused before hours are spent
         told: set[int] = set()
         cells = [cell for cell in self.sweep.cells if self.to_do[cell.name]]
         with ThreadPoolExecutor(self.jobs) as pool, self.progress:
@@ -128,7 +154,7 @@ class _Cells:
                     done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
                     for future in done:
                         self.progress.ended(future.result(), self.statuses)
-                        write_results(self.sweep, self.statuses)
+                        self.write()
                     self.progress.update()
                     if self.interrupted.is_set():
                         self._tell(told)
@@ -209,14 +235,14 @@ def _environment(jobs: int) -> dict[str, str]:
 def _conclude(cells: _Cells, stopped: int) -> int:
     """The tables, and what did not go well; returns the exit code."""
     sweep, console = cells.sweep, Console()
-    rows = write_results(sweep, cells.statuses)
+    rows = cells.write()
     for table in tables(summarize(rows)):
         console.print(table)
     for line in [*unfinished(rows), *of_other_threads(rows)]:
         console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
     for line in cells.failed.values():
         console.print(line, style="red", soft_wrap=True, highlight=False, markup=False)
-    done = sum(status == "done" for status in cells.statuses.values())
+    done = sum(not cells.to_do[cell.name] for cell in sweep.cells)
     console.print(
         f"{done} of {len(sweep.cells)} cells done; tables: {sweep.out}", soft_wrap=True, highlight=False, markup=False
     )

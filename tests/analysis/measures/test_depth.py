@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from analysis.measures.depth import KINDS, DepthSplit, _directions, _signs, depth_rises, depth_split, rays_of
+from analysis.measures.depth import KINDS, DepthSplit, _directions, _signs, depth_rises, depth_split, gradient_ratio, rays_of
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import TraceSettings
 from splat.curvature.objective import SceneObjective
@@ -54,6 +54,7 @@ def by_specification(objective: SceneObjective, loss: LossSettings) -> tuple[Ten
 def test_gradients_and_traces_are_those_of_each_views_dense_derivatives(objective):
     pairs, traces = by_specification(objective, PIXELWISE)
     split, n = depth_split(objective, generator()), len(objective.active)
+    assert gradient_ratio(objective) == pytest.approx(split.gradient_ratio)
     expected, order = pairs[pairs.any(dim=1)].sort(dim=0).values, split.components.sort(dim=0).values
     assert order.shape == expected.shape and torch.allclose(order, expected, rtol=1e-7, atol=1e-7 * float(pairs.max()))
     assert (split.depth.reason, split.depth.dim, split.lateral.dim) == ("exact", n, 2 * n)

@@ -11,11 +11,12 @@ from analysis.commands.cli import main
 from analysis.console.overrides import assignments, overridden
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
-from analysis.runs.claims.effects import Interval
+from analysis.runs.claims.effects import Interval, gains, log_ratios
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, judgements
 from analysis.runs.claims.study import _more, method_name, study
 from analysis.runs.sweep.sweep_file import read_sweep
+from figures.paper import ONLY
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
 from splat.training.state import LearningRates, TrainConfig
@@ -108,6 +109,17 @@ def test_an_index_that_contradicts_the_literal_one_is_named():
     assert "saddle" in first.finding
 
 
+def test_times_are_compared_only_on_one_machine_and_a_cell_counts_once():
+    rows = made_up(PAPER).assign(machine="A", cpu_seconds=100.0)
+    there = pd.DataFrame(rows[rows["method"].isin(["3dgs", STABLE])]).assign(machine="B", cpu_seconds=7.0)
+    there.loc[there["method"] == STABLE, "cpu_seconds"] = 21.0
+    rows.loc[rows["method"] == STABLE, "machine"] = "C"  # of which no 3DGS was trained
+    found = log_ratios(pd.concat([rows, there]), "cpu_seconds")
+    assert np.allclose(np.exp(found), 3.0) and len(found) == 3
+    assert log_ratios(rows, "cpu_seconds").empty and len(log_ratios(rows, "literal")) == 3
+    assert len(gains(pd.concat([rows, there]), STABLE)) == 3
+
+
 def test_the_interval_covers_the_mean_of_normal_numbers():
     rng = np.random.default_rng(1)
     found = [Interval.of(list(rng.standard_normal(3))) for _ in range(2000)]
@@ -149,12 +161,26 @@ def test_a_map_of_a_run_adds_what_one_view_sees(tmp_path, monkeypatch):
 
     from analysis.runs.claims import study as module
 
-    found = SimpleNamespace(fragility=SimpleNamespace(opacity_one_view=0.25))
+    shares = {"quats": 0.6, "log_scales": 0.5}
+    fragile = SimpleNamespace(opacity_one_view=0.25, needles=0.1, needles_trace=shares, depth_gradient=None)
+    found = SimpleNamespace(fragility=fragile)
     monkeypatch.setattr(module, "read_map", lambda folder: found if folder == tmp_path / "map" else None)
     assert module._of_map(tmp_path) == {}
     (tmp_path / "map").mkdir()
     (tmp_path / "map" / "map.json").touch()
-    assert module._of_map(tmp_path) == {"opacity_one_view": 0.25}
+    row = module._of_map(tmp_path)
+    assert np.isnan(row.pop("depth_gradient"))
+    assert row == {
+        "opacity_one_view": 0.25, "needle_count": 0.1, "needles_quats": 0.6, "needles_log_scales": 0.5,
+    }  # fmt: skip
+
+
+def test_needles_that_dominate_one_of_two_attributes_hold_in_part():
+    rows = made_up(PAPER).assign(needles_quats=0.9, needles_log_scales=0.02)
+    third = judgements(rows)[2]
+    assert third.verdict == "holds in part" and "curvature of log scale on needles: 0.02" in third.finding
+    assert judgements(rows.assign(needles_log_scales=0.8))[2].verdict == "holds"
+    assert judgements(rows.assign(needles_quats=0.03))[2].verdict == "does not hold"
 
 
 def test_the_command_reads_a_table_and_draws(tmp_path, capsys):
@@ -188,19 +214,35 @@ def test_a_protocol_is_named_and_not_its_settings():
     assert method_name(overridden(config, {"neighbours": "4"})) == "fsgs protocol=llff neighbours=4"
 
 
-def test_the_study_in_the_repository_decides_every_statement():
+NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
+
+
+def names_in(file: str) -> set[str]:
+    """The methods of a sweep, as the table of a study has them."""
     names = set()
-    for cell in read_sweep(Path(__file__).parents[3] / "notebooks" / "study.toml").cells:
-        config = TrainConfig(iterations=cell.steps, method=METHODS[cell.training.method]())
-        config = overridden(config, assignments(cell.training.set))
-        names.add(method_name(config, cell.training.start or "scene"))
-    needed = {
-        "3dgs",
-        "stablegs",
-        "3dgs start=dense",
-        "stablegs start=dense",
-        "stablegs viewpoints=one",
-        ATTRIBUTES_ALONE,
-        VIEWPOINTS_ALONE,
-    }
-    assert needed | {AXIS.format(name) for name in ATTRIBUTES} <= names
+    for cell in read_sweep(NOTEBOOKS / file).cells:
+        options, method = cell.training, METHODS[cell.training.method]()
+        config = TrainConfig(iterations=cell.steps, protocol=options.protocol, method=method)
+        preset = presets(options.method, options.protocol)
+        config = overridden(config, {key: value for key, value in preset.items() if key not in ("start", "iterations")})
+        config = overridden(config, assignments(options.set))
+        names.add(method_name(config.method.scaled(config), options.start or preset.get("start", "scene")))
+    return names
+
+
+def test_every_stored_training_is_a_cell_of_the_file_that_repeats_it():
+    rows = pd.read_csv(NOTEBOOKS / "results" / "study.csv")
+    assert set(rows["method"]) <= names_in("study_small.toml")
+    cells = read_sweep(NOTEBOOKS / "study_small.toml").cells
+    assert set(rows["steps"]) == {cell.steps for cell in cells} and set(rows["seed"]) <= {cell.seed for cell in cells}
+
+
+@pytest.mark.parametrize("file", ["study.toml", "study_small.toml"])
+def test_the_studies_in_the_repository_decide_every_statement(file):
+    names = names_in(file)
+    needed = {"3dgs", "stablegs", "stablegs viewpoints=one", ATTRIBUTES_ALONE, VIEWPOINTS_ALONE}
+    assert needed | {AXIS.format(name) for name in ATTRIBUTES} | set(ONLY.values()) <= names
+
+
+def test_the_full_study_has_the_start_of_the_sparse_view_literature():
+    assert {"3dgs start=dense", "stablegs start=dense"} <= names_in("study.toml")

@@ -19,7 +19,7 @@ import tyro
 from analysis.commands.cli import main
 from analysis.probe.record import loss_name
 from analysis.records.provenance import usable_cores
-from analysis.runs.sweep.sweep import _Cells, locked, missing, probe_arguments
+from analysis.runs.sweep.sweep import _Cells, locked, missing, only, probe_arguments
 from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import results
@@ -223,6 +223,19 @@ def test_what_is_done_is_not_done_again(finished, folder, no_commands):
     before = (folder / "out/results.csv").read_bytes(), (folder / "out/summary.csv").read_bytes()
     assert main(["sweep", str(finished.file)]) == 0 and no_commands == []
     assert before == ((folder / "out/results.csv").read_bytes(), (folder / "out/summary.csv").read_bytes())
+
+
+def test_only_the_cells_asked_for_run_and_the_tables_keep_the_others(finished, folder, no_commands, capsys):
+    whole = read_sweep(folder / "sweep.toml")
+    assert [cell.name for cell in only(whole, ["still/asp only", "still/3dgs/0"]).cells] == [
+        "still/asp only/1", "still/3dgs/0", "still/asp only/0",
+    ]  # fmt: skip
+    assert main(["sweep", str(whole.file), "--only", "still/3dgs/1"]) == 0
+    assert "1 of 1 cells done" in capsys.readouterr().out and not no_commands
+    rows = pd.read_csv(finished.out / "results.csv")
+    assert list(rows["status"]) == ["done", "done", "to do", "to do"] and rows["psnr"].notna().sum() == 2
+    assert main(["sweep", str(whole.file), "--only", "still/3d"]) == 2
+    assert "expected --only still/3dgs, still/asp only" in capsys.readouterr().err
 
 
 def test_what_is_done_with_other_settings_is_refused_by_name(finished, folder, no_commands, capsys):
