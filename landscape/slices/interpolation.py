@@ -19,7 +19,7 @@ from math import inf
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
-from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 CONFIDENCE = 0.95
 TAIL = 0.25  # share of the errors that the tail is fitted to
@@ -53,7 +53,7 @@ class PlaneInterpolant:
 
         From the axes alone: the corners, then the middles of the quarters, ...
         """
-        distances, found = cKDTree(self._places[known]).query(self._places)[0], []
+        distances, found = cdist(self._places, self._places[known]).min(axis=1), []
         for _ in range(min(count, int((~known).sum()))):
             found.append(int(distances.round(DIGITS).argmax()))
             step = np.hypot(*(self._places - self._places[found[-1]]).T)
