@@ -1,9 +1,10 @@
 """Figures: the effects behind the verdicts on the paper's statements, and what goes with the score.
 
-`python -m figures.claims OUT` draws OUT/claims.png from OUT/claims.csv and OUT/predictors.png from OUT/predictors.csv, as
-`landscape claims` wrote them.
+`python -m figures.claims OUT` draws OUT/claims.png and OUT/claim-N.png, one for each statement, from OUT/claims.csv, and
+OUT/predictors.png from OUT/predictors.csv, as `landscape claims` wrote them.
 """
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -12,44 +13,49 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.records.findings import attribute_name
-from figures.style import BLUE, VERMILION, folder_script, new_figure, save, style
+from figures.style import BLUE, UNDETERMINED, VERMILION, folder_script, new_figure, save, style
 
-UNITS = {"×": "StableGS over 3DGS, or a ratio (×)", "dB": "PSNR gained (dB)", "": "share or correlation"}
+UNITS = {"×": "ratio (×)", "dB": "PSNR gained (dB)", "": "share or correlation"}
 KINDS = {"all": "all runs", "between": "means of methods", "within": "seeds of a method"}
-ROW = 0.17  # inches
+VERDICTS = {"holds": BLUE, "holds in part": BLUE, "does not hold": VERMILION, "cannot be tested here": UNDETERMINED}
+ROW, PANEL, WRAP = 0.17, 0.8, 76  # inches; characters
+SMALL = 150  # dots per inch of a statement's own picture
 FAR = 1e4  # a ratio beyond this, or below its inverse, ends at the edge
 
 
 def draw_claims(table: pd.DataFrame) -> Figure:
-    """One row an effect, a panel a unit."""
-    known = pd.DataFrame(table[table["n"] >= 2]).fillna({"unit": ""})
-    parts = {unit: pd.DataFrame(known[known["unit"] == unit]) for unit in UNITS}
-    panels = [(unit, part) for unit, part in parts.items() if len(part)]
+    """A panel for each statement, under its verdict; a row for each of its effects."""
+    parts = [pd.DataFrame(part) for _, part in table.fillna({"unit": ""}).groupby("statement")]
     with style():
-        figure = new_figure(0.7 + sum(0.45 + ROW * len(part) for _, part in panels), 6.8)
-        heights = [len(part) + 2 for _, part in panels] or [1]
-        axes = figure.subplots(max(len(panels), 1), 1, squeeze=False, height_ratios=heights)[:, 0]
-        for each, (unit, part) in zip(axes, panels):
-            _effects(each, part, unit)
-        if not panels:
-            axes[0].set_axis_off()
-            axes[0].text(0.5, 0.5, "fewer than two seeds: no intervals", ha="center")
+        figure = new_figure(sum(PANEL + ROW * len(part) for part in parts), 6.8)
+        panels = figure.subplots(len(parts), 1, squeeze=False, height_ratios=[len(part) + 2 for part in parts])[:, 0]
+        for axes, part in zip(panels, parts, strict=True):
+            _effects(axes, part)
     return figure
 
 
-def _effects(axes: Axes, part: pd.DataFrame, unit: str) -> None:
-    places = np.arange(len(part))[::-1]
-    value, low, high = (part[name].to_numpy(float) for name in ("value", "low", "high"))
+def _effects(axes: Axes, part: pd.DataFrame) -> None:
+    """Hollow: one training, which has no interval.  Without any, words."""
+    places, unit, verdict = np.arange(len(part))[::-1], part["unit"].iloc[0], part["verdict"].iloc[0]
+    value, low, high, claimed = (part[name].to_numpy(float) for name in ("value", "low", "high", "claimed"))
+    several = part["n"].to_numpy() >= 2
     if unit == "×":
         axes.set_xscale("log")
         value, low, high = (np.clip(x, 1 / FAR, FAR) for x in (value, low, high))
-    axes.hlines(places, low, high, color=BLUE, linewidth=1.2)
-    axes.plot(value, places, "o", color=BLUE, markersize=3.5)
-    axes.plot(part["claimed"], places, "D", color=VERMILION, markersize=3.5, markerfacecolor="white")
+    axes.hlines(places[several], low[several], high[several], color=BLUE, linewidth=1.2)
+    for chosen, face in ((several, BLUE), (~several, "white")):
+        axes.plot(value[chosen], places[chosen], "o", color=BLUE, markerfacecolor=face, markersize=3.5)
+    axes.plot(claimed, places, "D", color=VERMILION, markersize=3.5, markerfacecolor="white")
     axes.plot(part["null"], places, "|", color="0.5", markersize=8)
-    axes.set_yticks(places, [f"{row['statement']}  {row['effect']}" for row in part.to_dict("records")])
+    for place, n in zip(places, part["n"]):
+        if n < 2:
+            words = "one training" if n else "not measured"
+            axes.annotate(words, (1.01, place), xycoords=("axes fraction", "data"), color=UNDETERMINED, va="center")
+    axes.set_yticks(places, list(part["effect"]))
     axes.set_ylim(-0.7, len(part) - 0.3)
     axes.set_xlabel(UNITS[unit])
+    statement = textwrap.fill(f"{part['statement'].iloc[0]}. {part['text'].iloc[0]}", WRAP)
+    axes.set_title(f"{statement}\n{verdict}", loc="left", color=VERDICTS[verdict])
     axes.grid(True, axis="x")
 
 
@@ -88,10 +94,12 @@ def _words(name: str) -> str:
 
 
 def draw(folder: Path, suffix: str) -> list[Path]:
-    drawn = {"claims": draw_claims, "predictors": draw_predictors}
-    return [
-        save(make(pd.read_csv(folder / f"{name}.csv")), folder / f"{name}.{suffix}") for name, make in drawn.items()
-    ]
+    claims, related = (pd.read_csv(folder / f"{name}.csv") for name in ("claims", "predictors"))
+    drawn = {"claims": draw_claims(claims), "predictors": draw_predictors(related)}
+    for number, part in claims.groupby("statement"):
+        drawn[f"claim-{number}"] = draw_claims(pd.DataFrame(part))
+        drawn[f"claim-{number}"].set_dpi(SMALL)
+    return [save(figure, folder / f"{name}.{suffix}") for name, figure in drawn.items()]
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.records.quantities import quantity
@@ -33,19 +34,25 @@ class Quadrature(Protocol):
 
 def draw_density(density: Quadrature) -> Figure:
     """Density over curvature, logarithmic; density: see `Quadrature`."""
-    curvature, height, sigma = smooth_density(np.asarray(density.nodes), np.asarray(density.weights))
     with style():
         figure = new_figure(2.2)
         axes = figure.subplots()
-        axes.fill_between(curvature, height, height.max() / 10**DECADES, color=BLUE, alpha=0.25, linewidth=0)
-        axes.plot(curvature, height, color=BLUE, linewidth=0.9)
-        axes.set_yscale("log")
-        axes.set_ylim(height.max() / 10**DECADES, 3 * height.max())
-        axes.set_xlabel("curvature")
-        axes.set_ylabel("density of directions")
+        sigma = draw_on(axes, np.asarray(density.nodes), np.asarray(density.weights))
         axes.set_title(f"Spectral density, broadened by σ = {quantity(sigma)}", loc="left")
-        axes.grid(True)
     return figure
+
+
+def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> float:
+    """The density on axes; returns sigma."""
+    curvature, height, sigma = smooth_density(nodes, weights)
+    axes.fill_between(curvature, height, height.max() / 10**DECADES, color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(curvature, height, color=BLUE, linewidth=0.9)
+    axes.set_yscale("log")
+    axes.set_ylim(height.max() / 10**DECADES, 3 * height.max())
+    axes.set_xlabel("curvature (loss per squared parameter unit)")
+    axes.set_ylabel("density of directions")
+    axes.grid(True)
+    return sigma
 
 
 def smooth_density(

@@ -1,24 +1,29 @@
 """Figure after the paper's Fig. 1: two landscapes side by side, and what the two scenes look like from a view held out.
 
 `python -m figures.fig1 RUN_3DGS RUN_STABLEGS --out fig1.png`.  A column a run: the loss around the checkpoint along the two
-steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1; dashed: e_2); below, the first
-view that both have rendered.  Both share their axes (`figures.manifold`).
+steepest eigenvectors, as a surface, as contours, and its sections through the centre (e_1; dashed: e_2), under the largest
+eigenvalue and by how much it differs from the first run's; below, the photograph of the first view that both have rendered, and
+both renders with their PSNR.  Both share their axes (`figures.manifold`).
 """
 
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
 
+from analysis.records.quantities import quantity
+from analysis.records.run_files import METRICS, read_scores
 from figures.fig7 import command_line, names_of, read_all
 from figures.manifold import Scale, contours, landscape_of, require_same_function, section, surface
+from figures.plane import Plane
 from figures.style import BLACK, RUNS, literal, new_figure, style
 from landscape.errors import InputError
 
-RENDERS = "test"
+RENDERS, PANELS = "test", "panels"
 WIDTH = 4.8  # inches
 
 
@@ -37,28 +42,60 @@ def draw(runs: Sequence[Path]) -> Figure:
     with style():
         figure = new_figure(7.4)
         figure.set_figwidth(WIDTH)
-        maps = [figure.add_subplot(4, 2, 3 + i) for i in range(len(runs))]
+        above, below = figure.subfigures(2, 1, height_ratios=[3.6, 1])
+        maps = [above.add_subplot(3, 2, 3 + i) for i in range(len(runs))]
+        photograph = _photograph(runs[0], view)
+        pictures = below.subplots(1, len(runs) + (photograph is not None), squeeze=False)[0]
+        for axes in pictures:
+            axes.axis("off")
+        if photograph is not None:
+            pictures[0].imshow(photograph)
+            pictures[0].set_title(f"photograph of\n{literal(view)}")
         for i, (run, name, landscape) in enumerate(zip(runs, names, landscapes, strict=True)):
-            surface(figure, (4, 2, 1 + i), landscape, scale, name)
+            surface(above, (3, 2, 1 + i), landscape, scale, f"{name}: {_steepness(landscape, landscapes[0])}")
             filled = contours(maps[i], landscape, scale)
-            across = figure.add_subplot(4, 2, 5 + i)
+            across = above.add_subplot(3, 2, 5 + i)
             section(across, landscape, scale, 0, color=RUNS[i])
             section(across, landscape, scale, 1, color=RUNS[i], linestyle="--")
             across.set(
                 xlabel=scale.flat_label("e₁, e₂"), ylim=[end / 10.0**scale.loss for end in (scale.low, scale.high)]
             )
-            picture = figure.add_subplot(4, 2, 7 + i)
+            picture = pictures[i - len(runs)]
             picture.imshow(imread(run / RENDERS / view))
-            picture.axis("off")
-            picture.set_title(literal(view))
+            picture.set_title(f"{literal(name)}\n{_score(run, view)}")
             if i == 0:
                 across.set_ylabel(scale.loss_label)
             else:
-                figure.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9)
+                above.colorbar(filled, ax=maps, label=scale.loss_label, shrink=0.9)
         handles = [Line2D([], [], color=BLACK, label="along e₁")]
         handles.append(Line2D([], [], color=BLACK, linestyle="--", label="along e₂"))
-        figure.legend(handles=handles, loc="outside lower center", ncols=2)
+        above.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure
+
+
+def _steepness(landscape: Plane, first: Plane) -> str:
+    """The largest eigenvalue, and its change against the first run's in percent."""
+    value, reference = landscape.x.curvature, first.x.curvature
+    words = f"λ = {quantity(value)}"
+    if landscape is first or not (value and reference and np.isfinite([value, reference]).all()):
+        return words
+    return f"{words} ({100 * (value / reference - 1):+.0f}%)".replace("-", "−")
+
+
+def _score(run: Path, view: str) -> str:
+    """PSNR of the render of a held-out view, or of all, as far as the run's scores have it."""
+    scores = read_scores(run) if (run / METRICS).is_file() else None
+    if scores is None or scores.test is None:
+        return "not scored"
+    if (own := scores.test.views.get(view)) is not None and own.psnr is not None:
+        return f"{own.psnr:.2f} dB"
+    return "not scored" if scores.test.psnr is None else f"{scores.test.psnr:.2f} dB, mean of all views"
+
+
+def _photograph(run: Path, view: str) -> np.ndarray | None:
+    """The left of the panel that a training wrote beside the render; None where it is not there."""
+    path = run / RENDERS / PANELS / view
+    return imread(path)[:, : imread(run / RENDERS / view).shape[1]] if path.is_file() else None
 
 
 def _views(run: Path) -> set[str]:

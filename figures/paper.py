@@ -31,7 +31,7 @@ from figures.claims import draw_claims, draw_predictors
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
 
 RESULTS = Path(__file__).parents[1] / "notebooks" / "results"
-LINE = 0.065  # of the height of the axes, between names
+LETTER, ROW = 3.9, 8.5  # points: as wide as a letter of a name on the average, and as high
 BUDGET = 1.3  # the paper's time of StableGS over that of 3DGS, Sec. 4.3
 VIEWPOINTS = {"occlusion": "edge_rotation", "interpolation": "interpolation", "parallax": "parallax"}
 ONLY = {  # one way to move a viewpoint, beside the probes of attributes
@@ -92,7 +92,7 @@ def captions(rows: pd.DataFrame, drawn: Sequence[str]) -> str:
 def draw_budget(rows: pd.DataFrame) -> Figure:
     """A dot for each seed, a cross of 95% intervals for each method."""
     with style():
-        figure = new_figure(3.2, 5.0)
+        figure = new_figure(3.6, 6.8)
         axes = figure.add_subplot()
         axes.set_xscale("log")
         axes.axvline(BUDGET, color=UNDETERMINED, linewidth=0.8, linestyle="--")
@@ -100,36 +100,73 @@ def draw_budget(rows: pd.DataFrame) -> Figure:
             f"{BUDGET} ×, the paper's StableGS", (BUDGET, 0.02), xycoords=("data", "axes fraction"), rotation=90,
             xytext=(3, 0), textcoords="offset points", color=UNDETERMINED, va="bottom",
         )  # fmt: skip
-        places = []
+        places, lines = [], []
         for method in _methods(rows):
             time, score = _time(rows, method), numbers(rows, SCORE, method)
             colour = VERMILION if method.startswith(STABLE) else BLUE
             axes.plot(time.reindex(score.index), score, ".", color=colour, markersize=3, alpha=0.5)
             x, y = Interval.of(list(np.log(time))).exp(), Interval.of(score)
             if y.n >= LEAST:  # two seeds bound next to nothing
-                axes.hlines(y.value, x.low, x.high, color=colour, linewidth=1)
+                low, high = max(x.low, x.value / 10), min(x.high, 10 * x.value)
+                axes.hlines(y.value, low, high, color=colour, linewidth=1)
                 axes.vlines(x.value, y.low, y.high, color=colour, linewidth=1)
-            places.append((y.value, x.value, method, colour))
+                lines += [(low, y.value, high, y.value), (x.value, y.low, x.value, y.high)]
+            places.append((x.value, y.value, method, colour))
+        axes.margins(x=0.12)
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set(xlabel="processor time over that of 3DGS (×)", ylabel="PSNR on held-out views (dB)")
+        axes.set_title(_of_budget(rows, short=True), loc="left")
         axes.grid(True)
-        _label(axes, places)
+        _label(axes, places, lines)
     return figure
 
 
-def _label(axes: Axes, places: list[tuple[float, float, str, str]]) -> None:
-    """Names right of the axes, as high as their points where there is room, each joined to its own."""
-    low, high = axes.get_ylim()
-    heights: list[float] = []
-    for y, x, name, colour in sorted(places):
-        heights.append(max([(y - low) / (high - low), *(height + LINE for height in heights[-1:])]))
+def _label(
+    axes: Axes, places: list[tuple[float, float, str, str]], lines: list[tuple[float, float, float, float]]
+) -> None:
+    """Each name at its point or as near as the others leave room, joined to it by a line where that is not at its side.
+
+    places: x, y, name, colour; lines: ends x, y, x, y of what they keep clear of.  A letter is half as wide as high.
+    """
+    width, height = (72 * size for size in (6.8 * 0.88, 3.6 * 0.8))  # of the axes, points
+    (left, right), (low, high) = np.log(axes.get_xlim()), axes.get_ylim()
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return float(width * (np.log(x) - left) / (right - left)), height * (y - low) / (high - low)
+
+    points = [place(x, y) for x, y, *_ in places]
+    taken: list[tuple[float, ...]] = [(x - 3, y - 3, x + 3, y + 3) for x, y in points]
+    taken += [(*place(x0, y0), *(end + 1 for end in place(x1, y1))) for x0, y0, x1, y1 in lines]
+    for (px, py), (x, y, name, colour) in zip(points, places, strict=True):
+        words = name.replace(" protocol=llff", " (own code)")
+        size = len(words) * LETTER
+        options = [
+            (dx if side > 0 else -dx - size, dy)
+            for away in range(12)
+            for dy in (away * ROW, -away * ROW)
+            for dx in (5 + 4 * away,)
+            for side in (1, -1)
+        ]
+
+        def box(at: tuple[float, float], px=px, py=py, size=size) -> tuple[float, float, float, float]:
+            return px + at[0], py + at[1] - ROW / 2, px + at[0] + size, py + at[1] + ROW / 2
+
+        free = [at for at in options if _is_free(box(at), taken, width, height)]
+        dx, dy = free[0] if free else options[0]
+        taken.append(box((dx, dy)))
+        line = {"arrowstyle": "-", "color": "0.75", "linewidth": 0.4, "shrinkA": 1, "shrinkB": 2}
         axes.annotate(
-            literal(name), (x, y), xytext=(1.03, heights[-1] - LINE * len(places) / 3), textcoords="axes fraction", va="center",
-            ha="left", color=colour, annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": "0.75", "linewidth": 0.4, "shrinkB": 2, "relpos": (0, 0.5)},
+            literal(words), (x, y), xytext=(dx if dx > 0 else dx + size, dy), textcoords="offset points", va="center",
+            ha="left" if dx > 0 else "right", color=colour, arrowprops=line if dy else None,
         )  # fmt: skip
+
+
+def _is_free(box: Sequence[float], taken: Sequence[Sequence[float]], width: float, height: float) -> bool:
+    x0, y0, x1, y1 = box
+    inside = x0 >= 0 and x1 <= width and y0 >= 0 and y1 <= height
+    return inside and not any(x0 < b[2] and b[0] < x1 and y0 < b[3] and b[1] < y1 for b in taken)
 
 
 def draw_axes(rows: pd.DataFrame) -> Figure:
@@ -143,9 +180,14 @@ def draw_axes(rows: pd.DataFrame) -> Figure:
                 axes.hlines(place, gain.low, gain.high, color=BLUE, linewidth=1.2)
             if gain.n:
                 axes.plot(gain.value, place, "o", color=BLUE, markersize=3.5)
-            else:
+            if gain.n < 2:
                 axes.annotate(
-                    "not run", (0, place), xytext=(4, 0), textcoords="offset points", va="center", color=UNDETERMINED
+                    "one seed" if gain.n else "not run",
+                    (gain.value if gain.n else 0, place),
+                    xytext=(4, 0),
+                    textcoords="offset points",
+                    va="center",
+                    color=UNDETERMINED,
                 )
             if claimed is not None:
                 axes.plot(claimed, place, "D", color=VERMILION, markersize=3.5, markerfacecolor="white")
@@ -195,12 +237,16 @@ def _of_predictors(related: pd.DataFrame) -> str:
     return f"Over all runs PSNR on held-out views goes most with {', '.join(words)}; correlation is not cause."
 
 
-def _of_budget(rows: pd.DataFrame) -> str:
+def _of_budget(rows: pd.DataFrame, short: bool = False) -> str:
+    """short: of the best method and StableGS, without intervals."""
     scores = {method: Interval.of(numbers(rows, SCORE, method)) for method in _methods(rows)}
     if BASE not in scores:
         return "3DGS was not run."
-    best = max(scores, key=lambda method: scores[method].value)
+    best = max(scores, key=lambda method: (scores[method].n >= LEAST, scores[method].value))
     times = {name: Interval.of(list(np.log(_time(rows, name)))).exp() for name in (best, STABLE) if name in scores}
+    if short:
+        over = {name: scores[name].value - scores[BASE].value for name in times}
+        return "; ".join(f"{name} {over[name]:+.1f} dB in {time.value:.2g} × the time" for name, time in times.items())
     words = [f"{name} {scores[name].text(' dB')} in {time.text(' times')} its time" for name, time in times.items()]
     return f"3DGS scores {scores[BASE].text(' dB')}; {'; '.join(words)}."
 

@@ -24,6 +24,7 @@ from figures.plane import Direction, Plane, curvature_text, plane, same_scale
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
 
 LEVELS = 12
+LOWER = 0.01  # of the range of the loss
 WRAP = 76  # characters in a line of the sentence
 ACROSS, INTERVALS = 5, 3  # between ticks of the plane and of a cross-section: labels such as -0.008 stay apart
 RENDERED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": BLACK, "markeredgewidth": 0}
@@ -80,8 +81,18 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
     axes.set_ylabel(field.y.label)
     if same := same_scale(np.ptp(field.x.steps), np.ptp(field.y.steps)):
         axes.set_aspect(10.0 ** (field.y.exponent - field.x.exponent))
-    axes.set_title("Loss around the checkpoint" + ("" if same else " (axes differ in scale)"), loc="left")
+    axes.set_title(_finding(field) + ("" if same else "\n(axes differ in scale)"), loc="left")
     return filled
+
+
+def _finding(field: Plane) -> str:
+    """Whether the loss rises from the centre to all sides, and by how much.  A hundredth of the range is no lower ground."""
+    low, high, power = float(field.change.min()), float(field.change.max()), 10.0**field.exponent
+    if not high > low:
+        return "The loss is the same everywhere"
+    if low < -LOWER * (high - low):
+        return f"Lower ground near by: {quantity(power * low)}; highest {quantity(power * high)}"
+    return f"The loss rises to all sides, by up to {quantity(power * high)}"
 
 
 def _levels(field: Plane) -> np.ndarray:

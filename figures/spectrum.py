@@ -1,9 +1,10 @@
-"""Figure: the Ritz values of the search for the ends, the operator's eigenvalues seen through so many products.
+"""Figure: the spectrum: its density, who has the curvature, and what the search for its ends met.
 
-Above, value against rank on a symmetric logarithmic axis (linear within the band about 0), bars: residual norms, within
-each of which lies a true eigenvalue.  Filled: the residual is under a tenth of the value.  The ends are written out.
-Below, where a density was recorded, the share of directions whose curvature is at most x, and the share of sum |lambda| that
-they have, a line for each start vector: the further apart the two, the less isotropic the loss.
+First, where a density was recorded, it is drawn as `figures.density` does; then the same quadrature without broadening: the
+share of directions whose curvature is at most x, and the share of sum |lambda| that they have, a line for each start vector:
+the further apart the two, the less isotropic the loss.  Last, or alone, the Ritz values of the search, the eigenvalues
+seen through so many products: value against rank on a symmetric logarithmic axis (linear within the band about 0), bars:
+residual norms, within each of which lies a true eigenvalue.  Filled: the residual is under a tenth of the value.
 """
 
 import math
@@ -15,12 +16,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from analysis.records.quantities import measured, power_of_ten
+from analysis.records.quantities import measured, power_of_ten, quantity
 from analysis.records.records import ProbeRecord, Record
+from figures.density import draw_on
 from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, script, style
 from landscape.errors import InputError
 
 DECADES = 5  # shown on either side of 0
+FLAT = 0.01  # of the largest curvature
 CONVERGED = 0.1  # residual over |value|
 DIRECTIONS: dict[str, Any] = {"color": BLACK, "linewidth": 0.7}
 CURVATURE: dict[str, Any] = {"color": VERMILION, "linewidth": 0.7}
@@ -33,16 +36,33 @@ def draw(record: Record[ProbeRecord]) -> Figure:
     arrays = record.arrays["spectrum"]
     order = np.argsort(arrays["ritz_values"])
     values, residuals = arrays["ritz_values"][order], arrays["residuals"][order]
-    rows = 2 if "nodes" in arrays else 1
+    known = "nodes" in arrays
     with style():
-        figure = new_figure(1.5 + 1.2 * rows)
-        panels = figure.subplots(rows, 1, squeeze=False, height_ratios=[2, 1][:rows])
-        _draw_values(panels[0, 0], values, residuals)
-        _label_ends(panels[0, 0], record)
-        if rows == 2:
-            _draw_distribution(panels[1, 0], arrays["nodes"], arrays["weights"])
-        figure.legend(handles=_legend(rows == 2), loc="outside lower center", ncols=2, handlelength=1.2)
+        figure = new_figure(5.6 if known else 2.7)
+        *above, last = figure.subplots(
+            3 if known else 1, 1, squeeze=False, height_ratios=[1, 1, 1.6] if known else [1]
+        )[:, 0]
+        _draw_values(last, values, residuals)
+        _label_ends(last, record)
+        if known:
+            sigma = draw_on(above[0], arrays["nodes"], arrays["weights"])
+            above[0].set_title(
+                f"{_finding(arrays['nodes'], arrays['weights'])}\nbroadened by σ = {quantity(sigma)}", loc="left"
+            )
+            _draw_distribution(above[1], arrays["nodes"], arrays["weights"])
+        figure.legend(handles=_legend(known), loc="outside lower center", ncols=2, handlelength=1.2)
     return figure
+
+
+def _finding(nodes: np.ndarray, weights: np.ndarray) -> str:
+    """How many directions are nearly flat, by the mean of the start vectors' quadratures.
+
+    >>> _finding(np.array([[0.0, 10.0]]), np.array([[0.75, 0.25]]))
+    '75% of the directions have less than 1% of\\nthe largest curvature'
+    """
+    flat = float((weights * (np.abs(nodes) < FLAT * np.abs(nodes).max())).sum() / weights.sum())
+    words = f"{100 * flat:.3g}%" if flat < 0.9995 else "Over 99.9%"
+    return f"{words} of the directions have less than {FLAT:.0%} of\nthe largest curvature"
 
 
 def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
@@ -60,7 +80,7 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.set_xlabel(f"rank among the {len(values)} Ritz values")
     axes.set_ylabel("eigenvalue (loss per\nsquared parameter unit)")
-    axes.set_title("Spectrum of the active operator", loc="left")
+    axes.set_title("Eigenvalues as the search for the ends met them", loc="left")
     axes.grid(True)
 
 

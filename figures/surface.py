@@ -33,6 +33,7 @@ from landscape.errors import InputError
 RENDERER = [sys.executable, str(Path(render_surface.__file__))]
 TIME_LIMIT = 120  # seconds for one picture
 LEVELS = 10
+SAME = 0.005  # relative difference of two scales that look alike
 CORNER = 0.06  # of half an axis, from its start on, without a tick: another axis has one there
 
 
@@ -68,8 +69,17 @@ def draw(record: Record) -> Figure:
         figure.colorbar(colours, ax=axes, label=field.label, shrink=0.75, pad=0.0, aspect=20)
         curvatures = ", ".join(f"{d.name} {quantity(d.curvature)}" for d in (field.x, field.y))
         flat = "" if high > low else "\nthe loss is the same at every point"
-        figure.suptitle(f"Curvature along {curvatures}{flat}", fontsize=7)
+        figure.suptitle(f"Curvature along {curvatures}{flat}\n{_true_scale(field)}", fontsize=7)
     return figure
+
+
+def _true_scale(field: Plane) -> str:
+    """How the drawn lengths of the two steps compare; the box is as wide as it is deep."""
+    across, along = (float(np.ptp(d.steps)) for d in (field.x, field.y))
+    ratio = across / along if along > 0 else 1.0
+    if abs(ratio - 1) < SAME:
+        return f"steps along {field.x.name} and {field.y.name} are drawn to one scale"
+    return f"a step along {field.y.name} is drawn {ratio:.2g} times as long as one along {field.x.name}"
 
 
 def _heights(field: Plane) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,8 @@
-"""Figure: the trace of the Hessian's diagonal block of every attribute, and the curvature scale tau that follows.
+"""Figure: which attribute is steep, in what compares, with the trace of the Hessian's diagonal block of each beside its name.
+
+Traces have the units of their attributes.  What compares is s^2 tr / 2, the mean change of the loss by curvature when every
+parameter of the attribute moves by +-s at random, s the length of the optimiser's first step; as a share of the loss.  A record
+that does not know s has the traces themselves, and says that they do not compare.
 
 Magnitudes are on a logarithmic axis; the sign is in the marker (filled circle: positive; open square: negative; open
 diamond: the interval does not decide it).  An arrow at the left edge is a zero, or an interval that reaches 0.
@@ -12,9 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
+from msgspec import structs
 
 from analysis.records.findings import attribute_name
-from analysis.records.quantities import measured, power_of_ten, quantity
+from analysis.records.quantities import measured, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from analysis.records.schema import Trace
 from figures.style import NEGATIVE, POSITIVE, UNDETERMINED, literal, new_figure, script, style
@@ -28,21 +33,53 @@ SIGNS: dict[str, dict[str, Any]] = {
 
 
 def draw(record: Record[ProbeRecord]) -> Figure:
-    """Traces above, tau below, one row an attribute."""
+    """One row an attribute."""
     entries = record.data.traces
     samples = record.arrays.get("traces", {})
+    shares = shares_per_trace(record.data)
     with style():
-        figure = new_figure(0.75 + 0.62 * len(entries))
-        above, below = figure.subplots(2, 1)
-        _rows(above, entries, [_signed(entry) for entry in entries.values()])
-        _draw_traces(above, entries, samples)
-        above.set_xlabel("|trace| (loss per squared parameter unit)")
-        above.set_title("Trace and curvature scale by attribute", loc="left")
-        _rows(below, entries, [quantity(entry.tau) for entry in entries.values()])
-        _draw_taus(below, entries)
-        below.set_xlabel("curvature scale τ = √(max(trace, 0) / dim)")
+        figure = new_figure(0.95 + 0.31 * len(entries))
+        axes = figure.subplots()
+        _rows(axes, entries, [_signed(entry) for entry in entries.values()])
+        if shares:
+            _draw_traces(axes, {name: scaled(entry, shares[name]) for name, entry in entries.items()},
+                         {name: shares[name] * np.asarray(found) for name, found in samples.items()})  # fmt: skip
+            axes.set_xlabel("change of the loss by one random step\nas long as the optimiser's first (share)")
+        else:
+            _draw_traces(axes, entries, samples)
+            axes.set_xlabel("|trace|; rows have units of their own\nand do not compare")
+        axes.set_title(_title(entries, shares), loc="left", x=-0.45, wrap=False)
         figure.legend(handles=_legend(entries), loc="outside lower center", ncols=3, handletextpad=0.2, columnspacing=1)
     return figure
+
+
+def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
+    """By attribute, what a trace of 1 changes of the loss in a random step, as a share of it; empty where that is not known."""
+    loss = data.objective.value
+    if not data.steps or not loss or not loss > 0 or set(data.traces) - set(data.steps):
+        return {}
+    return {name: data.steps[name] ** 2 / (2 * loss) for name in data.traces}
+
+
+def scaled(trace: Trace, factor: float) -> Trace:
+    """The trace in another unit."""
+    names = ("value", "standard_error", "low", "high")
+    found = {name: getattr(trace, name) for name in names}
+    return structs.replace(trace, **{name: x if x is None else factor * x for name, x in found.items()})
+
+
+def _title(entries: dict[str, Trace], shares: dict[str, float]) -> str:
+    """Which attribute is steepest, and how much more than the next, where the intervals part them."""
+    ends = {
+        name: [abs(shares[name] * x) for x in _interval(entry)] for name, entry in entries.items() if name in shares
+    }
+    if len(ends) < 2:
+        return "Curvature of each attribute"
+    first, second, *_ = sorted(ends, key=lambda name: -min(ends[name]))
+    if not min(ends[first]) > max(max(found) for name, found in ends.items() if name != first) > 0:
+        return "No attribute is the steepest for certain"
+    ratio = sum(ends[first]) / sum(ends[second])
+    return f"Per step, {attribute_name(first)} is steepest: {ratio:.2g} × {attribute_name(second)}"
 
 
 def _draw_traces(axes: Axes, entries: dict[str, Trace], samples: dict[str, np.ndarray]) -> None:
@@ -63,16 +100,6 @@ def _draw_traces(axes: Axes, entries: dict[str, Trace], samples: dict[str, np.nd
         if low == left:
             _arrow(axes, left, row, {**look, "markerfacecolor": look["color"]})
         axes.plot([value], [row], linestyle="none", **look)
-
-
-def _draw_taus(axes: Axes, entries: dict[str, Trace]) -> None:
-    left = _logarithmic(axes, [entry.tau for entry in entries.values() if _drawable(entry.tau)])
-    for row, entry in enumerate(entries.values()):
-        look = SIGNS[_sign(entry)]
-        if entry.tau == 0:
-            _arrow(axes, left, row, look)
-        elif _drawable(entry.tau):
-            axes.plot([entry.tau], [row], linestyle="none", **look)
 
 
 def _rows(axes: Axes, entries: dict[str, Trace], numbers: list[str]) -> None:
@@ -124,6 +151,8 @@ def _drawable(number: float | None) -> TypeGuard[float]:
 
 def _legend(entries: dict[str, Trace]) -> list[Line2D]:
     present = {_sign(entry) for entry in entries.values()}
+    if present == {"positive"}:
+        return []
     return [Line2D([], [], linestyle="none", label=sign, **look) for sign, look in SIGNS.items() if sign in present]
 
 

@@ -1,7 +1,7 @@
 """Figure: the landscape along one or several trainings, from the table that `landscape trajectory` wrote.
 
 `python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Bands: 95% intervals of the traces, residuals of
-the eigenvalues; bars: brackets of the indices; triangles: lower bounds, where that is all that is known.  An axis is
+the eigenvalues; of the indices: brackets; triangles: lower bounds, where that is all that is known.  An axis is
 logarithmic where all of its values are positive and span more than a decade.  |lambda_max / lambda_min| has open markers where
 it is negative.
 """
@@ -18,7 +18,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-from matplotlib.transforms import Affine2D
 
 from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.quantities import power_of_ten
@@ -30,7 +29,6 @@ INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
 UNITS = "traces, eigenvalues: loss per squared parameter unit"
 PANEL = 1.12  # inches of height
 LEGEND_LINE = 0.14
-APART = 0.03  # of a panel's width, between the bars of two runs at the same step, which would hide each other
 
 
 def draw(table: pd.DataFrame) -> Figure:
@@ -80,7 +78,7 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
     Hollow where it is negative.  Of one that has only a lower bound, the bound is drawn, as a triangle; without one, nothing.
     """
     axes.set_yscale("log")
-    for i, (run, colour) in enumerate(runs.items()):
+    for run, colour in runs.items():
         part = pd.DataFrame(measured[(measured["run"] == run) & measured[name].notna()])
         steps, values = part["step"].to_numpy(float), part[name].to_numpy(float)
         magnitudes = np.abs(values)
@@ -90,21 +88,15 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
         shown = np.where(unbounded, low, magnitudes)
         shown[shown == 0] = np.nan  # of which a logarithmic axis has no place
         high = np.where(unbounded, shown, np.fmax(ends.max(axis=0), magnitudes))
-        bars = axes.errorbar(
-            steps, shown, yerr=np.stack([shown - low, high - shown]), color=colour, linewidth=1.0, elinewidth=0.6,
-            capsize=1.2, capthick=0.6,
-        )  # fmt: skip
-        drawn = bars.get_children()
+        axes.fill_between(steps, np.where(shown > 0, low, np.nan), high, color=colour, alpha=0.25, linewidth=0)
+        axes.plot(steps, shown, color=colour, linewidth=1.0)
         for kind, marker in ((~unbounded, "o"), (unbounded, "^")):
             for sign, face in ((values >= 0, colour), (values < 0, "white")):
                 chosen = kind & sign
-                drawn += axes.plot(
+                axes.plot(
                     steps[chosen], shown[chosen], marker, color=colour, markerfacecolor=face, markersize=3,
                     linestyle="none",
                 )  # fmt: skip
-        aside = Affine2D().translate(APART * (i - (len(runs) - 1) / 2), 0)
-        for artist in drawn:
-            artist.set_transform(axes.transScale + axes.transLimits + aside + axes.transAxes)
     _few_decades(axes)
 
 

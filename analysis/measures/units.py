@@ -5,6 +5,7 @@ scene        positions in units of the scene's size, the rest as it is: what two
 optimiser    D the learning rate of every parameter at the first step: curvature per step of the training
 """
 
+from dataclasses import asdict
 from typing import Literal
 
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 from splat.curvature.objective import SceneObjective
 from splat.training.state import LearningRates, learning_rates, position_rate
 
+ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 Metric = Literal["parameters", "scene", "optimiser"]
 FACING = 0.7  # views are forward-facing where every axis keeps this share of its length along their mean
 
@@ -36,6 +38,16 @@ def scene_units(objective: SceneObjective, size: float | None = None) -> Float[T
     scale = torch.ones_like(objective.active.flat)
     scale[objective.blocks["means"]] = scene_size(objective) if size is None else size
     return scale
+
+
+def step_lengths(rates: LearningRates, extent: float) -> dict[str, float]:
+    """How far Adam's first step moves a parameter, by attribute: its learning rate; of colour that of the constant band.
+
+    >>> step_lengths(LearningRates(), 2.0)["means"]
+    0.00032
+    """
+    lengths = asdict(rates) | {"means": rates.position * extent, "sh": rates.sh_constant}
+    return {name: lengths[name] for name in ATTRIBUTES}
 
 
 def optimiser_units(objective: SceneObjective, rates: LearningRates, extent: float) -> Float[Tensor, " p"]:

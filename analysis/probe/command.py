@@ -25,6 +25,7 @@ from analysis.console.options import ForeignOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.measures.memory import telling_needs
+from analysis.measures.units import step_lengths
 from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
@@ -102,6 +103,7 @@ def _run(
         found = measure(objective, settings, generator, stages, None if ranks else unfinished, told, deadline)
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
+        data.steps = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
         if family_options is not None:
             from analysis.measures.families import measure_families
 

@@ -104,8 +104,9 @@ class ProbeRecord(Struct, kw_only=True):
 
     traces: by attribute (means, log_scales, quats, opacity_logits, sh).  quantiles: share -> the eigenvalue that this share of
     all active ones does not exceed; None without a density.  finite_probe, depth, slice: None where they were left out.
-    skipped: by what was skipped.  checks: symmetry, round_off, finiteness, finite_difference.  timing: stage -> seconds, in the
-    order run, and "total".  notes: sentences on what was skipped, capped, or not reached.  arrays: group -> name -> shape.
+    steps: by attribute, how far the optimiser's first step moves a parameter.  skipped: by what was skipped.  checks: symmetry,
+    round_off, finiteness, finite_difference.  timing: stage -> seconds, in the order run, and "total".  notes: sentences on
+    what was skipped, capped, or not reached.  arrays: group -> name -> shape.
     """
 
     COMMAND: ClassVar[str] = "probe"
@@ -121,6 +122,7 @@ class ProbeRecord(Struct, kw_only=True):
     finite_probe: schema.FiniteProbe | None = None
     depth: schema.Depth | None = None
     block_shares: Maybe[list[schema.BlockShare]] = UNSET
+    steps: Maybe[dict[str, float]] = UNSET
     slice: schema.Slice | None = None
     counts: Counts
     checks: dict[str, Check]

@@ -32,8 +32,10 @@ PICTURES = {
     "slice2d": "The loss on the plane of the two steepest directions. Dots: renders, blue where the order of the splats or the "
     "set of visible ones is not the checkpoint's; dashed: the quadratic model.",
     "surface": "The same plane as a surface.",
-    "spectrum": "Curvatures met by the search for the spectrum's ends. Bars: residuals; a true eigenvalue lies within each.",
-    "traces": "Curvature of each attribute, summed over its parameters, and the mean curvature scale τ that follows from it.",
+    "spectrum": "The density of the spectrum, broadened; the share of all directions and of all curvature below a value; the "
+    "eigenvalues that the search for the ends met, each with the residual within which a true one lies.",
+    "traces": "What a random step as long as the optimiser's first changes of the loss by each attribute's curvature, which "
+    "compares; beside the names their traces, each in its own unit.",
 }
 
 

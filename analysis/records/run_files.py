@@ -45,11 +45,15 @@ _TRAJECTORY = "the records of landscape train --probe-every"
 
 
 class ViewScores(Struct, kw_only=True):
-    """Means over views; psnr in dB, infinite for perfect images; lpips: None where it cannot be computed."""
+    """Means over views; psnr in dB, infinite for perfect images; lpips: None where it cannot be computed.
+
+    views: those of each, by its name.
+    """
 
     psnr: Number = None
     ssim: Number = None
     lpips: Number = None
+    views: dict[str, "ViewScores"] = {}
 
 
 class Clock(Struct, kw_only=True):

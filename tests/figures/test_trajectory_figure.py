@@ -15,7 +15,7 @@ from analysis.runs.trajectories import gathered
 from analysis.train.trajectory import COLUMNS
 from figures import trajectory
 from figures.style import RUNS
-from figures.trajectory import APART, UNITS
+from figures.trajectory import UNITS
 from tests.figures.test_figures import require_layout
 from tests.recorded import ATTRIBUTES
 
@@ -76,20 +76,16 @@ def test_ticks_are_at_steps_such_as_are_recorded():
     assert list(trajectory.step_ticks().tick_values(90, 310)) == [0, 100, 200, 300, 400]
 
 
-def test_runs_at_the_same_steps_stand_symmetrically_beside_each_other():
-    table = pd.concat([rows().assign(run=name) for name in "abc"])
+def test_every_point_stands_at_its_step_and_the_band_is_its_bracket():
+    table = rows().assign(run="a")
     axes = {each.get_title(): each for each in trajectory.draw(table).axes}["|λmax / λmin|"]
-    width = axes.get_window_extent().width
-    at = [
-        (x.get_transform().transform((1000, 4.0)) - axes.transData.transform((1000, 4.0))) / width
-        for x in axes.lines
-        if x.get_linestyle() == "-"
-    ]
-    assert np.asarray(at) == pytest.approx(np.array([[-APART, 0], [0, 0], [APART, 0]]), abs=1e-9)
-    bars = [c.get_transform().transform((1000, 4.0)) for c in axes.collections]
-    assert len({round(float(x), 3) for x, _ in bars}) == 3
-    low, high = axes.get_xlim()
-    assert low < 1000 < 2000 < high
+    (line,) = [x for x in axes.lines if x.get_linestyle() == "-"]
+    measured = table[table["state"] != "skipped"]
+    assert list(np.asarray(line.get_xdata())) == list(measured["step"])
+    assert np.array_equal(line.get_transform().transform((1000, 4.0)), axes.transData.transform((1000, 4.0)))
+    corners = np.asarray(axes.collections[0].get_paths()[0].vertices)
+    ends = measured[["literal_low", "literal_high"]].abs().to_numpy()
+    assert corners[:, 1].min() == pytest.approx(ends.min()) and corners[:, 1].max() == pytest.approx(ends.max())
 
 
 def test_powers_of_ten_have_a_line_and_the_legend_says_what_is_open():

@@ -4,7 +4,7 @@ OUT/study.csv        the runs (`analysis.runs.claims.study`); the command takes 
 OUT/claims.csv       the effects behind each verdict (`analysis.runs.claims.statements`)
 OUT/predictors.csv   which quantity goes with the score (`analysis.runs.claims.predictors`)
 OUT/claims.json      the nine judgements
-OUT/claims.png, predictors.png   drawn by `figures.claims`
+OUT/claims.png, claim-N.png, predictors.png   drawn by `figures.claims`
 OUT/claims.html      all of it on a page that needs no network
 """
 
@@ -27,8 +27,7 @@ from splat.training.checkpoint import write_atomically
 
 STYLES = {"holds": "green", "holds in part": "yellow", "does not hold": "red", "cannot be tested here": "dim"}
 PICTURES = {
-    "claims": "Each effect with its 95% interval over the seeds. Grey: no effect; diamond: the size that the paper states.",
-    "predictors": "Rank correlation of each measured quantity with PSNR on held-out views, with its 95% interval.",
+    "predictors": "Rank correlation of each measured quantity with PSNR on held-out views, with its 95% interval."
 }
 
 
@@ -73,4 +72,8 @@ def _print(rows: pd.DataFrame, found: Sequence[Judgement], console: Console) -> 
 def render_page(rows: pd.DataFrame, found: Sequence[Judgement], out: Path) -> str:
     """The page as text, with the pictures that lie in the folder."""
     template = template_environment().get_template("claims.html.jinja")
-    return template.render(judgements=found, runs=runs_of(rows).to_dict("records"), pictures=pictures_in(out, PICTURES))
+    words = {f"claim-{each.number}": f"{each.statement} {each.verdict}: {each.finding}" for each in found}
+    own = {each["name"]: each for each in pictures_in(out, words)}
+    return template.render(
+        judgements=found, own=own, runs=runs_of(rows).to_dict("records"), pictures=pictures_in(out, PICTURES)
+    )

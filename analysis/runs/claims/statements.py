@@ -157,6 +157,7 @@ def samples(rows: pd.DataFrame) -> Judgement:
         return Judgement(
             6, "Ten random probes suffice for the traces.", "Eq. (6)", "cannot be tested here",
             "No run has the anisotropy of its attributes; probe with --families.",
+            (Effect("least relative error of a trace", Interval.of([]), SUFFICIENT, 0.0),),
         )  # fmt: skip
     worst = effects[0]
     verdict: Verdict = "holds" if worst.interval.high <= SUFFICIENT else "does not hold"
@@ -239,14 +240,15 @@ def judgements(rows: pd.DataFrame) -> list[Judgement]:
 
 
 def effect_table(found: Sequence[Judgement]) -> pd.DataFrame:
-    """A row for each effect: statement, verdict, effect, unit, value, low, high, n, null, claimed."""
+    """A row for each effect: statement, text, verdict, effect, unit, value, low, high, n, null, claimed."""
 
     def lines() -> Iterator[dict]:
         for judgement in found:
             for effect in judgement.effects:
                 interval = effect.interval
                 yield {
-                    "statement": judgement.number, "verdict": judgement.verdict, "effect": effect.name, "unit": effect.unit,
+                    "statement": judgement.number, "text": judgement.statement,
+                    "verdict": judgement.verdict, "effect": effect.name, "unit": effect.unit,
                     "value": interval.value, "low": interval.low, "high": interval.high, "n": interval.n,
                     "null": effect.null, "claimed": effect.claimed,
                 }  # fmt: skip

@@ -36,6 +36,7 @@ import pandas as pd
 from msgspec import structs
 
 from analysis.console.overrides import overridden
+from analysis.measures.units import step_lengths
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, Made, MapRecord, read_map, read_scores
@@ -163,7 +164,7 @@ def _finite(data: ProbeRecord, shares: Mapping[str, float], rates: LearningRates
     """The curvature at the step nearest to the length of Adam's."""
     if not data.finite_probe:
         return {}
-    lengths = asdict(rates) | {"means": rates.position * extent, "sh": rates.sh_constant}
+    lengths = step_lengths(rates, extent)
     length = sqrt(sum(share * lengths[name] ** 2 for name, share in shares.items()))
     steps, curvatures = data.finite_probe.steps, data.finite_probe.curvatures
     nearest = min(range(len(steps)), key=lambda i: abs(log(steps[i] / length)))

@@ -95,7 +95,11 @@ def metrics_of(run: Path) -> dict[str, float]:
     found = read_scores(run)
     row: dict[str, float] = {}
     for part, prefix in ((found.test, ""), (found.train, "train_")):
-        row |= {f"{prefix}{key}": _number(value) for key, value in structs.asdict(part or ViewScores()).items()}
+        row |= {
+            f"{prefix}{key}": _number(value)
+            for key, value in structs.asdict(part or ViewScores()).items()
+            if key != "views"
+        }
     clock = found.seconds or Clock()
     seconds = {
         "wall_seconds": _number(clock.wall),

@@ -7,7 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from analysis.measures.depth import KINDS, DepthSplit, _directions, _signs, depth_rises, depth_split, gradient_ratio, rays_of
+from analysis.measures.depth import (
+    KINDS,
+    DepthSplit,
+    _directions,
+    _signs,
+    depth_rises,
+    depth_split,
+    gradient_ratio,
+    rays_of,
+)
 from landscape.traces.estimate import TraceEstimate
 from landscape.traces.trace import TraceSettings
 from splat.curvature.objective import SceneObjective

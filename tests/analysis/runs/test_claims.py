@@ -189,9 +189,11 @@ def test_the_command_reads_a_table_and_draws(tmp_path, capsys):
     out = tmp_path / "claims"
     assert {path.name for path in out.iterdir()} == {
         "study.csv", "claims.csv", "predictors.csv", "claims.json", "claims.html", "claims.png", "predictors.png",
+        *(f"claim-{number}.png" for number in range(1, 10)),
     }  # fmt: skip
     assert [each["verdict"] for each in json.loads((out / "claims.json").read_text())] == ["holds"] * 9
     assert "holds" in capsys.readouterr().out
+    assert (out / "claims.html").read_text().count("<img ") == 9 + 1  # one for each, and the predictors
     again = study([out / "study.csv"])
     assert [each.verdict for each in judgements(again)] == ["holds"] * 9
 
