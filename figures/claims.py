@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from analysis.records.findings import attribute_name
 from figures.style import BLUE, UNDETERMINED, VERMILION, folder_script, new_figure, save, style
@@ -41,6 +42,9 @@ def _effects(axes: Axes, part: pd.DataFrame) -> None:
     several = part["n"].to_numpy() >= 2
     if unit == "×":
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         value, low, high = (np.clip(x, 1 / FAR, FAR) for x in (value, low, high))
     axes.hlines(places[several], low[several], high[several], color=BLUE, linewidth=1.2)
     for chosen, face in ((several, BLUE), (~several, "white")):

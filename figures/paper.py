@@ -245,7 +245,7 @@ def _of_budget(rows: pd.DataFrame, short: bool = False) -> str:
     best = max(scores, key=lambda method: (scores[method].n >= LEAST, scores[method].value))
     times = {name: Interval.of(list(np.log(_time(rows, name)))).exp() for name in (best, STABLE) if name in scores}
     if short:
-        over = {name: scores[name].value - scores[BASE].value for name in times}
+        over = {name: Interval.of(gains(rows, name)).value for name in times}
         return "; ".join(f"{name} {over[name]:+.1f} dB in {time.value:.2g} × the time" for name, time in times.items())
     words = [f"{name} {scores[name].text(' dB')} in {time.text(' times')} its time" for name, time in times.items()]
     return f"3DGS scores {scores[BASE].text(' dB')}; {'; '.join(words)}."
