@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, Record
-from figures.style import BLUE, new_figure, script, style
+from figures.style import BLUE, exponent_of, new_figure, script, style, unit_suffix
 from landscape.errors import InputError
 
 BROADENING = 0.01
@@ -45,12 +45,14 @@ def draw_density(density: Quadrature) -> Figure:
 def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> float:
     """The density on axes; returns sigma."""
     curvature, height, sigma = smooth_density(nodes, weights)
+    exponent = exponent_of(curvature)
+    curvature, height = curvature / 10.0**exponent, height / height.max()
     axes.fill_between(curvature, height, height.max() / 10**DECADES, color=BLUE, alpha=0.25, linewidth=0)
     axes.plot(curvature, height, color=BLUE, linewidth=0.9)
     axes.set_yscale("log")
     axes.set_ylim(height.max() / 10**DECADES, 3 * height.max())
-    axes.set_xlabel("curvature (loss per squared parameter unit)")
-    axes.set_ylabel("density of directions")
+    axes.set_xlabel(f"curvature{unit_suffix(exponent)},\nloss per squared parameter unit")
+    axes.set_ylabel("density over\nits highest")
     axes.grid(True)
     return sigma
 

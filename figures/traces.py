@@ -48,7 +48,7 @@ def draw(record: Record[ProbeRecord]) -> Figure:
         else:
             _draw_traces(axes, entries, samples)
             axes.set_xlabel("|trace|; rows have units of their own\nand do not compare")
-        axes.set_title(_title(entries, shares), loc="left", x=-0.45, wrap=False)
+        figure.suptitle(_title(entries, shares), x=0.02, ha="left", fontsize=7.5)
         figure.legend(handles=_legend(entries), loc="outside lower center", ncols=3, handletextpad=0.2, columnspacing=1)
     return figure
 
