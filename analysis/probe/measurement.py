@@ -11,6 +11,7 @@
     power iteration     for itself, where that is asked for
     finite probe *      the second difference of the loss along the first eigenvector, over a range of steps
     depth *             the positions' gradient and curvature along the rays and across them, and what finite steps there do
+    block shares        which share of H lies within the Gaussians' own blocks
 
 * not in a quick probe.  Every kernel has worked once when the checks are done: what follows compiles nothing.  The estimators
 stop at their accuracy or after so many products as settings allow at most; each result says which.  No clock decides but for a
@@ -64,9 +65,10 @@ from splat.backend.device import by_triton
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
+from splat.curvature.scores.shares import BlockShare, block_shares
 from splat.curvature.traces import block_traces, exact_traces
 
-STAGES = ("traces", "eigenvalues", "slice", "density", "power iteration", "finite probe", "depth")
+STAGES = ("traces", "eigenvalues", "slice", "density", "power iteration", "finite probe", "depth", "block shares")
 # what is said of a stage that was not asked for
 LEFT_OUT = {
     "density": "the spectral density was left out, and the indices that need it",
@@ -82,6 +84,7 @@ TYPICAL: dict[str, tuple[int, float, float]] = {
     "eigenvalues": (60, 28, 0),
     "slice": (230, 0, 184),
     "depth": (0, 3, 60),
+    "block shares": (0, 4, 0),
     "pictures": (0, 8, 45),
 }
 
@@ -105,7 +108,7 @@ class Spectrum:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What was measured; density, power, finite, depth and plane are None where a note says why.
+    """What was measured; density, power, finite, depth, plane and shares are None where a note says why.
 
     matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
     of the directions that are not exactly flat; unreached: stages that time did not reach.
@@ -122,6 +125,7 @@ class Measured:
     finite: FiniteProbe | None
     depth: Depth | None
     plane: PlaneSlice | None
+    shares: list[BlockShare] | None
     matvecs: int
     spared: int
     rank: int
@@ -188,6 +192,7 @@ def _all_stages(
     if settings.depth is not None:
         accuracy, steps = settings.depth, settings.depth_steps
         depth = kept.run("depth", Depth, lambda g, report, _: measure_depth(objective, accuracy, steps, g, report))
+    shares = kept.run("block shares", list[BlockShare], lambda g, report, _: _shares(at, g, report))
     matvecs, spared = (first + more for first, more in zip(checks, kept.counts, strict=True))
     wanted = {"density": settings.density_matvecs, "finite probe": settings.probe_steps, "depth": settings.depth}
     return Measured(
@@ -202,6 +207,7 @@ def _all_stages(
         finite=finite,
         depth=depth,
         plane=plane,
+        shares=shares,
         matvecs=matvecs,
         spared=spared,
         rank=at.hessian.rank,
@@ -245,6 +251,8 @@ def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str
     if settings.depth is None:
         del work["depth"]
         work["pictures"] = (0, 0, 12)
+    if settings.block_coupling:
+        work["block shares"] = (0, 16, 0)  # exact blocks take longest
     return {
         name: Work(products * product + renders * render, units) for name, (units, products, renders) in work.items()
     }
@@ -303,6 +311,11 @@ def _spectrum(
         active=active, ends=ends, trace=total_trace(traces), watch=watch,
     )  # fmt: skip
     return Spectrum(density, iterates[0] if iterates else None)
+
+
+def _shares(at: _Point, generator: torch.Generator, report: Progress) -> list[BlockShare]:
+    settings = at.settings
+    return block_shares(at.objective, generator, settings.block_samples, report, coupled=settings.block_coupling)
 
 
 def _finite(at: _Point, ends: EigenEnds, report: Progress) -> FiniteProbe:
