@@ -29,7 +29,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from analysis.console.kept import Kept
-from analysis.console.stages import Stages
+from analysis.console.stages import Stages, Work
 from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import ProductCheck, check_against_gradient
 from analysis.measures.memory import basis_within, vectors_within
@@ -77,13 +77,15 @@ LEFT_OUT = {
 }
 MOST_AT_ONCE = 4  # start vectors
 MOST_SAMPLES = 64  # of a trace, beyond which its exact value takes less
-# what a stage takes on two real scenes, as products with MOST_AT_ONCE vectors and as renders of all views
-TYPICAL: dict[str, tuple[int, int]] = {
-    "traces": (12, 0),
-    "eigenvalues": (10, 0),
-    "slice": (0, 180),
-    "depth": (2, 50),
-    "block shares": (4, 0),
+# what a stage took on three real scenes: units, as its progress counts them (0: of different kinds), products of MOST_AT_ONCE
+# vectors, and renders of all views
+TYPICAL: dict[str, tuple[int, float, float]] = {
+    "traces": (25, 11, 0),
+    "eigenvalues": (60, 28, 0),
+    "slice": (230, 0, 184),
+    "depth": (0, 3, 60),
+    "block shares": (0, 4, 0),
+    "pictures": (0, 8, 45),
 }
 
 
@@ -232,24 +234,28 @@ def _seconds_of_product(hessian: SceneHessian) -> float:
     return monotonic() - start
 
 
-def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str, float]:
-    """Seconds that every stage is expected to take, from those of a product and of a render."""
+def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str, Work]:
+    """What every stage is expected to take, from the seconds of a product and of a render."""
     work = dict(TYPICAL)
     if settings.trace_samples:
-        work["traces"] = (settings.trace_samples // 2, 0)
+        work["traces"] = (settings.trace_samples, 0.45 * settings.trace_samples, 0)
     if not settings.slice_plane:
-        work["slice"] = (0, 2 * settings.slice_points)
-    if settings.density_matvecs:
-        work["density"] = (settings.density_matvecs // MOST_AT_ONCE, 0)
+        work["slice"] = (2 * settings.slice_points, 0, 1.6 * settings.slice_points)
+    if count := settings.density_matvecs:
+        work["density"] = (count, 0.32 * count, 0)
     if settings.power_apart:
-        work["power iteration"] = (settings.power.max_matvecs, 0)
+        work["power iteration"] = (0, settings.power.max_matvecs, 0)
     if settings.probe_steps:
-        work["finite probe"] = (0, 2 * len(settings.probe_steps) + settings.noise_points + 1)
+        count = 2 * len(settings.probe_steps) + settings.noise_points + 1
+        work["finite probe"] = (count, 0, count)
     if settings.depth is None:
         del work["depth"]
+        work["pictures"] = (0, 0, 12)
     if settings.block_coupling:
-        work["block shares"] = (4 * TYPICAL["block shares"][0], 0)  # exact blocks take longest
-    return {name: products * product + renders * render for name, (products, renders) in work.items()}
+        work["block shares"] = (0, 16, 0)  # exact blocks take longest
+    return {
+        name: Work(products * product + renders * render, units) for name, (units, products, renders) in work.items()
+    }
 
 
 def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Progress) -> dict[str, TraceEstimate]:
