@@ -99,7 +99,9 @@ def _run(
         telling_needs(objective),
     ):
         generator = torch.Generator(device).manual_seed(options.seed)
-        found = measure(objective, settings, generator, stages, None if ranks else unfinished, told, deadline)
+        found = measure(
+            objective, settings, generator, stages, None if ranks else unfinished, told, deadline, checkpoint.all_views
+        )
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         if family_options is not None:
@@ -218,10 +220,10 @@ def _family_options(options: ProbeOptions) -> "FamilyOptions | None":
 
 
 def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjective) -> str:
-    counts, training = objective.counts, checkpoint.training
-    camera = objective.views[0].camera
+    counts, training, camera = objective.counts, checkpoint.training, objective.views[0].camera
+    views = f"{counts.views} of {checkpoint.all_views}" if checkpoint.all_views else f"{counts.views}"
     return (
-        f"{scene.name} after {training.step} steps: {counts.views} views of {camera.width} x {camera.height} px, "
+        f"{scene.name} after {training.step} steps: {views} views of {camera.width} x {camera.height} px, "
         f"{counts.active_gaussians:,} of {counts.gaussians:,} Gaussians in sight, "
         f"{counts.active_parameters:,} active parameters"
     )

@@ -1,5 +1,6 @@
 """Diagonal blocks of a Hessian, one a Gaussian: 11 x 11 of its geometry and opacity, and the diagonal of its SH."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Float, Float64
@@ -15,13 +16,19 @@ GEOMETRY_COLUMNS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PerGaussianBlocks(Brief):
-    """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH."""
+    """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH.
+
+    views: where the blocks are the mean over views, `traces` of each view's, in order.
+    """
 
     geometry: Float[Tensor, "n 11 11"]
     sh: Float[Tensor, "n k 3"]
+    views: Sequence[Mapping[str, float]] = ()
 
-    def __add__(self, other: "PerGaussianBlocks") -> "PerGaussianBlocks":
-        return PerGaussianBlocks(self.geometry + other.geometry, self.sh + other.sh)
+    def add(self, other: "PerGaussianBlocks") -> None:
+        """Add another's blocks to these, in their place."""
+        self.geometry.add_(other.geometry)
+        self.sh.add_(other.sh)
 
     def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
         """Trace of each attribute's block, summed in double precision.

@@ -18,11 +18,10 @@ call the objective's methods in the same order.
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
-from operator import add
+from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64, Shaped
 from torch import Tensor
 
 from landscape.errors import InputError
@@ -180,6 +179,12 @@ class SceneObjective:
         """The mean over all views, given the sum over this rank's views."""
         return self.ranks.sum(total) / self.counts.views
 
+    def of_all_views(self, rows: Shaped[Tensor, "m ..."]) -> Shaped[Tensor, "_ ..."]:
+        """A row for every view of all processes, given those of this rank's views."""
+        whole = rows.new_zeros(self.counts.views, *rows.shape[1:])
+        whole[self.view_numbers.start : self.view_numbers.stop] = rows
+        return self.ranks.sum(whole)
+
     def gather_rows(self, rows: Float[Tensor, "n m d"]) -> Float[Tensor, "n _ d"]:
         """The rows of all views, given those of this rank's views: as many for each view."""
         each = rows.shape[1] // len(self.views)
@@ -203,6 +208,11 @@ class SceneObjective:
         return LinearizedView(at, camera, self._losses[index], self.background, self.settings)
 
     @cached_property
+    def losses(self) -> Float64[Tensor, " m"]:
+        """The loss of every view at the active Gaussians."""
+        return self.of_all_views(torch.tensor([view.value for view in self.linearized], dtype=torch.float64))
+
+    @cached_property
     def gradient(self) -> Float[Tensor, " p"]:
         """The gradient of L at the active Gaussians."""
         return self.mean_over_views(torch.stack([view.gradient for view in self.linearized]).sum(dim=0))
@@ -212,9 +222,21 @@ class SceneObjective:
 
         approximate: with the diagonal of the loss's l'' in place of l'', without the coupling of pixels by SSIM.
         """
-        parts = (view.block_diagonal(gauss_newton=gauss_newton, approximate=approximate) for view in self.linearized)
-        total = reduce(add, parts)
-        return PerGaussianBlocks(self.mean_over_views(total.geometry), self.mean_over_views(total.sh))
+        total, quats, traces = None, self.active.quats, []
+        for view in self.linearized:
+            part = view.block_diagonal(gauss_newton=gauss_newton, approximate=approximate)
+            traces.append(part.traces(quats))
+            if total is None:
+                total = part
+            else:
+                total.add(part)
+        assert total is not None
+        names = list(traces[0])
+        each = self.of_all_views(
+            torch.tensor([[trace[name] for name in names] for trace in traces], dtype=torch.float64)
+        )
+        views = [dict(zip(names, row, strict=True)) for row in each.tolist()]
+        return PerGaussianBlocks(self.mean_over_views(total.geometry), self.mean_over_views(total.sh), views)
 
     @cached_property
     def approximate_blocks(self) -> tuple[PerGaussianBlocks, PerGaussianBlocks | None]:
