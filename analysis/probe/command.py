@@ -24,8 +24,8 @@ from analysis.console.kept import kept_stages
 from analysis.console.options import ForeignOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.measures.memory import telling_needs
-from analysis.probe.measurement import measure
+from analysis.measures.memory import expected_peak, require_pictures, size_of, telling_needs
+from analysis.probe.measurement import expected_seconds, measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.settings import ProbeSettings
@@ -38,6 +38,7 @@ from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import spawn
 from splat.backend.device import device_named
+from splat.backend.memory import staying_within
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
@@ -59,7 +60,7 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | 
     """
     require_seed(options.seed)
     device = device_named(options.device)
-    with torchrun_ranks(device) as ranks:
+    with torchrun_ranks(device) as ranks, staying_within(options.memory and size_of(options.memory)):
         return _run(options, command, drawn, device, ranks)
 
 
@@ -85,6 +86,7 @@ def _run(
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True, markup=False)
+    console.print(_expected(objective, settings), highlight=False, soft_wrap=True, markup=False)
     told = (
         f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} "
         f"{digests(scene.select(checkpoint.scene.train))} {settings} "
@@ -186,7 +188,9 @@ def scene_objective(
     """A loss, by default the training's, over its views, at the checkpoint; ranks: share them.  keep_unseen: see
     `SceneObjective`."""
     ranks = ranks or ALONE
-    training, views = checkpoint.training, scene.load(ranks.share(checkpoint.scene.train, "training view"))
+    training, names = checkpoint.training, ranks.share(checkpoint.scene.train, "training view")
+    require_pictures(scene.select(names), training.gaussians)
+    views = scene.load(names)
     config = replace(training.config, loss=loss or training.config.loss)
     return config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
@@ -227,6 +231,16 @@ def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjectiv
         f"{counts.active_gaussians:,} of {counts.gaussians:,} Gaussians in sight, "
         f"{counts.active_parameters:,} active parameters"
     )
+
+
+def _expected(objective: SceneObjective, settings: ProbeSettings) -> str:
+    """Time and memory, from a render and from the views' sizes.  MemoryError where it cannot fit."""
+    peak, flat = expected_peak(objective), objective.active.flat
+    objective.loss(flat)  # for the first render the kernels may compile
+    start = perf_counter()
+    objective.loss(flat)
+    seconds = expected_seconds(settings, perf_counter() - start)
+    return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
 
 
 def _embedded_surface(record: Record[ProbeRecord]) -> str:

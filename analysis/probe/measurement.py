@@ -74,6 +74,7 @@ LEFT_OUT = {
     "depth": "positions along and across the rays were left out",
 }
 MOST_AT_ONCE = 4  # start vectors
+PRODUCT, BEFORE = 6, 25  # renders that a product with them takes, and what comes before the first stage
 MOST_SAMPLES = 64  # of a trace, beyond which its exact value takes less
 # what a stage takes on two real scenes, as products with MOST_AT_ONCE vectors and as renders of all views
 TYPICAL: dict[str, tuple[int, int]] = {"traces": (12, 0), "eigenvalues": (10, 0), "slice": (0, 180), "depth": (2, 50)}
@@ -263,6 +264,11 @@ def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str
     if settings.depth is None:
         del work["depth"]
     return {name: products * product + renders * render for name, (products, renders) in work.items()}
+
+
+def expected_seconds(settings: ProbeSettings, render: float) -> float:
+    """About how long all stages take, from the seconds of a render of all views alone."""
+    return sum(_plan(settings, PRODUCT * render, render).values()) + BEFORE * render
 
 
 def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Progress) -> dict[str, TraceEstimate]:

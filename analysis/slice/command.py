@@ -29,7 +29,7 @@ from torch import Tensor
 
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.measures.memory import telling_needs
+from analysis.measures.memory import expected_peak, size_of, telling_needs
 from analysis.probe.command import opened, scene_objective
 from analysis.probe.measurement import evaluation
 from analysis.probe.record import provenance_of
@@ -55,6 +55,7 @@ from landscape.errors import InputError
 from landscape.probes import spawn
 from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
 from splat.backend.device import device_named
+from splat.backend.memory import staying_within
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
@@ -67,6 +68,11 @@ DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
 def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     """Slice the checkpoint's loss; returns the exit code.  command: as typed, for the record."""
+    with staying_within(options.memory and size_of(options.memory)):
+        return _run(options, command)
+
+
+def _run(options: SliceOptions, command: Sequence[str]) -> int:
     require_seed(options.seed)
     shape = Shape.of(options.along, options.dimension, options.radius, options.points, len(options.others))
     device = device_named(options.device)
@@ -80,6 +86,7 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         checkpoint.training.move(device)
         others = [_other_end(checkpoint, path) for path in options.others]
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
+        expected_peak(objective)  # which may be too much
     # a folder that is being written by another command, or cannot be, is noticed before anything is rendered
     with record_folder(out, SliceRecord) as folder, stages, telling_needs(objective):
         notes: list[str] = []

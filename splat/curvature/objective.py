@@ -36,6 +36,10 @@ from splat.model.settings import RenderSettings
 from splat.render.forward import background_of, rasterize_view, touches
 from splat.scenes.view import View
 
+OWN_BLOCK = 11 * 11  # numbers of a Gaussian's block without SH
+COPIES = 5  # of a vector, in a product: itself, without its null part, the sum, a view's, the result
+FEWEST, AT_ONCE = 8, 4  # vectors of a small basis; of a product
+
 
 class NothingInSight(InputError):
     """No view sees any of the Gaussians: there is no Hessian."""
@@ -58,6 +62,24 @@ class ActiveCounts:
     active_sh_degree: int
     radial_quaternions: int
     views: int
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Bytes, about: of a vector over the active parameters; of a linearised view; of a product for each of its vectors; of the
+    Gaussians' own blocks that are kept, and of the pass that makes them.
+    """
+
+    vector: int
+    view: int
+    product: int
+    blocks: int
+    making_blocks: int
+
+    @property
+    def beside(self) -> int:
+        """What is needed beside linearised views: blocks, a small basis, and the larger of a product and the blocks' pass."""
+        return self.blocks + FEWEST * self.vector + max(AT_ONCE * self.product, self.making_blocks)
 
 
 class SceneObjective:
@@ -129,14 +151,27 @@ class SceneObjective:
             views=sum(self._views_of_ranks),
         )
         sharing = 1 if flat.device.type == "cuda" else ranks.size
-        self._memory = free_memory(flat.device) // 2 // sharing if memory is None else memory
+        if memory is None:
+            free = free_memory(flat.device) // sharing
+            memory = min(free // 2, max(free - self.needs.beside, self.needs.view))
+        self._memory = memory
 
     def _seen(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
         """Which Gaussians touch a pixel of some view of any rank."""
-        seen = gaussians.flat.new_zeros(len(gaussians), dtype=torch.bool)
+        seen, self._sizes = gaussians.flat.new_zeros(len(gaussians), dtype=torch.bool), (0, 0, 0)
         for view in self.views:
-            seen |= touches(rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True))
+            raster = rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True)
+            seen |= touches(raster)
+            self._sizes = max(self._sizes, LinearizedView.size_of(raster, gaussians))
         return self.ranks.any(seen)
+
+    @property
+    def needs(self) -> "Needs":
+        """About what the largest view and its products take."""
+        view, workspace, blocks = self._sizes
+        n, flat = len(self.active), self.active.flat
+        own = n * flat.element_size() * (OWN_BLOCK + 3 * (self.active.sh_degree + 1) ** 2)
+        return Needs(flat.nbytes, view, workspace + COPIES * flat.nbytes, 2 * own, max(blocks + own, 3 * own))
 
     @property
     def couples_pixels(self) -> bool:
