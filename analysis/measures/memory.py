@@ -45,36 +45,35 @@ def size_of(text: str) -> int:
 
 
 def require_pictures(frames: Sequence[Frame], gaussians: Gaussians) -> None:
-    """MemoryError that says what would fit, where pictures and Gaussians alone take more than is free."""
+    """InputError that says what would fit, where pictures and Gaussians alone take more than is free."""
     each = [PICTURES * 4 * frame.camera.width * frame.camera.height for frame in frames]
-    fixed, free = COPIES * gaussians.flat.nbytes, free_memory(torch.device("cpu"))
+    fixed, free = COPIES * gaussians.flat.nbytes, max(free_memory(torch.device("cpu")), 0)
     if fixed + sum(each) <= free:
         return
-    some = int((free - fixed) // max(each))
-    instead = f"--max-views {some} would fit" if some >= 1 else "fewer Gaussians or smaller pictures would"
-    raise MemoryError(
-        f"{len(frames)} pictures of up to {max(each) / PICTURES / 4:,.0f} px and {len(gaussians):,} Gaussians take "
-        f"{_gb(fixed + sum(each))}, and {_gb(max(free, 0))} are left; {instead}"
+    some = (free - fixed) // max(each)
+    raise InputError(
+        f"expected {_gb(fixed + sum(each))} of memory beside what is taken, for {len(frames)} pictures and "
+        f"{len(gaussians):,} Gaussians, got {_gb(free)}; "
+        + (f"--max-views {some} would fit" if some > 0 else "allow or free more, or take fewer Gaussians")
     )
 
 
 def expected_peak(objective: SceneObjective) -> int:
-    """About the most that a probe takes at a time, in bytes.  MemoryError that says what would fit, where less is free."""
+    """About the most that a probe takes at a time, in bytes.  InputError that says what would fit, where less is free."""
     needs, device = objective.needs, objective.active.flat.device
-    free, used = free_memory(device), resident_memory() if device.type == "cpu" else 0
-    least = needs.view + needs.beside
+    free, used = max(free_memory(device), 0), resident_memory() if device.type == "cpu" else 0
+    least, camera = needs.view + needs.beside, objective.views[0].camera
     if least > free:
-        raise MemoryError(
-            f"a probe of {len(objective.active):,} Gaussians in sight of views of {objective.views[0].camera.width} x "
-            f"{objective.views[0].camera.height} px takes at least {_gb(used + least)}, and {_gb(used + max(free, 0))} are "
-            f"allowed or there; --memory {ceil((used + least) / 1e8) / 10:g}GB or, as it grows with them, "
-            f"{int(len(objective.active) * max(free, 0) / least):,} Gaussians would fit"
+        raise InputError(
+            f"expected at least {_gb(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
+            f"{camera.width} x {camera.height} px, got {_gb(used + free)}; --memory {ceil((used + least) / 1e8) / 10:g}GB "
+            f"would fit on a machine that has it, here about {int(len(objective.active) * free / least):,} such Gaussians"
         )
     return used + min(free, len(objective.views) * needs.view + needs.beside)
 
 
 def _gb(size: float) -> str:
-    return f"{size / 1e9:.1f} GB"
+    return f"{size / 1e9:.2g} GB"
 
 
 @contextmanager

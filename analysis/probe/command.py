@@ -42,6 +42,7 @@ from splat.backend.memory import staying_within
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
+from splat.scenes.splits import read_names
 from splat.scenes.view import digests
 from splat.training.checkpoint import Checkpoint, open_checkpoint
 from splat.training.origin.foreign import Foreign
@@ -164,13 +165,7 @@ def _write(
 
 def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
     """A checkpoint, our own or another tool's, and its scene.  out: beside which a picture explains a refusal."""
-    listed = None
-    if ask.train_list is not None:
-        try:
-            listed = tuple(ask.train_list.read_text(encoding="utf-8").split("\n"))
-        except UnicodeDecodeError as error:
-            raise InputError(f"expected names of views, one in each line, in {ask.train_list}, got no text") from error
-        listed = tuple(name.strip() for name in listed if name.strip())
+    listed = None if ask.train_list is None else read_names(ask.train_list)
     foreign = Foreign(folder, ask.views, listed, ask.trained_by, ask.images, ask.downscale)
     checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
     scene = checkpoint.load_scene(path, folder)

@@ -122,7 +122,8 @@ def loss_name(loss: LossSettings) -> str:
     if loss.ssim_weight == 0:
         return pixel
     weighted = pixel if loss.pixel_weight == 1 else f"{loss.pixel_weight:g} {pixel}"
-    return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM)"
+    windows = " of windows within the image" if loss.border == "valid" else ""
+    return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM{windows})"
 
 
 def left_out_note(views: int, population: int | None) -> list[str]:

@@ -42,6 +42,7 @@ KIND = "expected a checkpoint written by landscape train"
 # settings that older files lack, where the training was the one of their defaults
 LATER = {
     "protocol",
+    "loss.border",
     "clamp_image",
     "rates.position_hold",
     "densify.split_distance",

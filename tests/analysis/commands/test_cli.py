@@ -240,6 +240,18 @@ def test_more_views_than_the_scene_has_are_refused(original, tmp_path, capsys):
     refuse(capsys, arguments(original, tmp_path / "run", "--views", "1"), "at least two views")
 
 
+def test_training_views_are_listed_in_a_file(original, tmp_path, capsys):
+    listed, empty, out = tmp_path / "list.txt", tmp_path / "empty.txt", tmp_path / "run"
+    names = load_scene(original).names
+    listed.write_text(f"{names[3]}\n\n{Path(names[0]).stem}\n")
+    empty.write_text("\n")
+    scene, split, _, _ = planned(TrainOptions(original, train_list=listed), out)
+    assert split.train == (names[3], names[0]) and set(split.test) == {*names} - {names[3], names[0]}
+    assert scene.names == names
+    refuse(capsys, arguments(original, out, "--train-list", str(empty)), "one in each line", "got none")
+    refuse(capsys, arguments(original, out, "--train-list", str(listed), "--views", "2"), "--views or --train-list")
+
+
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [

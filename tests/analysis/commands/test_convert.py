@@ -82,7 +82,7 @@ def test_a_training_starts_from_another_tools_gaussians_with_its_renderer(folder
     ]
     assert main([*common, "--trained-by", "gsplat-raw", "--out", str(out)]) == 0
     training = load_checkpoint(out / "checkpoint.pt").training
-    assert (training.config.render.alpha_max, training.step) == (0.999, 2)
+    assert (training.config.render.alpha_max, training.config.loss.border, training.step) == (0.999, "valid", 2)
     assert len(training.gaussians) == len(MADE.truth)
     moved = (training.gaussians.means - MADE.truth.means).abs().max()
     assert 0 < moved < 0.01 * training.extent
