@@ -21,11 +21,12 @@ from analysis.records.provenance import Provenance, provenance
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
 from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, literal
-from landscape.results import Bracket, sampling_error
+from landscape.results import Bracket, finite_or_none, sampling_error
 from landscape.slices.slice import Slice as Grid
 from landscape.spectrum.quantiles import quantile
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import ActiveCounts, SceneObjective
+from splat.curvature.scores.shares import BlockShare
 from splat.curvature.traces import curvature_scale
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
@@ -54,6 +55,7 @@ def probe_record(
         if found.finite is None
         else convert({**found.finite.record(), "direction": NAMES[0]}, schema.FiniteProbe),
         depth=found.depth,
+        block_shares=UNSET if found.shares is None else [_block_share(one) for one in found.shares],
         slice=None if found.plane is None else _slice(found.plane, found.ends.largest),
         counts=_counts(found, objective),
         checks=_checks(found),
@@ -162,6 +164,14 @@ def _trace(trace: TraceEstimate, left_out: LeftOut | None) -> schema.Trace:
     found = convert({**numbers, "tau": tau, "method": method}, schema.Trace)
     found.views_error = UNSET if left_out is None else trace.left_out(left_out.population)
     return found
+
+
+def _block_share(found: BlockShare) -> schema.BlockShare:
+    blocks, attributes, diagonal = map(finite_or_none, (found.blocks, found.attributes, found.diagonal))
+    return schema.BlockShare(
+        operator="gauss-newton" if found.gauss_newton else "hessian", coupled=found.coupled, blocks=blocks,
+        attributes=attributes, diagonal=diagonal, norm=found.norm, relative_error=found.error, samples=found.samples,
+    )  # fmt: skip
 
 
 def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalues:

@@ -37,6 +37,7 @@ from splat.render.forward import background_of, rasterize_view, touches
 from splat.scenes.view import View
 
 OWN_BLOCK = 11 * 11  # numbers of a Gaussian's block without SH
+KEPT_BLOCKS = 4  # approximate and exact ones, each of the Hessian and of a Gauss-Newton part
 COPIES = 5  # of a vector, in a product: itself, without its null part, the sum, a view's, the result
 FEWEST, AT_ONCE = 8, 4  # vectors of a small basis; of a product
 
@@ -171,7 +172,7 @@ class SceneObjective:
         view, workspace, blocks = self._sizes
         n, flat = len(self.active), self.active.flat
         own = n * flat.element_size() * (OWN_BLOCK + 3 * (self.active.sh_degree + 1) ** 2)
-        return Needs(flat.nbytes, view, workspace + COPIES * flat.nbytes, 2 * own, max(blocks + own, 3 * own))
+        return Needs(flat.nbytes, view, workspace + COPIES * flat.nbytes, KEPT_BLOCKS * own, max(blocks + own, 3 * own))
 
     @property
     def couples_pixels(self) -> bool:
@@ -257,21 +258,32 @@ class SceneObjective:
 
         approximate: with the diagonal of the loss's l'' in place of l'', without the coupling of pixels by SSIM.
         """
-        total, quats, traces = None, self.active.quats, []
+        return self.block_diagonals(approximate=approximate, parts=(gauss_newton,))[0]
+
+    def block_diagonals(
+        self, *, approximate: bool = False, parts: Sequence[bool] = (False, True)
+    ) -> list[PerGaussianBlocks]:
+        """`block_diagonal` of several parts at once; parts: which are Gauss-Newton."""
+        totals: list[PerGaussianBlocks] = []
+        traces: list[list[dict[str, float]]] = []
         for view in self.linearized:
-            part = view.block_diagonal(gauss_newton=gauss_newton, approximate=approximate)
-            traces.append(part.traces(quats))
-            if total is None:
-                total = part
-            else:
-                total.add(part)
-        assert total is not None
-        names = list(traces[0])
-        each = self.of_all_views(
-            torch.tensor([[trace[name] for name in names] for trace in traces], dtype=torch.float64)
-        )
-        views = [dict(zip(names, row, strict=True)) for row in each.tolist()]
+            found = view.block_diagonals(approximate=approximate, parts=parts)
+            traces.append([each.traces(self.active.quats) for each in found])
+            for total, each in zip(totals, found, strict=False):  # none before the first view
+                total.add(each)
+            totals = totals or found
+        return [self._mean_of_blocks(total, [each[i] for each in traces]) for i, total in enumerate(totals)]
+
+    def _mean_of_blocks(self, total: PerGaussianBlocks, traces: Sequence[Mapping[str, float]]) -> PerGaussianBlocks:
+        """The mean over all views, given the sum over this process's and the traces of each."""
+        rows = self.of_all_views(torch.tensor([list(each.values()) for each in traces], dtype=torch.float64))
+        views = [dict(zip(traces[0], row, strict=True)) for row in rows.tolist()]
         return PerGaussianBlocks(self.mean_over_views(total.geometry), self.mean_over_views(total.sh), views)
+
+    @cached_property
+    def exact_blocks(self) -> list[PerGaussianBlocks]:
+        """The blocks of the Hessian and of its Gauss-Newton part."""
+        return self.block_diagonals()
 
     @cached_property
     def approximate_blocks(self) -> tuple[PerGaussianBlocks, PerGaussianBlocks | None]:

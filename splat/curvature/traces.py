@@ -91,7 +91,7 @@ def exact_traces(
 
 def block_traces(objective: SceneObjective) -> dict[str, TraceEstimate]:
     """The same traces without a sample: sums over the Gaussians' exact own blocks, which only a CPU has."""
-    blocks = objective.block_diagonal()
+    blocks = objective.exact_blocks[0]
     found = blocks.traces(objective.active.quats)
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
