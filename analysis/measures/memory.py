@@ -31,12 +31,14 @@ def basis_within(eigen: EigenSettings, room: int) -> int:
     return min(eigen.basis, max(eigen.wanted + 3 * eigen.block, room))
 
 
-def size_of(text: str) -> int:
-    """Bytes from a size in words.  InputError where it is none.
+def size_of(text: str | None) -> int | None:
+    """Bytes from a size in words; None of None.  InputError where it is none.
 
     >>> size_of("8GB"), size_of("1.5 GiB"), size_of("500mb")
     (8000000000, 1610612736, 500000000)
     """
+    if text is None:
+        return None
     match = re.fullmatch(r"(\d+(?:\.\d+)?) ?([kmgt])(i?)b", text.strip(), re.I)
     if not match:
         raise InputError(f"expected a size of memory such as 8GB or 500MB, got {text!r}")

@@ -61,7 +61,7 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | 
     """
     require_seed(options.seed)
     device = device_named(options.device)
-    with torchrun_ranks(device) as ranks, staying_within(options.memory and size_of(options.memory)):
+    with torchrun_ranks(device) as ranks, staying_within(size_of(options.memory)):
         return _run(options, command, drawn, device, ranks)
 
 

@@ -135,9 +135,9 @@ def checked_lens(model: str, size: tuple[float, float], params: Sequence[float],
 def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Frame:
     """The final camera of a photograph, and how to read it.  ValueError where file and lens cannot belong together."""
     size, _ = image_header(photo.path)
-    fits = _same_shape((photo.lens.width, photo.lens.height), size)
-    turned = not fits and _same_shape((photo.lens.width, photo.lens.height), size[::-1]) and _quarter_turned(photo.path)
-    size = size[::-1] if turned else size
+    stored, across = (photo.lens.width, photo.lens.height), (size[1], size[0])
+    turned = not _same_shape(stored, size) and _same_shape(stored, across) and _quarter_turned(photo.path)
+    size = across if turned else size
     lens = _scaled_to(photo.lens, size, photo)
     pinhole = _pinhole(lens, photo)
     width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))

@@ -36,8 +36,8 @@ class CpuImageLoss:
         self.frame = Frame(height, width, plane_rows, stride, window(torch.float64).numpy().astype(dtype))
         scalar, self.structural = self.dtype.type, settings.structural(height, width)
         self.pixel = settings.pixel_weight / (3 * height * width)
-        numbers = map(scalar, (settings.eps, self.pixel, self.structural))
-        self.loss = Loss(KINDS[settings.pixel], *numbers, settings.margin)
+        eps, pixel, structural = map(scalar, (settings.eps, self.pixel, self.structural))
+        self.loss = Loss(KINDS[settings.pixel], eps, pixel, structural, settings.margin)
 
     def planes(self, sets: int) -> np.ndarray:
         """Uninitialised plane sets, (sets, 3, padded height, padded width)."""

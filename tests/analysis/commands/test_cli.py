@@ -30,6 +30,7 @@ from analysis.train.scores import render_name
 from splat.losses.reference import psnr
 from splat.model.gaussians import ATTRIBUTES
 from splat.render.render import render
+from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint

@@ -1,5 +1,7 @@
 """What is said of training views that were left out: the parts of single views, and the error of their mean."""
 
+from collections.abc import Iterable
+
 import pytest
 import torch
 
@@ -12,7 +14,7 @@ VIEWS = 5
 MADE = synthetic_scene(SyntheticSettings(gaussians=60, views=VIEWS, width=24, height=16))
 
 
-def objective(views=range(VIEWS)) -> SceneObjective:
+def objective(views: Iterable[int] = range(VIEWS)) -> SceneObjective:
     gaussians = MADE.truth.select(torch.arange(len(MADE.truth)), 1)
     gaussians.sh.add_(0.1 * torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(0)))
     loaded = MADE.scene.load()
