@@ -98,7 +98,9 @@ def test_a_probe_in_little_memory_says_what_it_needs_and_what_would_fit(tmp_path
     program = (
         "import resource, sys\nimport psutil\nimport analysis.probe.command as command\n"
         "from analysis.commands.cli import main\nmeasure = command.measure\n"
-        "def limited(objective, *more):\n    objective.linearized\n"
+        "from splat.curvature.hessian import SceneHessian\nimport torch\n"
+        "def limited(objective, *more):\n    objective.approximate_blocks, objective.gradient\n"  # kernels are loaded
+        "    H = SceneHessian(objective)\n    H.apply(torch.ones(H.dim, 4))\n"
         "    limit = psutil.Process().memory_info().vms + 2**20\n"
         "    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))\n    return measure(objective, *more)\n"
         "command.measure = limited\nsys.exit(main(sys.argv[1:]))"
