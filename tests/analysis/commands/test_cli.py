@@ -249,8 +249,9 @@ def test_training_views_are_listed_in_a_file(original, tmp_path, capsys):
     scene, split, _, _ = planned(TrainOptions(original, train_list=listed), out)
     assert split.train == (names[3], names[0]) and set(split.test) == {*names} - {names[3], names[0]}
     assert scene.names == names
-    refuse(capsys, arguments(original, out, "--train-list", str(empty)), "one in each line", "got none")
-    refuse(capsys, arguments(original, out, "--train-list", str(listed), "--views", "2"), "--views or --train-list")
+    train = ["train", str(original), "--out", str(out), "--train-list"]
+    refuse(capsys, [*train, str(empty)], "one in each line", "got none")
+    refuse(capsys, [*train, str(listed), "--views", "2"], "--views or --train-list, got both")
 
 
 @pytest.mark.parametrize(
