@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
-from analysis.records.quantities import quantity
+from analysis.records.quantities import power_of_ten, quantity
 from analysis.records.records import ProbeRecord, Record
 from figures.style import BLUE, exponent_of, new_figure, script, style, unit_suffix
 from landscape.errors import InputError
@@ -50,6 +51,8 @@ def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> float:
     axes.fill_between(curvature, height, height.max() / 10**DECADES, color=BLUE, alpha=0.25, linewidth=0)
     axes.plot(curvature, height, color=BLUE, linewidth=0.9)
     axes.set_yscale("log")
+    axes.set_yticks([10.0**-k for k in range(0, DECADES, 2)], [power_of_ten(-k) for k in range(0, DECADES, 2)])
+    axes.yaxis.set_minor_locator(NullLocator())
     axes.set_ylim(height.max() / 10**DECADES, 3 * height.max())
     axes.set_xlabel(f"curvature{unit_suffix(exponent)},\nloss per squared parameter unit")
     axes.set_ylabel("density over\nits highest")

@@ -29,7 +29,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from analysis.console.kept import Kept
-from analysis.console.stages import Stages
+from analysis.console.stages import Stages, Work
 from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import ProductCheck, check_against_gradient
 from analysis.measures.memory import basis_within, vectors_within
@@ -76,14 +76,17 @@ LEFT_OUT = {
     "depth": "positions along and across the rays were left out",
 }
 MOST_AT_ONCE = 4  # start vectors
+PRODUCT, BEFORE = 6, 25  # renders that a product with them takes, and what comes before the first stage
 MOST_SAMPLES = 64  # of a trace, beyond which its exact value takes less
-# what a stage takes on two real scenes, as products with MOST_AT_ONCE vectors and as renders of all views
-TYPICAL: dict[str, tuple[int, int]] = {
-    "traces": (12, 0),
-    "eigenvalues": (10, 0),
-    "slice": (0, 180),
-    "depth": (2, 50),
-    "block shares": (4, 0),
+# what a stage took on three real scenes: units, as its progress counts them (0: of different kinds), products of MOST_AT_ONCE
+# vectors, and renders of all views
+TYPICAL: dict[str, tuple[int, float, float]] = {
+    "traces": (25, 11, 0),
+    "eigenvalues": (60, 28, 0),
+    "slice": (230, 0, 184),
+    "depth": (0, 3, 60),
+    "block shares": (0, 4, 0),
+    "pictures": (0, 8, 45),
 }
 
 
@@ -109,7 +112,7 @@ class Measured:
     """What was measured; density, power, finite, depth, plane and shares are None where a note says why.
 
     matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
-    of the directions that are not exactly flat; unreached: stages that time did not reach.
+    of the directions that are not exactly flat; unreached: stages that time did not reach.  left_out: where views were.
     """
 
     value: float
@@ -129,6 +132,20 @@ class Measured:
     rank: int
     notes: tuple[str, ...]
     unreached: tuple[str, ...] = ()
+    left_out: "LeftOut | None" = None
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """What tells the error of measuring on fewer views than the training has.
+
+    population: those that it has.  losses: of the views measured; curvatures: v . H_m v in each of these views, of the
+    eigenvectors of the two largest eigenvalues and of the smallest.
+    """
+
+    population: int
+    losses: Float64[Tensor, " m"]
+    curvatures: Float64[Tensor, "m 3"]
 
 
 def measure(
@@ -139,8 +156,9 @@ def measure(
     folder: Path | None = None,
     told: str = "",
     deadline: float = inf,
+    population: int | None = None,
 ) -> Measured:
-    """Run every stage.  folder, told, deadline: see `Kept`."""
+    """Run every stage.  folder, told, deadline: see `Kept`; population: training views, where the objective has fewer."""
     with stages.stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
@@ -155,7 +173,7 @@ def measure(
     stages.expect(_plan(settings, product, render), words)
     kept = Kept(stages, generator, STAGES, lambda: [operator.matvecs, hessian.views.spared], folder, told, deadline)
     point = _Point(objective, hessian, operator, settings, gradient, value)
-    return _all_stages(point, kept, operator_check, gradient_check, checks)
+    return _all_stages(point, kept, operator_check, gradient_check, checks, population)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +189,12 @@ class _Point:
 
 
 def _all_stages(
-    at: _Point, kept: Kept, operator_check: OperatorCheck, gradient_check: ProductCheck, checks: tuple[int, int]
+    at: _Point,
+    kept: Kept,
+    operator_check: OperatorCheck,
+    gradient_check: ProductCheck,
+    checks: tuple[int, int],
+    population: int | None,
 ) -> Measured:
     objective, settings = at.objective, at.settings
     traces = kept.run("traces", dict[str, TraceEstimate], lambda g, report, _: _traces(at, kept.left, g, report), True)
@@ -211,7 +234,13 @@ def _all_stages(
         rank=at.hessian.rank,
         notes=(*(LEFT_OUT[name] for name, each in wanted.items() if not each), *kept.notes),
         unreached=tuple(kept.unreached),
+        left_out=None if population is None else _left_out(at, ends, population),
     )
+
+
+def _left_out(at: _Point, ends: EigenEnds, population: int) -> LeftOut:
+    vectors = torch.cat([ends.largest.vectors[:, :2], ends.smallest.vectors[:, :1]], dim=1)
+    return LeftOut(population, at.objective.losses, at.hessian.by_view(vectors))
 
 
 def _linearised(objective: SceneObjective, report: Progress) -> tuple[Tensor, float, float]:
@@ -232,24 +261,34 @@ def _seconds_of_product(hessian: SceneHessian) -> float:
     return monotonic() - start
 
 
-def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str, float]:
-    """Seconds that every stage is expected to take, from those of a product and of a render."""
+def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str, Work]:
+    """What every stage is expected to take, from the seconds of a product and of a render."""
     work = dict(TYPICAL)
     if settings.trace_samples:
-        work["traces"] = (settings.trace_samples // 2, 0)
+        work["traces"] = (settings.trace_samples, 0.45 * settings.trace_samples, 0)
     if not settings.slice_plane:
-        work["slice"] = (0, 2 * settings.slice_points)
-    if settings.density_matvecs:
-        work["density"] = (settings.density_matvecs // MOST_AT_ONCE, 0)
+        work["slice"] = (2 * settings.slice_points, 0, 1.6 * settings.slice_points)
+    if count := settings.density_matvecs:
+        work["density"] = (count, 0.32 * count, 0)
     if settings.power_apart:
-        work["power iteration"] = (settings.power.max_matvecs, 0)
+        work["power iteration"] = (0, settings.power.max_matvecs, 0)
     if settings.probe_steps:
-        work["finite probe"] = (0, 2 * len(settings.probe_steps) + settings.noise_points + 1)
+        count = 2 * len(settings.probe_steps) + settings.noise_points + 1
+        work["finite probe"] = (count, 0, count)
     if settings.depth is None:
         del work["depth"]
+        work["pictures"] = (0, 0, 12)
     if settings.block_coupling:
-        work["block shares"] = (4 * TYPICAL["block shares"][0], 0)  # exact blocks take longest
-    return {name: products * product + renders * render for name, (products, renders) in work.items()}
+        work["block shares"] = (0, 16, 0)  # exact blocks take longest
+    return {
+        name: Work(products * product + renders * render, units) for name, (units, products, renders) in work.items()
+    }
+
+
+def expected_seconds(settings: ProbeSettings, render: float) -> float:
+    """About how long all stages take, from the seconds of a render of all views alone."""
+    stages = _plan(settings, PRODUCT * render, render).values()
+    return sum(work.seconds for work in stages) + BEFORE * render
 
 
 def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Progress) -> dict[str, TraceEstimate]:
