@@ -42,7 +42,7 @@ def draw(runs: Sequence[Path]) -> Figure:
     with style():
         figure = new_figure(7.4)
         figure.set_figwidth(WIDTH)
-        above, below = figure.subfigures(2, 1, height_ratios=[3.6, 1])
+        above, below = figure.subfigures(2, 1, height_ratios=[3.6, 1], squeeze=False)[:, 0]
         maps = [above.add_subplot(3, 2, 3 + i) for i in range(len(runs))]
         photograph = _photograph(runs[0], view)
         pictures = below.subplots(1, len(runs) + (photograph is not None), squeeze=False)[0]

@@ -88,7 +88,7 @@ def needles(rows: pd.DataFrame) -> Judgement:
     columns["share of the steepest eigenvector on needles"] = "needles"
     effects = tuple(Effect(words, Interval.of(numbers(rows, name, BASE)), null, 0.5) for words, name in columns.items())
     verdicts = [decide(effect) for effect in effects][: len(STRETCHED) if len(effects) > len(STRETCHED) else 1]
-    verdict = verdicts[0] if len(set(verdicts)) == 1 else "holds in part"
+    verdict: Verdict = verdicts[0] if len(set(verdicts)) == 1 else "holds in part"
     if "cannot be tested here" in verdicts:
         verdict = "cannot be tested here"
     words = "; ".join(f"{effect.name}: {effect.interval.text()}" for effect in effects)

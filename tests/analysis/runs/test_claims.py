@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from msgspec import convert
 
 from analysis.commands.cli import main
 from analysis.console.overrides import assignments, overridden
@@ -19,6 +20,7 @@ from analysis.runs.sweep.sweep_file import read_sweep
 from figures.paper import ONLY
 from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
+from splat.training.start import Source
 from splat.training.state import LearningRates, TrainConfig
 from tests.recorded import synthetic, written
 
@@ -228,7 +230,8 @@ def names_in(file: str) -> set[str]:
         preset = presets(options.method, options.protocol)
         config = overridden(config, {key: value for key, value in preset.items() if key not in ("start", "iterations")})
         config = overridden(config, assignments(options.set))
-        names.add(method_name(config.method.scaled(config), options.start or preset.get("start", "scene")))
+        start = convert(options.start or preset.get("start", "scene"), Source)
+        names.add(method_name(config.method.scaled(config), start))
     return names
 
 
