@@ -31,7 +31,7 @@ from figures.claims import draw_claims, draw_predictors
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
 
 RESULTS = Path(__file__).parents[1] / "notebooks" / "results"
-LETTER, ROW = 3.9, 8.5  # points: as wide as a letter of a name on the average, and as high
+LETTER, ROW = 4.4, 8.5  # points: as wide as a letter of a name on the average, and as high
 BUDGET = 1.3  # the paper's time of StableGS over that of 3DGS, Sec. 4.3
 VIEWPOINTS = {"occlusion": "edge_rotation", "interpolation": "interpolation", "parallax": "parallax"}
 ONLY = {  # one way to move a viewpoint, beside the probes of attributes

@@ -26,6 +26,7 @@ Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested h
 LEAST, CONFIDENCE = 3, 0.95
 BASE, STABLE = "3dgs", "stablegs"
 SCORE = "psnr"
+STRETCHED = ("quats", "log_scales")  # what needles are said to dominate
 PAIR = ("scene", "seed")
 SURROUNDINGS = ("machine", "threads")  # without which times do not compare
 

@@ -16,6 +16,7 @@ from analysis.runs.claims.effects import (
     LEAST,
     SCORE,
     STABLE,
+    STRETCHED,
     Effect,
     Interval,
     Verdict,
@@ -25,7 +26,6 @@ from analysis.runs.claims.effects import (
     numbers,
     ratio_effect,
 )  # fmt: skip
-from analysis.runs.claims.study import STRETCHED
 
 ATTRIBUTES_ALONE, VIEWPOINTS_ALONE = "stablegs vsp_weight=0", "stablegs asp_weight=0"
 AXIS = ATTRIBUTES_ALONE + " probe.attributes={}"

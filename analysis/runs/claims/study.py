@@ -40,6 +40,7 @@ from analysis.measures.units import step_lengths
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, Made, MapRecord, read_map, read_scores
+from analysis.runs.claims.effects import STRETCHED
 from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
 from landscape.errors import InputError
 from splat.model.typed import leaves
@@ -51,7 +52,6 @@ from splat.training.state import LearningRates, TrainConfig
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
 SAMPLES = 10  # the paper's B
-STRETCHED = ("quats", "log_scales")  # what needles are said to dominate
 
 
 def study(paths: Sequence[Path]) -> pd.DataFrame:
