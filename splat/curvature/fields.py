@@ -88,14 +88,15 @@ def scene_fields(objective: SceneObjective, progress: Progress | None = None) ->
     """
     if objective.ranks.size > 1:
         raise InputError("expected one process, got several that share the views; run without torchrun")
-    gaussians, sights, total = objective.active, [], None
+    gaussians, sights, total = objective.active, [], list[PerGaussianBlocks]()
     for index, (view, linearized) in enumerate(zip(objective.views, objective.linearized, strict=True)):
         sights.append(sight(gaussians, view.camera, objective.settings))
         parts = linearized.block_diagonals()
-        total = parts if total is None else [a + b for a, b in zip(total, parts, strict=True)]
+        for whole, part in zip(total, parts, strict=False):  # none before the first view
+            whole.add(part)
+        total = total or parts
         if progress:
             progress(index + 1, len(objective.views), "blocks of every Gaussian")
-    assert total is not None
     count = len(objective.views)
     hessian, gauss_newton = (PerGaussianBlocks(part.geometry / count, part.sh / count) for part in total)
     rays = mean_rays(objective, sights)
