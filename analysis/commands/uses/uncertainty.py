@@ -11,14 +11,13 @@ that knows nothing.
 """
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 import torch
 from jaxtyping import Float
 from rich.console import Console
-from scipy.stats import spearmanr
 
 from analysis.commands.uses.next_view import informations
 from analysis.commands.uses.options import UncertaintyOptions
@@ -75,9 +74,8 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
                     variance = pixel_variance(linearized, total, generator, options.samples, diagonal=diagonal).numpy()
                     maps[name] = np.sqrt(variance)
                     rows.append({"view": view.name, "precision": name, **agreement(variance, error)})
-                np.savez(
-                    folder / f"view-{place:03d}.npz", **{key: each.astype(np.float32) for key, each in maps.items()}
-                )
+                arrays: dict[str, Any] = {key: each.astype(np.float32) for key, each in maps.items()}
+                np.savez(folder / f"view-{place:03d}.npz", **arrays)
                 report(place + 1, len(held_out), "held-out views")
         table = pd.DataFrame(rows)
         table.to_csv(folder / "agreement.csv", index=False)
@@ -85,7 +83,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         (folder / UncertaintyRecord.FILE).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     console = Console()
-    means = table.groupby("precision")[["rank_correlation", "ause", "ause_random"]].mean()
+    means = table.drop(columns="view").pivot_table(index="precision")  # by default means
     console.print(means.round(3).to_string(), highlight=False, markup=False)
     words = f"means over {len(held_out)} held-out views; agreement.csv, view-*.png in {out}"
     console.print(words, *notes, sep="\n", highlight=False, markup=False, soft_wrap=True)
@@ -102,7 +100,7 @@ def agreement(variance: Float[np.ndarray, "h w"], error: Float[np.ndarray, "h w"
     predicted, true = variance.ravel(), error.ravel()
     best = _left(true, true)
     return {
-        "rank_correlation": float(spearmanr(predicted, true).statistic),
+        "rank_correlation": pd.Series(predicted).corr(pd.Series(true), method="spearman"),
         "ause": float((_left(true, predicted) - best).mean()),
         "ause_random": float((1 - best).mean()),
     }
