@@ -170,8 +170,9 @@ def measure(
     checks = operator.matvecs, hessian.views.spared
     product = _seconds_of_product(hessian)
     words = f"{MOST_AT_ONCE} products at once take {product:.2g} s, a render of all views {render:.2g} s"
-    stages.expect(_plan(settings, product, render), words)
     kept = Kept(stages, generator, STAGES, lambda: [operator.matvecs, hessian.views.spared], folder, told, deadline)
+    plan = _plan(settings, product, render)
+    stages.expect({name: work for name, work in plan.items() if not kept.has(name)}, words)
     point = _Point(objective, hessian, operator, settings, gradient, value)
     return _all_stages(point, kept, operator_check, gradient_check, checks, population)
 
