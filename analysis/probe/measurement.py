@@ -267,8 +267,9 @@ def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str
     work = dict(TYPICAL)
     if settings.trace_samples:
         work["traces"] = (settings.trace_samples, 0.45 * settings.trace_samples, 0)
-    if not settings.slice_plane:
-        work["slice"] = (2 * settings.slice_points, 0, 1.6 * settings.slice_points)
+    units, _, renders = work["slice"]
+    points = min(units, settings.slice_points**2) if settings.slice_plane else 2 * settings.slice_points
+    work["slice"] = (points, 0, renders * points / units)
     if count := settings.density_matvecs:
         work["density"] = (count, 0.32 * count, 0)
     if settings.power_apart:
