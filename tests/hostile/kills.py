@@ -35,6 +35,7 @@ from analysis.console import drawing, recording
 from analysis.console.interruption import ignored, raising
 from analysis.records.records import ProbeRecord, SliceRecord, read_record
 from analysis.records.run_files import MapRecord
+from splat.model.files.read import read_splats
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, training_state
@@ -183,14 +184,14 @@ class Convert(Ended):
     name = "convert"
 
     def words(self) -> list[str]:
-        return ["convert", str(self.checkpoint), str(self.out)]
+        return ["convert", str(self.checkpoint), str(self.out), "--to", "graphdeco"]
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
         self.seconds = max(self.seconds, 0.05)
 
     def numbers(self) -> Numbers:
-        return {"file": digest(self.out.read_bytes()), "n": str(len(load_checkpoint(self.out).training.gaussians))}
+        return {"file": digest(self.out.read_bytes()), "n": str(len(read_splats(self.out).gaussians))}
 
     def prepare(self, chance: random.Random) -> None:
         self.clean()
