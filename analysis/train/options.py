@@ -59,7 +59,7 @@ class TrainOptions:
     Options and --set go before it."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """KEY=VALUE changes a setting of the method or of the training, as in vsp_weight=0; may be repeated.
-    An unknown KEY is answered with the names of all."""
+    An unknown KEY is answered with the one that was meant, or with the names of all."""
     device: DeviceName = "auto"
     """Where to train.  auto: on the GPU where there is one that can be used, else on the CPU."""
     resume: FlagCreatePairsOff[bool] = False

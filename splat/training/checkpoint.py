@@ -251,6 +251,8 @@ def _instead(path: Path) -> str:
         return f"a folder; name the {inside} in it"
     if runs := sorted(path.glob("*/checkpoint.pt")):
         return f"a folder of runs; name one of them, such as {runs[0].parent}"
+    if (path.parent / "checkpoint.pt").is_file():
+        return f"a folder within the run {path.parent}; name that"
     return "a folder without one; name the run that landscape train wrote, its --out"
 
 

@@ -44,6 +44,9 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys):
     path.write_bytes(b"not a checkpoint")
     refused(capsys, [str(path)], "not one or is damaged")
     shutil.copy(run / "checkpoint.pt", path)
+    (copy / "probe").mkdir()
+    refused(capsys, [str(copy / "probe")], f"found a folder within the run {copy}; name that")
+    (copy / "probe").rmdir()
     refused(capsys, [str(path), "--scene", str(tmp_path / "nowhere")], "does not exist")
     write_transforms_scene(synthetic_scene(replace(SCENE, views=2)).scene, tmp_path / "other")
     refused(
@@ -95,7 +98,9 @@ def test_an_interrupted_probe_keeps_its_stages_and_says_how_to_go_on(run, tmp_pa
     assert main(words) == 130
     assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]
     said = capsys.readouterr().err
-    assert "kept: eigenvalues, slice, traces; the same command continues" in said and " ".join(words) in said
+    assert (
+        "kept: block shares, eigenvalues, slice, traces; the same command continues" in said and " ".join(words) in said
+    )
     monkeypatch.setattr("analysis.console.drawing.drawing", lambda *_: nullcontext(lambda target: []))
     monkeypatch.setattr("analysis.probe.measurement.extreme_eigenpairs", None)  # it is not searched for again
     assert main([*words, "--strict"]) == 0
