@@ -135,8 +135,8 @@ class GridEvaluations:
                 raise ValueError(
                     f"expected one-dimensional {', '.join(COLUMNS)} of kinds {', '.join(COLUMNS.values())}"
                 )
-            points, *found = (each.tolist() for each in columns)
-            stored = {point: each for point, *each in zip(points, *found, strict=True)}
+            points, values, crossed = (each.tolist() for each in columns)
+            stored = dict(zip(points, zip(values, crossed, strict=True), strict=True))
         except MemoryError:
             raise
         except Exception as error:  # NumPy and zipfile may raise nearly anything of damaged bytes
