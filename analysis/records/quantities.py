@@ -12,12 +12,13 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
 FINEST = 10  # significant digits
 BYTES, NOTHING = 254, 255  # of a scale in bytes: its end, and what has no value
+GREY = 128  # in bytes, of what has no value
 SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}  # of metrics.json
 PLACES = {"psnr": 2, "ssim": 4, "lpips": 4}
 
@@ -51,6 +52,17 @@ def measured(value: float | None, error: float | None) -> str:
     ('5.00 ± ?', '5.00', '–')
     """
     return quantity(value, math.inf if error is None else error)
+
+
+def apart(error: float | UnsetType | None) -> str:
+    """A second error, of views left out, after a number; empty where none were.
+
+    >>> apart(0.123), apart(None), apart(UNSET)
+    (' ∓ 0.12', ' ∓ ?', '')
+    """
+    if error is UNSET:
+        return ""
+    return " ∓ ?" if error is None else f" ∓ {_plain(error, 2)}"
 
 
 def percent(share: float) -> str:
@@ -167,6 +179,15 @@ class Shade(Struct, frozen=True, kw_only=True):
         if self.diverges:
             return "PuOr_r"
         return {"error": "magma", "order_gap": "cividis_r"}.get(self.name, "cividis")
+
+    @property
+    def palette(self) -> UInt8[np.ndarray, "256 3"]:
+        """The colours of `bytes`; grey: no value."""
+        from matplotlib import colormaps  # most readers of a record need none
+
+        colours = colormaps[self.colours](np.arange(NOTHING + 1) / BYTES)[:, :3]
+        colours[NOTHING] = GREY / 255
+        return (255 * colours).round().astype(np.uint8)
 
     def shown(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """t; nan for what has none."""

@@ -23,6 +23,8 @@ class TrainOptions:
     Blender: the usual eight; DTU: views 25, 22, 28, ... of pixelNeRF (with --downscale 4).
     all: every view that is not held out; of DTU the protocol's 9.
     Default: 8 for Blender, else 3."""
+    train_list: Unset[Path] = None
+    """A text file with the name of a training view in each line, instead of --views; all others are held out."""
     iterations: Unset[int] = None
     """Steps of the training, each on one view.  Default: 2000, or those of the --protocol."""
     seed: int = 0
