@@ -14,7 +14,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 Draw = Callable[[Path], list[str]]
-"""Draws into a folder; returns what it warned of.  Raises RuntimeError with its words if it failed."""
+"""Draws into a folder; returns what it warned of, or why it failed: the numbers stand without pictures."""
 
 
 @contextmanager
@@ -30,6 +30,14 @@ def draw(module: str, target: Path, *options: str) -> list[str]:
     command = [sys.executable, "-m", f"figures.{module}", *options, str(target)]
     with _group(command) as process:
         return _said(process)
+
+
+def draw_or_say(module: str, target: Path) -> list[str]:
+    """As `draw`; where it fails, with its words: the numbers stand without pictures."""
+    try:
+        return draw(module, target)
+    except RuntimeError as error:
+        return [" ".join(str(error).split())]
 
 
 @contextmanager
@@ -56,7 +64,7 @@ def _said(process: subprocess.Popen[str], told: str = "") -> list[str]:
     """Warnings of the process, once it is told this and has ended."""
     lines = [line for line in process.communicate(told)[1].splitlines() if line.strip()]
     if process.returncode:
-        raise RuntimeError("drawing failed: " + "\n".join(lines))
+        return ["drawing failed: " + " ".join(" ".join(lines).split())]
     return [line.split("Warning: ", 1)[1] for line in lines if "Warning: " in line]
 
 

@@ -367,7 +367,10 @@ def _bracket(index: schema.Index, written: Callable[[float], str] | None = None)
     """Between which numbers it lies.  written: how one of them is, where not as `limits` has them."""
     ends = index.low, index.high
     texts = limits(*ends) if written is None else [UNDETERMINED if end is None else written(end) for end in ends]
-    return "" if ends == (None, None) else f" (between {texts[0]} and {texts[1]})"
+    if None not in ends:
+        return f" (between {texts[0]} and {texts[1]})"
+    known = [f" (at {words} {text})" for words, end, text in zip(("least", "most"), ends, texts, strict=True) if end]
+    return known[0] if known else ""
 
 
 def _in_brackets(note: schema.Maybe[str]) -> str:

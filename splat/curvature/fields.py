@@ -36,6 +36,7 @@ from splat.render.sight import Sight, sight
 
 Values = dict[str, Float64[Tensor, " n"]]
 PER_UNIT = {"means": "1 / world unit²", "log_scales": "1", "quats": "1", "opacity_logits": "1 / logit²", "sh": "1"}
+WORDS = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "colour"}
 PREFIXES = ("", "gn_")
 MIXED = "1 / stored unit²"
 
@@ -50,7 +51,7 @@ class Field:
 
 
 OF_BLOCKS = {
-    **{f"trace_{name}": Field(f"trace of {name}", unit, "signed") for name, unit in PER_UNIT.items()},
+    **{f"trace_{name}": Field(f"trace of {WORDS[name]}", unit, "signed") for name, unit in PER_UNIT.items()},
     "largest": Field("largest curvature", MIXED, "log"),
     "log_det": Field("log-determinant", "ln", "linear"),
     "rank": Field("rank of the block", "directions", "linear"),
@@ -122,11 +123,11 @@ def block_fields(
 ) -> Values:
     """The fields of the blocks.  quats: of unit length; precision: in which the blocks were worked out."""
     found: Values = {}
-    on_complement = [_on_complement(blocks.geometry.double(), quats.double()) for blocks in (hessian, gauss_newton)]
-    for prefix, blocks, B in zip(PREFIXES, (hessian, gauss_newton), on_complement, strict=True):
+    across = [on_complement(blocks.geometry.double(), quats.double()) for blocks in (hessian, gauss_newton)]
+    for prefix, blocks, B in zip(PREFIXES, (hessian, gauss_newton), across, strict=True):
         for name, diagonal in blocks.diagonals_across(quats).items():
             found[f"{prefix}trace_{name}"] = diagonal.flatten(1).sum(dim=1)
-        values = _eigenvalues(B)
+        values = eigenvalues(B)
         size = values.abs()
         kept = size > len(values[0]) * torch.finfo(precision).eps * size.amax(dim=1, keepdim=True)
         found[f"{prefix}largest"] = values[:, -1]
@@ -137,7 +138,7 @@ def block_fields(
         depth = torch.einsum("ni,nij,nj->n", rays, position, rays)
         found[f"{prefix}depth"] = depth
         found[f"{prefix}lateral"] = (found[f"{prefix}trace_means"] - depth) / 2
-    found["split"] = _eigenvalues(on_complement[0] - on_complement[1])[:, 0]
+    found["split"] = eigenvalues(across[0] - across[1])[:, 0]
     return found
 
 
@@ -155,7 +156,7 @@ def sight_fields(sights: Sequence[Sight]) -> Values:
     }
 
 
-def _on_complement(blocks: Float64[Tensor, "n 11 11"], quats: Float64[Tensor, "n 4"]) -> Float64[Tensor, "n 10 10"]:
+def on_complement(blocks: Float64[Tensor, "n 11 11"], quats: Float64[Tensor, "n 4"]) -> Float64[Tensor, "n 10 10"]:
     """E^T B E: q i, q j, q k in place of the quaternion's four axes."""
     w, x, y, z = quats.unbind(dim=1)
     turns = torch.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w], dim=1).view(-1, 4, 3)
@@ -167,7 +168,7 @@ def _on_complement(blocks: Float64[Tensor, "n 11 11"], quats: Float64[Tensor, "n
     return E.mT @ blocks @ E
 
 
-def _eigenvalues(matrices: Float64[Tensor, "n d d"]) -> Float64[Tensor, "n d"]:
+def eigenvalues(matrices: Float64[Tensor, "n d d"]) -> Float64[Tensor, "n d"]:
     """Ascending."""
     values = matrices.new_empty(matrices.shape[:2])
 

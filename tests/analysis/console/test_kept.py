@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from analysis.console import stages
 from analysis.console.kept import Kept, kept_stages
 from analysis.console.stages import Stages
 
@@ -61,12 +62,14 @@ def _alone(name) -> Found:
     return found
 
 
-@pytest.mark.parametrize("harm", ["another command", "damaged", "another type"])
+@pytest.mark.parametrize("harm", ["another command", "cut", "one bit", "another type"])
 def test_what_is_not_this_command_s_is_measured_again(tmp_path, harm):
     kept(tmp_path).run("first", Found, Work())
     file = tmp_path / "first.msgpack"
-    if harm == "damaged":
-        file.write_bytes(file.read_bytes()[:-3])
+    if harm in ("cut", "one bit"):
+        content = bytearray(file.read_bytes())
+        content[-9] ^= 1
+        file.write_bytes(file.read_bytes()[:-3] if harm == "cut" else bytes(content))
     work = Work()
     if harm == "another type":
         kept(tmp_path).run("first", dict[str, int], lambda *_: {"a": 1})
@@ -88,4 +91,6 @@ def test_time_that_ends_gives_a_stage_up_and_begins_no_other(tmp_path):
         pytest.fail("it went on")
 
     soon = kept(tmp_path)
+    soon.stages.expect({"first": stages.Work(100.0), "second": stages.Work(2.0)}, "a guess")
     assert soon.run("first", Found, slow) is None and soon.unreached == ["first"]
+    assert soon.stages.left() == ", about 2 s left"  # what is given up takes no time
