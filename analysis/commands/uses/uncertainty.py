@@ -100,7 +100,7 @@ def agreement(variance: Float[np.ndarray, "h w"], error: Float[np.ndarray, "h w"
     predicted, true = variance.ravel(), error.ravel()
     best = _left(true, true)
     return {
-        "rank_correlation": pd.Series(predicted).corr(pd.Series(true), method="spearman"),
+        "rank_correlation": float(pd.Series(predicted).corr(pd.Series(true), method="spearman")),
         "ause": float((_left(true, predicted) - best).mean()),
         "ause_random": float((1 - best).mean()),
     }
