@@ -24,13 +24,15 @@ MOST_RECORDED = 1 << 28
 class ViewSum:
     """The sum of the Hessians, or Gauss-Newton parts, of this process's views: an operator of `landscape` on their device.
 
-    count: of the first so many views alone; of all by default.
+    count: of the first so many views alone; of all by default.  coupled: see `SceneHessian`.
     spared: products of a view with a vector that were left out so far, because the vector moves no Gaussian that the view draws
     (on a CPU).
     """
 
-    def __init__(self, objective: SceneObjective, *, gauss_newton: bool = False, count: int | None = None):
-        self.objective, self.gauss_newton, self.count = objective, gauss_newton, count
+    def __init__(
+        self, objective: SceneObjective, *, gauss_newton: bool = False, count: int | None = None, coupled: bool = True
+    ):
+        self.objective, self.gauss_newton, self.count, self.coupled = objective, gauss_newton, count, coupled
         self.dim, self.dtype, self.blocks = objective.active.flat.numel(), objective.active.flat.dtype, objective.blocks
         self.spared = 0
 
@@ -42,7 +44,7 @@ class ViewSum:
                 columns = slice(start, start + VECTORS)
                 some = V[:, columns]
                 if view.affects(some):
-                    total[:, columns] += view.ggn(some) if self.gauss_newton else view.hvp(some)
+                    total[:, columns] += (view.ggn if self.gauss_newton else view.hvp)(some, self.coupled)
                 else:
                     self.spared += some.shape[1]
         return total
@@ -57,6 +59,7 @@ class SceneHessian:
     Of the Hessian, P leaves out the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and
     the SH directions that no view sees; of Gauss-Newton, all directions that no view sees.  keep_null: P = 1 instead.
     count: the part of H that the first so many views of each process contribute; by default all of it.
+    coupled: False for the diagonal of l'' in place of l'', without SSIM's coupling of pixels.
 
     views: H without P, summed over this process's views.  projector: P.
 
@@ -75,9 +78,10 @@ class SceneHessian:
         gauss_newton: bool = False,
         keep_null: bool = False,
         count: int | None = None,
+        coupled: bool = True,
     ):
         self.objective, self.gauss_newton, self.keep_null = objective, gauss_newton, keep_null
-        self.views = ViewSum(objective, gauss_newton=gauss_newton, count=count)
+        self.views = ViewSum(objective, gauss_newton=gauss_newton, count=count, coupled=coupled)
         self.dim, self.dtype, self.blocks = self.views.dim, self.views.dtype, self.views.blocks
 
     @cached_property
