@@ -13,8 +13,8 @@ from torch import Tensor
 
 from landscape.operators.operator import require_vectors
 from splat.backend.gpu.graphs import CudaGraphCache, CudaGraphs
-from splat.curvature.active_spaces import Projector, projector_of
 from splat.curvature.linearize import VECTORS
+from splat.curvature.null.active_spaces import Projector, projector_of
 from splat.curvature.objective import SceneObjective
 
 # bytes of workspace; beyond it a GPU takes longer for a view's product than its kernels take to launch
@@ -24,7 +24,8 @@ MOST_RECORDED = 1 << 28
 class ViewSum:
     """The sum of the Hessians, or Gauss-Newton parts, of this process's views: an operator of `landscape` on their device.
 
-    count: of the first so many views alone; of all by default.  coupled: see `SceneHessian`.
+    count: of the first so many views alone; of all by default.  coupled: False for the pixel-diagonal of the losses' l'' in
+    place of l'', without the coupling of pixels by SSIM.
     spared: products of a view with a vector that were left out so far, because the vector moves no Gaussian that the view draws
     (on a CPU).
     """
@@ -44,7 +45,8 @@ class ViewSum:
                 columns = slice(start, start + VECTORS)
                 some = V[:, columns]
                 if view.affects(some):
-                    total[:, columns] += (view.ggn if self.gauss_newton else view.hvp)(some, self.coupled)
+                    product = view.ggn if self.gauss_newton else view.hvp
+                    total[:, columns] += product(some, coupled=self.coupled)
                 else:
                     self.spared += some.shape[1]
         return total
@@ -59,7 +61,7 @@ class SceneHessian:
     Of the Hessian, P leaves out the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and
     the SH directions that no view sees; of Gauss-Newton, all directions that no view sees.  keep_null: P = 1 instead.
     count: the part of H that the first so many views of each process contribute; by default all of it.
-    coupled: False for the diagonal of l'' in place of l'', without SSIM's coupling of pixels.
+    coupled: see `ViewSum`.
 
     views: H without P, summed over this process's views.  projector: P.
 

@@ -125,13 +125,13 @@ class LinearizedView:
         """J^T G for cotangents of colour and accumulated alpha."""
         return self._pulled([self._raster.backward(self._raster.pad(g)) for g in G])
 
-    def hvp(self, U: Float[Tensor, "p k"], coupled: bool = True) -> Float[Tensor, "p k"]:
-        """H U of the view's loss; coupled: False for the diagonal of l'' in its place."""
+    def hvp(self, U: Float[Tensor, "p k"], *, coupled: bool = True) -> Float[Tensor, "p k"]:
+        """H U of the view's loss.  coupled: False for the pixel-diagonal of l'' in place of l''."""
         return self._projection.vjp(self._adjoint_tangent(U, coupled), U)
 
-    def ggn(self, U: Float[Tensor, "p k"], coupled: bool = True) -> Float[Tensor, "p k"]:
+    def ggn(self, U: Float[Tensor, "p k"], *, coupled: bool = True) -> Float[Tensor, "p k"]:
         """G U, the Gauss-Newton part of H U."""
-        cotangents = self._bent(self._tangent(U).planes, coupled)
+        cotangents = self._curved(self._tangent(U), coupled)
         return self._pulled([self._raster.backward(cotangent) for cotangent in cotangents])
 
     def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
@@ -175,16 +175,16 @@ class LinearizedView:
     def _adjoint_tangent(self, U: Float[Tensor, "p k"], coupled: bool) -> Float[Tensor, "n k 9"]:
         """The tangent of the splats' adjoint; all else that it takes is free again before the result is made."""
         tangent = self._tangent(U)
-        return tangent.backward_tangent(self._adjoint, self._bent(tangent.planes, coupled, tangent.planes))
+        return tangent.backward_tangent(self._adjoint, self._curved(tangent, coupled))
 
-    def _bent(self, V: Float[Tensor, "k 4 H W"], coupled: bool, out: Tensor | None = None) -> Float[Tensor, "k 4 H W"]:
-        """l'' V, or its diagonal's product with V, to out (which may be V)."""
-        if coupled or not self._couples:
-            return self._loss.hvp(V, out=out)
-        result = torch.empty_like(V) if out is None else out
-        torch.mul(V[:, :3], self._loss.diagonal, out=result[:, :3])
-        result[:, 3].zero_()
-        return result
+    def _curved(self, tangent: Tangent, coupled: bool) -> Float[Tensor, "k 4 H W"]:
+        """l'' of the image's tangents, which it takes the place of."""
+        planes = tangent.planes
+        if coupled:
+            return self._loss.hvp(planes, out=planes)
+        planes[:, :3] *= self._loss.diagonal
+        planes[:, 3] = 0
+        return planes
 
     def _pulled(self, adjoints: Sequence[Adjoint]) -> Float[Tensor, "p k"]:
         """P'^T of adjoints of the splats."""
