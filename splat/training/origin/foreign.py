@@ -152,9 +152,11 @@ def _used(path: Path, scene: Scene) -> set[str]:
 
 
 def _config(scene: Scene, found: SplatFile, preset: Preset) -> TrainConfig:
-    """3DGS, with the preset's renderer, on the scene's background."""
+    """3DGS, with the preset's renderer and loss, on the scene's background."""
     red, green, blue = scene.background.tolist()
-    return TrainConfig(iterations=max(1, found.step or 1), background=(red, green, blue), render=preset.render)
+    return TrainConfig(
+        iterations=max(1, found.step or 1), background=(red, green, blue), render=preset.render, loss=preset.loss
+    )
 
 
 def _worlds(preset: Preset, scene: Scene, path: Path) -> Sequence[Similarity | None]:
