@@ -41,11 +41,11 @@ class NewtonBlocksMethod(SecondOrderMethod[NewtonBlocks]):
     def propose(self, local: Local, damping: float) -> Proposal:
         columns = [local.metric.inverse(damping)(local.b)]
         if self.settings.momentum and self.last is not None and len(self.last) == len(local.mask) * local.each:
-            columns.append(local.in_unknowns(self.last))
+            columns.append(local.in_unknowns(self.last.to(local.b)))
         Y = torch.stack([column / norm(column) for column in columns if norm(column) > 0], dim=1)
         curvature, slope = gram(Y, product(local.A, Y)), gram(Y, local.b[:, None])[:, 0]
         c = minimum(curvature + damping * gram(Y, Y), slope)
-        return Proposal((Y @ c.to(Y)), float(slope @ c - c @ curvature @ c / 2))
+        return Proposal(Y @ c.to(Y), float(slope @ c - c @ curvature @ c / 2))
 
     def taken(self, before: Gaussians, after: Gaussians) -> None:
         self.last = after.flat - before.flat
