@@ -167,7 +167,9 @@ def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> t
         except UnicodeDecodeError as error:
             raise InputError(f"expected names of views, one in each line, in {ask.train_list}, got no text") from error
         listed = tuple(name.strip() for name in listed if name.strip())
-    foreign = Foreign(folder, ask.views, listed, ask.trained_by, ask.images, ask.downscale)
+    foreign = Foreign(
+        folder, ask.views, listed, ask.trained_by, ask.images, ask.downscale, antialiased=ask.antialiased or None
+    )
     checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
     scene = checkpoint.load_scene(path, folder)
     return checkpoint.thinned(scene, ask.max_views), scene
