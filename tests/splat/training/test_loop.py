@@ -43,8 +43,9 @@ def test_mip_splattings_filter_is_renewed_when_its_training_does_and_resumes(mon
     torch.testing.assert_close(widths, sampling_widths(training.gaussians, cameras))
     for done in train(training, views):
         now = training.gaussians.filter_widths
-        if now is not widths:
-            assert now is not None and torch.equal(now, sampling_widths(training.gaussians, cameras))
+        assert now is not None and widths is not None
+        if not torch.equal(now, widths):
+            torch.testing.assert_close(now, sampling_widths(training.gaussians, cameras))
             renewed.append(done.step)
         widths = now
         if done.step == 9:
