@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from time import perf_counter
 from types import TracebackType
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -16,7 +17,15 @@ from landscape.results import Progress as Report
 
 Stage = Callable[[str], AbstractContextManager[Report]]
 NOW_AND_THEN = 15.0  # seconds between lines off a terminal
-STRAYS = 4.0  # by which a plan may be wrong
+LONGER = 0.25  # of what a stage has taken, which it takes at least still: one may take more than it was expected to
+SETTLED = 1.0  # seconds after which the rate of a stage is believed
+
+
+class Work(NamedTuple):
+    """What a stage is expected to take: seconds, and the units of which its progress is told; 0: of different kinds."""
+
+    seconds: float
+    units: float = 0.0
 
 
 def pace(done: int, seconds: float) -> str:
@@ -33,13 +42,14 @@ def pace(done: int, seconds: float) -> str:
 class Stages:
     """A context manager; `stage(name)` is one too, and gives what the estimators call with their progress.
 
-    Without a console nothing is printed.  timing: seconds a stage, in the order run; plan: seconds that stages to come are
-    expected to take.
+    Without a console nothing is printed.  timing: seconds a stage, in the order run; plan: what stages to come are expected to
+    take.
     """
 
     def __init__(self, console: Console | None = None) -> None:
         self.timing: dict[str, float] = {}
-        self.plan: dict[str, float] = {}
+        self.plan: dict[str, Work] = {}
+        self._slower = 1.0  # the last rate seen, as time for a unit over that of the plan
         bars = console is not None and console.is_terminal
         self._whole, self._console = console, None if bars or console is None or console.quiet else console
         self._said = perf_counter()
@@ -74,7 +84,7 @@ class Stages:
 
         def report(done: int, most: int, state: str) -> None:
             spent = perf_counter() - start
-            words = f"{done} of at most {most}{pace(done, spent)}{self.left(name, spent)}"
+            words = f"{done} of at most {most}{pace(done, spent)}{self.left(name, spent, done)}"
             self._progress.update(task, completed=done, total=most, state=f"{words}; {state}")
             if perf_counter() - self._said > NOW_AND_THEN:
                 self._say(f"{name}: {words}")
@@ -83,7 +93,7 @@ class Stages:
         self.timing[name] = perf_counter() - start
         done = self._progress.tasks[task].completed or 1  # an estimator that is done early has used less than the most
         self._progress.update(task, completed=done, total=done)
-        left = self.left("", 0.0)
+        left = self.left()
         self._say(f"{name}: {self.timing[name]:.1f} s{left}")
 
     def known(self, name: str, seconds: float) -> None:
@@ -92,21 +102,30 @@ class Stages:
         self._progress.update(self._progress.add_task(name, total=1, state="kept from before"), completed=1)
         self._say(f"{name}: kept from before")
 
-    def left(self, name: str, spent: float) -> str:
-        """The time left for all in words, while this stage has taken so many seconds: at the pace of those that are done."""
-        to_come = {each: seconds for each, seconds in self.plan.items() if each not in self.timing}
-        if not to_come:
-            return ""
-        done = {each: seconds for each, seconds in self.plan.items() if each in self.timing}
-        pace = sum(self.timing[each] for each in done) / sum(done.values()) if done else 1.0
-        pace = min(max(pace, 1 / STRAYS), STRAYS)
-        return f", about {max(pace * sum(to_come.values()) - spent, 1.0):.0f} s left"
+    def left(self, name: str = "", spent: float = 0.0, done: float = 0.0) -> str:
+        """The time left for all in words, while a stage has done so many units in so many seconds.
 
-    def expect(self, plan: Mapping[str, float], because: str) -> None:
+        A stage goes on at its rate; those to come are as much slower than planned.  Empty for a stage without a plan.
+        """
+        if name and name not in self.plan:
+            return ""
+        to_come = sum(work.seconds for each, work in self.plan.items() if each not in self.timing and each != name)
+        own = 0.0
+        if name:
+            work = self.plan[name]
+            rest = work.seconds * self._slower - spent
+            if done and work.units and spent > SETTLED:
+                self._slower = spent / done * work.units / work.seconds
+                rest = (work.units - done) * spent / done
+            own = max(rest, LONGER * spent)
+        seconds = own + self._slower * to_come
+        return f", about {max(seconds, 1.0):.0f} s left" if seconds else ""
+
+    def expect(self, plan: Mapping[str, Work], because: str) -> None:
         """Say how long stages to come will take, and why."""
         self.plan = dict(plan)
         if self._whole is not None:
-            seconds = sum(plan.values())
+            seconds = sum(work.seconds for work in plan.values())
             self._whole.print(f"about {max(seconds, 1.0):.0f} s from here: {because}", highlight=False, soft_wrap=True)
 
     def _say(self, words: str) -> None:

@@ -39,9 +39,9 @@ from landscape.probes import spawn
 from landscape.results import Progress, finite_or_none
 from landscape.spectrum.families import WHOLE, Lead
 from landscape.traces.trace import total_trace
-from splat.curvature.active_spaces import active_spaces
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
+from splat.curvature.null.active_spaces import active_spaces
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import exact_traces
 from splat.training.state import Training

@@ -19,11 +19,12 @@ from analysis.records.provenance import Provenance, provenance
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
 from analysis.records.tables import NEEDS_DENSITY
 from landscape import EigenEnds, Eigenpairs, anisotropy, literal
-from landscape.results import Bracket
+from landscape.results import Bracket, finite_or_none
 from landscape.slices.slice import Slice as Grid
 from landscape.spectrum.quantiles import quantile
 from splat.backend.cpu.simd import lanes_of
 from splat.curvature.objective import ActiveCounts, SceneObjective
+from splat.curvature.scores.shares import BlockShare
 from splat.curvature.traces import curvature_scale
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
@@ -51,6 +52,7 @@ def probe_record(
         if found.finite is None
         else convert({**found.finite.record(), "direction": NAMES[0]}, schema.FiniteProbe),
         depth=found.depth,
+        block_shares=UNSET if found.shares is None else [_block_share(one) for one in found.shares],
         slice=None if found.plane is None else _slice(found.plane, found.ends.largest),
         counts=_counts(found, objective),
         checks=_checks(found),
@@ -137,6 +139,14 @@ def _trace(numbers: Mapping[str, Any]) -> schema.Trace:
     method = "exact, the coupling of pixels sampled with random signs" if numbers["probes"] else "exact"
     tau = curvature_scale(numbers["value"] or 0.0, numbers["dim"], 1, "active")
     return convert({**numbers, "tau": tau, "method": method}, schema.Trace)
+
+
+def _block_share(found: BlockShare) -> schema.BlockShare:
+    blocks, attributes, diagonal = map(finite_or_none, (found.blocks, found.attributes, found.diagonal))
+    return schema.BlockShare(
+        operator="gauss-newton" if found.gauss_newton else "hessian", coupled=found.coupled, blocks=blocks,
+        attributes=attributes, diagonal=diagonal, norm=found.norm, relative_error=found.error, samples=found.samples,
+    )  # fmt: skip
 
 
 def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalues:

@@ -25,6 +25,7 @@ class ProbeSettings:
     probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
         noise of a render.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
+    block_samples: of the share of H within the Gaussians' blocks; block_coupling: with SSIM's coupling of pixels, too.
     memory: GiB for the vectors of a basis.
     """
 
@@ -45,6 +46,8 @@ class ProbeSettings:
     depth: TraceSettings | None = field(default_factory=lambda: TraceSettings(rtol=0.05, max_probes=1024))
     depth_steps: tuple[float, ...] = DEPTH_STEPS
     noise_points: int = NOISE_POINTS
+    block_samples: int = 8
+    block_coupling: bool = True
     memory: float = 2.0
 
     def __post_init__(self) -> None:
@@ -73,4 +76,6 @@ class ProbeSettings:
             slice_plane=False,
             probe_steps=(),
             depth=None,
+            block_samples=4,
+            block_coupling=False,
         )

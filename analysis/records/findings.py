@@ -5,7 +5,7 @@ Every sentence follows from numbers of the record and their errors alone; where 
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -53,6 +53,7 @@ def findings(data: ProbeRecord) -> list[Line]:
         *_of_needles(ends.max.lives_on, data.counts),
         *_of_finite_probe(data.finite_probe),
         *_of_depth(data.depth),
+        *_of_block_shares(data.block_shares or []),
         *_of_counts(data.counts),
         *_of_skips(data.skipped),
         *of_slice(data.slice, data.provenance),
@@ -274,6 +275,19 @@ def _of_depth(depth: schema.Depth | None) -> list[Line]:
         text += f"{', '.join(parts)}. They changed the order of the splats in up to {crossed:.0%} of the renders"
         lines.append(Line(f"{text}, which derivatives do not see."))
     return lines
+
+
+def _of_block_shares(shares: Sequence[schema.BlockShare]) -> list[Line]:
+    """What methods assume that keep the Gaussians' own blocks, or the diagonal, of an operator."""
+    names, parts = {"hessian": "the Hessian", "gauss-newton": "Gauss-Newton"}, []
+    for one in shares:
+        if one.blocks is not None and one.diagonal is not None:
+            share = f"{measured(100 * one.blocks, 100 * one.blocks * one.relative_error)}% ({one.diagonal:.0%} on the diagonal)"
+            parts.append(
+                f"of {names[one.operator]}{'' if one.coupled else ' without the coupling of pixels by SSIM'} {share}"
+            )
+    text = "Of the sum of all squared entries, this lies within the Gaussians' own blocks (11 x 11, and the diagonal of SH): "
+    return [Line(f"{text}{', '.join(parts)}.")] if parts else []
 
 
 def _of_skips(skipped: Mapping[str, Skip]) -> list[Line]:

@@ -120,6 +120,7 @@ class ProbeRecord(Struct, kw_only=True):
     quantiles: dict[str, schema.Index] | None = None
     finite_probe: schema.FiniteProbe | None = None
     depth: schema.Depth | None = None
+    block_shares: Maybe[list[schema.BlockShare]] = UNSET
     slice: schema.Slice | None = None
     counts: Counts
     checks: dict[str, Check]

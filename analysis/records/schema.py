@@ -233,6 +233,24 @@ class Depth(Struct, kw_only=True):
     rises: list[Rise]
 
 
+class BlockShare(Struct, kw_only=True):
+    """Which share of an operator's squared entries lies within Gaussians' own blocks (`splat.curvature.scores.shares`).
+
+    coupled: with SSIM's coupling of pixels.  blocks, attributes, diagonal: the share within the 11 x 11 of geometry and the
+    diagonal of SH, within the attributes' blocks of these, and on the diagonal; None where the operator is 0.  norm: squared.
+    relative_error: the standard error of the norm, and of each share, over it.  samples: random vectors.
+    """
+
+    operator: Operator
+    coupled: bool
+    blocks: Number
+    attributes: Number
+    diagonal: Number
+    norm: float
+    relative_error: float
+    samples: Count
+
+
 class Family(Struct, kw_only=True):
     """The anisotropy of one diagonal block of one operator (`analysis.measures.families`).
 

@@ -1,7 +1,7 @@
 """A record as tables: of a probe, for the terminal, and of its anisotropy families, for the terminal and the report."""
 
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from rich.table import Table
 from analysis.records.findings import attribute_name, is_open
 from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
 from analysis.records.records import Check, Counts, ProbeRecord
-from analysis.records.schema import INDICES, Depth, Effect, End, Family, Index, Number
+from analysis.records.schema import INDICES, BlockShare, Depth, Effect, End, Family, Index, Number
 
 ENDS = {
     "max": "largest eigenvalue",
@@ -40,6 +40,8 @@ def probe_table(data: ProbeRecord, width: int = 80) -> Table:
         *((name.replace("_", " "), *_index(index)) for name, index in data.anisotropy.items() if _measured(index)),
         None,
         *_depth_rows(data.depth),
+        None,
+        *_share_rows(data.block_shares or []),
         None,
         *_count_rows(data.counts),
         None,
@@ -134,6 +136,15 @@ def _depth_rows(depth: Depth | None) -> Iterator[Row]:
     for row in depth.rises:
         rises = f"{measured(row.depth, row.depth_error)} over {measured(row.lateral, row.lateral_error)}"
         yield f"depth / lateral rise, {row.pixels:g} px", measured(row.ratio, row.ratio_error), rises
+
+
+def _share_rows(shares: Iterable[BlockShare]) -> Iterator[Row]:
+    """Of the operators' squared entries."""
+    for one in shares:
+        coupling = "" if one.coupled else ", no coupling"
+        about = f"attributes' blocks {quantity(one.attributes)}, diagonal {quantity(one.diagonal)}"
+        error = None if one.blocks is None else one.blocks * one.relative_error
+        yield f"in blocks: {OPERATOR_NAMES[one.operator]}{coupling}", measured(one.blocks, error), about
 
 
 def _index(index: Index) -> tuple[str, str]:

@@ -15,6 +15,7 @@ NAMED = 12  # views in the first line
 HOW_IT_STARTS: dict[Source, str] = {
     "points": "the scene's points",
     "triangulated": "points triangulated in the training views",
+    "dense": "a plane sweep over the training views",
     "random": "random points",
     "box": "random points in the box of the scene's points",
 }

@@ -4,7 +4,8 @@
 
 Both axes are known at every coordinate, so that nothing is interpolated there.  a = d2f/dxdy at the centre; with it value,
 gradient and Hessian at the centre are those of f, whatever r is.  A smooth f has a smooth r, known wherever f is known off the
-axes; between these places r is a thin-plate spline (Duchon 1977).  Where a is not known, r(0, 0) is left free.
+axes; between these places r is the cubic spline sum_i c_i |p - p_i|^3 with a linear part (Duchon 1977).  Where a is not known,
+r(0, 0) is left free.
 
 The error of the interpolant is judged by its predictions at n points drawn at random from those that it does not know:
 
@@ -18,20 +19,23 @@ from math import inf
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
+from scipy.spatial.distance import cdist
 
 CONFIDENCE = 0.95
 TAIL = 0.25  # share of the errors that the tail is fitted to
 FEWEST_NODES = 4  # of a spline
+DIGITS = 9  # of distances: points that are as far but for round-off are taken in the order of their numbers
 
 
 class PlaneInterpolant:
     """The interpolant on a grid x times y that has 0 in both.  Points are numbered as in the flattened grid.
 
-    axes: the points of both axes.  coarse: the corners, the middles of the sides and of the halves.  mixed: a.
+    axes: the points of both axes.  mixed: a.
 
     >>> x = np.linspace(-1, 1, 9)
     >>> grid, f = PlaneInterpolant(x, x, mixed=0.5), (x[:, None] ** 2 + x * x[:, None] * (0.5 + x)).ravel()
-    >>> known = np.isin(np.arange(81), np.concatenate([grid.axes, grid.coarse]))
+    >>> known = np.isin(np.arange(81), grid.axes)
+    >>> known[grid.farthest(known, 16)] = True
     >>> int(known.sum()), float(abs(grid(np.where(known, f, np.nan)) - f).max()) < 1e-14
     (33, True)
     """
@@ -41,7 +45,20 @@ class PlaneInterpolant:
         self._i, self._j = (int(np.flatnonzero(axis == 0)[0]) for axis in (x, y))
         number = np.arange(len(x) * len(y)).reshape(len(x), len(y))
         self.axes = np.unique(np.concatenate([number[:, self._j], number[self._i]]))
-        self.coarse = number[np.ix_(_halves(self._i, len(x)), _halves(self._j, len(y)))].ravel()
+        places = np.meshgrid(*(axis / np.abs(axis).max() for axis in (x, y)), indexing="ij")
+        self._places = np.stack(places, axis=-1).reshape(-1, 2)
+
+    def farthest(self, known: np.ndarray, count: int) -> np.ndarray:
+        """Points that are each as far as can be from the known ones and from those before it; known: [points], not empty.
+
+        From the axes alone: the corners, then the middles of the quarters, ...
+        """
+        distances, found = cdist(self._places, self._places[known]).min(axis=1), []
+        for _ in range(min(count, int((~known).sum()))):
+            found.append(int(distances.round(DIGITS).argmax()))
+            step = np.hypot(*(self._places - self._places[found[-1]]).T)
+            distances = np.minimum(distances, step)
+        return np.array(found, int)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """At all points, from values [points] that are nan where not known.  nan where the axes have no finite value."""
@@ -54,19 +71,14 @@ class PlaneInterpolant:
 
     def _spline(self, r: np.ndarray) -> np.ndarray:
         """r everywhere, from where it is finite; 0 where it is known nowhere."""
-        places = np.stack(np.meshgrid(*(t / np.abs(t).max() for t in (self._x, self._y)), indexing="ij"), axis=-1)
         known = np.isfinite(r)
         known[self._i, :] = known[:, self._j] = False  # 0 / 0
         if self._mixed is not None:
             r[self._i, self._j], known[self._i, self._j] = 0.0, True
         if known.sum() < FEWEST_NODES:
             return np.zeros_like(r)
-        return RBFInterpolator(places[known], r[known])(places.reshape(-1, 2)).reshape(r.shape)
-
-
-def _halves(centre: int, n: int) -> list[int]:
-    """The ends of an axis and the middles between these and the centre."""
-    return sorted({0, centre // 2, (centre + n) // 2, n - 1} - {centre})
+        spline = RBFInterpolator(self._places[known.ravel()], r[known], kernel="cubic")
+        return spline(self._places).reshape(r.shape)
 
 
 def share_beyond(judged: int, looks: int) -> float:

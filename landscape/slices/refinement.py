@@ -1,13 +1,13 @@
-"""Choice of the points at which a slice is evaluated: both axes, then random points until those before them predict them well.
+"""Choice of the points at which a slice is evaluated: both axes, then points that fill the plane until they predict the others.
 
     axes        every point: nothing is interpolated along a line, nor along the two sections of a plane
-    coarse      16 points that reach the corners of the plane (`interpolation`)
+    fill        the points farthest from all that are known: COARSE at first, then half as many as are known beside the axes
     hold out    predict random points that are not known, then evaluate them; from then on the interpolant has them too.  If the
-                bound of the error that follows is within tolerance * range, the slice is done; else twice as many are held out
+                bound of the error that follows is within tolerance * range, the slice is done; else fill again
 
-So each point is judged before it is used, and the errors of the last hold-out are those of an interpolant with about half the
-points of the final one.  A plane whose bound is not within the tolerance when a budget ends is not resolved: its points are
-those that were evaluated.  Decisions are made once a hold-out, so that the result does not depend on the number of workers.
+The errors of the last hold-out are those of an interpolant without its points, so that the final one is better.  A plane whose
+bound is not within the tolerance when a budget ends is not resolved: its points are those that were evaluated.  Decisions are
+made once a hold-out, so that the result does not depend on the number of workers.
 """
 
 from dataclasses import dataclass
@@ -22,14 +22,16 @@ from landscape.results import StopReason
 from landscape.slices.grid_evaluations import GridEvaluations
 from landscape.slices.interpolation import PlaneInterpolant, error_bound
 
+COARSE = 16  # points
+
 
 @dataclass(frozen=True)
 class SliceSettings:
     """Which points of a plane are evaluated; the others are interpolated.
 
     tolerance: of the interpolation, as a share of the range of the values; None: every point is evaluated.
-    holdout: random points of the first hold-out.  From 64 of which the largest error is within the tolerance follows, with
-        97.5% confidence, that at most 5.6% of the others are not; the bound extrapolates to all.
+    holdout: random points of a hold-out.  From 64 of which the largest error is within the tolerance follows, with 97.5%
+        confidence, that at most 5.6% of the others are not; the bound extrapolates to all.
     workers: threads that evaluate.
     max_evaluations, max_seconds: budgets for what comes after the axes, which are always evaluated.  max_evaluations counts
         these and the one at the centre, and those of a store; time counts from the call.  Allowed only with a tolerance.
@@ -71,22 +73,22 @@ def evaluate_adaptively(
 ) -> Refined:
     """Evaluate points until the others are known to within the tolerance."""
     assert settings.tolerance is not None
-    begun, errors, looks, size = monotonic(), np.empty(0), 0, settings.holdout
+    begun, errors, looks, fill = monotonic(), np.empty(0), 0, COARSE
     evaluations.require(grid.axes)
-    coarse = grid.coarse
-    while not evaluations.known.all():
-        drawn = np.concatenate([coarse, _draw(evaluations.known, coarse, size, generator)])
-        if reason := _spent(evaluations, settings, len(drawn), monotonic() - begun):
+    while not (known := evaluations.known).all():
+        filling = grid.farthest(known, fill)
+        drawn = _draw(known, filling, settings.holdout, generator)
+        if reason := _spent(evaluations, settings, len(filling) + len(drawn), monotonic() - begun):
             return Refined(evaluations.value, errors, looks, reason)
-        evaluations.require(coarse)
-        drawn, coarse = drawn[len(coarse) :], coarse[:0]
+        evaluations.require(filling)
         predicted = grid(evaluations.value)[drawn]
         evaluations.require(drawn)
-        errors, looks, size = np.abs(predicted - evaluations.value[drawn]), looks + 1, 2 * len(drawn)
+        errors, looks = np.abs(predicted - evaluations.value[drawn]), looks + 1
+        fill = int(known.sum() - len(grid.axes)) // 2
         errors[~np.isfinite(errors)] = inf
-        bound = error_bound(errors, int((~evaluations.known).sum()), looks)
-        if bound <= settings.tolerance * value_range(evaluations.value) and not evaluations.known.all():
-            values = np.where(evaluations.known, evaluations.value, grid(evaluations.value))
+        bound = error_bound(errors, int((~known).sum()), looks)
+        if bound <= settings.tolerance * value_range(evaluations.value) and not known.all():
+            values = np.where(known, evaluations.value, grid(evaluations.value))
             return Refined(values, errors, looks, "tolerance")
     return Refined(evaluations.value, np.empty(0), looks, "exact")
 

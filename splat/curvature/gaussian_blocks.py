@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
@@ -22,6 +23,24 @@ class PerGaussianBlocks(Brief):
 
     def __add__(self, other: "PerGaussianBlocks") -> "PerGaussianBlocks":
         return PerGaussianBlocks(self.geometry + other.geometry, self.sh + other.sh)
+
+    def apply(self, V: Float[Tensor, "p k"], gaussians: Gaussians) -> Float[Tensor, "p k"]:
+        """B V of vectors over the parameters of these Gaussians."""
+        rows, result = gaussians.blocks, torch.empty_like(V)
+        n, vectors = len(gaussians), V.shape[1]
+        parts = [V[rows[name]].view(n, -1, vectors) for name in GEOMETRY_COLUMNS]
+        found = self.geometry.to(V) @ torch.cat(parts, dim=1)
+        for name, columns in GEOMETRY_COLUMNS.items():
+            result[rows[name]] = found[:, columns].reshape(-1, vectors)
+        result[rows["sh"]] = self.sh.to(V).reshape(-1, 1) * V[rows["sh"]]
+        return result
+
+    def across(self, quats: Float[Tensor, "n 4"]) -> "PerGaussianBlocks":
+        """P B P, where P projects out the unit quats."""
+        q = self.geometry.new_zeros(len(quats), 11, 1)
+        q[:, GEOMETRY_COLUMNS["quats"], 0] = quats.to(q)
+        half = self.geometry - q @ (q.mT @ self.geometry)
+        return PerGaussianBlocks(half - (half @ q) @ q.mT, self.sh)
 
     def traces(self, quats: Float[Tensor, "n 4"] | None = None, scale: Gaussians | None = None) -> dict[str, float]:
         """Trace of each attribute's block, summed in double precision.

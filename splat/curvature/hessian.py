@@ -13,8 +13,8 @@ from torch import Tensor
 
 from landscape.operators.operator import require_vectors
 from splat.backend.gpu.graphs import CudaGraphCache, CudaGraphs
-from splat.curvature.active_spaces import Projector, projector_of
 from splat.curvature.linearize import VECTORS
+from splat.curvature.null.active_spaces import Projector, projector_of
 from splat.curvature.objective import SceneObjective
 
 # bytes of workspace; beyond it a GPU takes longer for a view's product than its kernels take to launch
@@ -24,13 +24,16 @@ MOST_RECORDED = 1 << 28
 class ViewSum:
     """The sum of the Hessians, or Gauss-Newton parts, of this process's views: an operator of `landscape` on their device.
 
-    count: of the first so many views alone; of all by default.
+    count: of the first so many views alone; of all by default.  coupled: False for the pixel-diagonal of the losses' l'' in
+    place of l'', without the coupling of pixels by SSIM.
     spared: products of a view with a vector that were left out so far, because the vector moves no Gaussian that the view draws
     (on a CPU).
     """
 
-    def __init__(self, objective: SceneObjective, *, gauss_newton: bool = False, count: int | None = None):
-        self.objective, self.gauss_newton, self.count = objective, gauss_newton, count
+    def __init__(
+        self, objective: SceneObjective, *, gauss_newton: bool = False, count: int | None = None, coupled: bool = True
+    ):
+        self.objective, self.gauss_newton, self.count, self.coupled = objective, gauss_newton, count, coupled
         self.dim, self.dtype, self.blocks = objective.active.flat.numel(), objective.active.flat.dtype, objective.blocks
         self.spared = 0
 
@@ -42,7 +45,8 @@ class ViewSum:
                 columns = slice(start, start + VECTORS)
                 some = V[:, columns]
                 if view.affects(some):
-                    total[:, columns] += view.ggn(some) if self.gauss_newton else view.hvp(some)
+                    product = view.ggn if self.gauss_newton else view.hvp
+                    total[:, columns] += product(some, coupled=self.coupled)
                 else:
                     self.spared += some.shape[1]
         return total

@@ -125,13 +125,13 @@ class LinearizedView:
         """J^T G for cotangents of colour and accumulated alpha."""
         return self._pulled([self._raster.backward(self._raster.pad(g)) for g in G])
 
-    def hvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-        """H U of the view's loss."""
-        return self._projection.vjp(self._adjoint_tangent(U), U)
+    def hvp(self, U: Float[Tensor, "p k"], *, coupled: bool = True) -> Float[Tensor, "p k"]:
+        """H U of the view's loss.  coupled: False for the pixel-diagonal of l'' in place of l''."""
+        return self._projection.vjp(self._adjoint_tangent(U, coupled), U)
 
-    def ggn(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+    def ggn(self, U: Float[Tensor, "p k"], *, coupled: bool = True) -> Float[Tensor, "p k"]:
         """G U, the Gauss-Newton part of H U."""
-        cotangents = self._loss.hvp(self._tangent(U).planes)
+        cotangents = self._curved(self._tangent(U), coupled)
         return self._pulled([self._raster.backward(cotangent) for cotangent in cotangents])
 
     def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
@@ -172,10 +172,19 @@ class LinearizedView:
     def _tangent(self, U: Float[Tensor, "p k"]) -> Tangent:
         return self._raster.jvp(self._projection.jvp(U))
 
-    def _adjoint_tangent(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "n k 9"]:
+    def _adjoint_tangent(self, U: Float[Tensor, "p k"], coupled: bool) -> Float[Tensor, "n k 9"]:
         """The tangent of the splats' adjoint; all else that it takes is free again before the result is made."""
         tangent = self._tangent(U)
-        return tangent.backward_tangent(self._adjoint, self._loss.hvp(tangent.planes, out=tangent.planes))
+        return tangent.backward_tangent(self._adjoint, self._curved(tangent, coupled))
+
+    def _curved(self, tangent: Tangent, coupled: bool) -> Float[Tensor, "k 4 H W"]:
+        """l'' of the image's tangents, which it takes the place of."""
+        planes = tangent.planes
+        if coupled:
+            return self._loss.hvp(planes, out=planes)
+        planes[:, :3] *= self._loss.diagonal
+        planes[:, 3] = 0
+        return planes
 
     def _pulled(self, adjoints: Sequence[Adjoint]) -> Float[Tensor, "p k"]:
         """P'^T of adjoints of the splats."""

@@ -214,9 +214,22 @@ class SceneObjective:
 
         approximate: with the diagonal of the loss's l'' in place of l'', without the coupling of pixels by SSIM.
         """
-        parts = (view.block_diagonal(gauss_newton=gauss_newton, approximate=approximate) for view in self.linearized)
-        total = reduce(add, parts)
-        return PerGaussianBlocks(self.mean_over_views(total.geometry), self.mean_over_views(total.sh))
+        return self.block_diagonals(approximate=approximate, parts=(gauss_newton,))[0]
+
+    def block_diagonals(
+        self, *, approximate: bool = False, parts: Sequence[bool] = (False, True)
+    ) -> list[PerGaussianBlocks]:
+        """`block_diagonal` of several parts at once; parts: which are Gauss-Newton."""
+        views = (view.block_diagonals(approximate=approximate, parts=parts) for view in self.linearized)
+        totals = reduce(lambda one, other: list(map(add, one, other)), views)
+        return [
+            PerGaussianBlocks(self.mean_over_views(each.geometry), self.mean_over_views(each.sh)) for each in totals
+        ]
+
+    @cached_property
+    def exact_blocks(self) -> list[PerGaussianBlocks]:
+        """The blocks of the Hessian and of its Gauss-Newton part."""
+        return self.block_diagonals()
 
     @cached_property
     def approximate_blocks(self) -> tuple[PerGaussianBlocks, PerGaussianBlocks | None]:

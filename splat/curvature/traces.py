@@ -87,7 +87,7 @@ def exact_traces(
 
 def block_traces(objective: SceneObjective) -> dict[str, TraceEstimate]:
     """The same traces without a sample: sums over the Gaussians' exact own blocks, which only a CPU has."""
-    found = objective.block_diagonal().traces(objective.active.quats)
+    found = objective.exact_blocks[0].traces(objective.active.quats)
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
     return {

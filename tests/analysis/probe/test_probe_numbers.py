@@ -10,6 +10,8 @@ from rich.console import Console
 
 from analysis.measures.depth import STEPS, depth_split
 from analysis.probe.record import literal_index
+from analysis.records.findings import findings
+from analysis.records.quantities import measured
 from analysis.records.tables import probe_table
 from landscape import DenseOperator, EigenSettings, PowerSettings, extreme_eigenpairs, power_ends
 
@@ -165,3 +167,23 @@ def test_quantiles_ascend_and_hold_those_of_the_dense_spectrum(record, dense):
         high = math.inf if entry.high is None else entry.high
         held += low - rounding(H) <= at <= high + rounding(H)
     assert held == 7
+
+
+def test_the_share_within_gaussians_blocks_is_that_of_the_dense_hessian(record, dense):
+    objective, H, _, _ = dense
+    found = record.data.block_shares
+    assert [(one.operator, one.coupled) for one in found] == [
+        ("hessian", True),
+        ("gauss-newton", True),
+        ("hessian", False),
+        ("gauss-newton", False),
+    ]
+    inside = torch.eye(len(H), dtype=torch.bool)
+    names = [name for name in ATTRIBUTES if name != "sh"]
+    index = [torch.arange(len(H))[objective.blocks[name]].view(len(objective.active), -1) for name in names]
+    for own in torch.cat(index, dim=1):
+        inside[own[:, None], own] = True
+    share = float(H[inside].square().sum() / H.square().sum())
+    assert abs(found[0].blocks - share) < 5 * share * found[0].relative_error and found[0].relative_error < 0.1
+    said = " ".join(line.text for line in findings(record.data))
+    assert f"of the Hessian {measured(100 * found[0].blocks, 100 * found[0].blocks * found[0].relative_error)}%" in said

@@ -17,7 +17,7 @@ from analysis.commands.cli import main
 from analysis.records.records import read_record
 from analysis.train.command import planned
 from analysis.train.options import TrainOptions
-from analysis.train.remarks import _not_reached, poor_start
+from analysis.train.remarks import HOW_IT_STARTS, HOW_TO_START, _not_reached, poor_start
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -89,6 +89,7 @@ def test_frames_without_an_image_and_a_poor_start_are_said(original, tmp_path, c
     assert "random points, of which most lie on no surface" in capsys.readouterr().err
     sources: tuple[Source, ...] = get_args(Source)
     assert all(poor_start(load_scene(scene), source, 2) for source in sources)
+    assert set(HOW_IT_STARTS) == set(HOW_TO_START) == set(sources) - {"scene"}
     assert train(scene, tmp_path / "run", "--iterations", "2", "--resume") == 2  # the same scene, but other settings
     assert "iterations = 1" in capsys.readouterr().err
 

@@ -7,8 +7,9 @@ X, Y = np.linspace(-1, 1, 21), np.concatenate([np.linspace(-0.3, 0, 7), np.geoms
 
 
 def known(grid, values, more=()):
-    """The values on the axes, at the coarse points and at some more; nan elsewhere."""
-    at = np.isin(np.arange(values.size), np.concatenate([grid.axes, grid.coarse, more]))
+    """The values on the axes, at the 16 points farthest from these, and at some more; nan elsewhere."""
+    at = np.isin(np.arange(values.size), grid.axes)
+    at[np.concatenate([grid.farthest(at, 16), more]).astype(int)] = True
     return np.where(at, values, np.nan)
 
 
@@ -20,6 +21,16 @@ def test_on_the_axes_and_where_it_is_known_the_interpolant_is_the_function():
     assert at.reshape(21, 19)[10].all() and at.reshape(21, 19)[:, 6].all() and at.sum() == 21 + 18 + 16 + 2
     # round-off, as the solve of the spline amplifies it
     assert abs(found - values)[at].max() < 1e-11 and np.isfinite(found).all()
+
+
+def test_the_farthest_points_fill_the_plane_from_its_corners_inwards():
+    grid = PlaneInterpolant(np.linspace(-2, 2, 9), np.linspace(-1, 1, 9))
+    known = np.isin(np.arange(81), grid.axes)
+    assert sorted(grid.farthest(known, 4)) == [0, 8, 72, 80]
+    found = grid.farthest(known, 100)  # all there are, each once
+    assert len(found) == 64 and set(found) == set(np.flatnonzero(~known))
+    gaps = [grid.farthest(np.isin(np.arange(81), [*grid.axes, *found[:n]]), 1)[0] for n in range(64)]
+    assert gaps == list(found)  # as one by one
 
 
 @pytest.mark.parametrize("step", [1e-2, 1e-4])
@@ -35,7 +46,7 @@ def test_its_hessian_at_the_centre_is_the_functions(step):
     assert abs(mixed - 1) < 20 * step
 
 
-def test_without_the_hessian_a_product_is_found_from_the_coarse_points():
+def test_without_the_hessian_a_product_is_found_from_points_off_the_axes():
     values = (np.add.outer(X**3, abs(Y)) + 2 * np.outer(X, Y) + np.outer(X**2, Y)).ravel()
     grid = PlaneInterpolant(X, Y)
     assert abs(grid(known(grid, values)) - values).max() < 1e-12
@@ -44,7 +55,7 @@ def test_without_the_hessian_a_product_is_found_from_the_coarse_points():
 def test_values_that_are_not_finite_leave_the_others_as_they_are():
     values = np.outer(X**2, Y).ravel()
     grid = PlaneInterpolant(X, Y, mixed=0.0)
-    values[grid.coarse[5]] = np.inf
+    values[0] = np.inf  # a corner
     others = np.isfinite(values)
     assert abs(grid(known(grid, values)) - values)[others].max() < 1e-12
 

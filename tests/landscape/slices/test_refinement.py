@@ -62,14 +62,14 @@ def errors(loss, found):
     return (found.loss - true).abs() / (true.max() - true.min())
 
 
-@pytest.mark.parametrize(("loss", "tolerance", "share"), [(bowl, 0.01, 0.1), (valley, 0.01, 0.1), (crease, 0.05, 0.4)])
+@pytest.mark.parametrize(("loss", "tolerance", "share"), [(bowl, 0.01, 0.1), (valley, 0.01, 0.1), (crease, 0.05, 0.2)])
 def test_the_slice_takes_few_evaluations_and_is_as_good_as_asked_for(loss, tolerance, share):
     found = sliced(loss, tolerance=tolerance)
     off = errors(loss, found)
     assert found.reason == "tolerance" and found.resolved and found.tolerance == tolerance >= found.interpolation_error
     assert found.evaluations == 1 + int(found.evaluated.sum()) <= share * 41**2
     assert off.max() <= tolerance and found.error_seen <= found.interpolation_error
-    assert found.holdout.numel() == 64 * 2 ** (found.looks - 1)
+    assert found.holdout.numel() == 64
 
 
 @pytest.mark.parametrize("loss", [valley, crease, noise])
@@ -95,7 +95,8 @@ def test_a_parabola_costs_the_axes_the_coarse_points_and_the_hold_out():
 def test_any_number_of_points_a_side_works(side):
     axes = (symmetric_axis(2.0, side), symmetric_axis(1.0, 2 * side + 1) ** 3)
     found = sliced(bowl, axes=axes)
-    assert errors(bowl, found).max() < 1e-12 and found.loss.shape == (side, 2 * side + 1) and found.resolved
+    # round-off, as the solve of the spline amplifies it
+    assert errors(bowl, found).max() < 1e-11 and found.loss.shape == (side, 2 * side + 1) and found.resolved
 
 
 def test_the_centre_may_lie_anywhere_on_its_axes():
@@ -126,7 +127,7 @@ def test_the_same_seed_gives_the_same_slice_whatever_the_number_of_workers():
     assert torch.equal(one.holdout, four.holdout) and not torch.equal(one.evaluated, other.evaluated)
 
 
-@pytest.mark.parametrize("most", [1, 160, 161, 289, 290, 1000])
+@pytest.mark.parametrize("most", [1, 160, 161, 265, 266, 1000])
 def test_beyond_the_axes_no_more_evaluations_are_made_than_allowed(most):
     calls = []
 
@@ -137,7 +138,7 @@ def test_beyond_the_axes_no_more_evaluations_are_made_than_allowed(most):
     found = sliced(rough, max_evaluations=most)
     assert len(calls) == found.evaluations <= max(most, 82) and found.reason == "evaluation budget"
     assert found.interpolation_error > 0.1 and not found.resolved and found.loss[~found.evaluated].isnan().all()
-    assert found.looks == (most > 161) + (most > 289) + (most > 545)
+    assert found.looks == (most > 161) + (most > 265) + (most > 421) + (most > 655)
 
 
 def test_of_noise_every_point_is_evaluated():

@@ -7,8 +7,8 @@ import torch
 
 from analysis.measures.units import optimiser_units
 from landscape import ScaledOperator, families
-from splat.curvature.active_spaces import active_spaces
 from splat.curvature.hessian import SceneHessian
+from splat.curvature.null.active_spaces import active_spaces
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.training.state import LearningRates

@@ -17,9 +17,9 @@ from landscape.results import Bracket
 from landscape.spectrum.anisotropy import mass_quantile
 from landscape.spectrum.density import SETTLED, ActiveSpace, spectral_density
 from landscape.spectrum.quantiles import absolute_quantile, quantile
-from splat.curvature.active_spaces import projector_of
 from splat.curvature.hessian import SceneHessian
-from splat.curvature.null_space import CHUNK, TOLERANCE, RowSpace, _row_space, seen_colours, seen_parameters
+from splat.curvature.null.active_spaces import projector_of
+from splat.curvature.null.null_space import CHUNK, TOLERANCE, RowSpace, _row_space, seen_colours, seen_parameters
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from landscape.spectrum.density import ActiveSpace
 from landscape.spectrum.families import WHOLE
-from splat.curvature.null_space import RowSpace, seen_colours, seen_parameters
+from splat.curvature.null.null_space import RowSpace, seen_colours, seen_parameters
 from splat.curvature.objective import SceneObjective
 
 
