@@ -13,7 +13,7 @@ Every estimator returns a frozen dataclass: each number with its error, and the 
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from math import isfinite
+from math import isfinite, sqrt
 from pathlib import Path
 from textwrap import fill
 from typing import Any, Literal
@@ -95,6 +95,25 @@ def standard_deviation(samples: Float64[Tensor, "s *shape"]) -> Float64[Tensor, 
     """The standard deviation along the first axis; in units of the largest sample, as squares may leave the range of floats."""
     unit = float(samples.abs().max()) or 1.0
     return unit * (samples / unit).std(dim=0)
+
+
+def sampling_error(terms: Float64[Tensor, " m"], population: int) -> Number:
+    """Standard error of the mean of m terms as that of all `population` of which they are, had they been drawn at random.
+
+    s sqrt(1/m - 1/M), with the terms' standard deviation s, which errors of their own make larger; 0 where they are all,
+    None of a single one.
+
+    >>> import torch
+    >>> terms = torch.tensor([1.0, 3.0], dtype=torch.float64)
+    >>> sampling_error(terms, 2), sampling_error(terms, 4), sampling_error(terms[:1], 4)
+    (0.0, 0.7071067811865476, None)
+    """
+    m = len(terms)
+    if m >= population:
+        return 0.0
+    if m < 2:
+        return None
+    return float(standard_deviation(terms)) * sqrt(1 / m - 1 / population)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from rich.console import Console
 
 from analysis.bench.options import BenchOptions
 from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions, ViewOptions
+from analysis.commands.uses.options import NextViewOptions, PruneOptions
 from analysis.console.failures import report
 from analysis.console.interruption import ignored, raising
 from analysis.probe.options import ProbeOptions
@@ -36,6 +37,8 @@ COMMANDS = {
     "slice": SliceOptions,
     "map": MapOptions,
     "view": ViewOptions,
+    "prune": PruneOptions,
+    "next-view": NextViewOptions,
     "compare": CompareOptions,
     "claims": ClaimsOptions,
     "convert": ConvertOptions,
@@ -51,6 +54,8 @@ Options = (
     | SliceOptions
     | MapOptions
     | ViewOptions
+    | PruneOptions
+    | NextViewOptions
     | CompareOptions
     | ClaimsOptions
     | ConvertOptions
@@ -153,7 +158,9 @@ def at_files(options: Options) -> Options:
 
 def run(options: Options, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand."""
-    if isinstance(options, TrainOptions | ProbeOptions | SliceOptions | MapOptions | DemoOptions):
+    if isinstance(
+        options, TrainOptions | ProbeOptions | SliceOptions | MapOptions | PruneOptions | NextViewOptions | DemoOptions
+    ):
         from analysis.commands.compiling import compiling_is_said
 
         with compiling_is_said(Console(stderr=True)):
@@ -197,6 +204,18 @@ def _run(options: Options, arguments: Sequence[str]) -> int:
             from analysis.commands.view import run_view
 
             return run_view(options)
+        case PruneOptions():
+            from analysis.commands.uses.prune import run_prune
+
+            return run_prune(options, ["landscape", *arguments])
+        case NextViewOptions() if options.checkpoint.suffix == ".toml":
+            from analysis.commands.uses.study import run_study
+
+            return run_study(options.checkpoint)
+        case NextViewOptions():
+            from analysis.commands.uses.next_view import run_next_view
+
+            return run_next_view(options, ["landscape", *arguments])
         case TrajectoryOptions():
             from analysis.runs.trajectories import run_trajectory
 

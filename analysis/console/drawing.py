@@ -32,6 +32,14 @@ def draw(module: str, target: Path, *options: str) -> list[str]:
         return _said(process)
 
 
+def draw_or_say(module: str, target: Path) -> list[str]:
+    """As `draw`; where it fails, with its words: the numbers stand without pictures."""
+    try:
+        return draw(module, target)
+    except RuntimeError as error:
+        return [" ".join(str(error).split())]
+
+
 @contextmanager
 def _group(command: list[str]) -> Iterator[subprocess.Popen[str]]:
     """A process that ends with the block, and with it those that it has started: they would keep its output open for ever."""

@@ -88,15 +88,13 @@ class Kept:
                 self._add(entry)
                 return value
         if not partial and self.left == 0:
-            self.unreached.append(name)
-            return None
+            return self._give_up(name)
         notes, before = [], self.count()
         try:
             with self.stages.stage(name) as report:
                 value = work(self.streams[name], report if partial else self._timed(report), notes)
         except TimeUp:
-            self.unreached.append(name)
-            return None
+            return self._give_up(name)
         counts = [after - first for after, first in zip(self.count(), before, strict=True)]
         content = msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_plain))
         entry = Entry(self.key, content, notes, counts, self.stages.timing[name])
@@ -104,6 +102,10 @@ class Kept:
             self._write(name, entry)
         self._add(entry)
         return value
+
+    def _give_up(self, name: str) -> None:
+        self.unreached.append(name)
+        self.stages.plan.pop(name, None)
 
     def remove(self) -> None:
         if self.folder is not None:

@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from landscape.errors import InputError, did_you_mean
 from splat.model.settings import current_settings
 from splat.model.typed import leaves
+from splat.training.methods.methods import METHODS
 from splat.training.state import MethodSettings, TrainConfig
 
 T = TypeVar("T")
@@ -54,12 +55,15 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
 
 
 def _unknown(key: str, config: TrainConfig) -> str:
-    """The setting that was meant, then all."""
+    """The setting that was meant, of whatever method; else all."""
     common, own, method = _names(config), _names(config.method), config.method.name
-    return (
-        f"expected a setting of the training or of the method {method}, got {key!r}{did_you_mean(key, [*common, *own])} "
-        f"(of the training: {', '.join(common)}; of {method}: {', '.join(own) or 'none'})"
-    )
+    words = f"expected a setting of the training or of the method {method}, got {key!r}"
+    if meant := did_you_mean(key, [*common, *own]):
+        return words + meant
+    for name, kind in METHODS.items():
+        if meant := did_you_mean(key, _names(kind())):
+            return f"{words}{meant.removesuffix('?')} of the method {name}?"
+    return f"{words} (of the training: {', '.join(common)}; of {method}: {', '.join(own) or 'none'})"
 
 
 def _names(settings: TrainConfig | MethodSettings) -> list[str]:

@@ -17,8 +17,8 @@ the operator in float64, and the difference of the two products is reported apar
     |H32 v - H64 v| / |H64 v|
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import torch
@@ -31,11 +31,15 @@ from landscape.results import Progress
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import loss_against, view_loss
+from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
-from splat.projection.reference import project
+from splat.model.settings import RenderSettings
+from splat.projection.reference import Splats, project
 from splat.render.autograd import project_by_kernel, rasterize_by_kernel
 
 STEPS = (1e-10, 3e-11, 1e-11, 3e-12)  # per parameter; means in units of their spread
+CHUNK = 1 << 16  # Gaussians that autograd projects at a time
+MOVING = ("means", "conics", "opacities", "colours")  # of the splats; their depths give their order alone
 ENOUGH = ROUND_OFFS * torch.finfo(torch.float32).eps  # what a probe asks for
 
 
@@ -107,18 +111,41 @@ def _gradient(
 
     def gradient(theta: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
         nonlocal done
-        flat, total = theta.detach().requires_grad_(), torch.zeros_like(theta)
+        at, total = double.with_flat(theta.detach()), double.with_flat(torch.zeros_like(theta))
         for view, of_view, order in zip(shown, losses, depths, strict=True):
             size = view.camera.width, view.camera.height
-            splats = replace(project(double.with_flat(flat), view.camera, settings), depths=order)
+            with torch.no_grad():
+                parts = [project(some, view.camera, settings) for _, some in _chunks(at)]
+            whole = (torch.cat([getattr(part, each.name) for part in parts]) for each in fields(Splats))
+            splats = replace(Splats(*whole), depths=order)
+            moving = [getattr(splats, name).requires_grad_() for name in MOVING]
             image, _ = rasterize_by_kernel(splats, background, *size, settings)
-            total += torch.autograd.grad(view_loss(image, of_view), flat)[0]
+            _pull(torch.autograd.grad(view_loss(image, of_view), moving), at, total, view.camera, settings)
         done += 1
         if progress:
             progress(done, 2 * len(STEPS), "gradients in double precision")
-        return _without_lengths(double, objective.mean_over_views(total)[:, None])[:, 0]
+        return _without_lengths(double, objective.mean_over_views(total.flat)[:, None])[:, 0]
 
     return gradient
+
+
+def _chunks(gaussians: Gaussians) -> Iterator[tuple[slice, Gaussians]]:
+    """Autograd's graph of a projection takes a hundred times what its Gaussians do."""
+    for start in range(0, len(gaussians), CHUNK):
+        rows = slice(start, start + CHUNK)
+        yield rows, gaussians.with_flat(torch.cat([each[rows].reshape(-1) for each in gaussians.attributes.values()]))
+
+
+def _pull(
+    adjoints: Sequence[Tensor], at: Gaussians, total: Gaussians, camera: Camera, settings: RenderSettings
+) -> None:
+    """Add to total what adjoints of the MOVING parts of the splats are in the parameters."""
+    for rows, some in _chunks(at):
+        splats = project(some.with_flat(some.flat.requires_grad_()), camera, settings)
+        found = [getattr(splats, name) for name in MOVING]
+        (gradient,) = torch.autograd.grad(found, some.flat, [adjoint[rows] for adjoint in adjoints])
+        for sum_of, part in zip(total.attributes.values(), some.with_flat(gradient).attributes.values(), strict=True):
+            sum_of[rows] += part
 
 
 def _without_lengths(gaussians: Gaussians, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:

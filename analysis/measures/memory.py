@@ -1,16 +1,22 @@
 """What fits into memory: how many vectors; and, where it ran out, what a probe or a slice takes and what would fit."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import ceil, sqrt
 
+import torch
+
 from landscape import EigenSettings
-from landscape.errors import lacks_memory
-from splat.backend.memory import free_memory
+from landscape.errors import InputError, lacks_memory
+from splat.backend.memory import free_memory, resident_memory
 from splat.curvature.linearize import VECTORS, KeptViews
 from splat.curvature.objective import SceneObjective
+from splat.model.gaussians import Gaussians
+from splat.scenes.view import Frame
 
 MIB, GIB = 2**20, 2**30
+PICTURES, COPIES = 12, 4  # planes of a view, its loss's included; copies of the Gaussians
 FEWEST = 12  # vectors: four start vectors of a product, what it makes of them and a small basis
 
 
@@ -23,6 +29,53 @@ def vectors_within(objective: SceneObjective, memory: float) -> int:
 def basis_within(eigen: EigenSettings, room: int) -> int:
     """Number of vectors that the search for the ends may keep where there is room for so many; at least what it needs."""
     return min(eigen.basis, max(eigen.wanted + 3 * eigen.block, room))
+
+
+def size_of(text: str | None) -> int | None:
+    """Bytes from a size in words; None of None.  InputError where it is none.
+
+    >>> size_of("8GB"), size_of("1.5 GiB"), size_of("500mb")
+    (8000000000, 1610612736, 500000000)
+    """
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?([kmgt])(i?)b", text.strip(), re.I)
+    if not match:
+        raise InputError(f"expected a size of memory such as 8GB or 500MB, got {text!r}")
+    unit = 1024 if match[3] else 1000
+    return int(float(match[1]) * unit ** (1 + "kmgt".index(match[2].lower())))
+
+
+def require_pictures(frames: Sequence[Frame], gaussians: Gaussians) -> None:
+    """InputError that says what would fit, where pictures and Gaussians alone take more than is free."""
+    each = [PICTURES * 4 * frame.camera.width * frame.camera.height for frame in frames]
+    fixed, free = COPIES * gaussians.flat.nbytes, max(free_memory(torch.device("cpu")), 0)
+    if fixed + sum(each) <= free:
+        return
+    some = (free - fixed) // max(each)
+    raise InputError(
+        f"expected {_gb(fixed + sum(each))} of memory beside what is taken, for {len(frames)} pictures and "
+        f"{len(gaussians):,} Gaussians, got {_gb(free)}; "
+        + (f"--max-views {some} would fit" if some > 0 else "allow or free more, or take fewer Gaussians")
+    )
+
+
+def expected_peak(objective: SceneObjective) -> int:
+    """About the most that a probe takes at a time, in bytes.  InputError that says what would fit, where less is free."""
+    needs, device = objective.needs, objective.active.flat.device
+    free, used = max(free_memory(device), 0), resident_memory() if device.type == "cpu" else 0
+    least, camera = needs.view + needs.beside, objective.views[0].camera
+    if least > free:
+        raise InputError(
+            f"expected at least {_gb(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
+            f"{camera.width} x {camera.height} px, got {_gb(used + free)}; --memory {ceil((used + least) / 1e8) / 10:g}GB "
+            f"would fit on a machine that has it, here about {int(len(objective.active) * free / least):,} such Gaussians"
+        )
+    return used + min(free, len(objective.views) * needs.view + needs.beside)
+
+
+def _gb(size: float) -> str:
+    return f"{size / 1e9:.2g} GB"
 
 
 @contextmanager

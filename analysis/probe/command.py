@@ -24,8 +24,8 @@ from analysis.console.kept import kept_stages
 from analysis.console.options import ForeignOptions
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.measures.memory import telling_needs
-from analysis.probe.measurement import measure
+from analysis.measures.memory import expected_peak, require_pictures, size_of, telling_needs
+from analysis.probe.measurement import expected_seconds, measure
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.settings import ProbeSettings
@@ -38,9 +38,11 @@ from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import spawn
 from splat.backend.device import device_named
+from splat.backend.memory import staying_within
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.scenes.scene import Scene
+from splat.scenes.splits import read_names
 from splat.scenes.view import digests
 from splat.training.checkpoint import Checkpoint, open_checkpoint
 from splat.training.origin.foreign import Foreign
@@ -59,7 +61,7 @@ def run_probe(options: ProbeOptions, command: Sequence[str] = (), drawn: Draw | 
     """
     require_seed(options.seed)
     device = device_named(options.device)
-    with torchrun_ranks(device) as ranks:
+    with torchrun_ranks(device) as ranks, staying_within(size_of(options.memory)):
         return _run(options, command, drawn, device, ranks)
 
 
@@ -85,6 +87,7 @@ def _run(
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True, markup=False)
+    console.print(_expected(objective, settings), highlight=False, soft_wrap=True, markup=False)
     told = (
         f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} "
         f"{digests(scene.select(checkpoint.scene.train))} {settings} "
@@ -99,7 +102,9 @@ def _run(
         telling_needs(objective),
     ):
         generator = torch.Generator(device).manual_seed(options.seed)
-        found = measure(objective, settings, generator, stages, None if ranks else unfinished, told, deadline)
+        found = measure(
+            objective, settings, generator, stages, None if ranks else unfinished, told, deadline, checkpoint.all_views
+        )
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         if family_options is not None:
@@ -160,13 +165,7 @@ def _write(
 
 def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
     """A checkpoint, our own or another tool's, and its scene.  out: beside which a picture explains a refusal."""
-    listed = None
-    if ask.train_list is not None:
-        try:
-            listed = tuple(ask.train_list.read_text(encoding="utf-8").split("\n"))
-        except UnicodeDecodeError as error:
-            raise InputError(f"expected names of views, one in each line, in {ask.train_list}, got no text") from error
-        listed = tuple(name.strip() for name in listed if name.strip())
+    listed = None if ask.train_list is None else read_names(ask.train_list)
     foreign = Foreign(
         folder, ask.views, listed, ask.trained_by, ask.images, ask.downscale, antialiased=ask.antialiased or None
     )
@@ -186,7 +185,9 @@ def scene_objective(
     """A loss, by default the training's, over its views, at the checkpoint; ranks: share them.  keep_unseen: see
     `SceneObjective`."""
     ranks = ranks or ALONE
-    training, views = checkpoint.training, scene.load(ranks.share(checkpoint.scene.train, "training view"))
+    training, names = checkpoint.training, ranks.share(checkpoint.scene.train, "training view")
+    require_pictures(scene.select(names), training.gaussians)
+    views = scene.load(names)
     config = replace(training.config, loss=loss or training.config.loss)
     return config.objective(training.gaussians, views, keep_unseen=keep_unseen, ranks=ranks)
 
@@ -220,13 +221,23 @@ def _family_options(options: ProbeOptions) -> "FamilyOptions | None":
 
 
 def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjective) -> str:
-    counts, training = objective.counts, checkpoint.training
-    camera = objective.views[0].camera
+    counts, training, camera = objective.counts, checkpoint.training, objective.views[0].camera
+    views = f"{counts.views} of {checkpoint.all_views}" if checkpoint.all_views else f"{counts.views}"
     return (
-        f"{scene.name} after {training.step} steps: {counts.views} views of {camera.width} x {camera.height} px, "
+        f"{scene.name} after {training.step} steps: {views} views of {camera.width} x {camera.height} px, "
         f"{counts.active_gaussians:,} of {counts.gaussians:,} Gaussians in sight, "
         f"{counts.active_parameters:,} active parameters"
     )
+
+
+def _expected(objective: SceneObjective, settings: ProbeSettings) -> str:
+    """Time and memory, from a render and from the views' sizes.  MemoryError where it cannot fit."""
+    peak, flat = expected_peak(objective), objective.active.flat
+    objective.loss(flat)  # for the first render the kernels may compile
+    start = perf_counter()
+    objective.loss(flat)
+    seconds = expected_seconds(settings, perf_counter() - start)
+    return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
 
 
 def _embedded_surface(record: Record[ProbeRecord]) -> str:

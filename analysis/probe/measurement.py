@@ -76,6 +76,7 @@ LEFT_OUT = {
     "depth": "positions along and across the rays were left out",
 }
 MOST_AT_ONCE = 4  # start vectors
+PRODUCT, BEFORE = 6, 25  # renders that a product with them takes, and what comes before the first stage
 MOST_SAMPLES = 64  # of a trace, beyond which its exact value takes less
 # what a stage took on three real scenes: units, as its progress counts them (0: of different kinds), products of MOST_AT_ONCE
 # vectors, and renders of all views
@@ -111,7 +112,7 @@ class Measured:
     """What was measured; density, power, finite, depth, plane and shares are None where a note says why.
 
     matvecs: products H v of all stages; spared: products of single views that moved nothing there and were left out; rank:
-    of the directions that are not exactly flat; unreached: stages that time did not reach.
+    of the directions that are not exactly flat; unreached: stages that time did not reach.  left_out: where views were.
     """
 
     value: float
@@ -131,6 +132,20 @@ class Measured:
     rank: int
     notes: tuple[str, ...]
     unreached: tuple[str, ...] = ()
+    left_out: "LeftOut | None" = None
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """What tells the error of measuring on fewer views than the training has.
+
+    population: those that it has.  losses: of the views measured; curvatures: v . H_m v in each of these views, of the
+    eigenvectors of the two largest eigenvalues and of the smallest.
+    """
+
+    population: int
+    losses: Float64[Tensor, " m"]
+    curvatures: Float64[Tensor, "m 3"]
 
 
 def measure(
@@ -141,8 +156,9 @@ def measure(
     folder: Path | None = None,
     told: str = "",
     deadline: float = inf,
+    population: int | None = None,
 ) -> Measured:
-    """Run every stage.  folder, told, deadline: see `Kept`."""
+    """Run every stage.  folder, told, deadline: see `Kept`; population: training views, where the objective has fewer."""
     with stages.stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
@@ -157,7 +173,7 @@ def measure(
     stages.expect(_plan(settings, product, render), words)
     kept = Kept(stages, generator, STAGES, lambda: [operator.matvecs, hessian.views.spared], folder, told, deadline)
     point = _Point(objective, hessian, operator, settings, gradient, value)
-    return _all_stages(point, kept, operator_check, gradient_check, checks)
+    return _all_stages(point, kept, operator_check, gradient_check, checks, population)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +189,12 @@ class _Point:
 
 
 def _all_stages(
-    at: _Point, kept: Kept, operator_check: OperatorCheck, gradient_check: ProductCheck, checks: tuple[int, int]
+    at: _Point,
+    kept: Kept,
+    operator_check: OperatorCheck,
+    gradient_check: ProductCheck,
+    checks: tuple[int, int],
+    population: int | None,
 ) -> Measured:
     objective, settings = at.objective, at.settings
     traces = kept.run("traces", dict[str, TraceEstimate], lambda g, report, _: _traces(at, kept.left, g, report), True)
@@ -213,7 +234,13 @@ def _all_stages(
         rank=at.hessian.rank,
         notes=(*(LEFT_OUT[name] for name, each in wanted.items() if not each), *kept.notes),
         unreached=tuple(kept.unreached),
+        left_out=None if population is None else _left_out(at, ends, population),
     )
+
+
+def _left_out(at: _Point, ends: EigenEnds, population: int) -> LeftOut:
+    vectors = torch.cat([ends.largest.vectors[:, :2], ends.smallest.vectors[:, :1]], dim=1)
+    return LeftOut(population, at.objective.losses, at.hessian.by_view(vectors))
 
 
 def _linearised(objective: SceneObjective, report: Progress) -> tuple[Tensor, float, float]:
@@ -256,6 +283,12 @@ def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str
     return {
         name: Work(products * product + renders * render, units) for name, (units, products, renders) in work.items()
     }
+
+
+def expected_seconds(settings: ProbeSettings, render: float) -> float:
+    """About how long all stages take, from the seconds of a render of all views alone."""
+    stages = _plan(settings, PRODUCT * render, render).values()
+    return sum(work.seconds for work in stages) + BEFORE * render
 
 
 def _traces(at: _Point, seconds: float, generator: torch.Generator, report: Progress) -> dict[str, TraceEstimate]:

@@ -64,4 +64,7 @@ class ProbeOptions:
     Any but parameters measures the families, as --families does."""
     family_seconds: float = 1800.0
     """Time for the families together, in seconds, beside that of --seconds.  inf: no limit."""
+    memory: Unset[str] = None
+    """The most memory that the command takes, such as 8GB; one that cannot be done in it says what would fit.
+    Default: what is free.  On the CPU."""
     foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)

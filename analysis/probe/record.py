@@ -9,17 +9,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from msgspec import UNSET, convert
+from jaxtyping import Float64
+from msgspec import UNSET, UnsetType, convert
+from torch import Tensor
 
 from analysis.measures.gradient_check import ENOUGH
 from analysis.measures.localization import conditions, localize, mass_shares
-from analysis.probe.measurement import Measured, PlaneSlice
+from analysis.probe.measurement import LeftOut, Measured, PlaneSlice
 from analysis.records import schema
 from analysis.records.provenance import Provenance, provenance
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
 from analysis.records.tables import NEEDS_DENSITY
-from landscape import EigenEnds, Eigenpairs, anisotropy, literal
-from landscape.results import Bracket, finite_or_none
+from landscape import EigenEnds, Eigenpairs, TraceEstimate, anisotropy, literal
+from landscape.results import Bracket, finite_or_none, sampling_error
 from landscape.slices.slice import Slice as Grid
 from landscape.spectrum.quantiles import quantile
 from splat.backend.cpu.simd import lanes_of
@@ -39,10 +41,11 @@ def probe_record(
     found: Measured, objective: SceneObjective, made: Provenance, timing: Mapping[str, float]
 ) -> ProbeRecord:
     """All numbers that are no arrays, without the families.  timing: seconds of the stages so far."""
-    density = found.density
+    density, left_out = found.density, found.left_out
+    of_loss = UNSET if left_out is None else sampling_error(left_out.losses, left_out.population)
     return ProbeRecord(
-        objective=objective_of(objective, found.value, found.gradient_norm),
-        traces={name: _trace(trace.record()) for name, trace in found.traces.items()},
+        objective=objective_of(objective, found.value, found.gradient_norm, of_loss),
+        traces={name: _trace(trace, left_out) for name, trace in found.traces.items()},
         eigenvalues=_eigenvalues(found, objective),
         anisotropy=_anisotropy(found),
         quantiles=None
@@ -56,7 +59,11 @@ def probe_record(
         slice=None if found.plane is None else _slice(found.plane, found.ends.largest),
         counts=_counts(found, objective),
         checks=_checks(found),
-        notes=[*found.notes, *_unreached(found)],
+        notes=[
+            *found.notes,
+            *_unreached(found),
+            *left_out_note(objective.counts.views, left_out and left_out.population),
+        ],
         skipped=_skipped(found, objective, timing),
         provenance=made,
         timing=dict(timing),
@@ -117,10 +124,24 @@ def loss_name(loss: LossSettings) -> str:
     if loss.ssim_weight == 0:
         return pixel
     weighted = pixel if loss.pixel_weight == 1 else f"{loss.pixel_weight:g} {pixel}"
-    return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM)"
+    windows = " of windows within the image" if loss.border == "valid" else ""
+    return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM{windows})"
 
 
-def objective_of(objective: SceneObjective, value: float, gradient_norm: float) -> schema.Objective:
+def left_out_note(views: int, population: int | None) -> list[str]:
+    """What can be said of the views left out, and what cannot."""
+    if population is None:
+        return []
+    return [
+        f"measured on {views} of {population} training views: what the others would change stands beside the loss, the "
+        "traces and, along the directions found, the eigenvalues, as a standard error, as if the views had been drawn at "
+        "random; views left out may hold steeper directions; for the other numbers it is not known"
+    ]
+
+
+def objective_of(
+    objective: SceneObjective, value: float, gradient_norm: float, views_error: schema.Maybe[float | None] = UNSET
+) -> schema.Objective:
     return schema.Objective(
         loss=loss_name(objective.loss_settings),
         sizes=[(view.camera.width, view.camera.height) for view in objective.views],
@@ -128,6 +149,7 @@ def objective_of(objective: SceneObjective, value: float, gradient_norm: float) 
         operator="hessian",
         value=value,
         gradient_norm=gradient_norm,
+        views_error=views_error,
     )
 
 
@@ -135,10 +157,13 @@ def index_of(bracket: Bracket) -> schema.Index:
     return convert(bracket.record(), schema.Index)
 
 
-def _trace(numbers: Mapping[str, Any]) -> schema.Trace:
+def _trace(trace: TraceEstimate, left_out: LeftOut | None) -> schema.Trace:
+    numbers = trace.record()
     method = "exact, the coupling of pixels sampled with random signs" if numbers["probes"] else "exact"
     tau = curvature_scale(numbers["value"] or 0.0, numbers["dim"], 1, "active")
-    return convert({**numbers, "tau": tau, "method": method}, schema.Trace)
+    found = convert({**numbers, "tau": tau, "method": method}, schema.Trace)
+    found.views_error = UNSET if left_out is None else trace.left_out(left_out.population)
+    return found
 
 
 def _block_share(found: BlockShare) -> schema.BlockShare:
@@ -166,7 +191,21 @@ def _eigenvalues(found: Measured, objective: SceneObjective) -> schema.Eigenvalu
     rows = schema.Eigenvalues(max=exact(largest, 0), second=exact(largest, 1), min=exact(smallest, 0))
     if power is not None:
         rows.power_max, rows.power_min = eigenvalue(power, power.largest), eigenvalue(power, power.smallest)
+    if found.left_out is not None:
+        for end, curvatures in zip((rows.max, rows.second, rows.min), found.left_out.curvatures.T, strict=True):
+            if end:
+                end.views_error = sampling_error(curvatures, found.left_out.population)
+                end.without_one = without_one(curvatures)
     return rows
+
+
+def without_one(curvatures: Float64[Tensor, " m"]) -> tuple[float, float] | UnsetType:
+    """The least and the largest mean of all but one; UNSET of a single one."""
+    m = len(curvatures)
+    if m < 2:
+        return UNSET
+    means = (curvatures.sum() - curvatures) / (m - 1)
+    return float(means.min()), float(means.max())
 
 
 def _anisotropy(found: Measured) -> schema.Anisotropy:
@@ -217,8 +256,8 @@ def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
     )
 
 
-def counts_of(active: ActiveCounts, **work: int) -> Counts:
-    """work: the other fields of `Counts`."""
+def counts_of(active: ActiveCounts, views_of: int | None, **work: int) -> Counts:
+    """views_of: None where no views were left out; work: the other fields of `Counts`."""
     return Counts(
         gaussians=active.gaussians,
         visible_gaussians=active.active_gaussians,
@@ -229,6 +268,7 @@ def counts_of(active: ActiveCounts, **work: int) -> Counts:
         sh_degree_stored=active.sh_degree,
         sh_degree_active=active.active_sh_degree,
         views=active.views,
+        views_of=UNSET if views_of is None else views_of,
         **work,
     )
 
@@ -237,7 +277,12 @@ def _counts(found: Measured, objective: SceneObjective) -> Counts:
     renders = 0 if found.plane is None else found.plane.slice.evaluations * objective.counts.views
     kept = objective.linearized.kept
     return counts_of(
-        objective.counts, rank=found.rank, views_kept_linearised=kept, products=found.matvecs, renders=renders
+        objective.counts,
+        found.left_out and found.left_out.population,
+        rank=found.rank,
+        views_kept_linearised=kept,
+        products=found.matvecs,
+        renders=renders,
     )
 
 

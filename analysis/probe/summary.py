@@ -1,11 +1,12 @@
 """A probe in six lines, for the terminal, and what has to be said beside them."""
 
 from itertools import pairwise
+from math import hypot
 from pathlib import Path
 
 from analysis.records.findings import Line, findings, is_open
-from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
-from analysis.records.records import ProbeRecord
+from analysis.records.quantities import UNDETERMINED, apart, limits, measured, quantity
+from analysis.records.records import Counts, ProbeRecord
 from analysis.records.schema import Index, Trace
 
 SHORT = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "SH"}
@@ -16,13 +17,20 @@ def summary(data: ProbeRecord, report: Path) -> list[str]:
     counts, made = data.counts, data.provenance
     scene = f"{made.scene or 'scene'} after {made.iteration or 0:,} steps"
     return [
-        f"scene   {scene}: {counts.views} views, {counts.visible_gaussians:,} Gaussians in sight",
+        f"scene   {scene}: {_views(counts)}, {counts.visible_gaussians:,} Gaussians in sight",
         f"ends    {_ends(data)}",
         f"traces  {_order(data.traces)}",
         f"index   {_index(data)}",
         f"checks  {_checks(data)}; {data.timing['total']:.0f} s",
         f"report  {report}",
     ]
+
+
+def _views(counts: Counts) -> str:
+    """How many; where some were left out, what stands beside the numbers."""
+    if not counts.views_of:
+        return f"{counts.views} views"
+    return f"{counts.views} of {counts.views_of} views (∓: what the others may change)"
 
 
 def remarks(data: ProbeRecord, verbose: bool) -> list[Line]:
@@ -35,19 +43,22 @@ def _ends(data: ProbeRecord) -> str:
     texts = []
     for end in (data.eigenvalues.min, data.eigenvalues.max):
         reached = not (end.reason or "").endswith("budget")
-        texts.append(measured(end.value, end.residual) if reached else f"{UNDETERMINED} (not reached)")
+        texts.append(
+            measured(end.value, end.residual) + apart(end.views_error) if reached else f"{UNDETERMINED} (not reached)"
+        )
     return f"curvature from {texts[0]} to {texts[1]}"
 
 
 def _order(traces: dict[str, Trace]) -> str:
     """Traces by size; ≈ between two that are within two standard errors of each other."""
     ranked = sorted(traces.items(), key=lambda item: -abs(item[1].value or 0.0))
-    texts = [f"{SHORT.get(name, name)} {quantity(trace.value)}" for name, trace in ranked]
+    texts = [f"{SHORT.get(name, name)} {quantity(trace.value)}{apart(trace.views_error)}" for name, trace in ranked]
     signs = []
     for (_, first), (_, second) in pairwise(ranked):
-        apart = abs(first.value or 0.0) - abs(second.value or 0.0)
-        error = ((first.standard_error or 0.0) ** 2 + (second.standard_error or 0.0) ** 2) ** 0.5
-        signs.append(" > " if apart > 2 * error else " ≈ ")
+        gap = abs(first.value or 0.0) - abs(second.value or 0.0)
+        errors = (error or 0.0 for each in (first, second) for error in (each.standard_error, each.views_error))
+        error = hypot(*errors)
+        signs.append(" > " if gap > 2 * error else " ≈ ")
     return "".join(part for pair in zip(texts, [*signs, ""], strict=True) for part in pair)
 
 

@@ -111,6 +111,13 @@ def _of_traces(traces: Mapping[str, schema.Trace]) -> list[Line]:
     return lines
 
 
+def _known(error: schema.Maybe[float | None]) -> float:
+    """Infinite where it is not known, 0 where there is none."""
+    if error is UNSET:
+        return 0.0
+    return math.inf if error is None or math.isnan(error) else error
+
+
 def _of_largest_trace(traces: Mapping[str, schema.Trace], values: Mapping[str, float]) -> Line:
     """values: of the traces that are numbers, not all 0."""
     first, *others = sorted(values, key=lambda name: -abs(values[name]))
@@ -124,8 +131,8 @@ def _of_largest_trace(traces: Mapping[str, schema.Trace], values: Mapping[str, f
 
     def separated(name: str) -> bool:
         """Whether two standard errors of the difference of the sizes do not reach 0; an infinite error always does."""
-        errors = [traces[each].standard_error for each in (first, name)]
-        width = 2 * math.hypot(*(math.inf if error is None or math.isnan(error) else error for error in errors))
+        errors = [error for each in (first, name) for error in (traces[each].standard_error, traces[each].views_error)]
+        width = 2 * math.hypot(*(_known(error) for error in errors))
         return abs(values[first]) - abs(values[name]) >= width
 
     if near := [attribute_name(name) for name in others if not separated(name)]:
@@ -310,7 +317,8 @@ def _of_counts(counts: Counts) -> list[Line]:
         degrees = f"degree {counts.sh_degree_active} of {counts.sh_degree_stored}"
         lines.append(Line(f"Colour uses spherical harmonics of {degrees}; the bands above were left out."))
     used = f"{counts.active_parameters:,} of {counts.parameters:,} parameters"
-    return [*lines, Line(f"The operator acts on {used}, over {counts.views} views.")]
+    views = f"{counts.views} of {counts.views_of}" if counts.views_of else f"{counts.views}"
+    return [*lines, Line(f"The operator acts on {used}, over {views} views.")]
 
 
 def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
@@ -359,7 +367,10 @@ def _bracket(index: schema.Index, written: Callable[[float], str] | None = None)
     """Between which numbers it lies.  written: how one of them is, where not as `limits` has them."""
     ends = index.low, index.high
     texts = limits(*ends) if written is None else [UNDETERMINED if end is None else written(end) for end in ends]
-    return "" if ends == (None, None) else f" (between {texts[0]} and {texts[1]})"
+    if None not in ends:
+        return f" (between {texts[0]} and {texts[1]})"
+    known = [f" (at {words} {text})" for words, end, text in zip(("least", "most"), ends, texts, strict=True) if end]
+    return known[0] if known else ""
 
 
 def _in_brackets(note: schema.Maybe[str]) -> str:

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
@@ -51,6 +51,17 @@ def measured(value: float | None, error: float | None) -> str:
     ('5.00 ± ?', '5.00', '–')
     """
     return quantity(value, math.inf if error is None else error)
+
+
+def apart(error: float | UnsetType | None) -> str:
+    """A second error, of views left out, after a number; empty where none were.
+
+    >>> apart(0.123), apart(None), apart(UNSET)
+    (' ∓ 0.12', ' ∓ ?', '')
+    """
+    if error is UNSET:
+        return ""
+    return " ∓ ?" if error is None else f" ∓ {_plain(error, 2)}"
 
 
 def percent(share: float) -> str:

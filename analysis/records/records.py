@@ -62,7 +62,8 @@ class Format(Struct, frozen=True):
 
 class Counts(Struct, kw_only=True):
     """visible_gaussians: that touch a pixel.  active_parameters: of these, without SH bands that are not in use and the
-    lengths of quaternions.  rank: of the active operator.  products: H v made.  renders: of single views.
+    lengths of quaternions.  views_of: training views that there are, where fewer were measured.  rank: of the active operator.
+    products: H v made.  renders: of single views.
     """
 
     gaussians: Count
@@ -74,6 +75,7 @@ class Counts(Struct, kw_only=True):
     sh_degree_stored: Count
     sh_degree_active: Count
     views: Count
+    views_of: Maybe[Count] = UNSET
     rank: Maybe[Count] = UNSET
     views_kept_linearised: Maybe[Count] = UNSET
     products: Count = 0

@@ -42,7 +42,7 @@ class Objective(Struct, kw_only=True):
     """The function whose curvature is measured, beside the training views.
 
     loss: its formula in words.  sizes: (width, height) of each view, px.  value: L at the checkpoint.
-    gradient_norm: |dL/dTheta|.
+    gradient_norm: |dL/dTheta|.  views_error: of value, as for `TraceOf`.
     """
 
     loss: str | None = None
@@ -51,6 +51,7 @@ class Objective(Struct, kw_only=True):
     operator: Operator | None = None
     value: Number = None
     gradient_norm: Number = None
+    views_error: Maybe[Number] = UNSET
 
 
 class TraceOf(Struct, kw_only=True):
@@ -60,6 +61,8 @@ class TraceOf(Struct, kw_only=True):
     sign: "undetermined" where the interval does not decide it.  dim: parameters of the block.  probes: random vectors; 0 where
     exact.  matvecs: products H v.  reason: why it stopped, one of `landscape.results.StopReason`.
     method: "exact", or "exact, the coupling of pixels sampled with random signs".  note: why value is null, ...
+    views_error: where training views were left out (`Counts.views_of`), the standard error that this adds to value as that of
+    all of them, had they been drawn at random; null where it is not known.
     """
 
     value: Number
@@ -74,6 +77,7 @@ class TraceOf(Struct, kw_only=True):
     reason: str = ""
     method: str
     note: Maybe[str] = UNSET
+    views_error: Maybe[Number] = UNSET
 
     def __post_init__(self) -> None:
         _require_error("standard_error", self.standard_error)
@@ -110,7 +114,8 @@ class End(Struct, kw_only=True):
     """A Ritz value of an operator, signed, and its unit vector v.
 
     residual: |H v - value v|: a true eigenvalue lies within it.  vector_error: about the sine of the angle between v and the
-    true eigenvector.  reason, note: as for `TraceOf`.
+    true eigenvector.  reason, note: as for `TraceOf`.  views_error: likewise, of v . H v with this v: another direction may be
+    steeper in the views left out.  without_one: the least and the largest v . H v where one of the views measured is left out.
     """
 
     value: Number
@@ -118,6 +123,8 @@ class End(Struct, kw_only=True):
     vector_error: Number = None
     reason: str | None = None
     note: Maybe[str] = UNSET
+    views_error: Maybe[Number] = UNSET
+    without_one: Maybe[tuple[float, float]] = UNSET
 
     def __post_init__(self) -> None:
         _require_error("residual", self.residual)
@@ -307,6 +314,7 @@ class Direction(Struct, kw_only=True):
     kind: "eigenvectors", "random", "gradient" or "line".  slope, curvature: of the loss along it.  residual: of an
     eigenvector, else None.  unit: sqrt(2 loss_scale / |curvature|), the step within which the curvature alone changes the loss
     by loss_scale; infinite without curvature.  length: of the vector, in parameter units.  scale: what a step of 1 is.
+    views_error: of the curvature, as for `TraceOf`.
     """
 
     name: str
@@ -317,6 +325,7 @@ class Direction(Struct, kw_only=True):
     unit: Number
     length: Maybe[Number] = UNSET
     scale: Maybe[str] = UNSET
+    views_error: Maybe[Number] = UNSET
 
 
 class Slice(Struct, kw_only=True):

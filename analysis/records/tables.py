@@ -5,11 +5,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from msgspec import UNSET, UnsetType
 from rich import box
 from rich.table import Table
 
 from analysis.records.findings import attribute_name, is_open
-from analysis.records.quantities import UNDETERMINED, limits, measured, quantity
+from analysis.records.quantities import UNDETERMINED, apart, limits, measured, quantity
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import INDICES, BlockShare, Depth, Effect, End, Family, Index, Number
 
@@ -81,7 +82,8 @@ def wrapped(text: str, width: int) -> str:
 def _trace_rows(data: ProbeRecord) -> Iterator[Row]:
     for name, trace in data.traces.items():
         about = (
-            f"τ {quantity(trace.tau)}, {trace.sign}, dim {trace.dim:,}, {trace.matvecs} products{_reason(trace.reason)}"
+            f"τ {quantity(trace.tau)}, {trace.sign}, dim {trace.dim:,}, {trace.matvecs} products"
+            f"{_reason(trace.reason)}{_of_views(trace.views_error)}"
         )
         yield f"trace of {attribute_name(name)}", measured(trace.value, trace.standard_error), about
 
@@ -91,7 +93,8 @@ def _end_rows(data: ProbeRecord) -> Iterator[Row]:
     for name, end in data.eigenvalues.items():
         main, share = max(end.shares.items(), key=lambda item: item[1], default=("no attribute", 0.0))
         value = measured(end.value, end.residual)
-        about = f"{share:.0%} {attribute_name(main)}, {end.matvecs} products{_reason(end.reason)}"
+        about = f"{share:.0%} {attribute_name(main)}, {end.matvecs} products"
+        about += f"{_reason(end.reason)}{_of_views(end.views_error)}"
         if (end.reason or "").endswith("budget"):
             value, about = UNDETERMINED, f"at {value} so far; {about}"
         yield ENDS[name], value, about
@@ -119,6 +122,11 @@ def _measured(index: Index) -> bool:
 def _reason(reason: str | None) -> str:
     """Why it stopped, where that was not because the error asked for was reached."""
     return "" if reason in ("tolerance", "exact") else f", {reason}"
+
+
+def _of_views(error: float | UnsetType | None) -> str:
+    """What views left out may change, where some were."""
+    return "" if error is UNSET else f", views left out{apart(error)}"
 
 
 def _outcome(check: Check) -> str:

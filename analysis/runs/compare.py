@@ -89,7 +89,10 @@ def _relative(group: Group, common: Path) -> Group:
 def _folders(runs: Sequence[Path]) -> list[Path]:
     folders = [run.resolve() for run in runs]
     if len(set(folders)) < 2 or len(set(folders)) < len(folders):
-        raise InputError(f"expected at least two runs, each once, got {', '.join(map(str, runs)) or 'none'}")
+        named = ", ".join(map(str, runs)) or "none"
+        raise InputError(
+            f"expected at least two runs, each once, got {named}; name them as in landscape compare RUN OTHER"
+        )
     return folders
 
 

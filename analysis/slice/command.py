@@ -29,13 +29,13 @@ from torch import Tensor
 
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
-from analysis.measures.memory import telling_needs
+from analysis.measures.memory import expected_peak, size_of, telling_needs
 from analysis.probe.command import opened, scene_objective
 from analysis.probe.measurement import evaluation
 from analysis.probe.record import provenance_of
 from analysis.records.findings import of_slice, resolved
 from analysis.records.provenance import require_seed
-from analysis.records.quantities import measured, quantity
+from analysis.records.quantities import apart, measured, quantity
 from analysis.records.records import SliceRecord, record_folder, refusing_damage, require_replaceable
 from analysis.records.schema import FiniteProbe
 from analysis.slice.directions import (
@@ -49,12 +49,13 @@ from analysis.slice.directions import (
     recorded_probe,
 )
 from analysis.slice.options import SliceOptions
-from analysis.slice.record import Found, slice_arrays, slice_record
+from analysis.slice.record import Found, LeftOut, slice_arrays, slice_record
 from landscape import CountingOperator, SliceSettings, evaluate_slice, finite_probe
 from landscape.errors import InputError
 from landscape.probes import spawn
 from landscape.slices.grid_evaluations import Evaluation, Loss, slice_digest
 from splat.backend.device import device_named
+from splat.backend.memory import staying_within
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import is_foreign, read_splats
@@ -67,6 +68,11 @@ DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
 def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
     """Slice the checkpoint's loss; returns the exit code.  command: as typed, for the record."""
+    with staying_within(size_of(options.memory)):
+        return _run(options, command)
+
+
+def _run(options: SliceOptions, command: Sequence[str]) -> int:
     require_seed(options.seed)
     shape = Shape.of(options.along, options.dimension, options.radius, options.points, len(options.others))
     device = device_named(options.device)
@@ -80,12 +86,15 @@ def run_slice(options: SliceOptions, command: Sequence[str] = ()) -> int:
         checkpoint.training.move(device)
         others = [_other_end(checkpoint, path) for path in options.others]
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
+        expected_peak(objective)  # which may be too much
     # a folder that is being written by another command, or cannot be, is noticed before anything is rendered
     with record_folder(out, SliceRecord) as folder, stages, telling_needs(objective):
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:
-            found = _measure(objective, shape, others, known, settings, options, unfinished, stages)
+            found = _measure(
+                objective, shape, others, known, settings, options, unfinished, stages, checkpoint.all_views
+            )
         except BaseException:
             if unfinished.is_dir():
                 console.print(f"what was rendered is kept; to continue: {shlex.join(command)}", **SAID)
@@ -161,7 +170,9 @@ def _measure(
     options: SliceOptions,
     unfinished: Path,
     stages: Stages,
+    population: int | None,
 ) -> Found:
+    """population: training views, where the objective has fewer."""
     center = objective.active.flat
     seed = torch.Generator(center.device).manual_seed(options.seed)
     generators = {name: spawn(seed) for name in ("eigenvectors", "random", "holdout")}
@@ -195,7 +206,11 @@ def _measure(
         with stages.stage("finite steps") as report:
             steps = [reach * step for step in DECADES]
             probe = finite_probe(_evaluation(objective, 1), center, vectors[:, 0], true, steps, report)
-    return Found(found, probe, directions, vectors, cosine(exact), loss_scale, operator.matvecs + true.matvecs)
+    left_out = None
+    if population is not None:
+        left_out = LeftOut(population, SceneHessian(objective, keep_null=True).by_view(vectors))
+    matvecs = operator.matvecs + true.matvecs
+    return Found(found, probe, directions, vectors, cosine(exact), loss_scale, matvecs, left_out)
 
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:
@@ -226,7 +241,7 @@ def _conclude(data: SliceRecord, out: Path) -> None:
     """The curvatures, how well the slice is known, and the files to open."""
     say = partial(Console().print, **SAID)
     for direction in data.slice.directions:
-        curvature = measured(direction.curvature, direction.residual or 0.0)
+        curvature = measured(direction.curvature, direction.residual or 0.0) + apart(direction.views_error)
         text = f"{direction.name}: curvature {curvature}, slope {quantity(direction.slope or 0.0)}"
         say(f"{text}; one curvature unit is a step of {quantity(direction.unit)}")
     if data.finite_probe:

@@ -56,4 +56,7 @@ class SliceOptions:
     """Folder of the scene: where it has moved since the training, or of another tool's file."""
     out: Unset[Path] = None
     """Folder of the results.  Default: beside the checkpoint, such as slice-eigenvectors-2d or slice-line-1d."""
+    memory: Unset[str] = None
+    """The most memory that the command takes, such as 8GB; one that cannot be done in it says what would fit.
+    Default: what is free.  On the CPU."""
     foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)

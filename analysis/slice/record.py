@@ -5,7 +5,7 @@ from math import inf, sqrt
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from msgspec import convert
 from torch import Tensor
 
@@ -15,6 +15,7 @@ from analysis.records.provenance import Provenance
 from analysis.records.records import SliceRecord
 from analysis.slice.directions import Direction
 from landscape import FiniteProbe, Slice
+from landscape.results import sampling_error
 from splat.curvature.objective import SceneObjective
 
 
@@ -29,6 +30,25 @@ class Found:
     cosine: float | None
     loss_scale: float
     matvecs: int
+    left_out: "LeftOut | None" = None
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """What tells the error of fewer views than the `population` that the training has: the directions' curvatures in each."""
+
+    population: int
+    curvatures: Float64[Tensor, "m d"]
+
+
+def left_out_of_slice(views: int, population: int | None) -> list[str]:
+    if population is None:
+        return []
+    return [
+        f"the loss is that of {views} of {population} training views: what the others would change stands beside the "
+        "directions' curvatures, as a standard error, as if the views had been drawn at random; for the loss along them it is "
+        "not known"
+    ]
 
 
 def slice_record(found: Found, objective: SceneObjective, notes: list[str], made: Provenance) -> SliceRecord:
@@ -50,14 +70,20 @@ def slice_record(found: Found, objective: SceneObjective, notes: list[str], made
         )
         for direction, slope, curvature, length in zip(found.directions, *numbers, strict=True)
     ]
+    if found.left_out is not None:
+        for direction, curvatures in zip(directions, found.left_out.curvatures.T, strict=True):
+            direction.views_error = sampling_error(curvatures, found.left_out.population)
+    population = found.left_out and found.left_out.population
     about = {"directions": directions, "loss_scale": found.loss_scale, "cosine": found.cosine, **grid.record()}
     evaluations = grid.evaluations + (0 if probe is None else probe.evaluations)
     return SliceRecord(
         objective=objective_of(objective, grid.center_loss, float(objective.gradient.double().norm())),
         slice=convert(about, schema.Slice),
         finite_probe=None if probe is None else convert(probe.record(), schema.FiniteProbe),
-        counts=counts_of(objective.counts, products=found.matvecs, renders=evaluations * objective.counts.views),
-        notes=notes,
+        counts=counts_of(
+            objective.counts, population, products=found.matvecs, renders=evaluations * objective.counts.views
+        ),
+        notes=notes + left_out_of_slice(objective.counts.views, population),
         provenance=made,
         timing={},
     )

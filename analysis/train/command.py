@@ -45,7 +45,7 @@ from splat.model.typed import leaves, typed
 from splat.model.untrusted import beside, locked
 from splat.scenes.layers import require_depths
 from splat.scenes.scene import Scene, load_scene
-from splat.scenes.splits import Split, split_scene, usual_views
+from splat.scenes.splits import Split, read_names, split_scene, usual_views
 from splat.scenes.view import View
 from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
 from splat.training.densify import DensifySettings
@@ -190,13 +190,21 @@ def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig
         options.scene, options.images, options.downscale, colour, options.masks, options.depths,
         strict_frames=options.strict_frames,
     )  # fmt: skip
-    views = usual_views(scene) if options.views is None else options.views
-    split = split_scene(scene, None if views == "all" else views)
+    split = _split(options, scene)
     start = typed(Source, options.start or preset.get("start", "scene"), "start")
     reference = SceneReference.to(
         scene, out / CHECKPOINT, split, options.images, options.downscale, start, options.depths
     )
     return scene, split, _config(options, scene), reference
+
+
+def _split(options: TrainOptions, scene: Scene) -> Split:
+    if options.train_list is not None:
+        if options.views is not None:
+            raise InputError("expected --views or --train-list, got both; leave one out")
+        return split_scene(scene, train=read_names(options.train_list))
+    views = usual_views(scene) if options.views is None else options.views
+    return split_scene(scene, None if views == "all" else views)
 
 
 def _config(options: TrainOptions, scene: Scene) -> TrainConfig:

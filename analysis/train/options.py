@@ -23,6 +23,8 @@ class TrainOptions:
     Blender: the usual eight; DTU: views 25, 22, 28, ... of pixelNeRF (with --downscale 4).
     all: every view that is not held out; of DTU the protocol's 9.
     Default: 8 for Blender, else 3."""
+    train_list: Unset[Path] = None
+    """A text file with the name of a training view in each line, instead of --views; all others are held out."""
     iterations: Unset[int] = None
     """Steps of the training, each on one view.  Default: 2000, or those of the --protocol."""
     seed: int = 0
@@ -61,7 +63,7 @@ class TrainOptions:
     Options and --set go before it."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """KEY=VALUE changes a setting of the method or of the training, as in vsp_weight=0; may be repeated.
-    An unknown KEY is answered with the names of all."""
+    An unknown KEY is answered with the one that was meant, or with the names of all."""
     device: DeviceName = "auto"
     """Where to train.  auto: on the GPU where there is one that can be used, else on the CPU."""
     resume: FlagCreatePairsOff[bool] = False

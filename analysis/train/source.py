@@ -39,4 +39,6 @@ def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Pl
     world = found.scene
     scene = posed(scene, world.similarity, centred=world.centred)
     reference = replace(reference, similarity=world.similarity, centred=world.centred)
-    return (scene, split, replace(config, render=found.training.config.render), reference), found.training.gaussians
+    theirs = found.training.config
+    loss = replace(config.loss, border=theirs.loss.border)
+    return (scene, split, replace(config, render=theirs.render, loss=loss), reference), found.training.gaussians

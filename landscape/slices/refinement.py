@@ -1,7 +1,7 @@
 """Choice of the points at which a slice is evaluated: both axes, then points that fill the plane until they predict the others.
 
     axes        every point: nothing is interpolated along a line, nor along the two sections of a plane
-    fill        the points farthest from all that are known: COARSE at first, then half as many as are known beside the axes
+    fill        the points farthest from all that are known: COARSE at first, then 3/4 as many as are known beside the axes
     hold out    predict random points that are not known, then evaluate them; from then on the interpolant has them too.  If the
                 bound of the error that follows is within tolerance * range, the slice is done; else fill again
 
@@ -84,7 +84,7 @@ def evaluate_adaptively(
         predicted = grid(evaluations.value)[drawn]
         evaluations.require(drawn)
         errors, looks = np.abs(predicted - evaluations.value[drawn]), looks + 1
-        fill = int(known.sum() - len(grid.axes)) // 2
+        fill = 3 * int(known.sum() - len(grid.axes)) // 4
         errors[~np.isfinite(errors)] = inf
         bound = error_bound(errors, int((~known).sum()), looks)
         if bound <= settings.tolerance * value_range(evaluations.value) and not known.all():

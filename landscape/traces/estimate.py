@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from landscape.results import Sign, StopReason, plain
+from landscape.results import Number, Sign, StopReason, plain, sampling_error
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,8 @@ class TraceEstimate:
     block, dim: its name and number of rows.  low, high: an interval that contains the trace with probability `confidence`.
     samples: one for each of `probes` random vectors, in order; value is their mean, standard_error the error of the mean.  With
     the method "exact" there are none.  matvecs: products used; blocks that are read from the same products each count them all.
-    method: "hutchinson", "hutch++", "xtrace" or "exact" (`landscape.traces.trace`).
+    method: "hutchinson", "hutch++", "xtrace" or "exact" (`landscape.traces.trace`).  terms: where H is the mean of several
+    operators whose traces are known apart, the estimate of each.
     """
 
     block: str
@@ -32,12 +33,21 @@ class TraceEstimate:
     reason: StopReason
     samples: Float64[Tensor, " probes"]
     method: str = "hutchinson"
+    terms: Float64[Tensor, " m"] | None = None
 
     @classmethod
-    def exact(cls, block: str, dim: int, value: float, confidence: float, matvecs: int = 0) -> "TraceEstimate":
+    def exact(
+        cls,
+        block: str,
+        dim: int,
+        value: float,
+        confidence: float,
+        matvecs: int = 0,
+        terms: Float64[Tensor, " m"] | None = None,
+    ) -> "TraceEstimate":
         """A trace without error, no part of which was sampled."""
         none = torch.zeros(0, dtype=torch.float64)
-        return cls(block, dim, value, 0.0, value, value, confidence, 0, matvecs, "exact", none, "exact")
+        return cls(block, dim, value, 0.0, value, value, confidence, 0, matvecs, "exact", none, "exact", terms)
 
     def __repr__(self) -> str:
         return (
@@ -45,6 +55,10 @@ class TraceEstimate:
             f"  {self.confidence:.0%} in [{self.low:.6g}, {self.high:.6g}]\n"
             f"  {self.method}, {self.probes} vectors, {self.matvecs} products; ended: {self.reason}"
         )
+
+    def left_out(self, population: int) -> Number:
+        """The standard error of taking the mean over `population` operators from these terms; None where that is not known."""
+        return None if self.terms is None else sampling_error(self.terms, population)
 
     @property
     def half_width(self) -> float:

@@ -2,6 +2,7 @@
 
 import resource
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 import psutil
@@ -14,6 +15,25 @@ VERSIONS = {  # of control groups: folder, limit, usage
 }
 
 
+_most: int | None = None  # bytes that this process shall stay within
+
+
+@contextmanager
+def staying_within(size: int | None) -> Iterator[None]:
+    """Let `free_memory` count so many bytes, in memory at a time, as all that this process may have; None: no such limit."""
+    global _most
+    _most, before = size, _most
+    try:
+        yield
+    finally:
+        _most = before
+
+
+def resident_memory() -> int:
+    """Bytes of this process that are in memory."""
+    return psutil.Process().memory_info().rss
+
+
 def free_memory(device: torch.device) -> int:
     """Free bytes on a device; on a GPU with those that torch keeps for future tensors."""
     if device.type == "cuda":
@@ -23,7 +43,9 @@ def free_memory(device: torch.device) -> int:
 
 
 def _of_process() -> Iterator[int]:
-    """What the limits of this process leave, of addresses and of data."""
+    """What the limits of this process leave, of memory, of addresses and of data."""
+    if _most is not None:
+        yield _most - resident_memory()
     used = psutil.Process().memory_info()
     for kind, bytes_used in ((resource.RLIMIT_AS, used.vms), (resource.RLIMIT_DATA, getattr(used, "data", used.rss))):
         limit = resource.getrlimit(kind)[0]

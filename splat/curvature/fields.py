@@ -88,14 +88,15 @@ def scene_fields(objective: SceneObjective, progress: Progress | None = None) ->
     """
     if objective.ranks.size > 1:
         raise InputError("expected one process, got several that share the views; run without torchrun")
-    gaussians, sights, total = objective.active, [], None
+    gaussians, sights, total = objective.active, [], list[PerGaussianBlocks]()
     for index, (view, linearized) in enumerate(zip(objective.views, objective.linearized, strict=True)):
         sights.append(sight(gaussians, view.camera, objective.settings))
         parts = linearized.block_diagonals()
-        total = parts if total is None else [a + b for a, b in zip(total, parts, strict=True)]
+        for whole, part in zip(total, parts, strict=False):  # none before the first view
+            whole.add(part)
+        total = total or parts
         if progress:
             progress(index + 1, len(objective.views), "blocks of every Gaussian")
-    assert total is not None
     count = len(objective.views)
     hessian, gauss_newton = (PerGaussianBlocks(part.geometry / count, part.sh / count) for part in total)
     rays = mean_rays(objective, sights)
@@ -121,11 +122,11 @@ def block_fields(
 ) -> Values:
     """The fields of the blocks.  quats: of unit length; precision: in which the blocks were worked out."""
     found: Values = {}
-    on_complement = [_on_complement(blocks.geometry.double(), quats.double()) for blocks in (hessian, gauss_newton)]
-    for prefix, blocks, B in zip(PREFIXES, (hessian, gauss_newton), on_complement, strict=True):
+    across = [on_complement(blocks.geometry.double(), quats.double()) for blocks in (hessian, gauss_newton)]
+    for prefix, blocks, B in zip(PREFIXES, (hessian, gauss_newton), across, strict=True):
         for name, diagonal in blocks.diagonals_across(quats).items():
             found[f"{prefix}trace_{name}"] = diagonal.flatten(1).sum(dim=1)
-        values = _eigenvalues(B)
+        values = eigenvalues(B)
         size = values.abs()
         kept = size > len(values[0]) * torch.finfo(precision).eps * size.amax(dim=1, keepdim=True)
         found[f"{prefix}largest"] = values[:, -1]
@@ -136,7 +137,7 @@ def block_fields(
         depth = torch.einsum("ni,nij,nj->n", rays, position, rays)
         found[f"{prefix}depth"] = depth
         found[f"{prefix}lateral"] = (found[f"{prefix}trace_means"] - depth) / 2
-    found["split"] = _eigenvalues(on_complement[0] - on_complement[1])[:, 0]
+    found["split"] = eigenvalues(across[0] - across[1])[:, 0]
     return found
 
 
@@ -154,7 +155,7 @@ def sight_fields(sights: Sequence[Sight]) -> Values:
     }
 
 
-def _on_complement(blocks: Float64[Tensor, "n 11 11"], quats: Float64[Tensor, "n 4"]) -> Float64[Tensor, "n 10 10"]:
+def on_complement(blocks: Float64[Tensor, "n 11 11"], quats: Float64[Tensor, "n 4"]) -> Float64[Tensor, "n 10 10"]:
     """E^T B E: q i, q j, q k in place of the quaternion's four axes."""
     w, x, y, z = quats.unbind(dim=1)
     turns = torch.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w], dim=1).view(-1, 4, 3)
@@ -166,7 +167,7 @@ def _on_complement(blocks: Float64[Tensor, "n 11 11"], quats: Float64[Tensor, "n
     return E.mT @ blocks @ E
 
 
-def _eigenvalues(matrices: Float64[Tensor, "n d d"]) -> Float64[Tensor, "n d"]:
+def eigenvalues(matrices: Float64[Tensor, "n d d"]) -> Float64[Tensor, "n d"]:
     """Ascending."""
     values = matrices.new_empty(matrices.shape[:2])
 

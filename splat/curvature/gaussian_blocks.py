@@ -1,5 +1,6 @@
 """Diagonal blocks of a Hessian, one a Gaussian: 11 x 11 of its geometry and opacity, and the diagonal of its SH."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,13 +17,19 @@ GEOMETRY_COLUMNS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PerGaussianBlocks(Brief):
-    """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH."""
+    """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH.
+
+    views: where the blocks are the mean over views, `traces` of each view's, in order.
+    """
 
     geometry: Float[Tensor, "n 11 11"]
     sh: Float[Tensor, "n k 3"]
+    views: Sequence[Mapping[str, float]] = ()
 
-    def __add__(self, other: "PerGaussianBlocks") -> "PerGaussianBlocks":
-        return PerGaussianBlocks(self.geometry + other.geometry, self.sh + other.sh)
+    def add(self, other: "PerGaussianBlocks") -> None:
+        """Add another's blocks to these, in their place."""
+        self.geometry.add_(other.geometry)
+        self.sh.add_(other.sh)
 
     def apply(self, V: Float[Tensor, "p k"], gaussians: Gaussians) -> Float[Tensor, "p k"]:
         """B V of vectors over the parameters of these Gaussians."""

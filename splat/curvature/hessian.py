@@ -8,7 +8,7 @@ from functools import cached_property
 from itertools import islice
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.operators.operator import require_vectors
@@ -50,6 +50,11 @@ class ViewSum:
                 else:
                     self.spared += some.shape[1]
         return total
+
+    def forms(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:
+        """v . H_m v of each of this process's views and each column."""
+        products = (view.ggn(V) if self.gauss_newton else view.hvp(V) for view in self.objective.linearized)
+        return torch.stack([(V.double() * HV).sum(dim=0).cpu() for HV in products])
 
 
 class SceneHessian:
@@ -103,6 +108,11 @@ class SceneHessian:
         PV = self.project(V.to(self.objective.active.flat.device))
         total = self._recordings(self.views.apply, PV) if self.recordable(V.shape[1]) else self.views.apply(PV)
         return self.project(self.objective.mean_over_views(total)).to(V.device)
+
+    def by_view(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:
+        """v . P H_m P v of every view's part of H and each column: their mean over the views is v . P H P v."""
+        PV = self.project(V.to(self.objective.active.flat.device))
+        return self.objective.of_all_views(self.views.forms(PV))
 
     def recordable(self, vectors: int) -> bool:
         """Whether products with so many vectors are worth a CUDA graph: of views on a GPU that are all kept, and small."""

@@ -17,6 +17,7 @@ projection, loss) are those of the device of the Gaussians.  On a GPU no product
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from math import prod
 
 import torch
 from jaxtyping import Float, Float64
@@ -30,11 +31,14 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.dispatch import linearize_projection
-from splat.projection.formulas import ProjectionJacobian, lens_of
+from splat.projection.formulas import ROWS, ProjectionJacobian, lens_of
 from splat.raster.cpu.raster import CpuRaster
-from splat.raster.dispatch import Adjoint, Tangent
+from splat.raster.dispatch import Adjoint, Raster, Tangent
+from splat.raster.formulas import BLOCK_SUMS
 from splat.render.forward import rasterize_view, touches
 
+LOSS_PLANES = 16  # target, its moments, gradient and a blurred one
+DOUBLE_BLOCK = 8 * 9 * 9  # bytes
 VECTORS = 8  # at a time in a product: a wider block gains nothing more, because it leaves the second-level cache
 
 
@@ -73,6 +77,15 @@ class LinearizedView:
     @property
     def image(self) -> Float[Tensor, "3 h w"]:
         return self._raster.crop(self._raster.planes[:3]).clone()
+
+    @staticmethod
+    def size_of(raster: Raster, gaussians: Gaussians) -> tuple[int, int, int]:
+        """About how many bytes a view of this raster takes: `bytes`, `workspace(1)`, and the pass of `block_diagonal`."""
+        size, drawn = gaussians.flat.element_size(), len(raster.touched)
+        plane = raster.planes[0].nbytes
+        kept = raster.bytes + size * (drawn * sum(map(prod, ROWS)) + 9 * len(gaussians)) + LOSS_PLANES * plane
+        blocks = size * raster.intersections_reached * BLOCK_SUMS + drawn * DOUBLE_BLOCK
+        return kept, raster.workspace(1) + 3 * plane, blocks
 
     @property
     def intersections(self) -> int:

@@ -18,11 +18,10 @@ call the objective's methods in the same order.
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
-from operator import add
+from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64, Shaped
 from torch import Tensor
 
 from landscape.errors import InputError
@@ -36,6 +35,11 @@ from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.render.forward import background_of, rasterize_view, touches
 from splat.scenes.view import View
+
+OWN_BLOCK = 11 * 11  # numbers of a Gaussian's block without SH
+KEPT_BLOCKS = 4  # approximate and exact ones, each of the Hessian and of a Gauss-Newton part
+COPIES = 5  # of a vector, in a product: itself, without its null part, the sum, a view's, the result
+FEWEST, AT_ONCE = 8, 4  # vectors of a small basis; of a product
 
 
 class NothingInSight(InputError):
@@ -59,6 +63,24 @@ class ActiveCounts:
     active_sh_degree: int
     radial_quaternions: int
     views: int
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Bytes, about: of a vector over the active parameters; of a linearised view; of a product for each of its vectors; of the
+    Gaussians' own blocks that are kept, and of the pass that makes them.
+    """
+
+    vector: int
+    view: int
+    product: int
+    blocks: int
+    making_blocks: int
+
+    @property
+    def beside(self) -> int:
+        """What is needed beside linearised views: blocks, a small basis, and the larger of a product and the blocks' pass."""
+        return self.blocks + FEWEST * self.vector + max(AT_ONCE * self.product, self.making_blocks)
 
 
 class SceneObjective:
@@ -132,14 +154,27 @@ class SceneObjective:
             views=sum(self._views_of_ranks),
         )
         sharing = 1 if flat.device.type == "cuda" else ranks.size
-        self._memory = free_memory(flat.device) // 2 // sharing if memory is None else memory
+        if memory is None:
+            free = free_memory(flat.device) // sharing
+            memory = min(free // 2, max(free - self.needs.beside, self.needs.view))
+        self._memory = memory
 
     def _seen(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
         """Which Gaussians touch a pixel of some view of any rank."""
-        seen = gaussians.flat.new_zeros(len(gaussians), dtype=torch.bool)
+        seen, self._sizes = gaussians.flat.new_zeros(len(gaussians), dtype=torch.bool), (0, 0, 0)
         for view in self.views:
-            seen |= touches(rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True))
+            raster = rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True)
+            seen |= touches(raster)
+            self._sizes = max(self._sizes, LinearizedView.size_of(raster, gaussians))
         return self.ranks.any(seen)
+
+    @property
+    def needs(self) -> "Needs":
+        """About what the largest view and its products take."""
+        view, workspace, blocks = self._sizes
+        n, flat = len(self.active), self.active.flat
+        own = n * flat.element_size() * (OWN_BLOCK + 3 * (self.active.sh_degree + 1) ** 2)
+        return Needs(flat.nbytes, view, workspace + COPIES * flat.nbytes, KEPT_BLOCKS * own, max(blocks + own, 3 * own))
 
     @property
     def couples_pixels(self) -> bool:
@@ -182,6 +217,12 @@ class SceneObjective:
         """The mean over all views, given the sum over this rank's views."""
         return self.ranks.sum(total) / self.counts.views
 
+    def of_all_views(self, rows: Shaped[Tensor, "m ..."]) -> Shaped[Tensor, "_ ..."]:
+        """A row for every view of all processes, given those of this rank's views."""
+        whole = rows.new_zeros(self.counts.views, *rows.shape[1:])
+        whole[self.view_numbers.start : self.view_numbers.stop] = rows
+        return self.ranks.sum(whole)
+
     def gather_rows(self, rows: Float[Tensor, "n m d"]) -> Float[Tensor, "n _ d"]:
         """The rows of all views, given those of this rank's views: as many for each view."""
         each = rows.shape[1] // len(self.views)
@@ -205,6 +246,11 @@ class SceneObjective:
         return LinearizedView(at, camera, self._losses[index], self.background, self.settings)
 
     @cached_property
+    def losses(self) -> Float64[Tensor, " m"]:
+        """The loss of every view at the active Gaussians."""
+        return self.of_all_views(torch.tensor([view.value for view in self.linearized], dtype=torch.float64))
+
+    @cached_property
     def gradient(self) -> Float[Tensor, " p"]:
         """The gradient of L at the active Gaussians."""
         return self.mean_over_views(torch.stack([view.gradient for view in self.linearized]).sum(dim=0))
@@ -220,11 +266,21 @@ class SceneObjective:
         self, *, approximate: bool = False, parts: Sequence[bool] = (False, True)
     ) -> list[PerGaussianBlocks]:
         """`block_diagonal` of several parts at once; parts: which are Gauss-Newton."""
-        views = (view.block_diagonals(approximate=approximate, parts=parts) for view in self.linearized)
-        totals = reduce(lambda one, other: list(map(add, one, other)), views)
-        return [
-            PerGaussianBlocks(self.mean_over_views(each.geometry), self.mean_over_views(each.sh)) for each in totals
-        ]
+        totals: list[PerGaussianBlocks] = []
+        traces: list[list[dict[str, float]]] = []
+        for view in self.linearized:
+            found = view.block_diagonals(approximate=approximate, parts=parts)
+            traces.append([each.traces(self.active.quats) for each in found])
+            for total, each in zip(totals, found, strict=False):  # none before the first view
+                total.add(each)
+            totals = totals or found
+        return [self._mean_of_blocks(total, [each[i] for each in traces]) for i, total in enumerate(totals)]
+
+    def _mean_of_blocks(self, total: PerGaussianBlocks, traces: Sequence[Mapping[str, float]]) -> PerGaussianBlocks:
+        """The mean over all views, given the sum over this process's and the traces of each."""
+        rows = self.of_all_views(torch.tensor([list(each.values()) for each in traces], dtype=torch.float64))
+        views = [dict(zip(traces[0], row, strict=True)) for row in rows.tolist()]
+        return PerGaussianBlocks(self.mean_over_views(total.geometry), self.mean_over_views(total.sh), views)
 
     @cached_property
     def exact_blocks(self) -> list[PerGaussianBlocks]:

@@ -80,19 +80,32 @@ def exact_traces(
     pixelwise = {} if coupled is None else coupled.traces(quats, units)
     first, most = (samples, samples) if samples else (settings.min_probes, settings.max_probes)
     traces = [
-        SampledTrace(name, sizes[name], known[name], pixelwise.get(name), settings, first, most) for name in known
-    ]
+        SampledTrace(
+            name, sizes[name], known[name], pixelwise.get(name), settings, first, most,
+            None if scale is not None else [view[name] for view in whole.views],
+        )
+        for name in known
+    ]  # fmt: skip
     return sampled_traces(objective, generator, partial(_signs, objective, scale), traces, progress)
 
 
 def block_traces(objective: SceneObjective) -> dict[str, TraceEstimate]:
     """The same traces without a sample: sums over the Gaussians' exact own blocks, which only a CPU has."""
-    found = objective.exact_blocks[0].traces(objective.active.quats)
+    blocks = objective.exact_blocks[0]
+    found = blocks.traces(objective.active.quats)
     sizes = {name: rows.stop - rows.start for name, rows in objective.blocks.items()}
     sizes["quats"] -= len(objective.active)
     return {
-        name: TraceEstimate.exact(name, sizes[name], value, ONE_PERCENT.confidence) for name, value in found.items()
+        name: TraceEstimate.exact(
+            name, sizes[name], value, ONE_PERCENT.confidence, terms=_terms([view[name] for view in blocks.views])
+        )
+        for name, value in found.items()
     }
+
+
+def _terms(values: Sequence[float]) -> Float64[Tensor, " m"]:
+    """`TraceEstimate.terms`: of every view."""
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def curvature_scale(trace: float, parameters: int, gaussians: int, dimension: Dimension) -> float:
@@ -126,7 +139,7 @@ def sampled_traces(
         together = min(max(COLUMNS // len(still), 1), next_look - count)
         sampled = coupling_samples(objective, generator, draw, [trace.name for trace in still], together)
         seconds = monotonic() - start
-        for trace, x, y in zip(still, *sampled, strict=True):
+        for trace, x, y in zip(still, *(each.unbind(dim=1) for each in sampled), strict=True):
             trace.add(x, y, late=seconds > trace.settings.max_seconds)
         if progress:
             state = f"traces: {count + together} samples of the coupling between pixels"
@@ -138,14 +151,24 @@ class SampledTrace:
     """The samples of one trace, at least `first` and at most `most`, and whether it needs more (`open`).
 
     known: T_b of the module's docstring.  pixelwise: C_b; None where the loss does not couple pixels, so that T_b is the trace.
+    views: T_b of the single views, where these are wanted too.
     """
 
     def __init__(
-        self, name: str, dim: int, known: float, pixelwise: float | None, settings: TraceSettings, first: int, most: int
+        self,
+        name: str,
+        dim: int,
+        known: float,
+        pixelwise: float | None,
+        settings: TraceSettings,
+        first: int,
+        most: int,
+        views: Sequence[float] | None = None,
     ):
         self.name, self.dim, self.settings, self.first, self.most = name, dim, settings, first, most
-        self.known, self.pixelwise = known, pixelwise
+        self.known, self.pixelwise, self.views = known, pixelwise, views
         self.full = self.diagonal = torch.zeros(0, dtype=torch.float64)
+        self.apart: list[Float64[Tensor, "m s"]] = []
         # a run ends at `first` samples at the earliest: if the tolerance holds there and held CONFIRMATION samples before
         look = most if first == most else max(first - CONFIRMATION, LEAST_SAMPLES)
         self.looks, self.open, self.late = StoppingRule(look, most), pixelwise is not None, False
@@ -154,8 +177,10 @@ class SampledTrace:
     def count(self) -> int:
         return len(self.full)
 
-    def add(self, x: Float64[Tensor, " s"], y: Float64[Tensor, " s"], late: bool) -> None:
-        self.full, self.diagonal = torch.cat([self.full, x]), torch.cat([self.diagonal, y])
+    def add(self, x: Float64[Tensor, "m s"], y: Float64[Tensor, "m s"], late: bool) -> None:
+        """x and y of the single views."""
+        self.full, self.diagonal = torch.cat([self.full, x.mean(dim=0)]), torch.cat([self.diagonal, y.mean(dim=0)])
+        self.apart.append(x - y)
         self.late = late and self.count >= self.first
         if self.late:
             self.open = False
@@ -165,7 +190,8 @@ class SampledTrace:
     def estimate(self) -> TraceEstimate:
         settings = self.settings
         if self.pixelwise is None:
-            return TraceEstimate.exact(self.name, self.dim, self.known, settings.confidence)
+            terms = None if self.views is None else _terms(self.views)
+            return TraceEstimate.exact(self.name, self.dim, self.known, settings.confidence, terms=terms)
         samples = self.known - self.pixelwise + controlled(self.full, self.diagonal, self.pixelwise)
         value = float(samples.mean())
         error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.pixelwise))
@@ -177,8 +203,12 @@ class SampledTrace:
             reason = "tolerance"
         return TraceEstimate(
             self.name, self.dim, value, error, value - half, value + half, settings.confidence, self.count, self.count,
-            reason, samples,
+            reason, samples, terms=self._terms_of_views(),
         )  # fmt: skip
+
+    def _terms_of_views(self) -> Float64[Tensor, " m"] | None:
+        """T_b + E[x - y] of every view."""
+        return None if self.views is None else _terms(self.views) + torch.cat(self.apart, dim=1).mean(dim=1)
 
 
 def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> float:
@@ -197,16 +227,16 @@ def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " 
 
 def coupling_samples(
     objective: SceneObjective, generator: torch.Generator, draw: Draw, names: Sequence[str], count: int
-) -> tuple[Float64[Tensor, "b s"], Float64[Tensor, "b s"]]:
-    """x and y of the named parts for `count` draws, which depend on neither names nor count."""
+) -> tuple[Float64[Tensor, "m b s"], Float64[Tensor, "m b s"]]:
+    """x and y of every view and the named parts for `count` draws, which depend on neither names nor count."""
     seeds = torch.randint(2**62, (count,), generator=generator, device=generator.device).tolist()
-    total = torch.zeros(2, len(names) * count, dtype=torch.float64)
+    found = []
     for index, linearized in enumerate(objective.linearized):
         view = objective.view_numbers[index]
         generators = [torch.Generator(generator.device).manual_seed(seed + view) for seed in seeds]
-        total += torch.stack(linearized.loss_curvatures(draw(index, generators, names).flatten(1))).cpu()
-    x, y = objective.mean_over_views(total)
-    return x.view(len(names), count), y.view(len(names), count)
+        found.append(torch.stack(linearized.loss_curvatures(draw(index, generators, names).flatten(1))).cpu())
+    x, y = objective.of_all_views(torch.stack(found)).view(-1, 2, len(names), count).unbind(dim=1)
+    return x, y
 
 
 def _signs(

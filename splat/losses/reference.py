@@ -5,7 +5,8 @@ Images are (3, h, w) in [0, 1].  Every loss is a mean over pixels and channels.
     l1          |r|                            r = image - target
     charbonnier sqrt(r^2 + eps^2)              a smooth l1; its second derivative is eps^2 / (r^2 + eps^2)^(3/2)
     l2          r^2
-    SSIM        11 x 11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, as in 3DGS
+    SSIM        11 x 11 Gaussian window, sigma 1.5, C1 = 0.01^2, C2 = 0.03^2; beyond the image are zeros, as in 3DGS (padded),
+                or windows that reach beyond it do not count (valid)
     photometric (1 - lambda) pixel + lambda (1 - SSIM), lambda = 0.2: StableGS's Eq. (2) as 3DGS weighs it;
                 literal: pixel + lambda (1 - SSIM), the same as printed
 """
@@ -24,6 +25,7 @@ WINDOW, SIGMA = 11, 1.5
 REACH = WINDOW // 2
 C1, C2 = 0.01**2, 0.03**2
 PixelLoss = Literal["l1", "charbonnier", "l2"]
+Border = Literal["padded", "valid"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ class LossSettings:
     """Which loss a view contributes: the pixel loss, and ssim_weight = lambda in [0, 1], of 1 - SSIM.
 
     eps: Charbonnier's, in units of intensity.  literal: the pixel loss has the weight 1 instead of 1 - lambda.
+    border: whether SSIM's windows may reach beyond the image.
 
     >>> LossSettings("l2", ssim_weight=0.2).pixel_weight
     0.8
@@ -40,12 +43,32 @@ class LossSettings:
     ssim_weight: float = 0.2
     eps: float = 0.01
     literal: bool = False
+    border: Border = "padded"
 
     def __post_init__(self) -> None:
         if self.pixel not in ("l1", "charbonnier", "l2"):
             raise InputError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
         if not (0 <= self.ssim_weight <= 1 and self.eps > 0):
             raise InputError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
+        if self.border not in ("padded", "valid"):
+            raise InputError(f"expected the border 'padded' or 'valid', got {self.border!r}")
+
+    @property
+    def margin(self) -> int:
+        """Pixels at every side of the image round which no window counts."""
+        return REACH if self.border == "valid" else 0
+
+    def structural(self, height: int, width: int) -> float:
+        """The weight of 1 - SSIM of one value of a channel.  InputError where no window fits into the image."""
+        rows, columns = height - 2 * self.margin, width - 2 * self.margin
+        if not self.ssim_weight:
+            return 0.0
+        if min(rows, columns) < 1:
+            raise InputError(
+                f"expected pictures of at least {WINDOW} px a side, the size of SSIM's window, got {width} x {height}; "
+                "reduce less"
+            )
+        return self.ssim_weight / (3 * rows * columns)
 
     @property
     def pixel_weight(self) -> float:
@@ -91,7 +114,9 @@ def photometric_loss(
     """The loss of one view, a scalar that torch can differentiate."""
     loss = settings.pixel_weight * pixel_loss(image, target, settings.pixel, settings.eps)
     if settings.ssim_weight:
-        loss = loss + settings.ssim_weight * (1 - ssim_map(image, target).mean())
+        height, width = image.shape[1:]
+        m, weight = settings.margin, settings.structural(height, width)
+        loss = loss + weight * (1 - ssim_map(image, target)[:, m : height - m, m : width - m]).sum()
     return loss
 
 

@@ -4,8 +4,10 @@ A `Photo` holds what a reader of a scene format knows of an image: its file, its
 + 0.5 as everywhere here) and its pose.  `frame` checks the file's header against the lens and fixes the final camera:
 
     stored size    the lens is scaled to the file's size where the aspect ratio is the same within rounding (`images_8`)
-    undistortion   images of radial and tangential lenses are resampled bilinearly into the largest pinhole image without
-                   blank pixels, with the pinhole camera that pycolmap (as `colmap image_undistorter`) chooses
+    EXIF           a file that a quarter turn of its EXIF orientation brings to its camera's shape is turned; all others are
+                   taken as they are stored, as COLMAP does
+    undistortion   images of lenses that are no pinholes, fisheyes too, are resampled bilinearly into the largest pinhole image
+                   without blank pixels, with the pinhole camera that pycolmap (as `colmap image_undistorter`) chooses
     downscale      a pixel becomes the mean over its footprint, fractions of pixels included: values stay in [0, 1], and
                    edges stay in place at any ratio (a box filter of whole pixels moves them by up to a quarter pixel)
     layers         masks and depth maps (`splat/scenes/layers.py`) are brought to the size of the file, then treated
@@ -23,7 +25,8 @@ import numpy as np
 import pycolmap
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32
+from PIL import ImageOps
 from torch import Tensor
 
 from landscape.errors import InputError
@@ -33,7 +36,12 @@ from splat.scenes.view import Frame, Subset, View
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
-UNDISTORTED_HERE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+RADIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+UNDISTORTED_HERE = (
+    *RADIAL_MODELS, "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FOV", "THIN_PRISM_FISHEYE"
+)  # fmt: skip
+SIXTEEN_BITS = ("I;16", "I;16B", "I;16L")  # modes of a grey picture; Pillow reads coloured ones with 8
+EXIF_ORIENTATION, QUARTER_TURNS = 0x0112, (5, 6, 7, 8)
 LARGEST_SIDE = 2**31 - 1  # px; COLMAP counts them in 32 bits
 SMALLEST = 4  # px a side of a reduced picture; a smaller one comes from a mistyped factor
 LARGEST_DISPLACEMENT = 2  # of a corner, in half diagonals; the strongest lenses stay below 1
@@ -93,15 +101,25 @@ def require_files(paths: Sequence[Path], advice: str = "or name another folder o
 def image_header(path: Path) -> tuple[tuple[int, int], bool]:
     """((width, height), whether it has an alpha channel), without reading the pixels."""
     with opened_image(path) as file:
-        if file.mode.startswith(("I", "F")):
-            raise InputError(f"expected an image of 8 bits a channel, got mode {file.mode} in {path}; convert it")
+        if file.mode.startswith(("I", "F")) and file.mode not in SIXTEEN_BITS:
+            raise InputError(f"expected an image of 8 or 16 bits a channel, got mode {file.mode} in {path}; convert it")
         return file.size, file.has_transparency_data
 
 
-def image_pixels(path: Path) -> UInt8[np.ndarray, "h w c"]:
-    """Red, green, blue, and alpha where the image has it, from 0 to 255."""
+def image_pixels(path: Path, turned: bool = False) -> Float32[np.ndarray, "h w c"]:
+    """Red, green, blue, and alpha where the image has it, from 0 to 1.  turned: as its EXIF orientation says."""
     with opened_image(path) as file:
-        return np.array(file.convert("RGBA" if file.has_transparency_data else "RGB"))
+        image = ImageOps.exif_transpose(file) if turned else file
+        if image.mode in SIXTEEN_BITS:
+            grey = np.array(image).astype(np.float32) / np.float32(2**16 - 1)
+            return np.repeat(grey[:, :, None], 3, axis=2)
+        return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB")).astype(np.float32) / 255
+
+
+def _quarter_turned(path: Path) -> bool:
+    """Whether the EXIF orientation of an image file turns it by a right angle."""
+    with opened_image(path) as file:
+        return file.getexif().get(EXIF_ORIENTATION) in QUARTER_TURNS
 
 
 def checked_lens(model: str, size: tuple[float, float], params: Sequence[float], name: str) -> pycolmap.Camera:
@@ -117,6 +135,9 @@ def checked_lens(model: str, size: tuple[float, float], params: Sequence[float],
 def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Frame:
     """The final camera of a photograph, and how to read it.  ValueError where file and lens cannot belong together."""
     size, _ = image_header(photo.path)
+    stored, across = (photo.lens.width, photo.lens.height), (size[1], size[0])
+    turned = not _same_shape(stored, size) and _same_shape(stored, across) and _quarter_turned(photo.path)
+    size = across if turned else size
     lens = _scaled_to(photo.lens, size, photo)
     pinhole = _pinhole(lens, photo)
     width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
@@ -132,7 +153,7 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
         raise InputError(f"the camera of image {photo.name!r} cannot be: {error}") from error
     camera = full.resized(width, height)
     warp = partial(_warp, lens, pinhole, (width, height))
-    view = partial(_view, photo, camera, warp, background)
+    view = partial(_view, photo, turned, camera, warp, background)
     return Frame(photo.name, camera, view, photo.subset, photo.depth_range, photo.path)
 
 
@@ -168,7 +189,7 @@ def _pinhole(lens: pycolmap.Camera, photo: Photo) -> pycolmap.Camera:
         return lens
     if model not in UNDISTORTED_HERE:
         raise InputError(
-            f"expected a pinhole lens or radial and tangential distortion ({', '.join(UNDISTORTED_HERE)}), got "
+            f"expected a pinhole lens or one that can be undistorted ({', '.join(UNDISTORTED_HERE)}), got "
             f"{model} for image {photo.name!r}; make pinhole images first: colmap image_undistorter --image_path "
             f"{photo.path.parent} --input_path MODEL --output_path NEW_SCENE, where MODEL is the folder of cameras.bin"
         )
@@ -191,9 +212,9 @@ def _displacement(lens: pycolmap.Camera) -> float:
     return float(np.hypot(*(np.asarray(lens.img_from_cam(rays)) - corners).T).max() / np.hypot(*size / 2))
 
 
-def _view(photo: Photo, camera: Camera, warp: Warp, background: Float[Tensor, "3"]) -> View:
+def _view(photo: Photo, turned: bool, camera: Camera, warp: Warp, background: Float[Tensor, "3"]) -> View:
     """Composite over the background, undistort, downscale: in this order, no transparent colour bleeds in."""
-    layers = torch.from_numpy(image_pixels(photo.path)).permute(2, 0, 1).to(torch.float32) / 255
+    layers = torch.from_numpy(image_pixels(photo.path, turned)).permute(2, 0, 1)
     size = (layers.shape[2], layers.shape[1])
     if has_alpha := len(layers) == 4:
         rgb, alpha = layers[:3], layers[3:]

@@ -12,6 +12,7 @@ compared with that of its camera, when the scene is loaded; pixels are read when
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -65,8 +66,10 @@ class Scene(Brief):
         return [by_name[name] for name in names]
 
     def load(self, names: Sequence[str] | None = None) -> list[View]:
-        """Read the pictures of these frames (all by default)."""
-        return [frame.view() for frame in (self.frames if names is None else self.select(names))]
+        """Read the pictures of these frames (all by default), several at a time."""
+        frames = self.frames if names is None else self.select(names)
+        with ThreadPoolExecutor(max(1, min(len(frames), torch.get_num_threads()))) as readers:
+            return list(readers.map(lambda frame: frame.view(), frames))
 
     def extent(self, names: Sequence[str] | None = None) -> float:
         """`camera_extent` of these frames (all by default)."""

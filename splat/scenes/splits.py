@@ -17,6 +17,7 @@ explicit   training (and test) views by name or by number
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -166,6 +167,18 @@ def explicit_split(names: Sequence[str], train: Sequence[str | int], test: Seque
     if both:
         raise InputError(f"expected test views that do not train, got {both[0]!r} in both lists")
     return Split(chosen, held_out, "explicit")
+
+
+def read_names(path: Path) -> tuple[str, ...]:
+    """The names of views in a text file, one in each line.  InputError where it is no text or has none."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"expected names of views, one in each line, in {path}, got no text") from error
+    names = tuple(line.strip() for line in lines if line.strip())
+    if not names:
+        raise InputError(f"expected names of views, one in each line, in {path}, got none")
+    return names
 
 
 def _resolve(names: Sequence[str], key: str | int) -> str:

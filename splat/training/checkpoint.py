@@ -42,6 +42,7 @@ KIND = "expected a checkpoint written by landscape train"
 # settings that older files lack, where the training was the one of their defaults
 LATER = {
     "protocol",
+    "loss.border",
     "clamp_image",
     "rates.position_hold",
     "densify.split_distance",
@@ -55,13 +56,15 @@ REMEDY = "take another copy of the file, or train anew"
 class Checkpoint(Brief):
     """A training as it was saved, the scene that it belongs to, and the version of torch that wrote it.
 
-    origin: of another tool's file, what was assumed (`foreign_training`).
+    origin: of another tool's file, what was assumed (`foreign_training`).  all_views: how many views it was trained on, where
+    the scene names fewer (`thinned`).
     """
 
     training: Training
     scene: SceneReference
     torch_version: str
     origin: dict[str, Any] | None = None
+    all_views: int | None = None
 
     @property
     def assumptions(self) -> list[str]:
@@ -79,7 +82,8 @@ class Checkpoint(Brief):
         kept = [i for i, name in enumerate(self.scene.train) if name in chosen]
         train, sizes = [self.scene.train[i] for i in kept], [self.scene.sizes[i] for i in kept]
         known = self.scene.photographs and [self.scene.photographs[i] for i in kept]
-        return replace(self, scene=replace(self.scene, train=train, sizes=sizes, photographs=known))
+        scene_of_these = replace(self.scene, train=train, sizes=sizes, photographs=known)
+        return replace(self, scene=scene_of_these, all_views=self.all_views or len(self.scene.train))
 
     def load_scene(self, path: Path, scene: Path | None = None) -> Scene:
         """The scene that this checkpoint, read from path, belongs to, see `SceneReference.load`."""
@@ -254,6 +258,8 @@ def _instead(path: Path) -> str:
         return f"a folder; name the {inside} in it"
     if runs := sorted(path.glob("*/checkpoint.pt")):
         return f"a folder of runs; name one of them, such as {runs[0].parent}"
+    if (path.parent / "checkpoint.pt").is_file():
+        return f"a folder within the run {path.parent}; name that"
     return "a folder without one; name the run that landscape train wrote, its --out"
 
 

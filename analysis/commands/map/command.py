@@ -44,6 +44,7 @@ from splat.curvature.fields import FIELDS, Field, Values, scene_fields
 from splat.curvature.objective import SceneObjective
 from splat.render.sight import Sight
 from splat.scenes.view import View
+from splat.training.checkpoint import Checkpoint
 
 ENDS = {"e1": "share of e₁", "e_min": "share of e_min"}
 AXES = ("order_gap", "condition", "one_view")  # of fragility
@@ -111,7 +112,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         data = MapRecord(
             gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
             sentences=[each.sentence for each in shown] + fragility_sentences(fragile), steepest=shown, fragility=fragile,
-            notes=notes + checkpoint.assumptions, provenance=made,
+            notes=notes + checkpoint.assumptions + _views_left_out(checkpoint), provenance=made,
         )  # fmt: skip
         _write(folder, data)
         with stages.stage("pictures"):
@@ -191,6 +192,16 @@ def _write_ends(folder: Path, objective: SceneObjective, found: Fields, report: 
         shown.append(one)
         report(done + 1, len(found.ends), "directions")
     return shown
+
+
+def _views_left_out(checkpoint: Checkpoint) -> list[str]:
+    if checkpoint.all_views is None:
+        return []
+    seen = len(checkpoint.scene.train)
+    return [
+        f"measured on {seen} of {checkpoint.all_views} training views; what the others would change is not known of single "
+        "Gaussians, which may be seen by none of the views measured"
+    ]
 
 
 def _write(folder: Path, data: MapRecord) -> None:

@@ -34,10 +34,10 @@ class CpuImageLoss:
         plane_rows = -(-height // TILE_ROWS) * TILE_ROWS
         self.dtype = np.dtype(dtype)
         self.frame = Frame(height, width, plane_rows, stride, window(torch.float64).numpy().astype(dtype))
-        count, scalar = 3 * height * width, self.dtype.type
-        self.pixel, self.structural = settings.pixel_weight / count, settings.ssim_weight / count
-        numbers = map(scalar, (settings.eps, self.pixel, self.structural))
-        self.loss = Loss(KINDS[settings.pixel], *numbers)
+        scalar, self.structural = self.dtype.type, settings.structural(height, width)
+        self.pixel = settings.pixel_weight / (3 * height * width)
+        eps, pixel, structural = map(scalar, (settings.eps, self.pixel, self.structural))
+        self.loss = Loss(KINDS[settings.pixel], eps, pixel, structural, settings.margin)
 
     def planes(self, sets: int) -> np.ndarray:
         """Uninitialised plane sets, (sets, 3, padded height, padded width)."""

@@ -36,7 +36,7 @@ def second_rows(start, stop, frame, loss, x, y, target, blurred_sp, seconds, unc
             if row < first:
                 continue
             at = top + row * frame.stride
-            seconds_row(own, row, top, frame, target, second)
+            seconds_row(own, row, top, frame, loss.margin, target, second)
             for i in range(0, frame.stride, lanes(x)):
                 residual, found = load(x, at + i) - load(y, at + i), seconds_at(second, i, frame)
                 for j in range(SECONDS):

@@ -26,6 +26,8 @@ from splat.losses.cpu.window import (
     blur_down_three,
     bordered_rows,
     clear,
+    counts,
+    leave_margin,
     moments_along,
     moments_down,
     part_of,
@@ -53,12 +55,16 @@ PAIR_FIELDS = 4  # m, p, M, V; after differentiation what is blurred for the gra
 
 
 class Loss(NamedTuple):
-    """The pixel loss and its eps, and the weights of it and of 1 - S over the number of values; no SSIM if structural is 0."""
+    """The pixel loss and its eps, and the weights of it and of 1 - S over the number of values; no SSIM if structural is 0.
+
+    margin: pixels at every side round which no window counts.
+    """
 
     kind: int
     eps: float
     pixel: float
     structural: float
+    margin: int
 
 
 @formula
@@ -90,9 +96,9 @@ def window_at(own, row, i, at, frame, target):
 
 
 @formula
-def differentiate(own, row, top, frame, target, rows, values, slopes, gradient):
+def differentiate(own, row, top, frame, margin, target, rows, values, slopes, gradient):
     """Stage two of the gradient, if any: S_m, S_p, S_q of a row, blurred along it, to `slopes`; the sum of 1 - S."""
-    if row < 0 or row >= frame.height:
+    if not counts(row, margin, frame):
         clear(slopes, 0, 3, row, frame)
         return 0.0
     for i in range(0, frame.stride, lanes(own)):
@@ -101,7 +107,9 @@ def differentiate(own, row, top, frame, target, rows, values, slopes, gradient):
         store(values, BORDER + i, distance)
         if gradient is not None:
             put(rows, i, frame, (sm, sp, sq))
+    leave_margin(values, 1, margin, frame)
     if gradient is not None:
+        leave_margin(rows, 3, margin, frame)
         blur_along(rows, 3, frame, slopes, 0, row)
     return row_sum(values, frame.width)
 
@@ -144,9 +152,9 @@ def feed_pair(x, y, top, row, frame, rows, ring):
 
 
 @formula
-def differentiate_pair(ring, row, frame, rows, values, slopes):
+def differentiate_pair(ring, row, frame, margin, rows, values, slopes):
     """Stage two of a pair: the fields of `pair_slopes`, blurred along the row; the sum of 1 - S."""
-    if row < 0 or row >= frame.height:
+    if not counts(row, margin, frame):
         clear(slopes, 0, PAIR_FIELDS, row, frame)
         return 0.0
     for i in range(0, frame.stride, lanes(ring)):
@@ -155,6 +163,8 @@ def differentiate_pair(ring, row, frame, rows, values, slopes):
         distance, in_m, in_p, in_mean, in_variance = pair_slopes(m, p, mean, variance)
         store(values, BORDER + i, distance)
         put(rows, i, frame, (in_m, in_p, in_mean, in_variance))
+    leave_margin(values, 1, margin, frame)
+    leave_margin(rows, PAIR_FIELDS, margin, frame)
     blur_along(rows, PAIR_FIELDS, frame, slopes, 0, row)
     return row_sum(values, frame.width)
 
@@ -200,9 +210,11 @@ def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, pixel
                 row = ahead - REACH
                 if first - reach <= row < last + reach:
                     if target is None:
-                        distance = differentiate_pair(ring, row, frame, rows, values, slopes)
+                        distance = differentiate_pair(ring, row, frame, loss.margin, rows, values, slopes)
                     else:
-                        distance = differentiate(ring, row, top, frame, target, rows, values, slopes, gradient)
+                        distance = differentiate(
+                            ring, row, top, frame, loss.margin, target, rows, values, slopes, gradient
+                        )
                     if first <= row < last:
                         distances[channel * frame.height + row] = distance
             row = ahead - lead
@@ -217,11 +229,16 @@ def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, pixel
 
 
 @formula
-def seconds_row(own, row, top, frame, target, second):
+def seconds_row(own, row, top, frame, margin, target, second):
     """S's second derivatives at a row of the image, to SECONDS bordered rows."""
+    if not counts(row, margin, frame):
+        for i in range(SECONDS * (frame.stride + 2 * BORDER)):
+            second[i] = 0
+        return
     for i in range(0, frame.stride, lanes(own)):
         m, p, q, mu, var = window_at(own, row, i, top + row * frame.stride, frame, target)
         put(second, i, frame, ssim_seconds(m, p, q, mu, var))
+    leave_margin(second, SECONDS, margin, frame)
 
 
 @formula
@@ -293,7 +310,7 @@ def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, products
                 feed(None, x, y, top, ahead, frame, rows, own, 0)
                 inside = first - reach <= row < last + reach and 0 <= row < frame.height
                 if inside:
-                    seconds_row(own, row, top, frame, target, second)
+                    seconds_row(own, row, top, frame, loss.margin, target, second)
                 for k in range(K):
                     feed(V[k], x, y, top, ahead, frame, rows, ring, 3 * k)
                     if products is not None and inside:
@@ -327,7 +344,7 @@ def diagonal_rows(start, stop, frame, loss, x, y, target, blurred_sp, squared, d
                 feed(None, x, y, top, ahead, frame, rows, own, 0)
                 row = ahead - REACH
                 if 0 <= row < frame.height and row >= first - REACH:
-                    seconds_row(own, row, top, frame, target, second)
+                    seconds_row(own, row, top, frame, loss.margin, target, second)
                     blur_along(second, SECONDS, squared, bends, 0, row)
                 else:
                     clear(bends, 0, SECONDS, row, frame)

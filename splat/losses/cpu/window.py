@@ -72,6 +72,22 @@ def put(rows, i, frame, numbers):
 
 
 @formula
+def counts(row, margin, frame):
+    """Whether a row is far enough from the image's upper and lower edges."""
+    return margin <= row < frame.height - margin
+
+
+@formula
+def leave_margin(rows, fields, margin, frame):
+    """Bordered rows are 0 so near to the image's left and right edges."""
+    for field in range(fields):
+        at = field * (frame.stride + 2 * BORDER) + BORDER
+        for i in range(margin):
+            rows[at + i] = 0
+            rows[at + frame.width - 1 - i] = 0
+
+
+@formula
 def begin_of(rows, field, frame):
     """Where a bordered row has its first number; what follows its `width` numbers, and what precedes them, is set to 0."""
     at = field * (frame.stride + 2 * BORDER)

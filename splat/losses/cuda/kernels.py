@@ -163,20 +163,31 @@ def moments_down(along, out, constants, height, width, BLOCK: tl.constexpr):
 
 
 @jit
+def counted(values, x, y, height, width, MARGIN: tl.constexpr):
+    """The values, 0 so near to the image's edges."""
+    inside = (x >= MARGIN) & (x < width - MARGIN) & (y >= MARGIN) & (y < height - MARGIN)
+    found = ()
+    for j in tl.static_range(len(values)):
+        found = found + (tl.where(inside, values[j], 0.0),)
+    return found if MARGIN > 0 else values
+
+
+@jit
 def differentiate(
     fed, target_moments, out, second, distances, constants, height, width,
-    SLOPES: tl.constexpr, SECOND: tl.constexpr, BLOCK: tl.constexpr,
+    SLOPES: tl.constexpr, SECOND: tl.constexpr, MARGIN: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sums of 1 - S; with SLOPES also S_m, S_p, S_q, with SECOND the second derivatives of S."""
-    at, _x, y, here, size = pixels(height, width, BLOCK)
+    at, x, y, here, size = pixels(height, width, BLOCK)
     m, p, q = windowed_down(fed, at, y, height, width, constants, here, 3)
     mu, var = load_all(target_moments, at, size, here, 2)
-    distance, sm, sp, sq = ssim_slopes(m, p, q, mu, var)
+    distance, sm, sp, sq = counted(ssim_slopes(m, p, q, mu, var), x, y, height, width, MARGIN)
     partial_sum(distance, here, distances)
     if SLOPES:
         store_all(out, at, size, (sm, sp, sq), here, 3)
     if SECOND:
-        store_all(second, at, size, ssim_seconds(m, p, q, mu, var), here, SECONDS)
+        found = counted(ssim_seconds(m, p, q, mu, var), x, y, height, width, MARGIN)
+        store_all(second, at, size, found, here, SECONDS)
 
 
 @jit
@@ -267,14 +278,14 @@ def finish_diagonal(
 
 
 @jit
-def differentiate_pair(fed, along, out, distances, constants, height, width, BLOCK: tl.constexpr):
+def differentiate_pair(fed, along, out, distances, constants, height, width, MARGIN: tl.constexpr, BLOCK: tl.constexpr):
     """Sums of 1 - S, and the four fields of `pair_slopes`."""
-    at, _x, y, here, size = pixels(height, width, BLOCK)
+    at, x, y, here, size = pixels(height, width, BLOCK)
     m, p = windowed_down(fed, at, y, height, width, constants, here, 2)
     mean, variance = windowed_moments(along, at, y, height, width, constants, here)
-    distance, in_m, in_p, in_mean, in_variance = pair_slopes(m, p, mean, variance)
-    partial_sum(distance, here, distances)
-    store_all(out, at, size, (in_m, in_p, in_mean, in_variance), here, 4)
+    found = counted(pair_slopes(m, p, mean, variance), x, y, height, width, MARGIN)
+    partial_sum(found[0], here, distances)
+    store_all(out, at, size, found[1:], here, 4)
 
 
 @jit

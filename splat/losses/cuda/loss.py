@@ -23,8 +23,8 @@ class CudaImageLoss:
 
     def __init__(self, image: Float[Tensor, "3 h w"], settings: LossSettings):
         self.like, self.shape = image.new_empty(0), tuple(image.shape[-2:])
-        count = 3 * self.shape[0] * self.shape[1]
-        self.pixel, self.structural = settings.pixel_weight / count, settings.ssim_weight / count
+        self.pixel, self.structural = settings.pixel_weight / image[:3].numel(), settings.structural(*self.shape)
+        self.margin = {"MARGIN": settings.margin}
         numbers = torch.tensor([settings.eps, self.pixel, self.structural], dtype=torch.float64)
         taps = window(torch.float64)
         self.constants = torch.cat([taps, numbers]).to(image, non_blocking=True)
@@ -90,7 +90,7 @@ class CudaImageLoss:
         if self.ssim:
             r, slopes = x - y, self.fields(4)
             fed, along = self.fed(r[None], r, y, 2), self.moments_along(0.5 * (x + y))
-            self.run(kernels.differentiate_pair, fed, along, slopes, sums[1], self.constants)
+            self.run(kernels.differentiate_pair, fed, along, slopes, sums[1], self.constants, **self.margin)
             slopes = self.blurred(slopes, self.constants)
         in_x, in_y = self.fields(), self.fields()
         self.run(
@@ -119,7 +119,8 @@ class CudaViewLoss(CudaImageLoss):
             bends = self.fields(SECONDS) if second else bends
             fed = self.fed(residual[None], residual, self.target, 3)
             outputs = first, bends, sums[1]
-            self.run(kernels.differentiate, fed, self.moments, *outputs, self.constants, SLOPES=slopes, SECOND=second)
+            flags = {"SLOPES": slopes, "SECOND": second, **self.margin}
+            self.run(kernels.differentiate, fed, self.moments, *outputs, self.constants, **flags)
             first = self.blurred(first, self.constants) if slopes else first
         inputs, outputs = (first, residual, self.target), (gradient, sp, sums[0])
         self.run(kernels.finish_gradient, *inputs, *outputs, self.constants, **self.which, SLOPES=slopes)

@@ -14,7 +14,7 @@ import torch
 
 from landscape.errors import InputError, lacks_memory
 from splat.model.untrusted import inside
-from splat.scenes.images import Photo, image_files, image_folder
+from splat.scenes.images import IMAGE_SUFFIXES, Photo, image_files, image_folder
 from splat.scenes.view import Points
 
 MODEL_FOLDERS = ("sparse/0", "sparse", ".")
@@ -112,11 +112,20 @@ def _paths(names: list[str], folder: Path) -> list[Path]:
     """
     if any((folder / name).is_file() for name in names):
         return [inside(folder, name) for name in names]
+    nested = [_with_suffix(inside(folder, name)) for name in names]
+    if any(path.is_file() for path in nested):
+        return nested
     files = image_files(folder)
     if len(files) == len(names) and all(re.fullmatch(r"image\d+", path.stem) for path in files):
         return files
     by_stem = {path.stem: path for path in files}
     return [by_stem.get(Path(name).stem) or inside(folder, name) for name in names]
+
+
+def _with_suffix(path: Path) -> Path:
+    """The file under another suffix of images, where there is one."""
+    others = (path.with_suffix(case(suffix)) for suffix in IMAGE_SUFFIXES for case in (str, str.upper))
+    return next((other for other in others if other.is_file()), path)
 
 
 def points_of(reconstruction: pycolmap.Reconstruction, posed: list[pycolmap.Image]) -> Points | None:

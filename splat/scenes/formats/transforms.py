@@ -7,7 +7,7 @@ to camera rotation here is diag(1, -1, -1) R^T.  Intrinsics stand at the top or 
     camera_angle_x               horizontal field of view, radians, where fl_x is not given
     k1 k2 k3 p1 p2               OpenCV's radial and tangential distortion (k4 ... of a rational model are refused)
     mask_path                    the image's mask (`splat/scenes/layers.py`), from the folder of the file
-    camera_model, is_fisheye     PINHOLE, SIMPLE_PINHOLE, OPENCV and the like; fisheye and panoramas are refused
+    camera_model, is_fisheye     PINHOLE, SIMPLE_PINHOLE, OPENCV and the like; OPENCV_FISHEYE with k1 to k4; others are refused
     ply_file_path                points; an integer list property `views` of a vertex numbers the frames that see it
     background                   (this project) the colour that the pictures were composited over
 
@@ -32,7 +32,7 @@ from splat.model.files.ply import read_header, read_rows
 from splat.model.untrusted import inside
 from splat.scenes.images import (
     PINHOLE_MODELS,
-    UNDISTORTED_HERE,
+    RADIAL_MODELS,
     Photo,
     checked_lens,
     image_folder,
@@ -43,6 +43,7 @@ from splat.scenes.view import Points, Subset
 
 BLENDER_FILES: tuple[tuple[Subset, str], ...] = (("train", "transforms_train.json"), ("test", "transforms_test.json"))
 SINGLE_FILE = "transforms.json"
+FISHEYE = "OPENCV_FISHEYE"
 REFUSED_TERMS = ("k4", "k5", "k6")
 NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "k1", "k2", "k3", "p1", "p2", *REFUSED_TERMS)
 
@@ -68,7 +69,7 @@ def read_transforms(
     paths = [] if images is not None else [_image_path(root, frame["file_path"]) for frame in data["frames"]]
     if not any(p.is_file() for p in paths) and (images is not None or not (root / "images").exists()):
         folder = image_folder(root, images)
-        paths = [_image_path(folder, Path(frame["file_path"]).name) for frame in data["frames"]]
+        paths = [_in_folder(folder, frame["file_path"]) for frame in data["frames"]]
     photos, skipped = _photos(path, data, paths, None, strict)
     points = None
     if cloud := _file(data, "ply_file_path", path):
@@ -95,6 +96,13 @@ def _image_path(folder: Path, file_path: str) -> Path:
     path = inside(folder, file_path)
     candidates = [path] + [path.with_name(path.name + suffix) for suffix in (".png", ".jpg", ".jpeg")]
     return next((candidate for candidate in candidates if candidate.is_file()), path)
+
+
+def _in_folder(folder: Path, file_path: str) -> Path:
+    """The file in another folder of the images: by its path below the folder that the file names, else by its name."""
+    nested = Path(*Path(file_path).parts[1:]) if len(Path(file_path).parts) > 1 else Path(file_path)
+    found = _image_path(folder, str(nested))
+    return found if found.is_file() else _image_path(folder, Path(file_path).name)
 
 
 def _name(frame: Mapping[str, Any]) -> str:
@@ -151,13 +159,13 @@ def _lens(values: Mapping[str, Any], size: tuple[int, int], name: str, path: Pat
     if wrong:
         raise InputError(f"expected a finite number, got {wrong[0]} = {values[wrong[0]]!r} for {name!r} in {path}")
     model = str(values.get("camera_model", "OPENCV"))
-    if values.get("is_fisheye") or model not in PINHOLE_MODELS + UNDISTORTED_HERE:
-        kind = "a fisheye lens" if values.get("is_fisheye") else f"camera_model {model}"
+    fisheye = bool(values.get("is_fisheye")) or model == FISHEYE
+    if not fisheye and model not in PINHOLE_MODELS + RADIAL_MODELS:
         raise InputError(
-            f"expected pinhole images or radial and tangential distortion, got {kind} for {name!r} in {path}: a "
-            "pinhole renderer cannot draw it; undistort the photographs to pinhole images first"
+            f"expected pinhole images, {FISHEYE}, or radial and tangential distortion, got camera_model {model} for {name!r} "
+            f"in {path}: a pinhole renderer cannot draw it; undistort the photographs to pinhole images first"
         )
-    rational = [key for key in REFUSED_TERMS if values.get(key)]
+    rational = [key for key in REFUSED_TERMS if values.get(key) and not (fisheye and key == "k4")]
     if rational:
         raise InputError(
             f"expected at most k1, k2, k3, p1 and p2, got {', '.join(rational)} for {name!r} in {path}, whose meaning "
@@ -167,6 +175,9 @@ def _lens(values: Mapping[str, Any], size: tuple[int, int], name: str, path: Pat
     fx = _focal(values, width, name, path)
     fy = float(values.get("fl_y", fx))
     centre = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
+    if fisheye:
+        terms = [float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4")]
+        return checked_lens(FISHEYE, (width, height), [fx, fy, *centre, *terms], name)
     k1, k2, p1, p2, k3 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3"))
     if not any((k1, k2, p1, p2, k3)):
         return checked_lens("PINHOLE", (width, height), [fx, fy, *centre], name)

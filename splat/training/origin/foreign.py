@@ -74,7 +74,7 @@ def foreign_training(path: Path, ask: Foreign, picture: Path) -> tuple[Training,
     scene, images, downscale = _scene(found, ask, preset)
     split, how = _split(scene, found, ask, path)
     reference = SceneReference.to(scene, path, split, images, downscale)
-    config = _config(scene, found, render)
+    config = _config(scene, found, preset, render)
     world, level = _world(found.gaussians, scene, reference, config, _worlds(preset, scene, path), picture, name)
     similarity = None if world is None else world.tolist()
     reference = replace(reference, similarity=similarity, centred=preset.centred)
@@ -151,10 +151,12 @@ def _used(path: Path, scene: Scene) -> set[str]:
     return {name for name in scene.names if Path(name).stem in listed}
 
 
-def _config(scene: Scene, found: SplatFile, render: RenderSettings) -> TrainConfig:
-    """3DGS, with the trainer's renderer, on the scene's background."""
+def _config(scene: Scene, found: SplatFile, preset: Preset, render: RenderSettings) -> TrainConfig:
+    """3DGS, with the trainer's renderer and loss, on the scene's background."""
     red, green, blue = scene.background.tolist()
-    return TrainConfig(iterations=max(1, found.step or 1), background=(red, green, blue), render=render)
+    return TrainConfig(
+        iterations=max(1, found.step or 1), background=(red, green, blue), render=render, loss=preset.loss
+    )
 
 
 def _worlds(preset: Preset, scene: Scene, path: Path) -> Sequence[Similarity | None]:

@@ -6,16 +6,16 @@
     blur, px^2  0.3         0.3             0.3          0.3          0.3     0.3         0.3
     antialiased mip         mip-plain       mip          mip-plain    plain** mip*        mip
     principal   middle      own             own          own          own     own         own
-    SSIM        padded      valid           valid        valid        own     valid       padded
+    SSIM        padded      valid           valid        valid        own*    valid       padded
     width       <= 1600     any             any          any          any     any         any
     world       scene       normalised      normalised   its file     scene   scene       scene
 
-*: not known here, 3DGS's.  **: mip-plain with a blur of 0.1.  antialiased: by what equation, where the Gaussians are
+*: not known, or not here: 3DGS's.  **: mip-plain with a blur of 0.1.  antialiased: by what equation, where the Gaussians are
 (`splat/projection/antialias.py`).  mip-splatting is a graphdeco with that, a blur of its cfg_args' kernel_size (0.1), and a 3-D
 filter.  Sources: graphdeco-inria/gaussian-splatting 1152adc; gsplat v1.5.3 and 1.6 (`_constants.py`,
 `examples/simple_trainer.py`, `losses.py`); nerfstudio `models/splatfacto.py`; Brush `kernels/helpers.rs`, `rasterize.rs`;
-LichtFeld `src/training/trainer.cpp`.  Not followed, and said in the record: SSIM without the border ("valid") is taken with
-zero padding; the limits of the projection's Jacobian are 3DGS's; splats end at alpha 1/255 and not at 3 or 3.33 sigma.
+LichtFeld `src/training/trainer.cpp`.  SSIM: whether windows may reach beyond the image (`LossSettings.border`).  Not followed:
+the limits of the projection's Jacobian are 3DGS's; splats end at alpha 1/255 and not at 3 or 3.33 sigma.
 """
 
 from collections.abc import Mapping
@@ -23,10 +23,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from landscape.errors import InputError
+from splat.losses.reference import LossSettings
 from splat.model.settings import Antialias, RenderSettings
 
 World = Literal["scene", "gsplat", "nerfstudio"]
-VALID = "its SSIM leaves out a border of 5 px, here that border counts, with zeros beyond the image"
 UNKNOWN = "its near plane is not known here, 3DGS's 0.2 is used"
 
 
@@ -39,6 +39,7 @@ class Preset:
     """
 
     render: RenderSettings = RenderSettings()
+    loss: LossSettings = LossSettings()
     world: World = "scene"
     centred: bool = False
     widest: int | None = None
@@ -47,17 +48,19 @@ class Preset:
     different: tuple[str, ...] = ()
 
 
+_VALID = LossSettings(border="valid")
 _OLD, _NEW = RenderSettings(alpha_max=0.999, near=0.01), RenderSettings(near=0.01)
 PRESETS: Mapping[str, Preset] = {
     "graphdeco": Preset(centred=True, widest=1600),
-    "gsplat": Preset(_OLD, "gsplat", antialias="mip-plain", different=(VALID,)),
-    "gsplat-raw": Preset(_OLD, antialias="mip-plain", different=(VALID,)),  # with --no-normalize-world-space
-    "gsplat-1.6": Preset(_NEW, "gsplat", different=(VALID,)),
+    "gsplat": Preset(_OLD, _VALID, "gsplat", antialias="mip-plain"),
+    "gsplat-raw": Preset(_OLD, _VALID, antialias="mip-plain"),  # with --no-normalize-world-space
+    "gsplat-1.6": Preset(_NEW, _VALID, "gsplat"),
     "nerfstudio": Preset(
         _OLD,
+        _VALID,
         "nerfstudio",
         antialias="mip-plain",
-        different=(VALID, "it trains on random backgrounds and on clamped colours, here neither is done"),
+        different=("it trains on random backgrounds and on clamped colours, here neither is done",),
     ),
     "brush": Preset(
         RenderSettings(alpha_max=0.999),
@@ -68,7 +71,7 @@ PRESETS: Mapping[str, Preset] = {
     "mip-splatting": Preset(
         RenderSettings(blur=0.1, antialias="mip-splatting"), centred=True, widest=1600, antialias="mip-splatting"
     ),
-    "lichtfeld": Preset(different=(VALID, UNKNOWN)),
+    "lichtfeld": Preset(loss=_VALID, different=(UNKNOWN, "its antialiasing is not known here, 3DGS's is used")),
     "splat-landscape": Preset(),
 }
 

@@ -30,6 +30,7 @@ from analysis.train.scores import render_name
 from splat.losses.reference import psnr
 from splat.model.gaussians import ATTRIBUTES
 from splat.render.render import render
+from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
@@ -238,6 +239,19 @@ def test_more_views_than_the_scene_has_are_refused(original, tmp_path, capsys):
     refuse(capsys, arguments(original, tmp_path / "run", "--views", "30"), "at most 4 training views", "got 30")
     refuse(capsys, arguments(original, tmp_path / "run", "--views", "0"), "at least 1 training view, got 0")
     refuse(capsys, arguments(original, tmp_path / "run", "--views", "1"), "at least two views")
+
+
+def test_training_views_are_listed_in_a_file(original, tmp_path, capsys):
+    listed, empty, out = tmp_path / "list.txt", tmp_path / "empty.txt", tmp_path / "run"
+    names = load_scene(original).names
+    listed.write_text(f"{names[3]}\n\n{Path(names[0]).stem}\n")
+    empty.write_text("\n")
+    scene, split, _, _ = planned(TrainOptions(original, train_list=listed), out)
+    assert split.train == (names[3], names[0]) and set(split.test) == {*names} - {names[3], names[0]}
+    assert scene.names == names
+    train = ["train", str(original), "--out", str(out), "--train-list"]
+    refuse(capsys, [*train, str(empty)], "one in each line", "got none")
+    refuse(capsys, [*train, str(listed), "--views", "2"], "--views or --train-list, got both")
 
 
 @pytest.mark.parametrize(

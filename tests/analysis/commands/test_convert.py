@@ -60,6 +60,11 @@ def test_a_ply_is_probed_and_its_record_says_what_was_assumed(folder):
     record = read_record(folder / "probe").data
     assert record.provenance.origin["trained_by"] == "splat-landscape" and len(record.provenance.views) == 2
     assert any("trained by splat-landscape (the file)" in note for note in record.notes)
+    assert (record.counts.views, record.counts.views_of) == (2, 4)
+    ends, traces = record.eigenvalues, record.traces.values()
+    assert all(each.views_error > 0 for each in (record.objective, ends.max, ends.second, ends.min, *traces))
+    assert ends.max.without_one[0] < ends.max.value < ends.max.without_one[1]
+    assert any("2 of 4 training views" in note for note in record.notes)
 
 
 def test_a_training_starts_from_another_tools_gaussians_with_its_renderer(folder):
@@ -77,7 +82,7 @@ def test_a_training_starts_from_another_tools_gaussians_with_its_renderer(folder
     ]
     assert main([*common, "--trained-by", "gsplat-raw", "--out", str(out)]) == 0
     training = load_checkpoint(out / "checkpoint.pt").training
-    assert (training.config.render.alpha_max, training.step) == (0.999, 2)
+    assert (training.config.render.alpha_max, training.config.loss.border, training.step) == (0.999, "valid", 2)
     assert len(training.gaussians) == len(MADE.truth)
     moved = (training.gaussians.means - MADE.truth.means).abs().max()
     assert 0 < moved < 0.01 * training.extent

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from analysis.console import stages
 from analysis.console.kept import Kept, kept_stages
 from analysis.console.stages import Stages
 
@@ -88,4 +89,6 @@ def test_time_that_ends_gives_a_stage_up_and_begins_no_other(tmp_path):
         pytest.fail("it went on")
 
     soon = kept(tmp_path)
+    soon.stages.expect({"first": stages.Work(100.0), "second": stages.Work(2.0)}, "a guess")
     assert soon.run("first", Found, slow) is None and soon.unreached == ["first"]
+    assert soon.stages.left() == ", about 2 s left"  # what is given up takes no time

@@ -5,21 +5,24 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from analysis.commands.cli import main
 from analysis.measures import memory
-from analysis.measures.memory import GIB, MIB, telling_needs, vectors_within
+from analysis.measures.memory import GIB, MIB, expected_peak, require_pictures, size_of, telling_needs, vectors_within
+from landscape.errors import InputError
+from splat.backend.memory import free_memory, resident_memory, staying_within
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 
 ROOT = Path(__file__).parents[3]
+MADE = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=64, height=48))
 
 
 @pytest.fixture
 def objective() -> SceneObjective:
-    made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=64, height=48))
-    return SceneObjective(made.truth, made.scene.load())
+    return SceneObjective(MADE.truth, MADE.scene.load())
 
 
 def free(monkeypatch, amount: float) -> None:
@@ -56,6 +59,38 @@ def test_what_products_take_is_told_where_memory_runs_out(objective, monkeypatch
         raise RuntimeError("another")
 
 
+def test_what_a_view_takes_is_foreseen_from_its_raster(objective):
+    needs, kept = objective.needs, objective.linearized
+    assert 0.7 < needs.view / kept.first.bytes < 1.5
+    assert 0.7 < (needs.product - 5 * needs.vector) / kept.workspace(1) < 1.5
+
+
+def test_less_memory_keeps_fewer_views_and_too_little_is_refused(objective, monkeypatch):
+    needs, used = objective.needs, resident_memory()
+    assert needs.view + needs.beside < expected_peak(objective) - used < 3 * needs.view + needs.beside + 2**24
+    few = SceneObjective(objective.active, objective.views, memory=needs.view)
+    assert few.linearized.kept == 1 and objective.linearized.kept == 2
+    free(monkeypatch, needs.view)
+    with pytest.raises(InputError, match=r"expected at least 0\.\d+ GB .* got .*; --memory 0\.\d+GB would fit"):
+        expected_peak(objective)
+    free(monkeypatch, 1e6)
+    with pytest.raises(InputError, match=r"--max-views 6 would fit"):
+        require_pictures([*MADE.scene.frames] * 5, objective.active)
+
+
+def test_a_process_stays_within_what_it_was_told():
+    cpu = torch.device("cpu")
+    with staying_within(resident_memory() + 50 * MIB):
+        assert 0 < free_memory(cpu) <= 50 * MIB
+    assert free_memory(cpu) > 60 * MIB
+
+
+@pytest.mark.parametrize("text", ["8", "much", "-1GB", "GB"])
+def test_what_is_no_size_is_refused(text):
+    with pytest.raises(InputError, match="such as 8GB"):
+        size_of(text)
+
+
 def test_a_probe_in_little_memory_says_what_it_needs_and_what_would_fit(tmp_path):
     made = synthetic_scene(SyntheticSettings(gaussians=60, views=5, width=200, height=150))
     write_transforms_scene(made.scene, tmp_path / "scene")
@@ -63,7 +98,9 @@ def test_a_probe_in_little_memory_says_what_it_needs_and_what_would_fit(tmp_path
     program = (
         "import resource, sys\nimport psutil\nimport analysis.probe.command as command\n"
         "from analysis.commands.cli import main\nmeasure = command.measure\n"
-        "def limited(objective, *more):\n    objective.linearized\n"
+        "from splat.curvature.hessian import SceneHessian\nimport torch\n"
+        "def limited(objective, *more):\n    objective.approximate_blocks, objective.gradient\n"  # kernels are loaded
+        "    H = SceneHessian(objective)\n    H.apply(torch.ones(H.dim, 4))\n"
         "    limit = psutil.Process().memory_info().vms + 2**20\n"
         "    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))\n    return measure(objective, *more)\n"
         "command.measure = limited\nsys.exit(main(sys.argv[1:]))"

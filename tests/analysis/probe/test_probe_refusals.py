@@ -44,6 +44,9 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(run, tmp_path, capsys):
     path.write_bytes(b"not a checkpoint")
     refused(capsys, [str(path)], "not one or is damaged")
     shutil.copy(run / "checkpoint.pt", path)
+    (copy / "probe").mkdir()
+    refused(capsys, [str(copy / "probe")], f"found a folder within the run {copy}; name that")
+    (copy / "probe").rmdir()
     refused(capsys, [str(path), "--scene", str(tmp_path / "nowhere")], "does not exist")
     write_transforms_scene(synthetic_scene(replace(SCENE, views=2)).scene, tmp_path / "other")
     refused(

@@ -385,7 +385,7 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     data["eigenvalues"]["min"] |= {"reason": reason, "matvecs": 15}
     data["provenance"] |= {"settings": settings, "command": "landscape probe run --seconds 45 --out there"}
     (line,) = (line for line in findings(probe_of(data)) if line.level == "open")
-    assert line.text.startswith(f"{index.replace('_', ' ').capitalize()}: – (between 0.500 and –); ")
+    assert line.text.startswith(f"{index.replace('_', ' ').capitalize()}: – (at least 0.500); ")
     assert line.text.endswith(f"{command}." if command else "no more products resolve it.")
     text = Page(page(tmp_path / "probe", data, arrays)).text
     assert "361" not in text and "0.500" in text

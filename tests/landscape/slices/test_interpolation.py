@@ -76,6 +76,13 @@ def test_the_bound_holds_for_all_points_as_often_as_it_says(draw, least):
     assert all(error_bound(row[:64], 1000, looks=2) > error_bound(row[:64], 1000, looks=1) for row in errors[:20])
 
 
+def test_the_bound_holds_where_a_tenth_of_the_errors_is_ten_times_as_large():
+    """As beside a jump: most errors say nothing of the largest ones."""
+    random = np.random.default_rng(2)
+    errors = random.exponential(size=(400, 1064)) * np.where(random.random((400, 1064)) < 0.1, 10, 1)
+    assert np.mean([error_bound(row[:64], 1000, looks=1) >= row[64:].max() for row in errors]) > 0.9
+
+
 def test_without_errors_to_judge_by_nothing_is_bounded():
     assert error_bound(np.empty(0), 5, 0) == error_bound(np.array([0.1, np.inf]), 5, 1) == np.inf
     assert error_bound(np.empty(0), 0, 0) == 0.0 and error_bound(np.zeros(64), 1000, 1) == 0.0

@@ -127,7 +127,7 @@ def test_the_same_seed_gives_the_same_slice_whatever_the_number_of_workers():
     assert torch.equal(one.holdout, four.holdout) and not torch.equal(one.evaluated, other.evaluated)
 
 
-@pytest.mark.parametrize("most", [1, 160, 161, 265, 266, 1000])
+@pytest.mark.parametrize("most", [1, 160, 161, 285, 286, 1000])
 def test_beyond_the_axes_no_more_evaluations_are_made_than_allowed(most):
     calls = []
 
@@ -138,7 +138,7 @@ def test_beyond_the_axes_no_more_evaluations_are_made_than_allowed(most):
     found = sliced(rough, max_evaluations=most)
     assert len(calls) == found.evaluations <= max(most, 82) and found.reason == "evaluation budget"
     assert found.interpolation_error > 0.1 and not found.resolved and found.loss[~found.evaluated].isnan().all()
-    assert found.looks == (most > 161) + (most > 265) + (most > 421) + (most > 655)
+    assert found.looks == (most > 161) + (most > 285) + (most > 502) + (most > 881)
 
 
 def test_of_noise_every_point_is_evaluated():

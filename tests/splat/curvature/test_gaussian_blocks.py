@@ -221,7 +221,8 @@ def test_traces_with_ssim_are_within_their_errors_over_many_seeds(
 def samples_of(
     objective: SceneObjective, generator: torch.Generator, names: list[str], count: int
 ) -> tuple[Tensor, Tensor]:
-    return coupling_samples(objective, generator, partial(_signs, objective, None), names, count)
+    x, y = coupling_samples(objective, generator, partial(_signs, objective, None), names, count)
+    return x.mean(dim=0), y.mean(dim=0)
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.5], ids=["near a fit", "far from a fit"])
@@ -243,7 +244,7 @@ def test_intervals_of_fixed_and_adaptive_budgets_cover_as_stated(noise: float) -
             for _ in range(200):
                 block = SampledTrace(name, 0, known[name], pixelwise[name], settings, first, most)
                 while block.open:
-                    block.add(*pool[:, i, [at % pool.shape[2]], None].squeeze(2), late=False)
+                    block.add(*pool[:, i, [at % pool.shape[2]]][:, None], late=False)
                     at += 1
                 estimate = block.estimate()
                 covered += estimate.low <= truth[name] <= estimate.high

@@ -10,6 +10,7 @@ import torch
 from scipy.ndimage import correlate1d
 from torch import Tensor
 
+from landscape.errors import InputError
 from splat.losses.autograd import consistency_loss, view_loss
 from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import WINDOW, LossSettings, PixelLoss, photometric_loss, psnr, ssim, ssim_map, window
@@ -24,10 +25,15 @@ SETTINGS = [
     LossSettings("l2", ssim_weight=0),
     LossSettings("charbonnier", ssim_weight=0, eps=0.1),
     LossSettings("l1", ssim_weight=1.0),
+    LossSettings("charbonnier", ssim_weight=0.4, border="valid"),
 ]
 each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
 each_size = pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 each_loss = pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: f"{s.pixel} {s.ssim_weight} {s.literal}")
+CASES = [(size, settings) for size in SIZES for settings in SETTINGS if min(size) > 2 * settings.margin]
+each_case = pytest.mark.parametrize(
+    ("size", "settings"), CASES, ids=[f"{h}x{w} {s.pixel} {s.ssim_weight} {s.literal}" for (h, w), s in CASES]
+)
 
 
 def image_and_target(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -73,6 +79,14 @@ def test_similarity_is_kornias_away_from_the_border():
     image, target = image_and_target((40, 31))
     peer = kornia.metrics.ssim(image[None], target[None], 11, eps=0.0, padding="valid")[0]
     assert relative_error(ssim_map(image, target)[:, 5:-5, 5:-5], peer) < 1e-12
+    valid = photometric_loss(image, target, LossSettings(ssim_weight=1.0, border="valid"))
+    assert float(valid) == pytest.approx(float(1 - peer.mean()), rel=1e-12)
+
+
+def test_a_picture_smaller_than_a_window_has_no_valid_one():
+    with pytest.raises(InputError, match="at least 11 px a side"):
+        CpuViewLoss(torch.zeros(3, 10, 40), LossSettings(border="valid"), torch.float32)
+    assert CpuViewLoss(torch.zeros(3, 11, 11), LossSettings(border="valid"), torch.float32).structural == 0.2 / 3
 
 
 def test_psnr_is_kornias():
@@ -107,8 +121,7 @@ def test_the_photometric_loss_weighs_its_parts_as_written():
 
 
 @each_dtype
-@each_loss
-@each_size
+@each_case
 def test_kernels_give_the_specifications_value_gradient_and_products(size, settings, dtype):
     expected = truth(size, settings)
     loss = CpuViewLoss(expected.target.to(dtype), settings, dtype)
@@ -123,8 +136,7 @@ def test_kernels_give_the_specifications_value_gradient_and_products(size, setti
 
 
 @each_dtype
-@each_loss
-@each_size
+@each_case
 def test_quadratic_forms_are_those_of_products_and_of_the_diagonal(size, settings, dtype):
     expected = truth(size, settings)
     exact, loss = (CpuViewLoss(expected.target.to(each), settings, each) for each in (torch.float64, dtype))
@@ -177,7 +189,7 @@ def test_near_a_fit_of_a_smooth_picture_ssim_keeps_its_digits_in_float32():
 @each_dtype
 @each_loss
 def test_padding_and_alpha_have_no_derivative(settings, dtype):
-    size = (7, 9)
+    size = (13, 17)
     expected = truth(size, settings)
     loss = CpuViewLoss(expected.target.to(dtype), settings, dtype)
     held = loss.linearize(loss.padded(expected.image.to(dtype)))
@@ -221,8 +233,8 @@ def test_threads_change_no_bit_and_products_may_overwrite_their_vectors(settings
 @each_loss
 @pytest.mark.parametrize("size", [(17, 21), (1, 40)], ids=["17x21", "1x40"])
 def test_the_diagonal_is_that_of_the_dense_hessian(size, settings):
-    expected = truth(size, settings)
-    loss = CpuViewLoss(expected.target, settings, torch.float64)
+    expected = truth(size if min(size) > 2 * settings.margin else (40, 11), settings)
+    loss, size = CpuViewLoss(expected.target, settings, torch.float64), expected.image.shape[1:]
     held = loss.linearize(loss.padded(expected.image))
     count = expected.image.numel()
     every = [loss.padded(row.view(3, *size)) for row in torch.eye(count, dtype=torch.float64)]
@@ -234,7 +246,7 @@ def test_the_diagonal_is_that_of_the_dense_hessian(size, settings):
 
 @each_loss
 def test_autograd_reaches_the_kernels_twice(settings):
-    image, target = image_and_target((9, 6))
+    image, target = image_and_target((12, 11) if settings.margin else (9, 6))
     image = (target + 0.1 + 0.2 * (image - target).abs()).requires_grad_()  # no kink within the step
     loss = CpuViewLoss(target, settings, torch.float64)
     assert torch.autograd.gradcheck(lambda x: 100 * view_loss(x, loss), (image,))
@@ -262,8 +274,7 @@ def truth_of_both(size: tuple[int, int], settings: LossSettings) -> tuple[Tensor
 
 
 @each_dtype
-@each_loss
-@each_size
+@each_case
 def test_consistency_has_the_specifications_value_and_gradients(size, settings, dtype):
     value, *gradients = truth_of_both(size, settings)
     x, y = (picture.to(dtype).requires_grad_() for picture in image_and_target(size))

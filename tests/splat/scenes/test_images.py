@@ -59,6 +59,57 @@ def test_a_distorted_picture_becomes_that_of_the_pinhole_camera(tmp_path: Path, 
         assert pixel.min() > -0.5 and pixel.max() < side + 0.5  # the corners lie in the photograph, or on its edge
 
 
+@pytest.mark.parametrize("kind", ["transforms", "colmap"])
+def test_a_fisheye_picture_becomes_that_of_the_pinhole_camera(tmp_path: Path, kind: str) -> None:
+    """theta_d = theta (1 + k1 theta^2 + ...), theta the angle to the axis, inverted by Newton's method."""
+    (fx, fy, cx, cy), terms = LENS_INTRINSICS, (0.05, -0.02, 0.01, -0.004)
+    column, row = np.meshgrid(np.arange(LENS_SIZE[0]) + 0.5, np.arange(LENS_SIZE[1]) + 0.5)
+    x, y = (column - cx) / fx, (row - cy) / fy
+    distance = np.hypot(x, y)
+    theta = distance.copy()
+    for _ in range(20):
+        powers = [theta ** (2 * i + 2) for i in range(4)]
+        value = theta * (1 + sum(k * p for k, p in zip(terms, powers))) - distance
+        theta -= value / (1 + sum((2 * i + 3) * k * p for i, (k, p) in enumerate(zip(terms, powers))))
+    stretch = np.tan(theta) / distance
+    exact = waves(x * stretch, y * stretch)
+    if kind == "transforms":
+        named = dict(zip(("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"), (fx, fy, cx, cy, *terms)))
+        folders.write_transforms(tmp_path, **named, w=LENS_SIZE[0], h=LENS_SIZE[1], camera_model="OPENCV_FISHEYE")
+    else:
+        model = folders.reconstruction("OPENCV_FISHEYE", (*LENS_INTRINSICS, *terms))
+        model.cameras[1].width, model.cameras[1].height = LENS_SIZE
+        folders.write_colmap(tmp_path, model=model)
+    for name in NAMES:
+        Image.fromarray((exact * 255).round().astype(np.uint8)).save(tmp_path / "images" / name)
+    view = load_scene(tmp_path).load()[0]
+    camera = view.camera
+    column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    wanted = waves((column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy)
+    bent = sum(np.abs(np.diff(exact, n=2, axis=axis)).max() for axis in (0, 1))
+    assert np.abs(view.image.permute(1, 2, 0).numpy() - wanted).max() <= 0.5 / 255 + bent / 8
+
+
+def test_a_photograph_is_turned_by_its_exif_where_only_that_fits_its_camera(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    upright = Image.open(tmp_path / "images/a.png")
+    wanted = load_scene(tmp_path).load()[0].image
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned by 90 degrees clockwise
+    upright.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "images/a.png", exif=exif)
+    assert torch.equal(load_scene(tmp_path).load()[0].image, wanted)
+    upright.save(tmp_path / "images/a.png", exif=exif)  # it fits as it is stored, as COLMAP reads it
+    assert torch.equal(load_scene(tmp_path).load()[0].image, wanted)
+
+
+def test_grey_pictures_of_16_bits_keep_all_of_them(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    grey = np.arange(SIZE[0] * SIZE[1], dtype=np.uint16).reshape(SIZE[::-1]) * 150
+    Image.fromarray(grey).save(tmp_path / "images/a.png")
+    image = load_scene(tmp_path).load()[0].image
+    np.testing.assert_allclose(image.numpy(), np.broadcast_to(grey / 65535, (3, *grey.shape)), atol=1e-7)
+
+
 @pytest.mark.parametrize("absurd", [{"k1": 1e30}, {"k1": -1e30}, {"k1": -20.0}, {"p2": 1e6}, {"k3": 1e300}])
 def test_distortion_that_is_no_lens_is_refused(tmp_path: Path, absurd: dict[str, float]) -> None:
     folders.write_transforms(tmp_path / "transforms", **absurd)
@@ -177,14 +228,15 @@ def test_the_largest_image_folder_is_taken_and_images_overrides(tmp_path: Path) 
         load_scene(tmp_path, images="images_4")
 
 
-def test_files_that_are_no_pictures_or_have_more_than_8_bits_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_no_pictures_or_have_real_numbers_are_refused(tmp_path: Path) -> None:
     folders.write_transforms(tmp_path)
     path = tmp_path / "images/c.png"
     path.write_bytes(b"no picture")
     with pytest.raises(ValueError, match=r"cannot read .*c\.png"):
         load_scene(tmp_path)
-    Image.fromarray(np.zeros((SIZE[1], SIZE[0]), dtype=np.uint16)).save(path)
-    with pytest.raises(ValueError, match=r"8 bits a channel, got mode I;16 in .*c\.png"):
+    Image.fromarray(np.zeros((SIZE[1], SIZE[0]), dtype=np.float32)).save(path.with_suffix(".tiff"))
+    path.with_suffix(".tiff").rename(path)
+    with pytest.raises(ValueError, match=r"16 bits a channel, got mode F in .*c\.png"):
         load_scene(tmp_path)
 
 

@@ -1,5 +1,6 @@
 """COLMAP models: written by pycolmap, binary and text, and the real fern."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -153,10 +154,35 @@ def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_a_fisheye_colmap_model_is_refused_with_the_command_that_mends_it(tmp_path: Path) -> None:
-    folders.write_colmap(tmp_path, model=folders.reconstruction("OPENCV_FISHEYE", (*FOCAL, *CENTRE, 0.1, 0, 0, 0)))
-    with pytest.raises(ValueError, match=r"OPENCV_FISHEYE for image 'a.png'.*colmap image_undistorter --image_path"):
+def test_a_lens_without_pinhole_is_refused_with_the_command_that_mends_it(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path, model=folders.reconstruction("EUCM", (*FOCAL, *CENTRE, 0.5, 1.0)))
+    with pytest.raises(ValueError, match=r"EUCM for image 'a.png'.*colmap image_undistorter --image_path"):
         load_scene(tmp_path)
+
+
+def test_every_photograph_has_the_camera_of_its_own(tmp_path: Path) -> None:
+    model = folders.reconstruction()
+    other = pycolmap.Camera(camera_id=2, model="SIMPLE_RADIAL", width=48, height=36, params=[50.0, 24.0, 18.0, 0.05])
+    model.add_camera_with_trivial_rig(other)
+    folders.write_colmap(tmp_path, model=model, text=True)
+    path = tmp_path / "sparse/0/images.txt"
+    path.write_text("".join(re.sub(r" 1 b\.png", " 2 b.png", line) for line in path.read_text().splitlines(True)))
+    folders.write_pictures(tmp_path / "images", ("b.png",), (48, 36))
+    scene = load_scene(tmp_path)
+    assert [frame.camera.fx for frame in scene.frames] == pytest.approx([FOCAL[0], 50.0, FOCAL[0]])
+    for view in scene.load():
+        assert view.image.shape[1:] == (view.camera.height, view.camera.width)
+
+
+def test_nested_photographs_are_found_in_other_folders_and_under_other_suffixes(tmp_path: Path) -> None:
+    folders.write_colmap(tmp_path, text=True)
+    path = tmp_path / "sparse/0/images.txt"
+    path.write_text(re.sub(r" ([abc])\.png", r" left/\1.jpg", path.read_text()))
+    for name in ("a.png", "b.PNG", "c.png"):
+        folders.write_pictures(tmp_path / "images_2" / "left", (name,), (12, 9))
+    scene = load_scene(tmp_path, images="images_2")
+    assert scene.names == ("left/a.jpg", "left/b.jpg", "left/c.jpg") and scene.frames[0].camera.width == 12
+    assert [frame.path.name for frame in scene.frames if frame.path] == ["a.png", "b.PNG", "c.png"]
 
 
 def test_the_points_of_fern_fall_where_colmap_projects_and_observes_them(fern: Path) -> None:

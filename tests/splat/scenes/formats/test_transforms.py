@@ -58,12 +58,7 @@ def test_intrinsics_of_a_frame_win_over_those_at_the_top(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("top", "message"),
-    [
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model OPENCV_FISHEYE"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR"),
-        ({"is_fisheye": True}, "a fisheye lens"),
-        ({"k1": 0.1, "k4": 0.2}, "got k4"),
-    ],
+    [({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR"), ({"k1": 0.1, "k4": 0.2}, "got k4")],
 )
 def test_lenses_that_a_pinhole_cannot_stand_for_are_refused(
     tmp_path: Path, top: dict[str, object], message: str

@@ -1,0 +1,62 @@
+"""Options of the commands that put exact curvature to use: `landscape prune` and `next-view`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+from analysis.console.options import ForeignOptions, Unset
+
+
+@dataclass(frozen=True)
+class PruneOptions:
+    """Remove the Gaussians that matter least, by scores of exact curvature, and show what each score is worth."""
+
+    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
+    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    keep: float = 0.5
+    """Share of the Gaussians to keep, above 0."""
+    score: str = "rise_l2"
+    """By which they are chosen.
+    rise, rise_l2: by how much the loss, or the squared error, would rise without the Gaussian, to second order.
+    log_det_6, log_det_11, gn_diagonal: log-determinants of its Gauss-Newton block, PUP 3D-GS's and whole, and its diagonal.
+    opacity, size_opacity: as they are."""
+    refine: int = 0
+    """Steps of training after it, without density control."""
+    curve: FlagCreatePairsOff[bool] = False
+    """Also score every --score at 0 to 95% removed, on training and held-out views, and after --curve-steps at 50% and 90%."""
+    curve_steps: int = 300
+    """Steps of training for the points of the curve with refinement; 0: none."""
+    sample: int = 200
+    """Gaussians that are really removed, one at a time, as the truth that scores are compared with."""
+    seed: int = 0
+    """Seed of the sample and of the refinement."""
+    scene: Unset[Path] = None
+    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    out: Unset[Path] = None
+    """Folder of the results.  Default: prune, beside the checkpoint."""
+    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+
+
+@dataclass(frozen=True)
+class NextViewOptions:
+    """Say which further photograph would tell most about a scene, before it is taken; or run a study of such choices."""
+
+    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
+    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply.
+    A FILE.toml: a study that trains, picks and trains on, as analysis/commands/uses/study.py describes; continues where it was
+    stopped."""
+    candidates: UseAppendAction[tuple[str, ...]] = ()
+    """A view of the scene whose camera to judge, by name; may be given again.
+    Default: all that are neither trained on nor held out."""
+    take: int = 1
+    """How many to choose, one after the other, each knowing those before it."""
+    by: str = "d"
+    """By which gain: d (log-determinant of each Gaussian's block), t (trace), e (least eigenvalue), d_diagonal, or published
+    (FisherRF's)."""
+    scene: Unset[Path] = None
+    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    out: Unset[Path] = None
+    """Folder of the results.  Default: next-view, beside the checkpoint; of a study as its file says."""
+    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)

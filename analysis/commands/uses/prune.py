@@ -1,0 +1,226 @@
+"""`landscape prune`: a scene with fewer Gaussians, and how good each score for choosing them is.
+
+    checkpoint.pt, pruned.ply   the Gaussians that are kept
+    scores.csv          every score (`splat.curvature.scores.removal`) of the Gaussians in sight, and `error`, the true rise of
+                        the loss, of those that were removed one at a time
+    correlations.csv    rank correlations (Spearman) of the scores with that truth and with each other
+    curve.csv           with --curve: PSNR and SSIM by score, share removed, and steps of training after it; curve.png
+    prune.json          where it comes from
+
+Gaussians that no training view sees go first.  What --curve has measured is kept until it is done: the same command continues.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pandas as pd
+import torch
+from jaxtyping import Float64, Int64
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from analysis.commands.uses.options import PruneOptions
+from analysis.console.drawing import draw_or_say
+from analysis.console.kept import Kept
+from analysis.console.stages import Stages
+from analysis.probe.command import opened, scene_objective
+from analysis.probe.record import provenance_of
+from analysis.records.json_files import json_text, plain
+from analysis.records.records import record_folder, require_replaceable
+from landscape.errors import InputError, did_you_mean
+from landscape.results import Progress
+from splat.curvature.objective import SceneObjective
+from splat.curvature.scores.removal import EXACT, SCORES, removal_errors, removal_scores
+from splat.losses.reference import LossSettings
+from splat.model.files.splat_ply import splat_ply
+from splat.model.gaussians import Gaussians
+from splat.scenes.view import View
+from splat.training.checkpoint import Checkpoint, save_checkpoint
+from splat.training.loop import train
+from splat.training.score.evaluate import evaluate
+from splat.training.state import ThreeDGS, Training
+
+L2 = LossSettings("l2", ssim_weight=0)
+REMOVED = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+REFINED = (0.5, 0.9)
+TRUTH = "error"
+STAGES = ("true removals", *SCORES, *(f"{name} refined" for name in SCORES))
+Row = dict[str, str | int | float]
+
+
+class PruneRecord:
+    """What marks a folder of this command."""
+
+    FILE: ClassVar[str] = "prune.json"
+
+
+def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
+    """Prune the checkpoint; returns the exit code.  command: as typed, for the record."""
+    if not 0 < options.keep <= 1 or options.refine < 0 or options.curve_steps < 0 or options.sample < 3:
+        raise InputError(
+            f"expected --keep in (0, 1], steps of at least 0 and --sample of at least 3, got {options.keep:g}, "
+            f"{options.refine}, {options.curve_steps} and {options.sample}"
+        )
+    if options.score not in SCORES:
+        raise InputError(
+            f"expected --score {', '.join(SCORES)}, got {options.score!r}{did_you_mean(options.score, SCORES)}"
+        )
+    out = options.out or options.checkpoint.parent / "prune"
+    console, unfinished = Console(stderr=True), out.with_name(f".{out.name}.unfinished")
+    require_replaceable(out, PruneRecord)
+    stages = Stages(console)
+    with stages.stage("load"):
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
+        objective, l2 = (scene_objective(checkpoint, scene, loss=loss) for loss in (None, L2))
+        held_out = scene.load(checkpoint.scene.test) if checkpoint.scene.test else []
+    told = f"{sha256(options.checkpoint.read_bytes()).hexdigest()} {replace(options, out=None, keep=1, score='', refine=0)}"
+    with record_folder(out, PruneRecord) as folder, stages:
+        kept = Kept(stages, torch.Generator().manual_seed(options.seed), STAGES, folder=unfinished, told=told)
+        with stages.stage("scores"):
+            scores = removal_scores(objective, l2)
+        errors = _truth(kept, objective, options)
+        table = pd.DataFrame({name: score.numpy() for name, score in scores.items()})
+        table.insert(0, "gaussian", objective.mask.nonzero()[:, 0].numpy())
+        table[TRUTH] = errors.numpy()
+        table.to_csv(folder / "scores.csv", index=False)
+        ranks = table.filter([TRUTH, *SCORES]).corr(method="spearman")
+        ranks.to_csv(folder / "correlations.csv")
+        curve = None
+        if options.curve:
+            curve = _curve(kept, checkpoint, objective, held_out, scores, options)
+            curve.to_csv(folder / "curve.csv", index=False)
+        with stages.stage("pruned"):
+            training = pruned(checkpoint.training, objective, scores[options.score], options.keep)
+            refine(training, objective.views, options.refine, options.seed)
+            reference = replace(checkpoint.scene, relative=os.path.relpath(scene.root, out.resolve()))
+            save_checkpoint(folder / "checkpoint.pt", training, reference)
+            (folder / "pruned.ply").write_bytes(splat_ply(training.gaussians))
+        made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
+        (folder / PruneRecord.FILE).write_text(json_text(plain(made)), encoding="utf-8")
+        notes = draw_or_say("uses", folder) if curve is not None else []
+        result = _scored(training.gaussians, objective, held_out)
+    kept.remove()
+    _conclude(ranks, curve, training.gaussians, result, out)
+    if notes:
+        console.print(*notes, sep="\n", style="yellow", highlight=False, markup=False)
+    return 0
+
+
+def pruned(training: Training, objective: SceneObjective, score: Float64[Tensor, " n"], keep: float) -> Training:
+    """The training with the Gaussians of the highest scores alone, at least one; nothing is left of Adam's moments.
+
+    score: of the objective's active Gaussians; the others go first.
+    """
+    everyone = torch.full((len(objective.mask),), -torch.inf, dtype=torch.float64)
+    everyone[objective.mask] = score
+    count = max(round(keep * len(everyone)), 1)
+    chosen = everyone.argsort(descending=True, stable=True)[:count].sort().values
+    gaussians, config = training.gaussians.select(chosen), training.config
+    config = replace(config, method=ThreeDGS(), densify=replace(config.densify, enabled=False))
+    fresh = Training.start(gaussians, training.extent, config)
+    fresh.step = training.step
+    return fresh
+
+
+def refine(training: Training, views: Sequence[View], steps: int, seed: int) -> None:
+    """Train on, at the rates that the training ended with and without density control."""
+    if not steps:
+        return
+    config = training.config
+    rates = replace(config.rates, position=config.rates.position_final)
+    training.config = replace(config, iterations=training.step + steps, rates=rates)
+    training.generator = torch.Generator().manual_seed(seed)
+    for _ in train(training, views):
+        pass
+
+
+def _truth(kept: Kept, objective: SceneObjective, options: PruneOptions) -> Float64[Tensor, " n"]:
+    """nan of those that are not in the sample."""
+    n = len(objective.active)
+    generator = torch.Generator().manual_seed(options.seed)
+    chosen: Int64[Tensor, " m"] = torch.randperm(n, generator=generator)[: options.sample].sort().values
+    found = kept.run(STAGES[0], Tensor, lambda _g, report, _n: removal_errors(objective, chosen, report))
+    assert found is not None  # there is no deadline
+    errors = torch.full((n,), torch.nan, dtype=torch.float64)
+    errors[chosen] = found
+    return errors
+
+
+def _curve(
+    kept: Kept,
+    checkpoint: Checkpoint,
+    objective: SceneObjective,
+    held_out: Sequence[View],
+    scores: dict[str, Float64[Tensor, " n"]],
+    options: PruneOptions,
+) -> pd.DataFrame:
+    def points(name: str, steps: int, shares: Sequence[float], report: Progress) -> list[Row]:
+        rows = []
+        for done, removed in enumerate(shares):
+            training = pruned(checkpoint.training, objective, scores[name], 1 - removed)
+            refine(training, objective.views, steps, options.seed)
+            found = _scored(training.gaussians, objective, held_out)
+            rows.append({"score": name, "removed": removed, "steps": steps, **found})
+            report(done + 1, len(shares), name)
+        return rows
+
+    rows: list[Row] = []
+    for name in SCORES:
+        for steps, shares in ((0, REMOVED), *([(options.curve_steps, REFINED)] if options.curve_steps else [])):
+            stage = f"{name} refined" if steps else name
+            rows += kept.run(stage, list[Row], lambda _g, report, _n, a=(name, steps, shares): points(*a, report)) or []
+    return pd.DataFrame(rows)
+
+
+def _scored(gaussians: Gaussians, objective: SceneObjective, held_out: Sequence[View]) -> dict[str, float]:
+    """Mean PSNR and SSIM on the training views and, where there are any, on those held out."""
+    found = {}
+    for name, views in (("train", objective.views), ("test", held_out)):
+        if views:
+            scores = evaluate(gaussians, views, objective.background, objective.settings)
+            found |= {f"{name}_psnr": scores.psnr, f"{name}_ssim": scores.ssim}
+    return found
+
+
+def lost(curve: pd.DataFrame, removed: float, steps: int, column: str) -> dict[str, float]:
+    """How much of a measure each score loses against the scene with all its Gaussians."""
+    rows = {(row["score"], row["removed"], row["steps"]): row[column] for row in curve.to_dict("records")}
+    return {score: rows[score, 0, 0] - rows[score, removed, steps] for score in SCORES}
+
+
+def _conclude(
+    ranks: pd.DataFrame, curve: pd.DataFrame | None, gaussians: Gaussians, result: dict[str, float], out: Path
+) -> None:
+    console, said = Console(), dict[str, Any](highlight=False, markup=False, soft_wrap=True)
+    columns = [] if curve is None else [(removed, steps) for removed in REFINED for steps in sorted({*curve.steps})]
+    measure = "test_psnr" if "test_psnr" in result else "train_psnr"
+    table = Table(caption=f"rank: Spearman's correlation with the true rise; dB: {measure.split('_')[0]} PSNR lost")
+    for title in (
+        "score",
+        "rank",
+        *(f"{removed:.0%}{f', {steps} steps' if steps else ''}" for removed, steps in columns),
+    ):
+        table.add_column(title, justify="left" if title == "score" else "right")
+    losses = [lost(curve, *at, measure) for at in columns] if curve is not None else []
+    for name in SCORES:
+        table.add_row(name, f"{ranks.loc[TRUTH, name]:.3f}", *(f"{loss[name]:.2f} dB" for loss in losses))
+    console.print(table)
+    for (removed, steps), loss in zip(columns, losses, strict=True):
+        best = min(EXACT, key=lambda name, of=loss: of[name])
+        verb = "less than" if loss[best] < loss["opacity"] else "NOT less than"
+        console.print(
+            f"{removed:.0%} removed, {steps} steps after: {best} loses {loss[best]:.2f} dB, {verb} opacity's "
+            f"{loss['opacity']:.2f} dB",
+            **said,
+        )
+    scored = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in result.items() if np.isfinite(value))
+    console.print(f"kept {len(gaussians):,} Gaussians: {scored}", **said)
+    console.print(
+        f"checkpoint.pt, pruned.ply, scores.csv, correlations.csv{', curve.png' if columns else ''} in {out}", **said
+    )

@@ -1,0 +1,134 @@
+"""What exact curvature is good for: the pictures of `landscape prune` and `next-view`.  `python -m figures.uses RUN/prune`"""
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    folder_script,
+    literal,
+    new_figure,
+    save,
+    style,
+)
+
+SCORES = {
+    "rise": ("rise of the loss", VERMILION),
+    "rise_l2": ("rise of the squared error", ORANGE),
+    "log_det_11": ("log det, 11 x 11", BLUE),
+    "log_det_6": ("log det, 6 x 6 (PUP)", SKY),
+    "gn_diagonal": ("Gauss-Newton diagonal", GREEN),
+    "opacity": ("opacity", BLACK),
+    "size_opacity": ("size x opacity", PURPLE),
+}
+MEASURES = {"train_psnr": "training views, PSNR (dB)", "test_psnr": "held-out views, PSNR (dB)"}
+
+
+def _rows(table: pd.DataFrame, **known: str | bool) -> Any:
+    """Those with these values."""
+    for name, value in known.items():
+        table = table.loc[table[name] == value]
+    return table
+
+
+def draw_curve(curve: pd.DataFrame) -> Figure:
+    """PSNR by the share of Gaussians removed; crosses: after some steps of training."""
+    measures = [name for name in MEASURES if name in curve]
+    curve = curve.assign(refined=curve["steps"] > 0)
+    with style():
+        figure = new_figure(2.6, 3.3 * len(measures))
+        for axes, measure in zip(figure.subplots(1, len(measures), squeeze=False)[0], measures, strict=True):
+            for name, (words, colour) in SCORES.items():
+                plain, after = (_rows(curve, score=name, refined=refined) for refined in (False, True))
+                axes.plot(100 * plain["removed"], plain[measure], color=colour, label=words, marker=".", markersize=3)
+                axes.plot(100 * after["removed"], after[measure], color=colour, marker="x", linestyle="none")
+            axes.set(xlabel="Gaussians removed (%)", ylabel=MEASURES[measure])
+            axes.grid(visible=True)
+        steps = curve.steps.max()
+        title = f"x: after {steps} steps of training" if steps else None
+        axes.legend(title=title, loc="lower left", title_fontsize=6.5)  # pyright: ignore[reportPossiblyUnboundVariable]
+    return figure
+
+
+RULES = {
+    "d": ("D-optimal, blocks", BLUE),
+    "t": ("T-optimal, blocks", SKY),
+    "e": ("E-optimal, blocks", PURPLE),
+    "d_diagonal": ("D-optimal, diagonal", GREEN),
+    "published": ("FisherRF's diagonal", VERMILION),
+    "uniform": ("uniform", BLACK),
+    "random": ("random", ORANGE),
+}
+
+
+def draw_gains(table: pd.DataFrame) -> Figure:
+    """Every gain of every candidate as a share of the largest, the picks first."""
+    with style():
+        figure = new_figure(1.2 + 0.16 * len(table))
+        axes = figure.subplots()
+        rows = range(len(table))
+        for name in [name for name in RULES if name in table]:
+            words, colour = RULES[name]
+            axes.plot(
+                table[name] / table[name].max(),
+                rows,
+                color=colour,
+                label=words,
+                marker="o",
+                linestyle="none",
+                markersize=3,
+            )
+        picks = ["" if pd.isna(pick) else f"  ({pick:.0f})" for pick in table["pick"]]
+        axes.set_yticks(rows, [literal(f"{Path(str(name)).name}{pick}") for name, pick in zip(table["view"], picks)])
+        axes.invert_yaxis()
+        axes.set(xlabel="gain over the best candidate's; (1): the first pick")
+        axes.grid(visible=True)
+        figure.legend(loc="outside upper center", ncols=2)
+    return figure
+
+
+def draw_study(table: pd.DataFrame) -> Figure:
+    """Held-out PSNR by the number of views: means over the seeds, and dots for each of them."""
+    scenes = list(dict.fromkeys(table["scene"]))
+    with style():
+        figure = new_figure(2.6, 3.3 * len(scenes))
+        for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
+            for place, name in enumerate([name for name in RULES if name in {*table["rule"]}]):
+                words, colour = RULES[name]
+                rows = _rows(table, scene=scene, rule=name)
+                mean = rows.pivot_table(index="views", values="psnr")  # by default the mean
+                axes.plot(mean.index, mean["psnr"], color=colour, label=words)
+                axes.plot(
+                    rows["views"] + 0.03 * place, rows["psnr"], color=colour, marker=".", markersize=3, linestyle="none"
+                )
+            axes.set(title=literal(scene), xlabel="training views", ylabel="held-out views, PSNR (dB)")
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+            axes.grid(visible=True)
+            axes.legend()
+    return figure
+
+
+PICTURES = {"curve": draw_curve, "gains": draw_gains, "study": draw_study}
+
+
+def draw(folder: Path, suffix: str = "png") -> list[Path]:
+    """Those whose numbers are in the folder."""
+    return [
+        save(make(pd.read_csv(folder / f"{name}.csv")), folder / f"{name}.{suffix}")
+        for name, make in PICTURES.items()
+        if (folder / f"{name}.csv").is_file()
+    ]
+
+
+if __name__ == "__main__":
+    folder_script(draw, "what curvature is good for", "prune")

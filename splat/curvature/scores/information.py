@@ -1,0 +1,122 @@
+"""What views tell about each Gaussian: blocks of J^T J, which need cameras and no photographs, and what a further view adds.
+
+J is the Jacobian of a view's image, all its pixels and channels: under noise of one size in each channel J^T J is the Fisher
+information of the parameters, and twice the Gauss-Newton part of half the squared error.  Of every Gaussian the 10 x 10 of its
+geometry and opacity is kept, without the quaternion's length, and the diagonal of its SH, in stored parameters.  With B the sum
+over the views seen so far and a prior, and C that of a candidate, by Gaussian:
+
+    d           ln det (B + C) - ln det B, summed: D-optimality, twice the nats that the candidate tells about the scene
+    t           tr B^-1 C
+    e           ln of how much the least eigenvalue of B grows, in units of the prior, summed
+    d_diagonal  d of the diagonals alone
+    published   FisherRF's score (Jiang et al. 2024), sum over parameters c / (b + 1e-6) for the diagonals of the squared *sum
+                over the channels* of the derivatives, in which opposite channels cancel: here that of Gaussians whose red is
+                the sum of their channels, which is the same but where one is clamped at 0
+
+Prior: precisions that are PRIOR times the mean of the training views' diagonals, one for each attribute.  It stands for what
+is known without any view, and decides what a Gaussian that none has seen yet is worth.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from splat.curvature.fields import eigenvalues, on_complement
+from splat.curvature.gaussian_blocks import PerGaussianBlocks
+from splat.curvature.linearize import LinearizedView
+from splat.losses.autograd import loss_against
+from splat.losses.reference import LossSettings
+from splat.model.camera import Camera
+from splat.model.gaussians import Gaussians
+from splat.model.harmonics import Y00
+from splat.model.settings import RenderSettings
+
+GAINS = ("d", "t", "e", "d_diagonal", "published")
+PRIOR = 1e-3
+FISHERRF_LAMBDA = 1e-6
+COLUMNS = {"means": slice(0, 3), "log_scales": slice(3, 6), "quats": slice(6, 9), "opacity_logits": slice(9, 10)}
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """Of n Gaussians.  geometry: positive semi-definite.  summed: FisherRF's diagonal."""
+
+    geometry: Float64[Tensor, "n 10 10"]
+    sh: Float64[Tensor, "n k 3"]
+    summed: Float64[Tensor, "n q"]
+
+    def __add__(self, other: "Information") -> "Information":
+        return Information(self.geometry + other.geometry, self.sh + other.sh, self.summed + other.summed)
+
+    @property
+    def diagonal(self) -> Float64[Tensor, "n q"]:
+        return torch.cat([self.geometry.diagonal(dim1=1, dim2=2), self.sh.flatten(1)], dim=1)
+
+
+def information(
+    gaussians: Gaussians, camera: Camera, background: Float[Tensor, "3"], settings: RenderSettings = RenderSettings()
+) -> Information:
+    """J^T J of one view of Gaussians with unit quaternions: two passes over the pixels.
+
+    >>> from splat import SyntheticSettings, synthetic_scene
+    >>> made = synthetic_scene(SyntheticSettings(gaussians=50, views=2, width=16, height=12))
+    >>> found = information(made.truth, made.scene.frames[0].camera, torch.zeros(3))
+    >>> found.geometry.shape[1:], bool((found.diagonal >= 0).all())
+    (torch.Size([10, 10]), True)
+    """
+    quats = gaussians.quats.double()
+    blocks = _squares(gaussians, camera, background, settings)
+    values, vectors = torch.linalg.eigh(on_complement(blocks.geometry.double(), quats))
+    geometry = (vectors * values.clamp_min(0)[:, None]) @ vectors.mT
+    grey = _squares(channel_sum(gaussians), camera, _red(background.sum()), settings)
+    own, sh = on_complement(grey.geometry.double(), quats).diagonal(dim1=1, dim2=2), blocks.sh.double()
+    return Information(geometry, sh, torch.cat([own.clamp_min(0), sh.flatten(1)], dim=1))
+
+
+def prior_of(seen: Information, share: float = PRIOR) -> Information:
+    """The prior's precisions, from the information of the training views."""
+    diagonal, geometry = seen.geometry.diagonal(dim1=1, dim2=2), torch.zeros_like(seen.geometry)
+    for columns in COLUMNS.values():
+        geometry.diagonal(dim1=1, dim2=2)[:, columns] = share * diagonal[:, columns].mean()
+    return Information(geometry, torch.full_like(seen.sh, share * float(seen.sh.mean())), torch.zeros_like(seen.summed))
+
+
+def gains(seen: Information, prior: Information, candidate: Information) -> dict[str, float]:
+    """What a candidate adds to the views seen, by every criterion."""
+    before = seen + prior
+    after, root = before + candidate, prior.geometry.diagonal(dim1=1, dim2=2).rsqrt()
+    sh_gain = float((after.sh / before.sh).log().sum())
+    least = [eigenvalues(root[:, :, None] * each.geometry * root[:, None, :])[:, 0] for each in (before, after)]
+    solved = torch.linalg.solve(before.geometry, candidate.geometry).diagonal(dim1=1, dim2=2)
+    return {
+        "d": float((after.geometry.logdet() - before.geometry.logdet()).sum()) + sh_gain,
+        "t": float(solved.sum() + (candidate.sh / before.sh).sum()),
+        "e": float((least[1] / least[0]).log().sum()),
+        "d_diagonal": float((after.diagonal / before.diagonal).log().sum()),
+        "published": float((candidate.summed / (seen.summed + FISHERRF_LAMBDA)).sum()),
+    }
+
+
+def channel_sum(gaussians: Gaussians) -> Gaussians:
+    """Gaussians whose red is the sum of their three channels, and whose other channels are black."""
+    sh = torch.zeros_like(gaussians.sh)
+    sh[:, :, 0] = gaussians.sh.sum(dim=2)
+    sh[:, 0] += torch.tensor([1.0, -0.5, -0.5]).to(sh) / Y00  # a channel is 1/2 + Y00 times its first coefficient
+    return Gaussians.pack(gaussians.attributes | {"sh": sh})
+
+
+def _red(value: Float[Tensor, ""]) -> Float[Tensor, "3"]:
+    return torch.stack([value, 0 * value, 0 * value])
+
+
+def _squares(
+    gaussians: Gaussians, camera: Camera, background: Float[Tensor, "3"], settings: RenderSettings
+) -> PerGaussianBlocks:
+    """The blocks of J^T J: the mean of squared errors has l'' = 2 / (3 h w)."""
+    nothing = torch.zeros(3, camera.height, camera.width)
+    loss = loss_against(nothing, LossSettings("l2", ssim_weight=0), gaussians.flat)
+    view = LinearizedView(gaussians, camera, loss, background.to(gaussians.flat), settings)
+    blocks, pixels = view.block_diagonal(gauss_newton=True), 1.5 * camera.height * camera.width
+    return PerGaussianBlocks(pixels * blocks.geometry, pixels * blocks.sh)

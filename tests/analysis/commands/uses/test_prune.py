@@ -1,0 +1,107 @@
+"""`landscape prune`: what is kept, what the files hold, and that a curve goes on where it was stopped."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from analysis.commands.cli import main
+from analysis.commands.uses import prune
+from splat.curvature.scores.removal import SCORES
+from splat.model.files.read import read_splats
+from splat.model.files.splat_ply import splat_ply
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint
+from splat.training.score.evaluate import evaluate
+
+MADE = synthetic_scene(SyntheticSettings(gaussians=50, views=5, width=24, height=16))
+QUICK = ("--curve", "--curve-steps", "2", "--sample", "6")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Gaussians, one of them opaque and out of sight, with the scene that they were trained on."""
+    folder = tmp_path_factory.mktemp("pruned")
+    write_transforms_scene(MADE.scene, folder / "scene")
+    unseen = MADE.truth.select(torch.tensor([*range(len(MADE.truth)), 0]))
+    unseen.means[-1], unseen.opacity_logits[-1] = torch.tensor([0.0, 0.0, -50.0]), 5.0
+    (folder / "in.ply").write_bytes(splat_ply(unseen, tool="splat-landscape"))
+    return folder
+
+
+def run(folder: Path, *words: str) -> int:
+    return main(["prune", str(folder / "in.ply"), "--scene", str(folder / "scene"), "--views", "3", *words])
+
+
+@pytest.fixture(scope="module")
+def curved(folder) -> Path:
+    assert run(folder, *QUICK, "--keep", "0.4", "--score", "opacity") == 0
+    return folder / "prune"
+
+
+def test_the_highest_scores_are_kept_in_both_files(curved, folder):
+    before, table = read_splats(folder / "in.ply").gaussians, pd.read_csv(curved / "scores.csv")
+    chosen = np.sort(table.sort_values("opacity", ascending=False).gaussian[: round(0.4 * len(before))])
+    assert len(before) - 1 not in chosen  # opaque, but no view sees it
+    expected = before.select(torch.from_numpy(chosen))
+    assert torch.equal(read_splats(curved / "pruned.ply").gaussians.flat, expected.flat)
+    loaded = load_checkpoint(curved / "checkpoint.pt")
+    assert torch.equal(loaded.training.gaussians.flat, expected.flat)
+    assert loaded.load_scene(curved / "checkpoint.pt").root == (folder / "scene").resolve()
+
+
+def test_the_curve_scores_what_is_left(curved):
+    curve, loaded = pd.read_csv(curved / "curve.csv"), load_checkpoint(curved / "checkpoint.pt")
+    assert {*curve.score} == {*SCORES} and len(curve) == len(SCORES) * (len(prune.REMOVED) + len(prune.REFINED))
+    path, views = curved / "checkpoint.pt", loaded.scene
+    kept = evaluate(loaded.training.gaussians, loaded.load_scene(path).load(views.test))
+    row = curve[(curve.score == "opacity") & (curve.removed == 0.6) & (curve.steps == 0)].iloc[0]
+    assert row.test_psnr == pytest.approx(kept.psnr, abs=1e-4) and row.test_ssim == pytest.approx(kept.ssim, abs=1e-6)
+    assert curve[curve.removed == 0].train_psnr.nunique() == 1
+    assert (curved / "curve.png").stat().st_size > 10_000
+
+
+def test_scores_are_compared_with_true_removals(curved):
+    table, ranks = pd.read_csv(curved / "scores.csv"), pd.read_csv(curved / "correlations.csv", index_col=0)
+    assert table.error.notna().sum() == 6
+    assert ranks.loc["error", "rise"] == pytest.approx(table[["error", "rise"]].corr("spearman").iloc[0, 1])
+
+
+def test_refinement_lowers_the_training_loss(folder, tmp_path):
+    psnr = {}
+    for steps in (0, 20):
+        out = tmp_path / str(steps)
+        assert run(folder, "--sample", "3", "--keep", "0.3", "--refine", str(steps), "--out", str(out)) == 0
+        loaded = load_checkpoint(out / "checkpoint.pt")
+        views = loaded.load_scene(out / "checkpoint.pt").load(loaded.scene.train)
+        psnr[steps] = evaluate(loaded.training.gaussians, views).psnr
+    assert psnr[20] > psnr[0] + 0.1
+
+
+def test_a_curve_that_is_stopped_goes_on(folder, curved, tmp_path, monkeypatch):
+    whole, calls = prune.refine, []
+
+    def refined(*arguments):
+        calls.append(arguments)
+        if len(calls) == 20:
+            raise KeyboardInterrupt
+        whole(*arguments)
+
+    monkeypatch.setattr(prune, "refine", refined)
+    monkeypatch.setattr(prune, "draw_or_say", lambda *_: [])
+    words = [*QUICK, "--out", str(tmp_path / "out")]
+    assert run(folder, *words) == 130 and not (tmp_path / "out").exists()
+    assert run(folder, *words) == 0
+    every = len(SCORES) * (len(prune.REMOVED) + len(prune.REFINED)) + 1
+    assert len(calls) == every + 7  # of the second score, which was under way
+    assert (tmp_path / "out" / "curve.csv").read_text() == (curved / "curve.csv").read_text()
+    assert not (tmp_path / ".out.unfinished").exists()
+
+
+@pytest.mark.parametrize("words", [("--keep", "0"), ("--score", "opacty"), ("--sample", "1")])
+def test_what_cannot_be_is_refused(folder, words, capsys):
+    assert run(folder, *words) == 2
+    assert "expected --" in capsys.readouterr().err

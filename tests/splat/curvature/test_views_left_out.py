@@ -1,0 +1,50 @@
+"""What is said of training views that were left out: the parts of single views, and the error of their mean."""
+
+from collections.abc import Iterable
+
+import pytest
+import torch
+
+from landscape.results import sampling_error
+from splat import SceneObjective, SyntheticSettings, synthetic_scene
+from splat.curvature.hessian import SceneHessian
+from splat.curvature.traces import block_traces, exact_traces
+
+VIEWS = 5
+MADE = synthetic_scene(SyntheticSettings(gaussians=60, views=VIEWS, width=24, height=16))
+
+
+def objective(views: Iterable[int] = range(VIEWS)) -> SceneObjective:
+    gaussians = MADE.truth.select(torch.arange(len(MADE.truth)), 1)
+    gaussians.sh.add_(0.1 * torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(0)))
+    loaded = MADE.scene.load()
+    return SceneObjective(gaussians, [loaded[i] for i in views])
+
+
+def test_traces_losses_and_curvatures_are_the_means_of_those_of_single_views():
+    whole, generator = objective(), torch.Generator().manual_seed(1)
+    V = torch.linalg.qr(torch.randn(len(whole.active.flat), 2, generator=generator))[0]
+    hessian = SceneHessian(whole)
+    forms = hessian.by_view(V)
+    P = hessian.project(V)
+    torch.testing.assert_close(forms.mean(dim=0), (P.double() * hessian.apply(V)).sum(dim=0), rtol=1e-4, atol=1e-7)
+    assert float(whole.losses.mean()) == pytest.approx(whole.loss(whole.active.flat), rel=1e-6)
+    exact = block_traces(whole)
+    for name, sampled in exact_traces(whole, generator, samples=16).items():
+        known, terms = exact[name], sampled.terms
+        assert known.terms is not None and terms is not None
+        assert float(known.terms.mean()) == pytest.approx(known.value, rel=1e-5, abs=1e-9)
+        for view in range(VIEWS):
+            alone = block_traces(objective([view]))[name]  # Gaussians that it does not see have no curvature in it
+            assert float(known.terms[view]) == pytest.approx(alone.value, rel=1e-4, abs=1e-7)
+        error = (sampled.samples.std() / 4) * VIEWS  # of a view's term, whose signs are its own
+        assert ((terms - known.terms).abs() <= 6 * error + 1e-5 * known.terms.abs()).all()
+
+
+def test_the_error_of_views_left_out_is_that_of_random_samples_and_0_of_all():
+    population = torch.randn(12, generator=torch.Generator().manual_seed(2), dtype=torch.float64).exp()
+    draws = [torch.randperm(12, generator=torch.Generator().manual_seed(seed))[:4] for seed in range(4000)]
+    true = torch.stack([population[draw].mean() for draw in draws]).std()
+    said = torch.tensor([sampling_error(population[draw], 12) for draw in draws]).square().mean().sqrt()
+    assert float(said) == pytest.approx(float(true), rel=0.05)
+    assert sampling_error(population, 12) == 0.0 and sampling_error(population[:1], 12) is None
