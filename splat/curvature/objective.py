@@ -165,7 +165,7 @@ class SceneObjective:
         for view in self.views:
             raster = rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True)
             seen |= touches(raster)
-            self._sizes = max(self._sizes, LinearizedView.size_of(raster, gaussians))
+            self._sizes = max(self._sizes, LinearizedView.size_of(raster, gaussians, self.settings))
         return self.ranks.any(seen)
 
     @property
