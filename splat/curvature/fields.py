@@ -36,6 +36,7 @@ from splat.render.sight import Sight, sight
 
 Values = dict[str, Float64[Tensor, " n"]]
 PER_UNIT = {"means": "1 / world unit²", "log_scales": "1", "quats": "1", "opacity_logits": "1 / logit²", "sh": "1"}
+WORDS = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "colour"}
 PREFIXES = ("", "gn_")
 MIXED = "1 / stored unit²"
 
@@ -50,7 +51,7 @@ class Field:
 
 
 OF_BLOCKS = {
-    **{f"trace_{name}": Field(f"trace of {name}", unit, "signed") for name, unit in PER_UNIT.items()},
+    **{f"trace_{name}": Field(f"trace of {WORDS[name]}", unit, "signed") for name, unit in PER_UNIT.items()},
     "largest": Field("largest curvature", MIXED, "log"),
     "log_det": Field("log-determinant", "ln", "linear"),
     "rank": Field("rank of the block", "directions", "linear"),
