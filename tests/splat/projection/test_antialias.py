@@ -82,7 +82,7 @@ def test_pictures_under_a_preset_are_those_of_its_tools_equations(name):
     sharp = [splat_of_gaussian(*each, *frame, 0.0) for each in zip(means, log_scales, quats, sh, strict=True)]
     factors = np.array([factor(covariance, blur) for _, covariance, _, _ in sharp])
     assert factors.min() < 0.01 and factors.max() > 0.9
-    blurred = [(mean, covariance + blur * np.eye(2), *rest) for mean, covariance, *rest in sharp]
+    blurred = [(mean, covariance + blur * np.eye(2), colour, z) for mean, covariance, colour, z in sharp]
     expected, alpha, _ = composited_picture(
         blurred, opacities * factors, BACKGROUND, SIZE, near=settings.near, cap=settings.alpha_max, cut=1 / 255,
         floor=1e-4,

@@ -53,7 +53,8 @@ def test_mip_splattings_filter_is_renewed_when_its_training_does_and_resumes(mon
     assert renewed == [6, 8, 10, 12]  # clones and splits until 10, and once more between there and the end
     resumed = load_checkpoint(saved).training
     assert list(train(resumed, views)) and torch.equal(resumed.gaussians.flat, training.gaussians.flat)
-    assert resumed.gaussians.filter_widths is not None and torch.equal(resumed.gaussians.filter_widths, widths)
+    assert resumed.gaussians.filter_widths is not None and widths is not None
+    assert torch.equal(resumed.gaussians.filter_widths, widths)
 
 
 def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands():
