@@ -24,7 +24,7 @@ class Format:
     def __init__(self, root: Path) -> None:
         self.root, self.chance = root, Random(0)
         self.write()
-        self.files = {name: (root / name).read_bytes() for name in self.broken()}
+        self.files = {name: (self.root / name).read_bytes() for name in self.broken()}
         self.use()
 
     def write(self) -> None:

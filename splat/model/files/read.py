@@ -14,6 +14,7 @@ from splat.model.files import quantised, tensor_files
 from splat.model.files.ply import MAGIC, read_header
 from splat.model.files.splat_file import SplatFile
 from splat.model.files.splat_ply import read_splat_ply
+from splat.model.untrusted import require_modest
 
 ZIP_MAGIC, LICHTFELD = b"PK\x03\x04", (b"LFKP", b"PKFL")
 LONGEST_SETTINGS = 1 << 16
@@ -35,6 +36,7 @@ def is_foreign(path: Path) -> bool:
             return start.startswith(known) or path.suffix.lower() == ".splat"
         try:
             with zipfile.ZipFile(file) as archive:
+                require_modest(archive)
                 return not tensor_files.is_own(archive) and (
                     tensor_files.is_tensor_file(archive) or quantised.is_sog(archive)
                 )

@@ -26,6 +26,7 @@ from landscape.errors import InputError, lacks_memory
 from splat.model.files.splat_file import SplatFile, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
+from splat.model.untrusted import require_modest
 
 RANK = re.compile(r"(.*_rank)(\d+)(\.pt)")
 OWN = b"splat-landscape checkpoint"
@@ -63,6 +64,7 @@ def load_tensors(content: bytes) -> Any:
     """What `torch.save` wrote, on the CPU.  Its members are as large as in the file, and their checksums right."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            require_modest(archive)
             if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
                 raise InputError("its members are compressed, which torch.save does not do")
             if wrong := archive.testzip():

@@ -1,5 +1,8 @@
 """The same Gaussians come out of every tool's file, to the last bit of a float32; what cannot be rendered is refused."""
 
+import io
+import zipfile
+from copy import copy
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,7 +13,7 @@ import torch
 from landscape.errors import InputError
 from splat.model.files.read import is_foreign, read_cfg_args, read_splats
 from splat.model.files.splat_ply import splat_ply
-from splat.model.files.tensor_files import gsplat_bytes
+from splat.model.files.tensor_files import gsplat_bytes, load_tensors
 from splat.projection.antialias import baked
 from tests.splat.model.files import written
 from tests.splat.model.files.written import FILES, columns, ply, scene
@@ -186,6 +189,18 @@ def test_what_cannot_be_rendered_is_refused_in_a_sentence(tmp_path, content, mes
     with pytest.raises(InputError, match=message) as caught:
         read_splats(stored(tmp_path, "file", content))
     assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_members_that_share_their_bytes_are_no_more_than_the_file_may_hold(tmp_path):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("a/data.pkl", bytes(10**6))
+        for i in range(100):
+            archive.filelist.append(copy(archive.filelist[0]))
+            archive.filelist[-1].filename = f"a/data/{i}"
+    with pytest.raises(InputError, match=r"promises 101,000,000 bytes"):
+        load_tensors(buffer.getvalue())
+    assert not is_foreign(stored(tmp_path, "bomb.pt", buffer.getvalue()))
 
 
 class Trap:
