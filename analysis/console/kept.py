@@ -103,6 +103,10 @@ class Kept:
         self._add(entry)
         return value
 
+    def has(self, name: str) -> bool:
+        """Whether a stage's result is there from before."""
+        return self._read(name) is not None
+
     def _give_up(self, name: str) -> None:
         self.unreached.append(name)
         self.stages.plan.pop(name, None)

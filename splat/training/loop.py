@@ -86,19 +86,28 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
             background, loss = drawn, config.loss_against(target, training.gaussians.flat)
         step = Step(number, training, training.gaussians, views, chosen, background, loss)
 
-        # the photometric gradient, and what the method makes of it
-        scale = method.opacity_scale(step)
-        base = loss_and_gradient(step.gaussians, step.camera, loss, background, config.render, scale)
-        _require_finite("loss", base.loss, step)
-        found = method.gradient(step, base)
-        _require_finite("gradient", float(found.gradient.sum()), step)
-
-        # update, then clone, split and prune
-        training.descend(found.gradient, number)
-        training.control_density(number, step.camera, found)
+        value = method.own_step(step)
+        value = photometric_step(step) if value is None else value
+        _require_finite("loss", value, step)
         method.after_step(step)
         training.step = number
-        yield StepResult(number, base.loss, len(training.gaussians), view.name)
+        yield StepResult(number, value, len(training.gaussians), view.name)
+
+
+def photometric_step(step: Step) -> float:
+    """A step of 3DGS on the sampled view, with what the method adds; the loss before it."""
+    training, config, method = step.training, step.config, step.training.method
+    # the photometric gradient, and what the method makes of it
+    scale = method.opacity_scale(step)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background, config.render, scale)
+    _require_finite("loss", base.loss, step)
+    found = method.gradient(step, base)
+    _require_finite("gradient", float(found.gradient.sum()), step)
+
+    # update, then clone, split and prune
+    training.descend(found.gradient, step.number)
+    training.control_density(step.number, step.camera, found)
+    return base.loss
 
 
 def with_background(view: View, old: Float[Tensor, "3"], new: Float[Tensor, "3"]) -> Float[Tensor, "3 h w"]:

@@ -66,9 +66,11 @@ class MethodSettings(Settings):
     """Settings of a method; `create` makes a `Method` from them.  name: its key in `methods.METHODS`.
 
     BEFORE: values for settings that older checkpoints lack, with which the method does the same as it did then.
+    ITERATIONS: steps of a training that is not told how many.
     """
 
     name: str = ""
+    ITERATIONS: ClassVar[int] = 2000
     BEFORE: ClassVar[dict[str, Any]] = {}
 
     def create(self, seed: int) -> "Method":
@@ -96,6 +98,7 @@ class Method(Generic[S]):
 
     hook            runs                                      arguments          result
     on_start        before the first step, after a resume     training, views    InputError where views lack what it needs
+    own_step        in place of all up to after_step          step               the loss before it; None: as 3DGS does
     opacity_scale   before the sampled view is rendered       step               (n,) factors on the opacities, or None
     gradient        after its backward pass, before Adam      step, base         loss and gradient to go on with
     on_densify      after each change of the Gaussians        change             which old one each new one comes from
@@ -116,6 +119,10 @@ class Method(Generic[S]):
 
     def on_start(self, training: "Training", views: Sequence[View]) -> None:
         """A second call changes nothing."""
+
+    def own_step(self, step: Step) -> float | None:
+        """Change step.training.gaussians, in place, without the sampled view, Adam and density control."""
+        return None
 
     def opacity_scale(self, step: Step) -> Float[Tensor, " n"] | None:
         return None

@@ -51,7 +51,7 @@ def test_a_stage_that_was_kept_is_read_and_not_done_again(tmp_path):
     assert torch.equal(first.vector, read.vector) and read.error == inf and read.names == {"a": 0.1}
     assert read.inner.vector.dtype == torch.float32 and read.parts[0].shape == (2, 3)
     assert two.notes == one.notes == ["a note"] and two.counts == one.counts == [1]
-    assert kept_stages(tmp_path / "kept") == ["first"]
+    assert kept_stages(tmp_path / "kept") == ["first"] and two.has("first") and not two.has("second")
     second = two.run("second", Found, again)  # as if nothing had been kept
     assert second is not None and torch.equal(second.vector, _alone("second").vector)
 

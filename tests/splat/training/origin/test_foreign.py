@@ -213,3 +213,13 @@ def test_fewer_views_are_spread_over_the_cameras(folder):
     assert found.thinned(scene, None) is found.thinned(scene, 99) is found
     with pytest.raises(InputError, match="at least 1 view"):
         spread_views(scene.frames, 0)
+
+
+def test_few_views_stand_for_their_neighbours_and_are_not_the_outermost(folder):
+    frame = MADE.scene.frames[0]
+    places = [torch.tensor([10.0 * (k // 3) + k % 3, 0.0, 0.0], dtype=torch.float64) for k in range(9)]  # three groups
+    frames = [replace(frame, name=str(k), camera=replace(frame.camera, centre=at)) for k, at in enumerate(places)]
+    assert sorted(spread_views(frames, 3)) == ["1", "4", "7"] and spread_views(frames, 1) == ["4"]
+    assert sorted(spread_views(frames, 9)) == [str(k) for k in range(9)]
+    together = [replace(frame, name=str(k)) for k in range(4)]
+    assert len({*spread_views(together, 3)}) == 3
