@@ -182,6 +182,8 @@ def with_rest(count: int) -> bytes:
         (written.saved({"step": 1, "pipeline": {"_model.field": torch.zeros(3)}}), "splatfacto"),
         (written.saved({"a": 1}), "no Gaussians of graphdeco, gsplat or nerfstudio"),
         (written.saved({"splats": {"means": torch.zeros(1).expand(5, 3)}}), "repeats its numbers"),
+        (written.saved({"step": torch.zeros(3), "splats": {"means": torch.zeros(3, device="meta")}}), "no tensor of"),
+        (written.saved({"splats": {"means": torch.nested.nested_tensor([torch.zeros(3)])}}), "no tensor of numbers"),
     ],
     ids=lambda value: None if isinstance(value, bytes) else value[:20],
 )
