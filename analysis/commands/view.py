@@ -38,6 +38,7 @@ from splat.curvature.objective import SceneObjective
 from splat.model.camera import Camera, look_at
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
+from splat.projection.antialias import baked
 from splat.projection.reference import rotation_matrices
 from splat.render.sight import sight
 from splat.training.checkpoint import write_atomically
@@ -126,6 +127,7 @@ class Frame:
 
     def splats(self, gaussians: Gaussians) -> dict[str, np.ndarray]:
         """centers and covariances, float32, that float16 can hold."""
+        gaussians = baked(gaussians)
         quats = gaussians.quats.double()
         axes = rotation_matrices(quats) * (gaussians.log_scales.double().exp() * self.scale)[:, None, :]
         covariances = (axes @ axes.mT).clamp(-LARGEST, LARGEST)
@@ -143,7 +145,7 @@ class Viewer:
         self._drawing = Lock()  # callbacks come from several threads
         active = objective.active
         self.plain = (0.5 + Y00 * active.sh[:, 0]).clamp(0, 1).float().numpy()
-        self.opacities = active.opacity_logits.sigmoid().float().numpy()[:, None]
+        self.opacities = baked(active).opacity_logits.sigmoid().float().numpy()[:, None]
         self.splats = server.scene.add_gaussian_splats(
             "/splats", **self.frame.splats(active), rgbs=self.plain, opacities=self.opacities
         )

@@ -48,6 +48,8 @@ class TrainOptions:
     """A checkpoint, our own or another tool's, whose Gaussians to start from, with its renderer and in its world."""
     trained_by: Unset[str] = None
     """Whose conventions another tool's file of --from follows, see landscape probe.  Default: what the file says."""
+    antialiased: FlagCreatePairsOff[bool] = False
+    """Another tool's file of --from does not say so, but its renderer was antialiased."""
     masks: Unset[Path] = None
     """Folder of object masks, named after the images; the scores are taken inside them.
     Default: mask or masks in the scene, or what its files name (nerfstudio's mask_path, DTU's idrmasks)."""

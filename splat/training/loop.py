@@ -8,6 +8,8 @@ Steps are counted from 1.  Views come in epochs, each a new random order.  All r
 
 The Gaussians hold only the SH bands in use; a band joins as zeros, which is the same as one whose gradient was zero.
 
+Where Gaussians have Mip-Splatting's 3-D filter (`render.antialias`), `Training.update_filter` keeps it up to date.
+
 The published code (graphdeco-inria/gaussian-splatting, train.py) orders a step in another way:
 
     update      after density control, whose new tensors have no gradient yet: a step that clones, splits and prunes updates
@@ -56,6 +58,7 @@ def prepare(training: Training, views: Sequence[View]) -> None:
             f"expected a training in which the method acts, got {config.method.name} which never does in "
             f"{config.iterations} steps ({late}); take more steps, let it begin earlier, or use the method 3dgs"
         )
+    training.update_filter(0, [view.camera for view in views])
     training.method.on_start(training, views)
 
 
@@ -74,6 +77,7 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
     prepare(training, views)
     config, method, dtype = training.config, training.method, training.gaussians.flat.dtype
     losses = [config.loss_against(view.image, training.gaussians.flat) for view in views]
+    cameras = [view.camera for view in views]
     while training.step < config.iterations:
         # what the step is about: a view, a background, the loss against that view
         number = training.step + 1
@@ -90,6 +94,7 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
         value = photometric_step(step) if value is None else value
         _require_finite("loss", value, step)
         method.after_step(step)
+        training.update_filter(number, cameras)
         training.step = number
         yield StepResult(number, value, len(training.gaussians), view.name)
 

@@ -27,11 +27,13 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.model.typed import Count, Length, NonNegative, Positive, Settings, Share, typed
+from splat.projection.antialias import sampling_widths
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.scenes.view import View
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.training.optim.adam import Adam
 
+FILTER_EVERY = 100  # steps
 Protocol = Literal["common", "llff"]
 Row = dict[str, Count | float | bool | str]  # of a history
 
@@ -325,6 +327,21 @@ class Training(Brief):
         flat = change.gaussians.flat
         self.screen_gradients = ScreenGradients.zero(len(change.gaussians), flat.dtype, flat.device)
         self.method.on_densify(change)
+
+    def update_filter(self, step: int, cameras: Sequence[Camera]) -> None:
+        """Give the Gaussians the 3-D filter of Mip-Splatting's training after a step, if that is how they are antialiased.
+
+        As its published code does: at the start, whenever density control has changed the Gaussians, and after that every
+        FILTER_EVERY steps but the last ones.
+        """
+        config = self.config
+        if config.render.antialias != "mip-splatting":
+            return
+        schedule, iterations = config.method.density_control(config), config.iterations
+        settled = not schedule.collects(step, iterations) and step < iterations - FILTER_EVERY
+        due = schedule.densifies(step, iterations) or (settled and step > 0 and step % FILTER_EVERY == 0)
+        if due or self.gaussians.filter_widths is None:
+            self.gaussians = self.gaussians.with_filter(sampling_widths(self.gaussians, cameras))
 
     def raise_sh_degree(self, degree: int) -> None:
         """Add bands of zeros up to this degree."""

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import json
 import zipfile
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -25,7 +26,7 @@ from tests.splat.model.files.test_quantised import sog, zipped
 CFG_ARGS = (
     "Namespace(sh_degree=3, eval=True, images='images', resolution=-1, white_background=False, antialiasing=False)"
 )
-CAMERAS = '[{"id": 0, "img_name": "view_000", "width": 24}, {"id": 1, "img_name": "view_001", "width": 24}]'
+CAMERAS = json.dumps([{"id": i, "img_name": f"view_{i:03d}", "width": 24} for i in range(4)])
 LIST = "list.txt"
 FRAME = '{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 1.0}'
 

@@ -82,6 +82,7 @@ class KeptStages(Format):
     """Stages of an interrupted probe: what is damaged is measured again."""
 
     name = "STAGE.msgpack"
+    refuses = False
     matrix: ClassVar = torch.diag(torch.linspace(-2, 7, 12, dtype=torch.float64))
 
     def write(self) -> None:

@@ -12,6 +12,7 @@ from splat.curvature.objective import SceneObjective
 from splat.model.files.splat_ply import splat_ply
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
+from splat.projection.antialias import baked
 
 TOP = 100
 
@@ -30,7 +31,7 @@ def coloured_ply(gaussians: Gaussians, seen: Bool[Tensor, " n"], shade: Shade, v
     rgb = torch.full((len(gaussians), 3), GREY / 255)
     rgb[seen] = torch.from_numpy(colours(shade, values.numpy()))
     attributes = gaussians.attributes | {"sh": ((rgb - 0.5) / Y00)[:, None].to(gaussians.flat)}
-    return splat_ply(Gaussians.pack(attributes))
+    return splat_ply(baked(Gaussians.pack(attributes).with_filter(gaussians.filter_widths)))
 
 
 def colours(shade: Shade, values: np.ndarray) -> np.ndarray:

@@ -141,6 +141,7 @@ class SecondOrderMethod(Method[S], Generic[S]):
         loss = replace(config.loss, pixel="charbonnier") if config.loss.pixel == "l1" else config.loss
         local = Local(SceneObjective(step.gaussians, views, loss, step.background, config.render), self.settings)
         moved = self._descend(local, step.number)
+        vars(local.objective).pop("linearized", None)  # refers back: would wait for the garbage collector
         if moved is not None:
             after = step.gaussians.with_flat(step.gaussians.flat.clone())
             for name, values in after.attributes.items():
