@@ -159,7 +159,7 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
             0, 1, maps["photograph"], f"Share of it: {', '.join(percent(each.share) for each in end.carriers)}"
         )
         for axes, shift in ((whole, (0, 0)), (part, (left, top))):
-            for carrier in end.carriers:
+            for carrier in reversed(end.carriers):  # the first above the others
                 _outline(axes, carrier.outline, shift, carrier is end.carriers[0])
         sheet.show(0, 2, maps["zero"], f"Render: loss {quantity(end.losses[1])}")
         sheet.show(1, 0, maps["minus"], f"One step back: loss {_signed(changes[0])}")

@@ -1,8 +1,9 @@
-"""What exact curvature is good for: the pictures of `landscape prune` and `next-view`.  `python -m figures.uses RUN/prune`"""
+"""Pictures of `landscape prune`, `next-view` and `uncertainty`: `python -m figures.uses RUN/prune`"""
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -10,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from figures.style import (
     BLACK,
     BLUE,
+    FIELD_MAP,
     GREEN,
     ORANGE,
     PURPLE,
@@ -121,9 +123,23 @@ def draw_study(table: pd.DataFrame) -> Figure:
 PICTURES = {"curve": draw_curve, "gains": draw_gains, "study": draw_study}
 
 
+def draw_uncertainty(path: Path) -> Figure:
+    """A held-out view: its photograph, its error, and the standard deviations of its pixels by blocks and by the diagonal."""
+    words = {"photograph": "photograph", "error": "|error|", "block": "uncertainty, blocks", "diagonal": "and diagonal"}
+    with style(), np.load(path, allow_pickle=False) as maps:
+        height, width = maps["error"].shape
+        figure = new_figure(6.6 / len(words) * height / width + 0.4, 6.6)
+        for axes, (name, title) in zip(figure.subplots(1, len(words)), words.items(), strict=True):
+            top = None if name == "photograph" else np.quantile(maps[name], 0.99) or 1.0
+            axes.imshow(maps[name], cmap=FIELD_MAP, vmin=0, vmax=top)
+            axes.set(title=title, xticks=[], yticks=[])
+    return figure
+
+
 def draw(folder: Path, suffix: str = "png") -> list[Path]:
     """Those whose numbers are in the folder."""
-    return [
+    views = [save(draw_uncertainty(path), path.with_suffix(f".{suffix}")) for path in sorted(folder.glob("view-*.npz"))]
+    return views + [
         save(make(pd.read_csv(folder / f"{name}.csv")), folder / f"{name}.{suffix}")
         for name, make in PICTURES.items()
         if (folder / f"{name}.csv").is_file()

@@ -159,7 +159,10 @@ def splat_in_many_digits(
     point: Sequence[Any], rotation: np.ndarray, centre: np.ndarray, pinhole: tuple[float, float, float, float],
     blur: float,
 ) -> list[Any]:  # fmt: skip
-    """Mean x, y and conic a, b, c of a Gaussian (mean, log-scales, quaternion w x y z), with mpmath's working precision."""
+    """Mean x, y and conic a, b, c of a Gaussian (mean, log-scales, quaternion w x y z), with mpmath's working precision.
+
+    And the square root of the ratio of its covariances' determinants without and with the blur.
+    """
     fx, fy, cx, cy = pinhole
     W = mpmath.matrix(rotation.tolist())
     x, y, z = W * mpmath.matrix([m - c for m, c in zip(point[:3], centre.tolist(), strict=True)])
@@ -174,8 +177,9 @@ def splat_in_many_digits(
     )
     jacobian = mpmath.matrix([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
     axes = jacobian * W * turn * mpmath.diag([mpmath.exp(s) for s in point[3:6]])
-    conic = mpmath.inverse(axes * axes.T + blur * mpmath.eye(2))
-    return [fx * x / z + cx, fy * y / z + cy, conic[0, 0], conic[0, 1], conic[1, 1]]
+    sharp, whole = axes * axes.T, axes * axes.T + blur * mpmath.eye(2)
+    conic, ratio = mpmath.inverse(whole), mpmath.det(sharp) / mpmath.det(whole)
+    return [fx * x / z + cx, fy * y / z + cy, conic[0, 0], conic[0, 1], conic[1, 1], mpmath.sqrt(ratio)]
 
 
 def hessian_in_many_digits(function: Callable[[list[Any]], Any], point: Sequence[float], digits: int) -> np.ndarray:

@@ -126,9 +126,11 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
     for workload in workloads:
         bench = ViewBench(workload)
         console.print(
-            f"[bold]{workload.name}[/]: {len(workload.gaussians)} Gaussians, {bench.view.camera.width} x "
+            f"{workload.name}: {len(workload.gaussians)} Gaussians, {bench.view.camera.width} x "
             f"{bench.view.camera.height} px, {bench.linearized.touched} visible, {bench.linearized.intersections} tile entries",
+            style="bold",
             highlight=False,
+            markup=False,
         )
         calls = {**bench.stages(), **bench.wholes(), **bench.peers()}
         measured = interleaved(calls, options.repetitions, clock=meter.seconds)
@@ -141,7 +143,7 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
         held = _bounds(workload, bench, measured, cost, meter)
         console.print(rich_table(held.drop(columns="scene"), "asked for"))
         if bench.lack:
-            console.print(f"no gradient to compare with: {bench.lack}", soft_wrap=True, highlight=False)
+            console.print(f"no gradient to compare with: {bench.lack}", soft_wrap=True, highlight=False, markup=False)
         times.append(lines)
         bounds.append(held)
         for tables, name in ((times, "bench.csv"), (bounds, "bounds.csv")):  # what comes next may fail
@@ -151,8 +153,8 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
     times.append(pd.DataFrame(_scaling(workloads[0], max(1, options.repetitions // SCALING_SHARE), meter)))
     write_table(pd.concat(times, ignore_index=True), options.out / "bench.csv", console)
     write_table(pd.concat(bounds, ignore_index=True), options.out / "bounds.csv", console)
-    draw("bench", options.out / "bench.csv")
-    console.print(str(options.out / "bench.png"), soft_wrap=True, highlight=False)
+    for line in (*draw("bench", options.out / "bench.csv"), str(options.out / "bench.png")):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def _precision(workload: Workload, path: Path, console: Console) -> None:

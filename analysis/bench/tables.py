@@ -5,7 +5,9 @@ from pathlib import Path
 import pandas as pd
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from splat.training.checkpoint import write_atomically
 
@@ -22,13 +24,13 @@ def rich_table(table: pd.DataFrame, title: str) -> Table:
     return result
 
 
-def _cell(value: object) -> str:
+def _cell(value: object) -> str | Text:
     if isinstance(value, bool):
-        return "yes" if value else "[bold]no[/]"
+        return "yes" if value else Text("no", "bold")
     if isinstance(value, float):
         small = 0 < abs(value) < 1e-3
         return "" if pd.isna(value) else f"{value:.1e}" if small else f"{value:.{3 if abs(value) < 1000 else 6}g}"
-    return str(value)
+    return escape(str(value))
 
 
 def write_table(table: pd.DataFrame, path: Path, console: Console | None = None) -> None:

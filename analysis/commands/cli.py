@@ -19,7 +19,7 @@ from rich.console import Console
 
 from analysis.bench.options import BenchOptions
 from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions, ViewOptions
-from analysis.commands.uses.options import NextViewOptions, PruneOptions
+from analysis.commands.uses.options import NextViewOptions, PruneOptions, UncertaintyOptions
 from analysis.console.failures import report
 from analysis.console.interruption import ignored, raising
 from analysis.probe.options import ProbeOptions
@@ -39,6 +39,7 @@ COMMANDS = {
     "view": ViewOptions,
     "prune": PruneOptions,
     "next-view": NextViewOptions,
+    "uncertainty": UncertaintyOptions,
     "compare": CompareOptions,
     "claims": ClaimsOptions,
     "convert": ConvertOptions,
@@ -56,6 +57,7 @@ Options = (
     | ViewOptions
     | PruneOptions
     | NextViewOptions
+    | UncertaintyOptions
     | CompareOptions
     | ClaimsOptions
     | ConvertOptions
@@ -158,9 +160,8 @@ def at_files(options: Options) -> Options:
 
 def run(options: Options, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand."""
-    if isinstance(
-        options, TrainOptions | ProbeOptions | SliceOptions | MapOptions | PruneOptions | NextViewOptions | DemoOptions
-    ):
+    of_curvature = ProbeOptions | SliceOptions | MapOptions | PruneOptions | NextViewOptions | UncertaintyOptions
+    if isinstance(options, TrainOptions | DemoOptions | of_curvature):
         from analysis.commands.compiling import compiling_is_said
 
         with compiling_is_said(Console(stderr=True)):
@@ -216,6 +217,10 @@ def _run(options: Options, arguments: Sequence[str]) -> int:
             from analysis.commands.uses.next_view import run_next_view
 
             return run_next_view(options, ["landscape", *arguments])
+        case UncertaintyOptions():
+            from analysis.commands.uses.uncertainty import run_uncertainty
+
+            return run_uncertainty(options, ["landscape", *arguments])
         case TrajectoryOptions():
             from analysis.runs.trajectories import run_trajectory
 

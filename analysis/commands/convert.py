@@ -15,6 +15,7 @@ from splat.model.files.splat_file import SplatFile
 from splat.model.files.splat_ply import splat_ply
 from splat.model.files.tensor_files import gsplat_bytes
 from splat.model.settings import RenderSettings
+from splat.projection.antialias import baked
 from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
 
 OURS = "splat-landscape"
@@ -53,10 +54,12 @@ def _to_tool(options: ConvertOptions, to: str) -> list[str]:
     content = (
         splat_ply(found.gaussians, extra, found.tool)
         if to == "graphdeco"
-        else gsplat_bytes(found.gaussians, found.step or 0, extra, found.tool)
+        else gsplat_bytes(baked(found.gaussians), found.step or 0, extra, found.tool)
     )
     write_atomically(options.out, content)
     kept = [f"with {', '.join(extra)}"] if extra else []
+    if to != "graphdeco" and found.gaussians.filter_widths is not None:
+        kept.append("their 3-D filter, for which such a file has no place, is now in scales and opacities")
     return [f"{len(found.gaussians)} Gaussians", *kept, *found.notes]
 
 

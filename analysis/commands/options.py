@@ -70,7 +70,8 @@ class ViewOptions:
     host: str = "127.0.0.1"
     """Who may open the page; 0.0.0.0: everybody who reaches this machine."""
     html: Unset[Path] = None
-    """Write a page that needs no server to this file instead: splats in the field's colours and cameras, without controls."""
+    """Write a page that needs no server to this file instead: splats in the field's colours and cameras, without controls.
+    RUN/view.html is linked to by the probe's report."""
     scene: Unset[Path] = None
     """Folder of the scene: where it has moved since the training, or of another tool's file."""
     foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)

@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib import colormaps
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from analysis.commands.map.command import Fields, measured_fields
+from analysis.commands.map.command import PROBE, Fields, measured_fields
 from analysis.commands.map.files import colours
 from analysis.commands.map.pictures import rendered
 from analysis.commands.options import ViewOptions
@@ -30,6 +29,8 @@ from analysis.console.stages import Stages
 from analysis.measures.steepest import in_bytes
 from analysis.probe.command import opened, scene_objective
 from analysis.records.quantities import Shade, percent, quantity
+from analysis.records.report import FILE as REPORT
+from analysis.records.report import SPLATS, legend, write_report
 from analysis.slice.directions import RISE, UNITS, recorded_probe
 from landscape import curvature_reach
 from landscape.errors import InputError
@@ -37,6 +38,7 @@ from splat.curvature.objective import SceneObjective
 from splat.model.camera import Camera, look_at
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
+from splat.projection.antialias import baked
 from splat.projection.reference import rotation_matrices
 from splat.render.sight import sight
 from splat.training.checkpoint import write_atomically
@@ -66,14 +68,16 @@ def run_view(options: ViewOptions) -> int:
             console.print(f"open http://{options.host}:{server.get_port()}; Ctrl-C ends it", highlight=False)
         notes: list[str] = []
         with stages, stages.stage("fields") as report:
-            viewer.add_fields(measured_fields(objective, folder / "probe", notes, report), options.shown)
+            viewer.add_fields(measured_fields(objective, folder / PROBE, notes, report), options.shown)
         for note in notes:
             console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
         if options.html is not None:
             write_atomically(options.html, server.scene.as_html().encode())
             console.print(f"written: {options.html}", highlight=False, markup=False, soft_wrap=True)
+            if options.html.resolve() == (folder / SPLATS).resolve() and (folder / PROBE / REPORT).is_file():
+                write_report(folder / PROBE)  # its page has a link to this one
             return 0
-        viewer.add_steps(steepest_directions(objective, folder / "probe"))
+        viewer.add_steps(steepest_directions(objective, folder / PROBE))
         Event().wait()
     except KeyboardInterrupt:
         console.print("ended", highlight=False)
@@ -123,6 +127,7 @@ class Frame:
 
     def splats(self, gaussians: Gaussians) -> dict[str, np.ndarray]:
         """centers and covariances, float32, that float16 can hold."""
+        gaussians = baked(gaussians)
         quats = gaussians.quats.double()
         axes = rotation_matrices(quats) * (gaussians.log_scales.double().exp() * self.scale)[:, None, :]
         covariances = (axes @ axes.mT).clamp(-LARGEST, LARGEST)
@@ -140,7 +145,7 @@ class Viewer:
         self._drawing = Lock()  # callbacks come from several threads
         active = objective.active
         self.plain = (0.5 + Y00 * active.sh[:, 0]).clamp(0, 1).float().numpy()
-        self.opacities = active.opacity_logits.sigmoid().float().numpy()[:, None]
+        self.opacities = baked(active).opacity_logits.sigmoid().float().numpy()[:, None]
         self.splats = server.scene.add_gaussian_splats(
             "/splats", **self.frame.splats(active), rgbs=self.plain, opacities=self.opacities
         )
@@ -210,7 +215,9 @@ class Viewer:
         inside = np.ones(len(values), bool) if everything else (values >= low) & (values <= high)
         self.splats.rgbs = colours(shade, values)
         self.splats.opacities = self.opacities * inside[:, None]
-        self.legend.content = legend(shade)
+        self.legend.content = (
+            f'<div style="padding:0 1em;font-size:.85em">{shade.words}, {shade.unit}{legend(shade)}</div>'
+        )
 
     def step(self) -> None:
         """The splats, the render of the chosen view and the loss where the sliders are."""
@@ -242,7 +249,8 @@ class Viewer:
         lines = [f"**Gaussian {number:,}**, {percent(share)} of this pixel", ""]
         for name, kind in self.fields.kinds.items() if self.fields else ():
             assert self.fields is not None
-            lines.append(f"- {kind.words}: {quantity(float(self.fields.values[name][gaussian]))} {kind.unit}")
+            unit = "" if kind.unit == "1" else f" {kind.unit}"
+            lines.append(f"- {kind.words}: {quantity(float(self.fields.values[name][gaussian]))}{unit}")
         return "\n".join(lines)
 
 
@@ -253,14 +261,3 @@ def heaviest_on_ray(objective: SceneObjective, origin: Tensor, direction: Tensor
     weight = sight(objective.active, camera, objective.settings).weight
     best = int(weight.argmax())
     return (best, float(weight[best])) if weight[best] > 0 else None
-
-
-def legend(shade: Shade) -> str:
-    """The scale of colours with its ends."""
-    stops = [colormaps[shade.colours](x)[:3] for x in np.linspace(0, 1, 9)]
-    gradient = ", ".join(f"rgb({', '.join(str(round(255 * c)) for c in stop)})" for stop in stops)
-    return (
-        f'<div style="padding:0 1em;font-size:.85em">{shade.words}, {shade.unit}<div style="height:.8em;background:'
-        f'linear-gradient(to right, {gradient})"></div><div style="display:flex;justify-content:space-between"><span>'
-        f"{quantity(shade.value(shade.low))}</span><span>{quantity(shade.value(shade.high))}</span></div></div>"
-    )

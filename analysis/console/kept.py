@@ -25,6 +25,7 @@ from landscape.results import Progress
 from splat.training.checkpoint import write_atomically
 
 T = TypeVar("T")
+DIGEST = hashlib.sha256().digest_size
 
 
 class TimeUp(Exception):
@@ -34,7 +35,6 @@ class TimeUp(Exception):
 class Entry(msgspec.Struct):
     """A stage's result, the notes it made, how often it did what is counted, and the seconds it took."""
 
-    key: str
     value: msgspec.Raw
     notes: list[str]
     counts: list[int]
@@ -62,7 +62,7 @@ class Kept:
         deadline: float = inf,
     ) -> None:
         self.stages, self.folder, self.count, self.deadline = stages, folder, count, deadline
-        self.key = hashlib.sha256(told.encode()).hexdigest()
+        self.told = told.encode("utf-8", "surrogateescape")
         self.streams = {name: spawn(generator) for name in streams}
         self.notes: list[str] = []
         self.counts: list[int] = []
@@ -97,11 +97,15 @@ class Kept:
             return self._give_up(name)
         counts = [after - first for after, first in zip(self.count(), before, strict=True)]
         content = msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_plain))
-        entry = Entry(self.key, content, notes, counts, self.stages.timing[name])
+        entry = Entry(content, notes, counts, self.stages.timing[name])
         if not (partial and self.left == 0):
             self._write(name, entry)
         self._add(entry)
         return value
+
+    def has(self, name: str) -> bool:
+        """Whether a stage's result is there from before."""
+        return self._read(name) is not None
 
     def _give_up(self, name: str) -> None:
         self.unreached.append(name)
@@ -128,15 +132,21 @@ class Kept:
         if self.folder is None:
             return None
         with suppress(OSError, msgspec.DecodeError):
-            entry = msgspec.msgpack.decode(self._file(name).read_bytes(), type=Entry)
-            return entry if entry.key == self.key else None
+            kept = self._file(name).read_bytes()
+            if kept.startswith(self._key(content := kept[DIGEST:])):
+                return msgspec.msgpack.decode(content, type=Entry)
         return None
 
     def _write(self, name: str, entry: Entry) -> None:
         if self.folder is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(self._file(name), msgspec.msgpack.encode(entry))
+        content = msgspec.msgpack.encode(entry)
+        write_atomically(self._file(name), self._key(content) + content)
+
+    def _key(self, content: bytes) -> bytes:
+        """Of what one command found, whole: a digest, with which its file begins."""
+        return hashlib.sha256(self.told + b"\0" + content).digest()
 
     def _file(self, name: str) -> Path:
         assert self.folder is not None

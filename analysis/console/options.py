@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-from tyro.conf import arg
+from tyro.conf import FlagCreatePairsOff, arg
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 T = TypeVar("T")
@@ -21,8 +21,11 @@ class ForeignOptions:
 
     trained_by: Unset[str] = None
     """Of another tool's file: whose conventions to follow.
-    graphdeco, gsplat (up to 1.5; gsplat-raw without normalisation of the world), gsplat-1.6, nerfstudio, brush, lichtfeld.
+    graphdeco, gsplat (up to 1.5; gsplat-raw without normalisation of the world), gsplat-1.6, nerfstudio, brush, lichtfeld,
+    mip-splatting.
     Default: what the file says."""
+    antialiased: FlagCreatePairsOff[bool] = False
+    """Of another tool's file that does not say so: its renderer was antialiased."""
     views: Unset[int | Literal["all"]] = None
     """Of another tool's file: number of its training views, by the scene's protocol.
     Default: what the tool's files say, else all that are not held out."""

@@ -27,10 +27,7 @@ def write_with_pictures(
     data.timing = {"total": perf_counter() - start}
     write_record(folder, data, arrays)
     with stages.stage("pictures"):
-        try:
-            data.notes += draw("make_all", folder, *options) if drawn is None else drawn(folder)
-        except RuntimeError as error:  # the numbers stand without pictures
-            data.notes.append(" ".join(str(error).split()))
+        data.notes += draw("make_all", folder, *options) if drawn is None else drawn(folder)
     # the pictures are drawn from the record; only now is it known how long they took
     data.timing = {**stages.timing, "total": perf_counter() - start}
     write_data(folder, data)

@@ -19,6 +19,7 @@ Stage = Callable[[str], AbstractContextManager[Report]]
 NOW_AND_THEN = 15.0  # seconds between lines off a terminal
 LONGER = 0.25  # of what a stage has taken, which it takes at least still: one may take more than it was expected to
 SETTLED = 1.0  # seconds after which the rate of a stage is believed
+STRAYS = 4.0  # by which the time of a unit may be wrong
 
 
 class Work(NamedTuple):
@@ -115,7 +116,8 @@ class Stages:
             work = self.plan[name]
             rest = work.seconds * self._slower - spent
             if done and work.units and spent > SETTLED:
-                self._slower = spent / done * work.units / work.seconds
+                slower = spent / done * work.units / work.seconds
+                self._slower = min(max(slower, 1 / STRAYS), STRAYS)
                 rest = (work.units - done) * spent / done
             own = max(rest, LONGER * spent)
         seconds = own + self._slower * to_come

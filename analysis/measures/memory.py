@@ -66,10 +66,11 @@ def expected_peak(objective: SceneObjective) -> int:
     free, used = max(free_memory(device), 0), resident_memory() if device.type == "cpu" else 0
     least, camera = needs.view + needs.beside, objective.views[0].camera
     if least > free:
+        fit = int(len(objective.active) * free / least)
         raise InputError(
             f"expected at least {_gb(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
-            f"{camera.width} x {camera.height} px, got {_gb(used + free)}; --memory {ceil((used + least) / 1e8) / 10:g}GB "
-            f"would fit on a machine that has it, here about {int(len(objective.active) * free / least):,} such Gaussians"
+            f"{camera.width} x {camera.height} px, got {_gb(used + free)}, of which {_gb(used)} are taken; --memory "
+            f"{ceil((used + least) / 1e8) / 10:g}GB would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
         )
     return used + min(free, len(objective.views) * needs.view + needs.beside)
 

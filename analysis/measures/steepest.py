@@ -166,6 +166,7 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
     kind = f"a needle of {first.aspect:.0f} : 1" if first.aspect**2 > NEEDLE else f"a splat of {first.aspect:.1f} : 1"
     x, y = first.outline[0] / view.camera.width, first.outline[1] / view.camera.height
     row, column = (min(max(int(3 * each), 0), 2) for each in (y, x))
+    outside = "" if 0 <= x < 1 and 0 <= y < 1 else ", its centre outside of the picture"
     some = "both" if count == 2 else f"all {count}"
     seen = "one view" if first.views == 1 else f"{some if first.views == count else f'{first.views} of {count}'} views"
     if first.views > 1 and first.one_view >= 0.9:
@@ -173,5 +174,5 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
     alone = "" if share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
     return (
         f"{share:.0%} of {end.name}, {end.title}, {WORDS[name]} Gaussian {first.gaussian:,}, {kind} "
-        f"{PLACES[row][column]} of {view.name.rpartition('/')[2]}, seen by {seen}{alone}."
+        f"{PLACES[row][column]} of {view.name.rpartition('/')[2]}{outside}, seen by {seen}{alone}."
     )

@@ -166,7 +166,9 @@ def _write(
 def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
     """A checkpoint, our own or another tool's, and its scene.  out: beside which a picture explains a refusal."""
     listed = None if ask.train_list is None else read_names(ask.train_list)
-    foreign = Foreign(folder, ask.views, listed, ask.trained_by, ask.images, ask.downscale)
+    foreign = Foreign(
+        folder, ask.views, listed, ask.trained_by, ask.images, ask.downscale, antialiased=ask.antialiased or None
+    )
     checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
     scene = checkpoint.load_scene(path, folder)
     return checkpoint.thinned(scene, ask.max_views), scene

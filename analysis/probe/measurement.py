@@ -170,8 +170,9 @@ def measure(
     checks = operator.matvecs, hessian.views.spared
     product = _seconds_of_product(hessian)
     words = f"{MOST_AT_ONCE} products at once take {product:.2g} s, a render of all views {render:.2g} s"
-    stages.expect(_plan(settings, product, render), words)
     kept = Kept(stages, generator, STAGES, lambda: [operator.matvecs, hessian.views.spared], folder, told, deadline)
+    plan = _plan(settings, product, render)
+    stages.expect({name: work for name, work in plan.items() if not kept.has(name)}, words)
     point = _Point(objective, hessian, operator, settings, gradient, value)
     return _all_stages(point, kept, operator_check, gradient_check, checks, population)
 
@@ -266,8 +267,9 @@ def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str
     work = dict(TYPICAL)
     if settings.trace_samples:
         work["traces"] = (settings.trace_samples, 0.45 * settings.trace_samples, 0)
-    if not settings.slice_plane:
-        work["slice"] = (2 * settings.slice_points, 0, 1.6 * settings.slice_points)
+    units, _, renders = work["slice"]
+    points = min(units, settings.slice_points**2) if settings.slice_plane else 2 * settings.slice_points
+    work["slice"] = (points, 0, renders * points / units)
     if count := settings.density_matvecs:
         work["density"] = (count, 0.32 * count, 0)
     if settings.power_apart:

@@ -18,6 +18,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
 FINEST = 10  # significant digits
 BYTES, NOTHING = 254, 255  # of a scale in bytes: its end, and what has no value
+GREY = 128  # in bytes, of what has no value
 SCORES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}  # of metrics.json
 PLACES = {"psnr": 2, "ssim": 4, "lpips": 4}
 
@@ -178,6 +179,15 @@ class Shade(Struct, frozen=True, kw_only=True):
         if self.diverges:
             return "PuOr_r"
         return {"error": "magma", "order_gap": "cividis_r"}.get(self.name, "cividis")
+
+    @property
+    def palette(self) -> UInt8[np.ndarray, "256 3"]:
+        """The colours of `bytes`; grey: no value."""
+        from matplotlib import colormaps  # most readers of a record need none
+
+        colours = colormaps[self.colours](np.arange(NOTHING + 1) / BYTES)[:, :3]
+        colours[NOTHING] = GREY / 255
+        return (255 * colours).round().astype(np.uint8)
 
     def shown(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """t; nan for what has none."""

@@ -19,15 +19,16 @@ import plotly.io
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from analysis.records.findings import attribute_name, findings, headline, is_open
+from analysis.records.findings import Line, attribute_name, findings, headline, is_open
 from analysis.records.json_files import plain
-from analysis.records.quantities import limits, measured, quantity
+from analysis.records.quantities import BYTES, Shade, limits, measured, percent, quantity
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
-from analysis.records.run_files import MAP, MapRecord, read_map
+from analysis.records.run_files import MAP, MapRecord, Steepest, read_map
 from analysis.records.schema import INDICES
 from analysis.records.tables import family_lines
 
-FILE = "report.html"
+FILE, SPLATS = "report.html", "view.html"  # in the record's folder, and beside it: the page of `landscape view --html`
+FINE, COARSE = 82, 60  # quality of WebP: of photographs and drawings, and of maps, which are noisy
 PICTURES = {
     "slice2d": "The loss on the plane of the two steepest directions. Dots: renders, blue where the order of the splats or the "
     "set of visible ones is not the checkpoint's; dashed: the quadratic model.",
@@ -71,6 +72,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "measured": measured,
         "attribute": attribute_name,
         "cell": _cell,
+        "capitalise": lambda words: words[:1].upper() + words[1:],
         "open_ended": is_open,
     }
     surface = embedded_surface(record) if surface is None else surface
@@ -79,16 +81,23 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         counts=plain(record.data.counts),
         provenance=plain(record.data.provenance),
         numbers=numbers(record.data),
-        headline=headline(record.data),
+        headline=opening(record),
         findings=findings(record.data),
         views=views_in(record),
-        pictures=pictures_in(record.folder, PICTURES),
+        pictures=pictures_in(record.folder, PICTURES, shown_numbers(record)),
         where=where(record),
+        splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
         families=family_lines(record.data),
         indices=INDICES,
         surface=surface,
         plotly_js=base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode() if surface else "",
     )
+
+
+def opening(record: Record[ProbeRecord]) -> list[Line]:
+    """The three sentences at the top: where a map knows which Gaussian carries the steepest direction, it has the last one."""
+    lines, found = headline(record.data), map_beside(record)[1]
+    return [*lines[:2], Line(found.steepest[0].sentence)] if found and found.steepest else lines
 
 
 def numbers(data: ProbeRecord) -> list[dict[str, str]]:
@@ -113,51 +122,86 @@ def numbers(data: ProbeRecord) -> list[dict[str, str]]:
     return found
 
 
-def views_in(record: Record[ProbeRecord]) -> list[dict[str, str]]:
-    """Photograph and render of the training views whose pictures lie in the folder, as data URIs with the view's name."""
-    names, folder = record.data.provenance.views or [], record.folder
-    pairs = [(name, folder / PHOTOGRAPH.format(i), folder / RENDER.format(i)) for i, name in enumerate(names)]
-    return [
-        {"name": name, "photograph": _uri(photograph, "jpeg"), "render": _uri(render, "jpeg")}
-        for name, photograph, render in pairs
-        if photograph.is_file() and render.is_file()
-    ]
-
-
-def where(record: Record[ProbeRecord]) -> dict[str, Any]:
-    """Sentences and pictures, as JPEG, of the map beside the record that was made of the same step of the training, if any."""
+def map_beside(record: Record[ProbeRecord]) -> tuple[Path, MapRecord | None]:
+    """The folder of the map beside the record, and the map if it was made of the same step of the training."""
     folder = record.folder.parent / MAP
     if not (folder / MapRecord.FILE).is_file():
-        return {}
+        return folder, None
     found = read_map(folder)
-    if plain(found.provenance).get("iteration") != plain(record.data.provenance).get("iteration"):
-        return {}
-    beneath = "the Gaussians that carry it, outlined, and what a step along it does."
-    shown = [(end.file, f"{end.name}: {beneath}", end.sentence) for end in found.steepest]
-    for panel in found.panels[:1]:
-        words = (
-            f"{panel.name}: photograph, render, error, and {found.shades[found.field].words} of the Gaussians there."
-        )
-        axes = f"{panel.name}: where it is fragile in position, conditioning and opacity."
-        shown.append((panel.file, words, words))
-        shown.append((panel.file.replace("view", "fragility"), axes, " ".join(found.sentences[len(found.steepest) :])))
-    pictures = [
-        {"caption": caption, "words": words, "uri": _as_jpeg(folder / f"{name}.png")}
-        for name, caption, words in shown
-        if (folder / f"{name}.png").is_file()
+    same = plain(found.provenance).get("iteration") == plain(record.data.provenance).get("iteration")
+    return folder, found if same else None
+
+
+def views_in(record: Record[ProbeRecord]) -> list[dict[str, Any]]:
+    """Photograph and render of the training views whose pictures lie in the folder, with the maps of those that were mapped.
+
+    Each has its name and its pictures: what each is in words, a data URI, and the scale of its colours where it is a map.
+    """
+    names, folder = record.data.provenance.views or [], record.folder
+    pairs = [(folder / PHOTOGRAPH.format(i), folder / RENDER.format(i)) for i in range(len(names))]
+    drawn = [i for i, pair in enumerate(pairs) if all(path.is_file() for path in pair)]
+    maps, found = map_beside(record)
+    panels = {panel.place: maps / f"{panel.file}.npz" for panel in (found.panels if found else [])}
+    panels = {place: path for place, path in panels.items() if path.is_file() and place in drawn}
+    views = []
+    for i in sorted(panels) or drawn:
+        pictures = [
+            {"words": words, "uri": picture_uri(path), "legend": ""}
+            for words, path in zip(("photograph", "render"), pairs[i])
+        ]
+        if found and panels:
+            with np.load(panels[i], allow_pickle=False) as arrays:
+                for shade in (found.shades[found.field], found.shades["error"]):
+                    coloured = Image.fromarray(shade.palette[arrays[shade.name]])
+                    coloured.thumbnail(Image.open(pairs[i][0]).size)
+                    uri = picture_uri(coloured, COARSE)
+                    pictures.append({"words": f"{shade.words}, {shade.unit}", "uri": uri, "legend": legend(shade)})
+        views.append({"name": names[i], "pictures": pictures})
+    return views
+
+
+def where(record: Record[ProbeRecord]) -> list[dict[str, str]]:
+    """Of the map beside the record: its sentences, each as the caption of the picture that shows it, if that was drawn."""
+    folder, found = map_beside(record)
+    if found is None:
+        return []
+    shown = [(end.file, end.sentence, carriers_in_words(end)) for end in found.steepest]
+    fragile = " ".join(found.sentences[len(found.steepest) :])
+    panel = found.panels[0] if found.panels else None
+    words = f"{panel.name}: maps of its fragility in position, conditioning and opacity." if panel else ""
+    shown.append((panel.file.replace("view", "fragility") if panel else "", words, fragile))
+    return [
+        {"caption": caption, "words": words, "uri": picture_uri(path) if path.is_file() else ""}
+        for path, words, caption in ((folder / f"{name}.png", *rest) for name, *rest in shown)
     ]
-    return {"sentences": found.sentences, "pictures": pictures}
 
 
-def _as_jpeg(path: Path) -> str:
-    """A picture, mostly of photographs, in a quarter of its bytes."""
-    content = io.BytesIO()
-    Image.open(path).convert("RGB").save(content, "JPEG", quality=88)
-    return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode()}"
+def carriers_in_words(end: Steepest) -> str:
+    """The caption of the picture of an end of the spectrum."""
+    carriers = "; ".join(
+        f"Gaussian {each.gaussian:,} has {percent(each.share)} of it: standard deviations "
+        f"{', '.join(map(quantity, each.sigmas))}, splat of {each.aspect:.3g} : 1, opacity {each.opacity:.2f}"
+        for each in end.carriers
+    )
+    view = end.view.rpartition("/")[2]
+    return f"{end.name} in {view}, its carriers outlined, and renders one step back and forth along it. {carriers}."
 
 
-def _uri(path: Path, kind: str) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+def legend(shade: Shade) -> str:
+    """The scale of colours with its ends and its unit, as a part of a page."""
+    stops = ", ".join("rgb({}, {}, {})".format(*colour) for colour in shade.palette[:BYTES:30])
+    ends = [quantity(shade.value(t)) for t in (shade.low, shade.high)]
+    return (
+        f'<span style="display:block;height:.5em;background:linear-gradient(to right, {stops})"></span><span '
+        f'style="display:flex;justify-content:space-between"><span>{ends[0]}</span><span>{ends[1]}</span></span>'
+    )
+
+
+def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:
+    """A picture as a data URI; WebP takes a quarter of the bytes of PNG."""
+    content, image = io.BytesIO(), Image.open(picture) if isinstance(picture, Path) else picture
+    image.convert("RGB").save(content, "WEBP", quality=quality)
+    return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
 def interactive_surface(record: Record[ProbeRecord]) -> go.Figure | None:
@@ -208,12 +252,32 @@ def _escaped(text: str) -> str:
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
-def pictures_in(folder: Path, captions: Mapping[str, str]) -> list[dict[str, str]]:
-    """The pictures that were drawn, as data URIs with their captions."""
+def pictures_in(
+    folder: Path, captions: Mapping[str, str], words: Mapping[str, str] | None = None
+) -> list[dict[str, str]]:
+    """The pictures that were drawn, as data URIs with their captions; words: what they show, where the caption does not say."""
     drawn = [(name, caption, folder / f"{name}.png") for name, caption in captions.items()]
     return [
-        {"name": name, "caption": caption, "uri": _uri(path, "png")} for name, caption, path in drawn if path.is_file()
+        {"name": name, "caption": caption, "words": (words or {}).get(name, caption), "uri": picture_uri(path)}
+        for name, caption, path in drawn
+        if path.is_file()
     ]
+
+
+def shown_numbers(record: Record[ProbeRecord]) -> dict[str, str]:
+    """What the pictures show, in numbers: for those who do not see them."""
+    data, ends = record.data, record.data.eigenvalues
+    traces = ", ".join(f"{attribute_name(name)} {quantity(trace.value)}" for name, trace in data.traces.items())
+    found = {
+        "spectrum": f"Curvatures from {quantity(ends.min.value)} to {quantity(ends.max.value)}, in order of size.",
+        "traces": f"Traces: {traces}.",
+    }
+    if data.slice is not None and "slice" in record.arrays:
+        loss, names = record.arrays["slice"]["loss"], " and ".join(each.name for each in data.slice.directions)
+        extent = " to ".join(quantity(float(end(loss))) for end in (np.nanmin, np.nanmax))
+        plane = f"over the plane of {names}: from {extent}, at the centre {quantity(data.slice.center_loss)}."
+        found |= {"slice2d": f"Contours of the loss {plane}", "surface": f"Surface of the loss {plane}"}
+    return found
 
 
 def _cell(value: Any) -> str:

@@ -218,10 +218,7 @@ def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], ou
     write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode(errors="backslashreplace"))
     index = Comparison(runs={label: str((folder / PROBE).resolve()) for folder, label in shown_runs.items()})
     write_atomically(out / COMPARISON, json_text(plain(index)).encode())
-    try:
-        draw("compare", out)
-    except RuntimeError as error:  # the numbers stand without pictures
-        notes.append(" ".join(str(error).split()))
+    notes += draw("compare", out)
     names = [group.label for group in groups]
     write_atomically(out / PAGE, render_page(runs, names, shown, says, notes, out).encode(errors="backslashreplace"))
     for line in says:

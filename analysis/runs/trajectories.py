@@ -41,12 +41,10 @@ def run_trajectory(options: TrajectoryOptions) -> int:
     table.to_csv(temporary, index=False, errors="backslashreplace")
     temporary.replace(path)
     console.print(first_and_last(table))
-    try:
-        draw("trajectory", path)
-        drawn = f"picture: {out / PICTURE}; "
-    except RuntimeError as error:  # the numbers stand without the picture
-        console.print(" ".join(str(error).split()), style="yellow", highlight=False, soft_wrap=True, markup=False)
-        drawn = ""
+    (out / PICTURE).unlink(missing_ok=True)
+    for note in draw("trajectory", path):
+        console.print(note, style="yellow", highlight=False, soft_wrap=True, markup=False)
+    drawn = f"picture: {out / PICTURE}; " if (out / PICTURE).is_file() else ""
     console.print(f"{drawn}numbers: {path}", soft_wrap=True, highlight=False, markup=False)
     return 0
 

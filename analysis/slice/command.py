@@ -135,7 +135,14 @@ def _other_end(checkpoint: Checkpoint, path: Path) -> Float[Tensor, " n"]:
             f"expected a checkpoint of {len(here):,} Gaussians with SH degree {here.sh_degree} at the other end of the line, "
             f"got {len(there):,} with {there.sh_degree} in {path}; take two of one training after densification has ended"
         )
-    return there.with_flat(there.flat.to(here.flat)).aligned_to(here).flat
+    there = there.with_flat(there.flat.to(here.flat))
+    filters = [each.filter_widths for each in (here, there) if each.filter_widths is not None]
+    if len(filters) == 1 or (filters and not torch.equal(*filters)):
+        raise InputError(
+            f"expected a checkpoint with the same 3-D filter at the other end of the line, got another in {path}; take two of "
+            "one training between which it was not renewed"
+        )
+    return there.aligned_to(here).flat
 
 
 def _known(probe: Path, unfinished: Path, objective: SceneObjective, notes: list[str]) -> list[Tensor]:

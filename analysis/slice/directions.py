@@ -193,18 +193,25 @@ def largest_eigenvectors(
     for vectors in (each[:, :count] for each in known):
         if vectors.shape != (operator.dim, count) or not vectors.isfinite().all():
             continue
-        vectors = vectors.to(operator.dtype)
-        product, exact = operator.apply(vectors).double(), vectors.double()
-        values = (exact * product).sum(dim=0)
-        residuals = (product - values * exact).norm(dim=0)
+        start = vectors.to(operator.dtype)
+        values, residuals = _measured(operator, start)
         ordered = bool((values.diff() <= RTOL * values.abs().max()).all())  # the steepest first
-        if ordered and (residuals <= RTOL * values.abs()).all() and ((exact.norm(dim=0) - 1).abs() <= RTOL).all():
+        unit = (start.double().norm(dim=0) - 1).abs() <= RTOL
+        if ordered and unit.all() and (residuals <= RTOL * values.abs()).all():
             report(1, 1, "known already")
-            return vectors, residuals.tolist()
-        start = vectors
+            return start, residuals.tolist()
     settings = EigenSettings(largest=count, smallest=0, rtol=RTOL, max_matvecs=MAX_MATVECS)
-    pairs = extreme_eigenpairs(operator, generator, settings, start, report).largest
-    return pairs.vectors, pairs.residuals.tolist()
+    vectors = extreme_eigenpairs(operator, generator, settings, start, report).largest.vectors
+    return vectors, _measured(operator, vectors)[1].tolist()  # those of a run that continues from here
+
+
+def _measured(
+    operator: SymmetricOperator, vectors: Float[Tensor, "n k"]
+) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
+    """v.H v and |H v - (v.H v) v| of each column."""
+    product, exact = operator.apply(vectors).double(), vectors.double()
+    values = (exact * product).sum(dim=0)
+    return values, (product - values * exact).norm(dim=0)
 
 
 def recorded_probe(folder: Path, objective: SceneObjective, notes: list[str]) -> Record[ProbeRecord] | None:

@@ -219,7 +219,7 @@ def _asked(options: TrainOptions, scene: Scene) -> TrainConfig:
         meant = did_you_mean(options.method, METHODS)
         raise InputError(f"expected a method among {', '.join(METHODS)}, got {options.method!r}{meant}")
     config = TrainConfig(
-        iterations=TrainConfig.iterations if options.iterations is None else options.iterations,
+        iterations=METHODS[options.method].ITERATIONS if options.iterations is None else options.iterations,
         seed=options.seed,
         sh_degree=options.sh_degree,
         background=(red, green, blue),
@@ -278,11 +278,11 @@ def _follow(run: Run, options: TrainOptions, trajectory: Trajectory | None, cons
     total = training.config.iterations
     progress = TrainingProgress(run.out, training, run.views[0], options.log_every, console, options.tensorboard)
     with interruption() as interrupted, progress:
-        progress.begin(spent.wall)
+        progress.begin(spent)
         if trajectory:
             trajectory.before_steps()
         for done in spent.timed(train(training, run.views)):
-            progress.after_step(done, spent.wall)
+            progress.after_step(done, spent)
             if trajectory:
                 trajectory.after_step(spent.wall)
             stop = interrupted.is_set()

@@ -26,7 +26,8 @@ class TrainOptions:
     train_list: Unset[Path] = None
     """A text file with the name of a training view in each line, instead of --views; all others are held out."""
     iterations: Unset[int] = None
-    """Steps of the training, each on one view.  Default: 2000, or those of the --protocol."""
+    """Steps of the training, each on one view.  Default: 2000, or those of the --protocol.
+    newton-blocks and gn-cg: each on all views, 50."""
     seed: int = 0
     """Seed of everything random: the same seed gives the same checkpoint, bit for bit."""
     images: Unset[str] = None
@@ -47,13 +48,16 @@ class TrainOptions:
     """A checkpoint, our own or another tool's, whose Gaussians to start from, with its renderer and in its world."""
     trained_by: Unset[str] = None
     """Whose conventions another tool's file of --from follows, see landscape probe.  Default: what the file says."""
+    antialiased: FlagCreatePairsOff[bool] = False
+    """Another tool's file of --from does not say so, but its renderer was antialiased."""
     masks: Unset[Path] = None
     """Folder of object masks, named after the images; the scores are taken inside them.
     Default: mask or masks in the scene, or what its files name (nerfstudio's mask_path, DTU's idrmasks)."""
     depths: Unset[Path] = None
     """Folder of relative depth maps for the training views, NAME.npy or 16-bit NAME.png, for methods that use depth."""
     method: str = "3dgs"
-    """What is trained: 3dgs, stablegs, sam, dropgaussian, dropoutgs, cor-gs, fsgs or dngaussian."""
+    """What is trained: 3dgs, stablegs, sam, dropgaussian, dropoutgs, cor-gs, fsgs or dngaussian; in place of Adam:
+    newton-blocks or gn-cg, without density control."""
     protocol: Literal["common", "llff"] = "common"
     """Whose training the method is added to.
     common: the same for all methods, that of 3DGS.

@@ -7,7 +7,7 @@ Columns:
 
 step, gaussians    steps made, and the Gaussians after them
 loss, psnr         of the first training view as it would be rendered then: the loss that a step descends, and dB, peak 1
-seconds            that the steps so far took, by the clock, without loading, saving and scoring
+seconds, cpu       that the steps so far took, by the clock and of all processors together, without loading, saving and scoring
 """
 
 from math import isnan, nan
@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from analysis.train.training_time import TrainingTime
 from landscape.errors import InputError
 from splat.losses.autograd import view_loss
 from splat.losses.reference import psnr
@@ -30,7 +31,7 @@ from splat.training.loop import StepResult
 from splat.training.state import Training
 
 LOG, TENSORBOARD = "train.csv", "tensorboard"
-COLUMNS = ("step", "loss", "psnr", "gaussians", "seconds")
+COLUMNS = ("step", "loss", "psnr", "gaussians", "seconds", "cpu")
 SMOOTHING = 0.05  # the bar's loss is a running mean: a step sees one view, and views differ
 
 
@@ -76,25 +77,26 @@ class TrainingProgress:
         if self.scalars is not None:
             self.scalars.close()
 
-    def begin(self, seconds: float) -> None:
-        """seconds: of the steps of an interrupted run."""
-        self.begun = self.training.step, seconds
+    def begin(self, spent: TrainingTime) -> None:
+        """spent: in the steps of an interrupted run."""
+        self.begun = self.training.step, spent.wall
         if not self.training.step:
-            self._row(seconds)
+            self._row(spent)
 
-    def after_step(self, done: StepResult, seconds: float) -> None:
-        """seconds: of all steps so far."""
+    def after_step(self, done: StepResult, spent: TrainingTime) -> None:
+        """spent: in all steps so far."""
         self.loss = done.loss if isnan(self.loss) else self.loss + SMOOTHING * (done.loss - self.loss)
         state = f"loss {self.loss:.4f} {done.gaussians} Gaussians"
         self.bars.update(self.bar, completed=done.step, state=state)
         if done.step % self.every == 0 or done.step == self.training.config.iterations:
-            self._row(seconds)
+            self._row(spent)
 
-    def _row(self, seconds: float) -> None:
+    def _row(self, spent: TrainingTime) -> None:
         """Write a row, and say it where there is no bar."""
+        seconds = spent.wall
         step, total = self.training.step, self.training.config.iterations
         loss, ratio, gaussians = *scored(self.training, self.view), len(self.training.gaussians)
-        self.file.write(f"{step},{loss!r},{ratio!r},{gaussians},{seconds:.3f}\n")
+        self.file.write(f"{step},{loss!r},{ratio!r},{gaussians},{seconds:.3f},{spent.cpu:.3f}\n")
         self.file.flush()
         if self.scalars is not None:
             for name, value in {"loss": loss, "psnr": ratio, "gaussians": gaussians}.items():

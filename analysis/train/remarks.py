@@ -7,6 +7,7 @@ from pathlib import Path
 from splat.model.typed import leaves
 from splat.scenes.scene import Scene
 from splat.scenes.view import View
+from splat.training.methods.second_order.steps import SecondOrder
 from splat.training.start import Source
 from splat.training.state import TrainConfig, Training
 
@@ -31,6 +32,7 @@ HOW_TO_START: dict[Source, str] = {
 def remarks(scene: Scene, asked: TrainConfig, config: TrainConfig, begun: tuple[Source, int] | None) -> list[str]:
     """asked, config: the settings, not scaled and scaled; begun: the start and its Gaussians, None where resumed."""
     found = [_skipped(scene), begun and poor_start(scene, *begun), _scaled(asked, config), _not_reached(config)]
+    found += _of_second_order(config)
     return [words for words in found if words]
 
 
@@ -91,6 +93,16 @@ def _scaled(asked: TrainConfig, config: TrainConfig) -> str:
         f"{config.method.name}: its published schedule is scaled to {config.iterations} steps: {', '.join(changes)}; "
         "--set KEY=VALUE gives one of them another value"
     )
+
+
+def _of_second_order(config: TrainConfig) -> list[str]:
+    """What a method in place of Adam leaves out, in words."""
+    method, found = config.method, []
+    if isinstance(method, SecondOrder) and config.densify.enabled:
+        found.append(f"{method.name}: no Gaussian is cloned, split or removed, and no opacity is reset")
+    if isinstance(method, SecondOrder) and config.loss.pixel == "l1":
+        found.append(f"{method.name}: l1 has no second derivative; it descends charbonnier, a smooth l1, instead")
+    return found
 
 
 def _not_reached(config: TrainConfig) -> str:

@@ -26,15 +26,16 @@ def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Pl
     """
     scene, split, config, reference = plan
     if options.from_ is None:
-        if options.trained_by is not None:
-            raise InputError("expected --from beside --trained-by, which says whose file that is, got none")
+        if options.trained_by is not None or options.antialiased:
+            raise InputError("expected --from beside --trained-by or --antialiased, which speak of its file, got none")
         return plan, None
     if any(key.startswith("render.") for key in assignments(options.set)):
         raise InputError("expected --from, which brings its renderer, or --set render..., got both; leave one out")
     names, foreign = tuple(split.train), is_foreign(options.from_)
-    asked = Foreign(options.scene, None, names, options.trained_by, options.images, options.downscale)
+    said = {"trained_by": options.trained_by, "antialiased": options.antialiased or None}
+    asked = Foreign(options.scene, None, names, images=options.images, downscale=options.downscale, **said)
     picture = out.with_name(f"{out.name}-mismatch.png")
-    found = open_checkpoint(options.from_, asked if foreign else Foreign(trained_by=options.trained_by), picture)
+    found = open_checkpoint(options.from_, asked if foreign else Foreign(**said), picture)
     world = found.scene
     scene = posed(scene, world.similarity, centred=world.centred)
     reference = replace(reference, similarity=world.similarity, centred=world.centred)

@@ -7,7 +7,6 @@ objective are refused with an InputError.
 
 import hashlib
 import os
-import zipfile
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from math import isfinite
@@ -27,6 +26,7 @@ Loss = Callable[[Tensor], Evaluation]
 """loss(theta) -> the objective, or (the objective, smooth_piece): a label of the smooth piece that contains theta."""
 
 SAVE_EVERY = 5.0  # seconds
+COLUMNS = {"points": "i", "values": "f", "crossed": "b"}  # of the file, with the kinds of their types
 SAME_LOSS = 100.0  # units of round-off by which two evaluations at one point may differ, summed in different orders
 
 
@@ -130,9 +130,16 @@ class GridEvaluations:
             with np.load(self._store, allow_pickle=False) as archive:
                 digest, center_loss = str(archive["digest"]), float(archive["center_loss"])
                 has_pieces = bool(archive["has_signature"])
-                columns = [archive[name].tolist() for name in ("points", "values", "crossed")]
-            stored = {point: (value, crossed) for point, value, crossed in zip(*columns, strict=True)}
-        except (ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
+                columns = [archive[name] for name in COLUMNS]
+            if any((each.dtype.kind, each.ndim) != (kind, 1) for each, kind in zip(columns, COLUMNS.values())):
+                raise ValueError(
+                    f"expected one-dimensional {', '.join(COLUMNS)} of kinds {', '.join(COLUMNS.values())}"
+                )
+            points, values, crossed = (each.tolist() for each in columns)
+            stored = dict(zip(points, zip(values, crossed, strict=True), strict=True))
+        except MemoryError:
+            raise
+        except Exception as error:  # NumPy and zipfile may raise nearly anything of damaged bytes
             raise InputError(
                 f"expected a slice's evaluations in {self._store}, got a damaged file ({error}); {advice}"
             ) from None

@@ -36,6 +36,7 @@ from splat.render.sight import Sight, sight
 
 Values = dict[str, Float64[Tensor, " n"]]
 PER_UNIT = {"means": "1 / world unit²", "log_scales": "1", "quats": "1", "opacity_logits": "1 / logit²", "sh": "1"}
+WORDS = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "colour"}
 PREFIXES = ("", "gn_")
 MIXED = "1 / stored unit²"
 
@@ -50,7 +51,7 @@ class Field:
 
 
 OF_BLOCKS = {
-    **{f"trace_{name}": Field(f"trace of {name}", unit, "signed") for name, unit in PER_UNIT.items()},
+    **{f"trace_{name}": Field(f"trace of {WORDS[name]}", unit, "signed") for name, unit in PER_UNIT.items()},
     "largest": Field("largest curvature", MIXED, "log"),
     "log_det": Field("log-determinant", "ln", "linear"),
     "rank": Field("rank of the block", "directions", "linear"),
@@ -156,15 +157,21 @@ def sight_fields(sights: Sequence[Sight]) -> Values:
 
 
 def on_complement(blocks: Float64[Tensor, "n 11 11"], quats: Float64[Tensor, "n 4"]) -> Float64[Tensor, "n 10 10"]:
-    """E^T B E: q i, q j, q k in place of the quaternion's four axes."""
+    """E^T B E."""
+    E = complement(quats)
+    return E.mT @ blocks @ E
+
+
+def complement(quats: Float64[Tensor, "n 4"]) -> Float64[Tensor, "n 11 10"]:
+    """E: q i, q j, q k in place of the quaternion's four axes."""
     w, x, y, z = quats.unbind(dim=1)
     turns = torch.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w], dim=1).view(-1, 4, 3)
     columns = GEOMETRY_COLUMNS["quats"]
-    E = torch.zeros(len(blocks), 11, 10, dtype=blocks.dtype)
-    E[:, : columns.start, : columns.start] = torch.eye(columns.start, dtype=blocks.dtype)
+    E = torch.zeros(len(quats), 11, 10, dtype=quats.dtype)
+    E[:, : columns.start, : columns.start] = torch.eye(columns.start, dtype=quats.dtype)
     E[:, columns, columns.start : columns.start + 3] = turns
     E[:, columns.stop, columns.start + 3] = 1
-    return E.mT @ blocks @ E
+    return E
 
 
 def eigenvalues(matrices: Float64[Tensor, "n d d"]) -> Float64[Tensor, "n d"]:

@@ -66,6 +66,7 @@ class SceneHessian:
     Of the Hessian, P leaves out the lengths of the quaternions (null where the gradient vanishes, and by choice elsewhere) and
     the SH directions that no view sees; of Gauss-Newton, all directions that no view sees.  keep_null: P = 1 instead.
     count: the part of H that the first so many views of each process contribute; by default all of it.
+    coupled: see `ViewSum`.
 
     views: H without P, summed over this process's views.  projector: P.
 
@@ -84,9 +85,10 @@ class SceneHessian:
         gauss_newton: bool = False,
         keep_null: bool = False,
         count: int | None = None,
+        coupled: bool = True,
     ):
         self.objective, self.gauss_newton, self.keep_null = objective, gauss_newton, keep_null
-        self.views = ViewSum(objective, gauss_newton=gauss_newton, count=count)
+        self.views = ViewSum(objective, gauss_newton=gauss_newton, count=count, coupled=coupled)
         self.dim, self.dtype, self.blocks = self.views.dim, self.views.dtype, self.views.blocks
 
     @cached_property

@@ -31,7 +31,7 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.projection.dispatch import linearize_projection
-from splat.projection.formulas import ROWS, ProjectionJacobian, lens_of
+from splat.projection.formulas import ProjectionJacobian, lens_of, row_shapes
 from splat.raster.cpu.raster import CpuRaster
 from splat.raster.dispatch import Adjoint, Raster, Tangent
 from splat.raster.formulas import BLOCK_SUMS
@@ -79,11 +79,12 @@ class LinearizedView:
         return self._raster.crop(self._raster.planes[:3]).clone()
 
     @staticmethod
-    def size_of(raster: Raster, gaussians: Gaussians) -> tuple[int, int, int]:
+    def size_of(raster: Raster, gaussians: Gaussians, settings: RenderSettings) -> tuple[int, int, int]:
         """About how many bytes a view of this raster takes: `bytes`, `workspace(1)`, and the pass of `block_diagonal`."""
         size, drawn = gaussians.flat.element_size(), len(raster.touched)
         plane = raster.planes[0].nbytes
-        kept = raster.bytes + size * (drawn * sum(map(prod, ROWS)) + 9 * len(gaussians)) + LOSS_PLANES * plane
+        rows = row_shapes(antialiased=settings.antialias != "none" or gaussians.filter_widths is not None)
+        kept = raster.bytes + size * (drawn * sum(map(prod, rows)) + 9 * len(gaussians)) + LOSS_PLANES * plane
         blocks = size * raster.intersections_reached * BLOCK_SUMS + drawn * DOUBLE_BLOCK
         return kept, raster.workspace(1) + 3 * plane, blocks
 

@@ -126,6 +126,8 @@ class SceneObjective:
         setup = (len(gaussians), flat.dtype, degree, loss_settings, background, settings, keep_unseen)
         ranks.require_same("set-up", setup)
         ranks.require_same_vectors(flat[:, None])
+        if gaussians.filter_widths is not None:
+            ranks.require_same_vectors(gaussians.filter_widths[:, None])
         self.views, self.loss_settings, self.ranks = tuple(views), loss_settings, ranks
         self._views_of_ranks = [int(count) for count in ranks.gather(torch.tensor(len(views)))]
         # products are repeatable, however the training's steps were made
@@ -163,7 +165,7 @@ class SceneObjective:
         for view in self.views:
             raster = rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True)
             seen |= touches(raster)
-            self._sizes = max(self._sizes, LinearizedView.size_of(raster, gaussians))
+            self._sizes = max(self._sizes, LinearizedView.size_of(raster, gaussians, self.settings))
         return self.ranks.any(seen)
 
     @property

@@ -8,6 +8,8 @@
 
 All curvature in this project is with respect to these stored parameters.  The flat vector holds the attributes one after
 the other in the order above; each attribute is a view of it, so neither direction copies and autograd passes through.
+
+Gaussians of Mip-Splatting have a constant beside their parameters: the width of a 3-D filter (`splat/projection/antialias.py`).
 """
 
 from collections.abc import Mapping
@@ -44,7 +46,8 @@ def parameters_per_gaussian(sh_degree: int) -> int:
 class Gaussians(Brief):
     """n Gaussians over one flat vector of n (11 + 3 (sh_degree + 1)^2) stored parameters.
 
-    InputError where sh_degree or the length of the vector cannot be.
+    filter_widths: of each one's 3-D filter, world units, in the type of the vector and where that is; None: there is no filter.
+    InputError where sh_degree or the length of a vector cannot be.
 
     >>> gaussians = Gaussians(torch.zeros(2 * 14), sh_degree=0)
     >>> gaussians.means[1] = 1.0  # a view: writes to the flat vector
@@ -54,6 +57,7 @@ class Gaussians(Brief):
 
     flat: Float[Tensor, " p"]
     sh_degree: int
+    filter_widths: Float[Tensor, " n"] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:
@@ -65,6 +69,8 @@ class Gaussians(Brief):
                 f"expected a vector of n x {each} parameters at SH degree {self.sh_degree}, got "
                 f"{'a tensor that holds its numbers in another way' if other else tuple(flat.shape)}"
             )
+        if self.filter_widths is not None and self.filter_widths.shape != (len(self),):
+            raise InputError(f"expected {len(self)} filter widths, got {tuple(self.filter_widths.shape)}")
 
     @classmethod
     def pack(cls, attributes: Mapping[str, Tensor]) -> "Gaussians":
@@ -116,8 +122,12 @@ class Gaussians(Brief):
         return self.attributes["sh"]
 
     def with_flat(self, flat: Tensor) -> "Gaussians":
-        """The same layout over another vector of parameters."""
-        return Gaussians(flat, self.sh_degree)
+        """The same layout and filter over another vector of parameters."""
+        return Gaussians(flat, self.sh_degree, None if self.filter_widths is None else self.filter_widths.to(flat))
+
+    def with_filter(self, widths: Float[Tensor, " n"] | None) -> "Gaussians":
+        """The same parameters under another 3-D filter."""
+        return Gaussians(self.flat, self.sh_degree, None if widths is None else widths.to(self.flat))
 
     def to(self, dtype: torch.dtype) -> "Gaussians":
         return self.with_flat(self.flat.to(dtype))
@@ -127,7 +137,7 @@ class Gaussians(Brief):
 
         Differences of parameters, lines and planes between checkpoints are taken after this.
         """
-        found = Gaussians(self.flat.clone(), self.sh_degree)
+        found = self.with_flat(self.flat.clone())
         quats = found.quats
         quats /= quats.norm(dim=1, keepdim=True)
         quats *= torch.where((quats * other.quats).sum(dim=1, keepdim=True) < 0, -1.0, 1.0).to(quats)
@@ -144,6 +154,8 @@ class Gaussians(Brief):
         missing = bands - chosen["sh"].shape[1]
         chosen["sh"] = torch.nn.functional.pad(chosen["sh"], (0, 0, 0, max(missing, 0)))[:, :bands]
         result = Gaussians.pack(chosen)
+        if self.filter_widths is not None:
+            result = result.with_filter(self.filter_widths[index])
         if fresh is not None:
             for values in result.attributes.values():
                 values[fresh] = 0
@@ -164,6 +176,8 @@ class Gaussians(Brief):
         sizes = {
             name: value.detach().reshape(len(self), -1).abs().amax(dim=1) for name, value in self.attributes.items()
         }
+        if self.filter_widths is not None:
+            sizes["filter_widths"] = self.filter_widths
         largest = torch.finfo(self.flat.dtype).max ** 0.25
         quats, sh = sizes["quats"], sizes["sh"]
         range_of_quats = f" ({1 / largest:.1e} to {largest:.1e})"
@@ -172,6 +186,8 @@ class Gaussians(Brief):
             ((quats >= 1 / largest) & (quats <= largest), "quats", "moderate", range_of_quats),
             (sh <= largest, "sh", "moderate", f" (up to {largest:.1e})"),
         ]
+        if self.filter_widths is not None:
+            conditions.append((self.filter_widths >= 0, "filter_widths", "non-negative", ""))
         if torch.stack([good.all() for good, *_ in conditions]).all():  # waits for a GPU once
             return
         self._refuse(*next(condition for condition in conditions if not condition[0].all()))
@@ -179,6 +195,6 @@ class Gaussians(Brief):
     def _refuse(self, good: Tensor, name: str, quality: str, meaning: str) -> None:
         first = int((~good).nonzero()[0])
         raise InputError(
-            f"expected {quality} {name}{meaning}, got {self.attributes[name][first].tolist()} at Gaussian {first} "
+            f"expected {quality} {name}{meaning}, got {getattr(self, name)[first].tolist()} at Gaussian {first} "
             f"({int((~good).sum())} of {len(self)} are not {quality}); remove them from the checkpoint, or lower its rates"
         )

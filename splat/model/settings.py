@@ -13,6 +13,7 @@ from landscape.errors import InputError
 
 LARGEST = 1e18  # of what is multiplied by itself: float32 still holds its square
 Accumulation = Literal["deterministic", "atomic"]
+Antialias = Literal["none", "mip", "mip-plain", "mip-splatting"]
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,9 @@ class RenderSettings:
     """Thresholds of projection and compositing, and how a GPU accumulates sums.
 
     blur: variance added to the diagonal of every 2-D covariance, in px^2.
+    antialias: what an opacity is multiplied by because of the blur, by whose equation (`splat/projection/antialias.py`).  none:
+        1; mip: as 3DGS with --antialiasing; mip-plain: without its floor, as gsplat to 1.5 and Brush (whose blur is 0.1);
+        mip-splatting: as that (blur 0.1), and its trainings give every Gaussian a 3-D filter.
     fov_clamp: the projection's Jacobian is taken at x/z and y/z clamped to this multiple of tan(fov / 2).
     near: Gaussians whose centre is nearer than this to the camera plane (world units) are not drawn.
     alpha_max: cap of a Gaussian's alpha in a pixel, below 1 (at 1 the transmittance behind it would be 0).
@@ -37,6 +41,7 @@ class RenderSettings:
     """
 
     blur: float = 0.3
+    antialias: Antialias = "none"
     fov_clamp: float = 1.3
     near: float = 0.2
     alpha_max: float = 0.99
@@ -62,6 +67,8 @@ class RenderSettings:
             raise InputError(f"expected contour_sigma > 0 or None, got {self.contour_sigma}")
         if self.accumulation not in get_args(Accumulation):
             raise InputError(f"expected accumulation 'deterministic' or 'atomic', got {self.accumulation!r}")
+        if self.antialias not in get_args(Antialias):
+            raise InputError(f"expected antialias {', '.join(get_args(Antialias))}, got {self.antialias!r}")
 
 
 SMOOTH = replace(RenderSettings(), alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)
@@ -70,11 +77,11 @@ SMOOTH = replace(RenderSettings(), alpha_min=0.0, transmittance_min=0.0, fov_cla
 def current_settings(stored: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of `RenderSettings` under their names of today, from those of an older configuration.
 
-    `accumulation` was called `sums` ("ordered" for "deterministic"), and was missing before.
+    `accumulation` was called `sums` ("ordered" for "deterministic"), and was missing before; so was `antialias`.
 
     >>> current_settings({"blur": 0.3, "sums": "ordered"})
-    {'blur': 0.3, 'accumulation': 'deterministic'}
+    {'antialias': 'none', 'blur': 0.3, 'accumulation': 'deterministic'}
     """
-    fields = {name: value for name, value in stored.items() if name != "sums"}
+    fields = {"antialias": "none"} | {name: value for name, value in stored.items() if name != "sums"}
     accumulation = fields.setdefault("accumulation", stored.get("sums", "deterministic"))
     return {**fields, "accumulation": "deterministic" if accumulation == "ordered" else accumulation}

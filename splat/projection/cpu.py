@@ -11,6 +11,7 @@ import numpy as np
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.threads import over_range
 from splat.model.gaussians import Gaussians
+from splat.projection.antialias import antialiased_adjoint, antialiased_geometry, log_sizes, widths_of
 from splat.projection.formulas import (
     Lens,
     basis,
@@ -28,6 +29,12 @@ from splat.projection.whitening import converted, put
 def attribute_arrays(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     """The five attributes as NumPy views."""
     return tuple(value.detach().numpy() for value in gaussians.attributes.values())
+
+
+def width_array(gaussians: Gaussians, lens: Lens) -> np.ndarray | None:
+    """`widths_of` as a NumPy view."""
+    widths = widths_of(gaussians, lens)
+    return None if widths is None else widths.numpy()
 
 
 @formula
@@ -53,6 +60,12 @@ def six_of(row):
     )  # fmt: skip
 
 
+@formula
+def with_factor(bar, own):
+    """The adjoint of a splat with that of the antialiased opacity's factor F in place of the opacity's; own: opacity / F."""
+    return bar[0], bar[1], bar[2], bar[3], bar[4], own * bar[5]
+
+
 @kernel
 def convert(start, stop, way, splats, numbers, out):
     """`whitening.converted` of tangents or adjoints of splats, (n, 9); their colours are alike in all coordinates."""
@@ -63,8 +76,11 @@ def convert(start, stop, way, splats, numbers, out):
 
 
 @kernel
-def project_splats(start, stop, lens, means, log_scales, quats, logits, sh, splats, depths, drawn):
-    """Fill splats (n, 9), depths and drawn; a Gaussian behind the near plane gets an opacity of 0."""
+def project_splats(start, stop, lens, means, log_scales, quats, logits, sh, widths, splats, depths, drawn):
+    """Fill splats (n, 9), depths and drawn; a Gaussian behind the near plane gets an opacity of 0.
+
+    widths: None where nothing is antialiased, for which a kernel of its own is compiled.
+    """
     bands = sh.shape[1]
     for i in range(start, stop):
         mean = point(means, i)
@@ -73,10 +89,16 @@ def project_splats(start, stop, lens, means, log_scales, quats, logits, sh, spla
         for j in range(9):
             splats[i, j] = 0
         if drawn[i]:
-            values = geometry(lens, mean, point(log_scales, i), quaternion(quats, i))
+            splats[i, 5] = sigmoid(np.float64(logits[i]))
+            if widths is None:
+                values = geometry(lens, mean, point(log_scales, i), quaternion(quats, i))
+            else:
+                width = np.float64(widths[i])
+                found = antialiased_geometry(lens, mean, point(log_scales, i), quaternion(quats, i), width)
+                values = found[:5]
+                splats[i, 5] *= found[5]
             for j in range(5):
                 splats[i, j] = values[j]
-            splats[i, 5] = sigmoid(np.float64(logits[i]))
             harmonic = basis(direction_of(lens, mean)[0])
             for c in range(3):
                 colour = 0.5
@@ -87,8 +109,9 @@ def project_splats(start, stop, lens, means, log_scales, quats, logits, sh, spla
 
 @kernel
 def project_adjoint(
-    start, stop, lens, means, log_scales, quats, sh, splats, drawn, bar, d_means, d_log_scales, d_quats, d_logits, d_sh
-):
+    start, stop, lens, means, log_scales, quats, logits, sh, widths, splats, drawn, bar,
+    d_means, d_log_scales, d_quats, d_logits, d_sh,
+):  # fmt: skip
     """The adjoints of the stored parameters, given that of the splats, bar (n, 9); outputs start at 0."""
     bands = sh.shape[1]
     for i in range(start, stop):
@@ -97,7 +120,21 @@ def project_adjoint(
             moves |= bar[i, j] != 0
         if drawn[i] and moves:
             mean = point(means, i)
-            m, s, q = geometry_adjoint(lens, mean, point(log_scales, i), quaternion(quats, i), six_of(bar[i]))
+            opacity, splat_bar = np.float64(splats[i, 5]), six_of(bar[i])
+            if widths is None:
+                slope = 1.0 - opacity
+                m, s, q = geometry_adjoint(lens, mean, point(log_scales, i), quaternion(quats, i), splat_bar)
+            else:
+                width, logit = np.float64(widths[i]), np.float64(logits[i])
+                slope = sigmoid(-logit)
+                m, s, q = antialiased_adjoint(
+                    lens,
+                    mean,
+                    point(log_scales, i),
+                    quaternion(quats, i),
+                    width,
+                    with_factor(splat_bar, sigmoid(logit)),
+                )
             harmonic = basis(direction_of(lens, mean)[0])
             weight = np.zeros(16)
             for k in range(bands):
@@ -111,8 +148,7 @@ def project_adjoint(
                 d_log_scales[i, j] = s[j]
             for j in range(4):
                 d_quats[i, j] = q[j]
-            opacity = np.float64(splats[i, 5])
-            d_logits[i] = opacity * (1.0 - opacity) * bar[i, 5]
+            d_logits[i] = opacity * slope * bar[i, 5]
 
 
 def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -120,6 +156,6 @@ def project_arrays(gaussians: Gaussians, lens: Lens) -> tuple[np.ndarray, np.nda
     arrays = attribute_arrays(gaussians)
     n, dtype = len(gaussians), arrays[0].dtype
     splats, depths, drawn = np.empty((n, 9)), np.empty(n, dtype), np.empty(n, np.bool_)
-    over_range(n, project_splats, lens, *arrays, splats, depths, drawn)
-    require_sizes(lens, arrays[1], depths, drawn)
+    over_range(n, project_splats, lens, *arrays, width_array(gaussians, lens), splats, depths, drawn)
+    require_sizes(lens, log_sizes(gaussians).numpy(), depths, drawn)
     return splats, depths, drawn

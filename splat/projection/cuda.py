@@ -13,7 +13,8 @@ from triton import cdiv, next_power_of_2
 from splat.backend.gpu.compile import launch
 from splat.model.gaussians import Gaussians
 from splat.projection import cuda_kernels as kernels
-from splat.projection.formulas import GEOMETRY, ROWS, Lens, ProjectionJacobian
+from splat.projection.antialias import is_antialiased, log_sizes, widths_of
+from splat.projection.formulas import GEOMETRY, Lens, ProjectionJacobian, row_shapes
 from splat.projection.reference import LARGEST_SPLAT, require_sizes
 
 BLOCK = 128  # Gaussians that a program takes; for a product, times vectors
@@ -22,9 +23,15 @@ WIDEST = 8  # vectors that a program takes at a time
 CHUNK = 1 << 16  # Gaussians whose blocks are chained at a time
 
 
-def _lens_numbers(lens: Lens, device: torch.device) -> Float64[Tensor, " 20"]:
+def _lens_numbers(lens: Lens, device: torch.device) -> Float64[Tensor, " 22"]:
     numbers = [*lens.rotation.tolist(), *lens.centre.tolist(), *lens[2:]]
     return torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
+
+
+def _widths(gaussians: Gaussians, lens: Lens) -> Float[Tensor, " n"]:
+    """The widths that an antialiased kernel reads; others get a vector that they do not read."""
+    widths = widths_of(gaussians, lens)
+    return gaussians.flat.detach() if widths is None else widths
 
 
 def project(gaussians: Gaussians, lens: Lens) -> tuple[Float64[Tensor, "n 9"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
@@ -34,11 +41,13 @@ def project(gaussians: Gaussians, lens: Lens) -> tuple[Float64[Tensor, "n 9"], F
     drawn = flat.new_empty(n, dtype=torch.bool)
     launch(
         kernels.project_splats, (cdiv(n, BLOCK),),
-        flat, _lens_numbers(lens, flat.device), splats, depths, drawn, n, gaussians.sh.shape[1], BLOCK,
+        flat, _widths(gaussians, lens), _lens_numbers(lens, flat.device), splats, depths, drawn, n, gaussians.sh.shape[1],
+        is_antialiased(gaussians, lens), BLOCK,
     )  # fmt: skip
-    largest = float(gaussians.log_scales.detach().max()) if n else 0.0
+    sizes = log_sizes(gaussians)
+    largest = float(sizes.max()) if n else 0.0
     if largest + max(log(max(lens.fx, lens.fy) / lens.near), 0.0) > log(LARGEST_SPLAT):
-        require_sizes(lens, *(array.detach().cpu().numpy() for array in (gaussians.log_scales, depths, drawn)))
+        require_sizes(lens, *(array.cpu().numpy() for array in (sizes, depths, drawn)))
     return splats, depths, drawn
 
 
@@ -54,7 +63,8 @@ def project_adjoint(
     gradient = torch.empty_like(flat)
     launch(
         kernels.project_adjoint, (cdiv(n, BLOCK),),
-        flat, _lens_numbers(lens, flat.device), splats, drawn, bar.contiguous(), gradient, n, gaussians.sh.shape[1], BLOCK
+        flat, _widths(gaussians, lens), _lens_numbers(lens, flat.device), splats, drawn, bar.contiguous(), gradient, n,
+        gaussians.sh.shape[1], is_antialiased(gaussians, lens), BLOCK,
     )  # fmt: skip
     return gradient
 
@@ -79,12 +89,16 @@ class CudaProjection:
     ):
         flat, m = gaussians.flat.detach(), index.numel()
         self.n, self.bands, self.parameters = len(gaussians), gaussians.sh.shape[1], flat.numel()
-        self._at = ProjectionJacobian(index, *(flat.new_empty(*row, m) for row in ROWS))
+        self._antialiased = is_antialiased(gaussians, lens)
+        rows = row_shapes(antialiased=self._antialiased)
+        self._at = ProjectionJacobian(index, *(flat.new_empty(*row, m) for row in rows))
         inputs = (flat, _lens_numbers(lens, flat.device), splats, moments.contiguous(), index)
-        _, jacobian, curvature, *colours, logit_slope, logit_curvature = self._at
-        outputs = (jacobian, curvature, logit_slope, logit_curvature)
-        programs = (cdiv(m, FEW),)
-        launch(kernels.linearize_geometry, programs, *inputs, *outputs, self.n, m, FEW)
+        _, jacobian, curvature, *colours, _, _, _, _ = self._at
+        outputs = (jacobian, curvature, *self._at[-4:])
+        programs, widths = (cdiv(m, FEW),), _widths(gaussians, lens)
+        launch(
+            kernels.linearize_geometry, programs, *inputs, widths, *outputs, self.n, m, self._antialiased, FEW
+        )  # fmt: skip
         launch(kernels.linearize_colour, programs, *inputs, curvature, *colours, self.n, m, self.bands, FEW)
 
     @property
@@ -113,7 +127,7 @@ class CudaProjection:
         grid, rows, wide = self._grid(vectors)
         launch(
             kernels.push_forward, grid, block.contiguous(), at.index, at.jacobian, at.harmonic, at.visible, at.colour_slope,
-            at.logit_slope, out, self.n, at.index.numel(), vectors, self.bands, rows, wide
+            at.logit_slope, at.opacity_slope, out, self.n, at.index.numel(), vectors, self._antialiased, self.bands, rows, wide
         )  # fmt: skip
         return out
 
@@ -127,7 +141,7 @@ class CudaProjection:
         launch(
             kernels.pull_back, grid,
             cotangents.to(out.dtype).contiguous(), out if block is None else block.contiguous(), *self._at, out,
-            self.n, m, vectors, block is not None, self.bands, rows, wide
+            self.n, m, vectors, block is not None, self._antialiased, self.bands, rows, wide
         )  # fmt: skip
         return out
 
@@ -144,6 +158,8 @@ class CudaProjection:
             J = blocks.new_zeros(len(at.index), 9, GEOMETRY + 1)
             J[:, 0, GEOMETRY] = at.logit_slope
             J[:, 1:6, :GEOMETRY] = at.jacobian.movedim(-1, 0)
+            if self._antialiased:
+                J[:, 0, :GEOMETRY] = at.opacity_slope.T
             J[:, 6:, :3] = (at.visible[:, None] * at.colour_slope).movedim(-1, 0)
             product = J.mT @ blocks[some] @ J
             if second_order:
@@ -151,6 +167,8 @@ class CudaProjection:
                 bends = torch.zeros_like(product)
                 bends[:, j, k] = bends[:, k, j] = at.curvature.T
                 bends[:, GEOMETRY, GEOMETRY] = at.logit_curvature
+                if self._antialiased:
+                    bends[:, GEOMETRY, :GEOMETRY] = bends[:, :GEOMETRY, GEOMETRY] = at.opacity_curvature.T
                 product += bends
             geometry[at.index] = product.to(like.dtype)
             weight = at.visible * blocks[some].diagonal(dim1=1, dim2=2)[:, 6:].T

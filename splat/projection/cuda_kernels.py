@@ -12,8 +12,10 @@ Values and the tangents of the linearisation are in double precision, products w
 
 import triton.language as tl
 
+from splat.backend.cpu.dual import value_of
 from splat.backend.gpu.compile import jit, sized
-from splat.backend.gpu.formula import tangent_of, triton_formula, variable
+from splat.backend.gpu.formula import select, tangent_of, triton_formula, variable
+from splat.projection.antialias import antialiased_adjoint, antialiased_geometry
 from splat.projection.formulas import (
     GEOMETRY,
     Lens,
@@ -27,7 +29,7 @@ from splat.projection.formulas import (
 )
 from splat.projection.whitening import converted, geometry_coefficients, plain_gradient, whitening
 
-LENS = tl.constexpr(20)  # numbers of a lens: rotation 9, centre 3, then the others in order, the near plane last
+LENS = tl.constexpr(22)  # numbers of a lens: rotation 9, centre 3, then the others in order, the near plane last
 
 
 def lens_from(numbers):
@@ -41,17 +43,27 @@ def depth_of(lens, mean):
 
 
 @triton_formula
-def splat_of(lens, mean, log_scales, quat):
-    """Mean x, y and conic, and the sixteen harmonics at the view direction."""
+def splat_of(lens, mean, log_scales, quat, width, antialiased):
+    """Mean x, y and conic, and F where antialiased; and the sixteen harmonics at the view direction."""
     camera = lens_from(lens)
-    return geometry(camera, mean, log_scales, quat), basis(direction_of(camera, mean)[0])
+    if antialiased:
+        found = antialiased_geometry(camera, mean, log_scales, quat, width)
+    else:
+        found = geometry(camera, mean, log_scales, quat)
+    return found, basis(direction_of(camera, mean)[0])
 
 
 @triton_formula
-def adjoint_of(lens, mean, log_scales, quat, bar, weight, bands):
-    """The adjoints of mean, log-scales and quaternion: of the five numbers in bar, and of weight . harmonics in the mean."""
+def adjoint_of(lens, mean, log_scales, quat, width, antialiased, bar, weight, bands):
+    """The adjoints of mean, log-scales and quaternion: of the numbers in bar, and of weight . harmonics in the mean.
+
+    bar: of mean x, y and conic, and of F where antialiased.
+    """
     camera = lens_from(lens)
-    m, s, q = geometry_adjoint(camera, mean, log_scales, quat, bar)
+    if antialiased:
+        m, s, q = antialiased_adjoint(camera, mean, log_scales, quat, width, bar)
+    else:
+        m, s, q = geometry_adjoint(camera, mean, log_scales, quat, bar)
     along = colour_adjoint(camera, mean, weight, bands)
     return (m[0] + along[0], m[1] + along[1], m[2] + along[2], *s, *q)
 
@@ -67,6 +79,22 @@ def linearized_geometry(lens, mean, log_scales, quat, splat, moments, lane):
     jacobian = geometry_coefficients(W, [tangent_of(value) for value in geometry(camera, x, s, q)])
     m, t, r = geometry_adjoint(camera, x, s, q, plain_gradient(W, splat[5], moments))
     return jacobian, [tangent_of(row) for row in (*m, *t, *r)]
+
+
+@triton_formula
+def linearized_antialiased(lens, mean, log_scales, quat, own, width, splat, moments, lane):
+    """`linearized_geometry` where the opacity is own F, with its slope ln' F."""
+    camera = lens_from(lens)
+    numbers = (*mean, *log_scales, *quat)
+    variables = [variable(number, lane, i) for i, number in enumerate(numbers)]
+    x, s, q = variables[:3], variables[3:6], variables[6:]
+    W = whitening(splat)
+    *values, F = antialiased_geometry(camera, x, s, q, width)
+    jacobian = geometry_coefficients(W, [tangent_of(value) for value in values])
+    bar = plain_gradient(W, splat[5], moments)
+    m, t, r = antialiased_adjoint(camera, x, s, q, width, (*bar[:5], own * bar[5]))
+    slope = tangent_of(F) / select(value_of(F) > 0, value_of(F), 1.0)
+    return jacobian, [tangent_of(row) for row in (*m, *t, *r)], slope
 
 
 @triton_formula
@@ -163,7 +191,8 @@ def convert(splats, numbers, out, n, WAY: tl.constexpr, BLOCK: tl.constexpr):
 
 @sized("n")
 def project_splats(
-    flat, lens, splats, depths, drawn, n, BANDS: tl.constexpr, BLOCK: tl.constexpr
+    flat, widths, lens, splats, depths, drawn, n,
+    BANDS: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Splats (n, 9), depths and drawn; a Gaussian behind the near plane gets zeros."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -176,11 +205,15 @@ def project_splats(
     tl.store(drawn + i, ahead, here)
     logit = tl.load(flat + start_of(3, n) + i, here, other=0.0).to(tl.float64)
     found, harmonic = splat_of(
-        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here)
-    )
+        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here),
+        row(widths, i, 1, 1, here)[0], ANTIALIASED,
+    )  # fmt: skip
     for j in tl.static_range(5):
         tl.store(splats + i * 9 + j, tl.where(ahead, found[j], 0.0), here)
-    tl.store(splats + i * 9 + 5, tl.where(ahead, sigmoid(logit), 0.0), here)
+    opacity = sigmoid(logit)
+    if ANTIALIASED:
+        opacity = opacity * found[5]
+    tl.store(splats + i * 9 + 5, tl.where(ahead, opacity, 0.0), here)
     for c in tl.static_range(3):
         colour = logit * 0.0 + 0.5
         for b in tl.static_range(BANDS):
@@ -216,7 +249,8 @@ def harmonic_weights(flat, colour_bar, i, n, BANDS: tl.constexpr, mask):
 
 @sized("n")
 def project_adjoint(
-    flat, lens, splats, drawn, bar, gradient, n, BANDS: tl.constexpr, BLOCK: tl.constexpr
+    flat, widths, lens, splats, drawn, bar, gradient, n,
+    BANDS: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The gradient in the flat vector, given the adjoint of the splats, bar (n, 9)."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -226,20 +260,27 @@ def project_adjoint(
     mean = row(flat, i, 3, 3, here)
     colour_bar, _visible = colour_bars(bar, splats, i, here)
     weight = harmonic_weights(flat, colour_bar, i, n, BANDS, here)
+    opacity = tl.load(splats + i * 9 + 5, here, other=0.0)
+    logit_slope = 1.0 - opacity
+    splat_bar = row(bar, i, 9, 5, here)
+    if ANTIALIASED:
+        logit = tl.load(flat + start_of(3, n) + i, here, other=0.0).to(tl.float64)
+        logit_slope = sigmoid(-logit)
+        splat_bar = splat_bar + (sigmoid(logit) * tl.load(bar + i * 9 + 5, here, other=0.0),)
+    width = row(widths, i, 1, 1, here)[0]
     pulled = adjoint_of(
         camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here),
-        row(bar, i, 9, 5, here), weight, BANDS,
+        width, ANTIALIASED, splat_bar, weight, BANDS,
     )  # fmt: skip
     for j in tl.static_range(3):
         tl.store(gradient + i * 3 + j, tl.where(ahead, pulled[j], 0.0), here)
         tl.store(gradient + start_of(1, n) + i * 3 + j, tl.where(ahead, pulled[3 + j], 0.0), here)
     for j in tl.static_range(4):
         tl.store(gradient + start_of(2, n) + i * 4 + j, tl.where(ahead, pulled[6 + j], 0.0), here)
-    opacity = tl.load(splats + i * 9 + 5, here, other=0.0)
-    logit_bar = opacity * (1.0 - opacity) * tl.load(bar + i * 9 + 5, here, other=0.0)
+    logit_bar = opacity * logit_slope * tl.load(bar + i * 9 + 5, here, other=0.0)
     tl.store(gradient + start_of(3, n) + i, tl.where(ahead, logit_bar, 0.0), here)
     _found, harmonic = splat_of(
-        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here)
+        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here), width, False
     )
     for b in tl.static_range(BANDS):
         for c in tl.static_range(3):
@@ -252,19 +293,28 @@ def project_adjoint(
 
 @sized("n", "m")
 def linearize_geometry(
-    flat, lens, splats, moments, index, jacobian, curvature, logit_slope, logit_curvature, n, m,
-    BLOCK: tl.constexpr,
+    flat, lens, splats, moments, index, widths, jacobian, curvature, logit_slope, logit_curvature, opacity_slope,
+    opacity_curvature, n, m, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The derivatives of geometry and opacity of the Gaussians at index (m,), one direction a lane."""
     e, lane = places(BLOCK, 16)
     here = e < m
     i = tl.load(index + e, here, other=0)
-    rows, bends = linearized_geometry(
-        numbers(lens, LENS), row(flat, i, 3, 3, here), row(flat + start_of(1, n), i, 3, 3, here),
-        row(flat + start_of(2, n), i, 4, 4, here), row(splats, i, 9, 6, here), row(moments, i, 9, 6, here), lane,
-    )  # fmt: skip
-    slope = 1.0 - tl.load(splats + i * 9 + 5, here, other=0.0)
+    camera, mean, quat = numbers(lens, LENS), row(flat, i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here)
+    log_scales = row(flat + start_of(1, n), i, 3, 3, here)
+    splat, adjoint = row(splats, i, 9, 6, here), row(moments, i, 9, 6, here)
     S = tl.load(moments + i * 9, here, other=0.0).to(tl.float64)
+    if ANTIALIASED:
+        logit, width = tl.load(flat + start_of(3, n) + i, here, other=0.0).to(tl.float64), row(widths, i, 1, 1, here)[0]
+        slope = sigmoid(-logit)
+        rows, bends, thinning = linearized_antialiased(
+            camera, mean, log_scales, quat, sigmoid(logit), width, splat, adjoint, lane
+        )
+        tl.store(opacity_slope + lane * m + e, thinning, here & (lane < 10))
+        tl.store(opacity_curvature + lane * m + e, S * slope * thinning, here & (lane < 10))
+    else:
+        slope = 1.0 - tl.load(splats + i * 9 + 5, here, other=0.0)
+        rows, bends = linearized_geometry(camera, mean, log_scales, quat, splat, adjoint, lane)
     tl.store(logit_slope + e, slope, here & (lane == 0))
     tl.store(logit_curvature + e, slope * (2.0 * slope - 1.0) * S, here & (lane == 0))
     for r in tl.static_range(5):
@@ -319,8 +369,8 @@ def tangents_at(block, i, k, K, n, here):
 
 @sized("n", "m", "K")
 def push_forward(
-    block, index, jacobian, harmonic, visible, colour_slope, logit_slope, out, n, m, K,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr,
+    block, index, jacobian, harmonic, visible, colour_slope, logit_slope, opacity_slope, out, n, m, K,
+    ANTIALIASED: tl.constexpr, BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr,
 ):  # fmt: skip
     """P' u: rows of out (n, K, 9)."""
     e, k = places(BLOCK, VECTORS)
@@ -330,7 +380,11 @@ def push_forward(
     u = tangents_at(block, i, k, K, n, here)
     at = out + (i * K + k) * 9
     logit = tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
-    tl.store(at, tl.load(logit_slope + e, kept, other=0.0) * logit, here)
+    change = tl.load(logit_slope + e, kept, other=0.0) * logit
+    if ANTIALIASED:
+        for j in tl.static_range(10):
+            change += tl.load(opacity_slope + j * m + e, kept, other=0.0) * u[j]
+    tl.store(at, change, here)
     for r in tl.static_range(5):
         total = u[0] * 0.0
         for j in tl.static_range(10):
@@ -349,8 +403,8 @@ def push_forward(
 @sized("n", "m", "K")
 def pull_back(
     cotangents, block, index, jacobian, curvature, harmonic, slope, colour_bar, visible, colour_slope, logit_slope,
-    logit_curvature, out, n, m, K, SECOND_ORDER: tl.constexpr,
-    BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr,
+    logit_curvature, opacity_slope, opacity_curvature, out, n, m, K, SECOND_ORDER: tl.constexpr,
+    ANTIALIASED: tl.constexpr, BANDS: tl.constexpr, BLOCK: tl.constexpr, VECTORS: tl.constexpr,
 ):  # fmt: skip
     """P'^T of cotangents (n, K, 9), plus (a . P'') u where SECOND_ORDER: rows of out (p, K)."""
     e, k = places(BLOCK, VECTORS)
@@ -371,13 +425,22 @@ def pull_back(
         for c in tl.static_range(3):
             if j < 3:
                 total += tl.load(colour_slope + (c * 3 + j) * m + e, kept, other=0.0) * colour[c]
+        if ANTIALIASED:
+            total += tl.load(opacity_slope + j * m + e, kept, other=0.0) * bars[0]
         h = h + (total,)
     logit_bar = tl.load(logit_slope + e, kept, other=0.0) * bars[0]
     u = tangents_at(block, i, k, K, n, here)
     if SECOND_ORDER:
         h = curved(columns(curvature, e, m, 55, kept), u, h)
-        bend = tl.load(logit_curvature + e, kept, other=0.0)
-        logit_bar += bend * tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
+        logit = tl.load(block + (start_of(3, n) + i) * K + k, here, other=0.0)
+        logit_bar += tl.load(logit_curvature + e, kept, other=0.0) * logit
+        if ANTIALIASED:
+            bent = ()
+            for j in tl.static_range(10):
+                across = tl.load(opacity_curvature + j * m + e, kept, other=0.0)
+                bent = bent + (h[j] + across * logit,)
+                logit_bar += across * u[j]
+            h = bent
     first, second, third = h[0], h[1], h[2]
     for b in range(BANDS):
         at = (start_of(4, n) + (i * BANDS + b) * 3) * K + k

@@ -85,9 +85,9 @@ def projected_vjp(
 
         return cuda.project_adjoint(gaussians, lens, splats, drawn, bar)
     gradient = torch.zeros_like(gaussians.flat)
-    means, log_scales, quats, _, sh = cpu.attribute_arrays(gaussians)
+    inputs = (*cpu.attribute_arrays(gaussians), cpu.width_array(gaussians, lens))
     outputs = cpu.attribute_arrays(gaussians.with_flat(gradient))
-    arguments = (means, log_scales, quats, sh, splats.numpy(), drawn.numpy(), bar.numpy(), *outputs)
+    arguments = (*inputs, splats.numpy(), drawn.numpy(), bar.numpy(), *outputs)
     over_range(len(gaussians), cpu.project_adjoint, lens, *arguments)
     return gradient
 

@@ -21,7 +21,7 @@ from splat.backend.cpu.dual import exp, select, sqrt, value_of
 from splat.backend.cpu.jit import formula
 from splat.model.camera import Camera
 from splat.model.harmonics import Y00, Y1, Y2A, Y2B, Y2C, Y3A, Y3B, Y3C, Y3D
-from splat.model.settings import RenderSettings
+from splat.model.settings import Antialias, RenderSettings
 
 GEOMETRY = 10  # mean 3, log-scales 3, quaternion 4
 SYMMETRIC = GEOMETRY * (GEOMETRY + 1) // 2
@@ -31,10 +31,11 @@ class ProjectionJacobian(NamedTuple):
     """The derivatives of a view's splats, one row for each Gaussian at index (m,); arrays or tensors.
 
     jacobian (5, 10): QU, QV, QUU, QUV, QVV (`whitening.py`) in mean, log-scales, quaternion; logit_slope: Q0 in the opacity
-    logit.  harmonic (16,) and slope (16, 3), of the harmonics in the mean; visible (3,): 1 where the colour is not clamped
-    at 0; colour_slope (3, 3): of the colour in the mean, without that clamp.
+    logit; opacity_slope (10,): Q0 in the geometry, of length 0 where nothing is antialiased.  harmonic (16,) and slope (16, 3),
+    of the harmonics in the mean; visible (3,): 1 where the colour is not clamped at 0; colour_slope (3, 3): of the colour in
+    the mean, without that clamp.
     Second order, with the adjoint of the splat: curvature (55,), lower triangle of the geometry's (10, 10); logit_curvature;
-    colour_bar (3,): adjoint of the colour before its clamp.
+    opacity_curvature: of logit and geometry, as long as opacity_slope; colour_bar (3,): adjoint of the colour before its clamp.
     """
 
     index: Any
@@ -47,14 +48,21 @@ class ProjectionJacobian(NamedTuple):
     colour_slope: Any
     logit_slope: Any
     logit_curvature: Any
+    opacity_slope: Any
+    opacity_curvature: Any
 
 
-# What a Gaussian's row of each field but index holds.
-ROWS = ((5, GEOMETRY), (SYMMETRIC,), (16,), (16, 3), (3,), (3,), (3, 3), (), ())
+def row_shapes(*, antialiased: bool) -> tuple[tuple[int, ...], ...]:
+    """What a Gaussian's row of each field but index holds."""
+    opacity = (GEOMETRY if antialiased else 0,)
+    return (5, GEOMETRY), (SYMMETRIC,), (16,), (16, 3), (3,), (3,), (3, 3), (), (), opacity, opacity
 
 
 class Lens(NamedTuple):
-    """A camera as the kernels read it: rotation (9,) world to camera, row by row; centre (3,); pixels; thresholds."""
+    """A camera as the kernels read it: rotation (9,) world to camera, row by row; centre (3,); pixels; thresholds.
+
+    floor, epsilon: of the antialiased opacities' factor (`antialias.py`); a floor of 1 switches it off.
+    """
 
     rotation: np.ndarray
     centre: np.ndarray
@@ -65,7 +73,14 @@ class Lens(NamedTuple):
     limit_x: float
     limit_y: float
     blur: float
+    floor: float
+    epsilon: float
     near: float
+
+
+FACTORS: dict[Antialias, tuple[float, float]] = {
+    "none": (1.0, 0.0), "mip": (2.5e-5, 0.0), "mip-plain": (1e-30, 0.0), "mip-splatting": (0.0, 1e-6),
+}  # fmt: skip  # floor and epsilon
 
 
 def lens_of(camera: Camera, settings: RenderSettings) -> Lens:
@@ -74,7 +89,8 @@ def lens_of(camera: Camera, settings: RenderSettings) -> Lens:
     pinhole = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
     limit_x = settings.fov_clamp * camera.width / (2 * camera.fx)
     limit_y = settings.fov_clamp * camera.height / (2 * camera.fy)
-    return Lens(rotation, centre, *pinhole, limit_x, limit_y, float(settings.blur), float(settings.near))
+    thresholds = (float(settings.blur), *FACTORS[settings.antialias], float(settings.near))
+    return Lens(rotation, centre, *pinhole, limit_x, limit_y, *thresholds)
 
 
 @formula
@@ -150,18 +166,22 @@ def columns_of_rotation(unit):
 
 
 @formula
-def projected_axes(lens, mean, log_scales, quat):
+def scales_of(log_scales):
+    return exp(log_scales[0]), exp(log_scales[1]), exp(log_scales[2])
+
+
+@formula
+def projected_axes(lens, mean, scales, quat):
     """Everything that `geometry` and its adjoint share.
 
     x y z, 1 / z, the clamped u = x / z and v = y / z, the unit quaternion and 1 / |quat|, the three scales, the Gaussian's axes
-    in the camera frame (three columns, scaled), shrink, and r1, r2 times shrink.
+    in the camera frame (three columns, scaled), shrink, and r1, r2 times shrink.  scales: standard deviations.
     """
     x, y, z = to_camera(lens, offset_from(lens, mean))
     depth = 1.0 / z
     u, v = clamped(x * depth, lens.limit_x), clamped(y * depth, lens.limit_y)
     unit, inverse_norm = unit_quaternion(quat)
     c0, c1, c2 = columns_of_rotation(unit)
-    scales = (exp(log_scales[0]), exp(log_scales[1]), exp(log_scales[2]))
     m0 = scaled(to_camera(lens, c0), scales[0])
     m1 = scaled(to_camera(lens, c1), scales[1])
     m2 = scaled(to_camera(lens, c2), scales[2])
@@ -190,7 +210,7 @@ def conic_of(r1, r2, blur, shrink):
 def geometry(lens, mean, log_scales, quat):
     """Mean x, y (px) and conic a, b, c."""
     (x, y, _z), depth, _uv, _unit, _inverse, _scales, _axes, shrink, r1, r2 = projected_axes(
-        lens, mean, log_scales, quat
+        lens, mean, scales_of(log_scales), quat
     )
     (a, b, c), _q1, _q2 = conic_of(r1, r2, lens.blur, shrink)
     return lens.fx * x * depth + lens.cx, lens.fy * y * depth + lens.cy, a, b, c
@@ -199,16 +219,27 @@ def geometry(lens, mean, log_scales, quat):
 @formula
 def geometry_adjoint(lens, mean, log_scales, quat, bar):
     """The adjoints of mean, log_scales and quat (ten numbers), given those of mean x, y and conic a, b, c (five)."""
-    (x, y, _z), depth, (u, v), unit, inverse_norm, scales, (m0, m1, m2), shrink, r1, r2 = projected_axes(
-        lens, mean, log_scales, quat
-    )
-    (a, b, c), q1, q2 = conic_of(r1, r2, lens.blur, shrink)
+    shared = projected_axes(lens, mean, scales_of(log_scales), quat)
+    conic, q1, q2 = conic_of(shared[8], shared[9], lens.blur, shared[7])
+    return axes_adjoint(lens, shared, rows_adjoint(conic, q1, q2, bar), bar)
+
+
+@formula
+def rows_adjoint(conic, q1, q2, bar):
+    """The adjoints of the shrunken rows r1 and r2, given those of the conic, bar[2:5]."""
     # d conic = -Q dSigma Q, so the adjoint of (r1; r2) is -2 Q G Q (r1; r2) with G = [[a_bar, b_bar / 2], [b_bar / 2, c_bar]];
     # that of the shrunken rows is the same with their q1, q2: what they lack cancels
+    a, b, c = conic
     half = 0.5 * bar[3]
     p, q, s, t = a * bar[2] + b * half, a * half + b * bar[4], b * bar[2] + c * half, b * half + c * bar[4]
-    r1_bar = plus(scaled(q1, -2.0 * p), scaled(q2, -2.0 * q))
-    r2_bar = plus(scaled(q1, -2.0 * s), scaled(q2, -2.0 * t))
+    return plus(scaled(q1, -2.0 * p), scaled(q2, -2.0 * q)), plus(scaled(q1, -2.0 * s), scaled(q2, -2.0 * t))
+
+
+@formula
+def axes_adjoint(lens, shared, rows_bar, bar):
+    """The adjoints of mean, log-scales and quat, given those of the rows, and of the mean in the image, bar[:2]."""
+    (x, y, _z), depth, (u, v), unit, inverse_norm, scales, (m0, m1, m2), shrink, r1, r2 = shared
+    r1_bar, r2_bar = rows_bar
     # r1 = fx / z (row_x - u row_z), r2 = fy / z (row_y - v row_z), the rows those of the axes m
     along_x, along_y = scaled(r1_bar, (shrink * lens.fx) * depth), scaled(r2_bar, (shrink * lens.fy) * depth)
     row_z = (m0[2], m1[2], m2[2])

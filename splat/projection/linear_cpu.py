@@ -2,7 +2,7 @@
 
 Per Gaussian that matters, the Jacobian of the map from its stored parameters to its splat and the curvature `(a . P'')`, a the
 first-order adjoint of its splat.  SH enters the colour linearly: its derivatives are the harmonics at the view direction and
-their slope in the mean, so a Gaussian needs 179 numbers, not a dense 9 x 59 and 59 x 59.
+their slope in the mean, so a Gaussian needs 179 numbers, not a dense 9 x 59 and 59 x 59; 20 more where it is antialiased.
 
 Tangents and adjoints of the stored parameters are (n, parameters of a Gaussian..., K) per attribute: views of a (p, K) block
 that is laid out like the flat vector.  Tangents and adjoints of splats are (n, K, 9), in the coordinates of `whitening.py`.
@@ -15,15 +15,15 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from splat.backend.cpu.dual import DIRECTIONS, tangent_of, variable
+from splat.backend.cpu.dual import DIRECTIONS, tangent_of, value_of, variable
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.simd import store
 from splat.backend.cpu.threads import over_range
 from splat.model.gaussians import Gaussians, attribute_shapes
-from splat.projection.cpu import attribute_arrays, point, quaternion, six_of
+from splat.projection.antialias import antialiased_adjoint, antialiased_geometry
+from splat.projection.cpu import attribute_arrays, point, quaternion, sigmoid, six_of, width_array, with_factor
 from splat.projection.formulas import (
     GEOMETRY,
-    ROWS,
     Lens,
     ProjectionJacobian,
     basis,
@@ -31,6 +31,7 @@ from splat.projection.formulas import (
     direction_of,
     geometry,
     geometry_adjoint,
+    row_shapes,
 )
 from splat.projection.whitening import cancellation, geometry_coefficients, plain_gradient, put, whitening
 
@@ -56,7 +57,13 @@ def linearize_geometry(lens, W, like, mean, log_scales, quat, bar, jacobian, cur
         store(tangents.reshape(-1), j * DIRECTIONS, tangent_of(values[j]))
     for k in range(GEOMETRY):
         put(jacobian[:, k], geometry_coefficients(W, tangents[:, k]))
-    m, t, r = geometry_adjoint(lens, x, s, q, bar)
+    pack_curvature(geometry_adjoint(lens, x, s, q, bar), tangents, curvature)
+
+
+@formula
+def pack_curvature(adjoint, tangents, curvature):
+    """The lower triangle of the tangents of an adjoint of mean, log-scales and quaternion."""
+    m, t, r = adjoint
     rows = (m[0], m[1], m[2], t[0], t[1], t[2], r[0], r[1], r[2], r[3])
     place = 0
     for j in range(GEOMETRY):
@@ -64,6 +71,29 @@ def linearize_geometry(lens, W, like, mean, log_scales, quat, bar, jacobian, cur
         for k in range(j + 1):
             curvature[place + k] = tangents[0, k]
         place += j + 1
+
+
+@kernel
+def linearize_antialiased(
+    lens, W, mean, log_scales, quat, logit, width, bar, jacobian, curvature, opacity_slope, opacity_curvature
+):
+    """`linearize_geometry` of an antialiased Gaussian, in double precision, and the derivatives of its opacity.
+
+    bar[5]: S / opacity.  The opacity's curvature with its logit is S ln' sigmoid(logit) times its slope, S (1 - sigmoid).
+    """
+    like = np.empty(0)
+    x, s, q = variables(like, mean, log_scales, quat)
+    tangents = np.empty((6, DIRECTIONS))
+    values = antialiased_geometry(lens, x, s, q, width)
+    for j in range(6):
+        store(tangents.reshape(-1), j * DIRECTIONS, tangent_of(values[j]))
+    factor, own = value_of(values[5]), sigmoid(logit)
+    S = own * factor * bar[5]
+    for k in range(GEOMETRY):
+        put(jacobian[:, k], geometry_coefficients(W, tangents[:5, k]))
+        opacity_slope[k] = tangents[5, k] / factor if factor > 0 else 0.0
+        opacity_curvature[k] = S * sigmoid(-logit) * opacity_slope[k]
+    pack_curvature(antialiased_adjoint(lens, x, s, q, width, with_factor(bar, own)), tangents, curvature)
 
 
 @formula
@@ -87,27 +117,21 @@ def linearize_colour(lens, mean, x, colour_weight, bands, curvature, harmonic, s
 
 
 @kernel
-def linearize_gaussian(
-    lens, mean, log_scales, quat, splat, colour_weight, bands, moments, jacobian, curvature, harmonic, slope
-):
-    """One Gaussian's rows of a `ProjectionJacobian`; moments: the six of its adjoint.
+def linearize_gaussian(lens, W, mean, log_scales, quat, bar, jacobian, curvature):
+    """`linearize_geometry` in the precision that it needs.
 
     The geometry of a slanted needle has tangents in double precision: they cancel by a c / (a c - b^2), in whitening as well as
     in `geometry_adjoint`.
     """
-    W = whitening(splat)
-    bar = plain_gradient(W, splat[5], moments)
     if cancellation(W) > LEAST_CANCELLATION:
         linearize_geometry(lens, W, np.empty(0), mean, log_scales, quat, bar, jacobian, curvature)
     else:
-        linearize_geometry(lens, W, slope, mean, log_scales, quat, bar, jacobian, curvature)
-    x, _s, _q = variables(slope, mean, log_scales, quat)
-    linearize_colour(lens, mean, x, colour_weight, bands, curvature, harmonic, slope)
+        linearize_geometry(lens, W, jacobian, mean, log_scales, quat, bar, jacobian, curvature)
 
 
 @kernel
-def linearize_all(start, stop, found, lens, means, log_scales, quats, sh, splats, moments):
-    """Fill the rows of a `ProjectionJacobian`; moments (n, 9): the adjoint of the splats."""
+def linearize_all(start, stop, found, lens, means, log_scales, quats, logits, sh, widths, splats, moments):
+    """Fill the rows of a `ProjectionJacobian`; moments (n, 9): the adjoint of the splats; widths: as for `project_splats`."""
     bands = sh.shape[1]
     for e in range(start, stop):
         i = found.index[e]
@@ -117,13 +141,21 @@ def linearize_all(start, stop, found, lens, means, log_scales, quats, sh, splats
             found.colour_bar[e, c] = found.visible[e, c] * moments[i, 6 + c]
             for k in range(bands):
                 weight[k] += sh[i, k, c] * found.colour_bar[e, c]
-        opacity = splats[i, 5]
+        mean, log_scale, quat, W = point(means, i), point(log_scales, i), quaternion(quats, i), whitening(splats[i])
+        bar, opacity = plain_gradient(W, splats[i, 5], six_of(moments[i])), splats[i, 5]
+        if widths is None:
+            linearize_gaussian(lens, W, mean, log_scale, quat, bar, found.jacobian[e], found.curvature[e])
+        else:
+            width, logit = np.float64(widths[i]), np.float64(logits[i])
+            opacity = sigmoid(logit)
+            linearize_antialiased(
+                lens, W, mean, log_scale, quat, logit, width, bar, found.jacobian[e], found.curvature[e],
+                found.opacity_slope[e], found.opacity_curvature[e],
+            )  # fmt: skip
         found.logit_slope[e] = 1 - opacity
         found.logit_curvature[e] = (1 - opacity) * (1 - 2 * opacity) * moments[i, 0]
-        linearize_gaussian(
-            lens, point(means, i), point(log_scales, i), quaternion(quats, i), splats[i], weight, bands, six_of(moments[i]),
-            found.jacobian[e], found.curvature[e], found.harmonic[e], found.slope[e],
-        )  # fmt: skip
+        x, _s, _q = variables(found.slope, mean, log_scale, quat)
+        linearize_colour(lens, mean, x, weight, bands, found.curvature[e], found.harmonic[e], found.slope[e])
         for c in range(3):
             for j in range(3):
                 total = 0.0
@@ -151,6 +183,8 @@ def push_forward(start, stop, at, d_means, d_log_scales, d_quats, d_logits, d_sh
         for k in range(K):
             geometry_tangent(u, i, k, d_means, d_log_scales, d_quats)
             out[i, k, 0] = at.logit_slope[e] * d_logits[i, k]
+            for j in range(at.opacity_slope.shape[1]):
+                out[i, k, 0] += at.opacity_slope[e, j] * u[j]
             for r in range(5):
                 total = out.dtype.type(0)
                 for j in range(GEOMETRY):
@@ -195,6 +229,11 @@ def pull_back(
                 for j in range(3):
                     h[j] += at.colour_slope[e, c, j] * bar[c]
             out_logits[i, k] = at.logit_slope[e] * y[0]
+            for j in range(at.opacity_slope.shape[1]):
+                h[j] += at.opacity_slope[e, j] * y[0]
+                if second_order:
+                    h[j] += at.opacity_curvature[e, j] * d_logits[i, k]
+                    out_logits[i, k] += at.opacity_curvature[e, j] * u[j]
             if second_order:
                 for j in range(GEOMETRY):
                     for l in range(GEOMETRY):
@@ -228,6 +267,8 @@ def chain_blocks(start, stop, at, blocks, second_order, geometry_out, sh_out):
         i = at.index[e]
         J[0, GEOMETRY] = at.logit_slope[e]
         J[1:6, :GEOMETRY] = at.jacobian[e]
+        for j in range(at.opacity_slope.shape[1]):
+            J[0, j] = at.opacity_slope[e, j]
         for c in range(3):
             for j in range(3):
                 J[6 + c, j] = at.visible[e, c] * at.colour_slope[e, c, j]
@@ -247,6 +288,9 @@ def chain_blocks(start, stop, at, blocks, second_order, geometry_out, sh_out):
                 geometry_out[i, j, k] = geometry_out[i, k, j] = total
         if second_order:
             geometry_out[i, GEOMETRY, GEOMETRY] += at.logit_curvature[e]
+            for j in range(at.opacity_curvature.shape[1]):
+                geometry_out[i, GEOMETRY, j] += at.opacity_curvature[e, j]
+                geometry_out[i, j, GEOMETRY] = geometry_out[i, GEOMETRY, j]
 
 
 class CpuProjection:
@@ -260,10 +304,11 @@ class CpuProjection:
         moments: Float[Tensor, "n 9"],
         index: Int[Tensor, " m"],
     ):
-        means, log_scales, quats, _logits, sh = attribute_arrays(gaussians)
+        inputs, widths = attribute_arrays(gaussians), width_array(gaussians, lens)
         self.n, self.sh_degree, self.parameters = len(gaussians), gaussians.sh_degree, gaussians.flat.numel()
-        self._at = ProjectionJacobian(index.numpy(), *(np.empty((len(index), *row), means.dtype) for row in ROWS))
-        arguments = (lens, means, log_scales, quats, sh, splats.numpy(), moments.numpy())
+        rows = row_shapes(antialiased=widths is not None)
+        self._at = ProjectionJacobian(index.numpy(), *(np.empty((len(index), *row), inputs[0].dtype) for row in rows))
+        arguments = (lens, *inputs, widths, splats.numpy(), moments.numpy())
         over_range(len(index), linearize_all, self._at, *arguments)
 
     @property

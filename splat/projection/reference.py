@@ -8,10 +8,12 @@ Plain torch, any float type, differentiable any number of times; the kernels of 
     conic  its inverse [[a, b], [b, c]], in px^-2, with det = |r1 x r2|^2 + blur (|r1|^2 + |r2|^2) + blur^2:
            the textbook a c - b^2 cancels in float32, by 1e-3 at a condition number of 1e4
     colour max(0, 0.5 + sum_k Y_k(direction) sh_k)
+
+Scales and opacities of antialiased Gaussians: `antialias.py`.
 """
 
 from dataclasses import dataclass, fields
-from math import log
+from math import log, sqrt
 
 import numpy as np
 import torch
@@ -23,7 +25,7 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import harmonics
 from splat.model.settings import RenderSettings
-from splat.projection.formulas import Lens
+from splat.projection.formulas import FACTORS, Lens
 
 NEEDLE = 100.0  # the condition number from which on a splat is called a needle
 LARGEST_SPLAT = 2.0**60  # px, and world units: 1 / det of a needle is this squared over blur, which float32 still holds
@@ -72,19 +74,37 @@ def project(gaussians: Gaussians, camera: Camera, settings: RenderSettings = Ren
     limit_y = settings.fov_clamp * camera.height / (2 * camera.fy)
     u, v = (x / z).clamp(-limit_x, limit_x), (y / z).clamp(-limit_y, limit_y)
 
-    axes = to_camera @ rotation_matrices(gaussians.quats) * gaussians.log_scales.exp()[:, None, :]
+    scales, opacities = gaussians.log_scales.exp(), gaussians.opacity_logits.sigmoid()
+    if gaussians.filter_widths is not None:
+        wide = (scales.square() + gaussians.filter_widths[:, None].square()).sqrt()
+        scales, opacities = wide, opacities * (scales / wide).prod(dim=1)
+    axes = to_camera @ rotation_matrices(gaussians.quats) * scales[:, None, :]
     r1 = camera.fx / z[:, None] * (axes[:, 0] - u[:, None] * axes[:, 2])
     r2 = camera.fy / z[:, None] * (axes[:, 1] - v[:, None] * axes[:, 2])
     xx, xy, yy = (r1 * r1).sum(-1), (r1 * r2).sum(-1), (r2 * r2).sum(-1)
     cross = torch.linalg.cross(r1, r2)
     blur = settings.blur
-    det = (cross * cross).sum(-1) + blur * (xx + yy) + blur * blur
+    sharp = (cross * cross).sum(-1)
+    det = sharp + blur * (xx + yy) + blur * blur
+    opacities = opacities * _compensation(sharp, det, settings)
     conics = torch.stack([(yy + blur) / det, -xy / det, (xx + blur) / det], dim=-1)
 
     basis = harmonics(offset / offset.norm(dim=-1, keepdim=True), gaussians.sh_degree)
     colours = (0.5 + torch.einsum("nk,nkc->nc", basis, gaussians.sh)).clamp_min(0)
     centres = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
-    return Splats(centres, conics, gaussians.opacity_logits.sigmoid(), colours, z, drawn)
+    return Splats(centres, conics, opacities, colours, z, drawn)
+
+
+def _compensation(
+    sharp: Float[Tensor, " n"], det: Float[Tensor, " n"], settings: RenderSettings
+) -> Float[Tensor, " n"] | float:
+    """The 2-D filter's factor of opacities, given the covariance's determinant without and with the blur."""
+    if settings.antialias == "none":
+        return 1.0
+    floor, epsilon = FACTORS[settings.antialias]
+    squared = sharp / (det + epsilon) + epsilon
+    free = (squared > floor) & (sharp > epsilon)
+    return torch.where(free, torch.where(free, squared, 1.0).sqrt(), sqrt(floor))
 
 
 def on_screen(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:

@@ -31,9 +31,9 @@ from splat.raster.dispatch import Raster, rasterize
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, flat: Tensor, sh_degree: int, lens: Lens):
-        ctx.view = sh_degree, lens
-        splats, depths, drawn = projected(Gaussians(flat.detach(), sh_degree), lens)
+    def forward(ctx, flat: Tensor, sh_degree: int, widths: Tensor | None, lens: Lens):
+        ctx.view = sh_degree, widths, lens
+        splats, depths, drawn = projected(Gaussians(flat.detach(), sh_degree, widths), lens)
         ctx.save_for_backward(flat, splats, drawn)
         ctx.mark_non_differentiable(depths, drawn)
         return splats, depths, drawn
@@ -41,26 +41,29 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *outputs: Tensor):
         flat, splats, drawn = ctx.saved_tensors
-        return _ProjectAdjoint.apply(flat, outputs[0], splats.detach(), drawn, *ctx.view), None, None
+        return _ProjectAdjoint.apply(flat, outputs[0], splats.detach(), drawn, *ctx.view), None, None, None
 
 
 class _ProjectAdjoint(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, flat: Tensor, bar: Tensor, splats: Tensor, drawn: Tensor, sh_degree: int, lens: Lens) -> Tensor:
-        ctx.view = splats, drawn, sh_degree, lens
+    def forward(
+        ctx, flat: Tensor, bar: Tensor, splats: Tensor, drawn: Tensor, sh_degree: int, widths: Tensor | None, lens: Lens
+    ) -> Tensor:
+        ctx.view = splats, drawn, sh_degree, widths, lens
         ctx.save_for_backward(flat, bar)
-        return projected_vjp(Gaussians(flat.detach(), sh_degree), lens, splats, drawn, bar.detach().contiguous())
+        gaussians = Gaussians(flat.detach(), sh_degree, widths)
+        return projected_vjp(gaussians, lens, splats, drawn, bar.detach().contiguous())
 
     @staticmethod
     def backward(ctx, *outputs: Tensor):
-        (flat, bar), (splats, drawn, sh_degree, lens) = ctx.saved_tensors, ctx.view
-        gaussians, direction = Gaussians(flat.detach(), sh_degree), outputs[0].detach()[:, None]
+        (flat, bar), (splats, drawn, sh_degree, widths, lens) = ctx.saved_tensors, ctx.view
+        gaussians, direction = Gaussians(flat.detach(), sh_degree, widths), outputs[0].detach()[:, None]
         moments = moments_of(splats, bar.detach().contiguous())
         projection = linearize_projection(gaussians, lens, splats, moments, drawn.nonzero()[:, 0])
         tangents = projection.jvp(direction)
         product = projection.vjp(torch.zeros_like(tangents), direction)
         values = (product[:, 0], plain_tangents(splats, tangents[:, 0]))
-        return *last_derivative(values, flat, bar, *outputs), None, None, None, None
+        return *last_derivative(values, flat, bar, *outputs), None, None, None, None, None
 
 
 class _Rasterize(torch.autograd.Function):
@@ -93,7 +96,8 @@ class _RasterizeAdjoint(torch.autograd.Function):
 
 def project_by_kernel(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> Splats:
     """`reference.project`, by the kernels, in double precision.  depths carry no gradient: they only sort."""
-    splats, depths, drawn = _Project.apply(gaussians.flat, gaussians.sh_degree, lens_of(camera, settings))  # pyright: ignore
+    inputs = (gaussians.flat, gaussians.sh_degree, gaussians.filter_widths, lens_of(camera, settings))
+    splats, depths, drawn = _Project.apply(*inputs)  # pyright: ignore
     means, conics, opacities, colours = splats.split((2, 3, 1, 3), dim=1)
     return Splats(means, conics, opacities[:, 0], colours, depths, drawn)
 

@@ -21,6 +21,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from landscape.errors import InputError
 from splat.scenes.layers import dtu_number
@@ -32,6 +34,7 @@ BLENDER_TRAINING = (26, 86, 2, 55, 75, 93, 16, 73)
 DTU_TRAINING = (25, 22, 28, 40, 44, 48, 0, 8, 13)
 DTU_LEFT_OUT = (3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 36, 37, 38, 39)
 DTU_VIEWS = 49  # some scans have 64
+LOOKS = 20
 FEWEST = 3  # training views of the protocols for LLFF and DTU
 
 
@@ -139,20 +142,33 @@ def _number(name: str) -> int | None:
 
 
 def spread_views(frames: Sequence[Frame], count: int) -> list[str]:
-    """Names of frames spread evenly: the one nearest to the middle of the cameras, then always the farthest from those chosen.
+    """Names of frames that stand for all: each camera belongs to the nearest chosen one, which is in the middle of its own.
 
-    InputError where fewer than one is asked for.
+    Chosen at first are the one nearest to the middle of all, then always the farthest from those chosen, which prefers the
+    edges; then, until nothing changes (at most LOOKS times), the one nearest to the middle of each one's cameras.  InputError
+    where fewer than one is asked for.
     """
     if count < 1:
         raise InputError(f"expected at least 1 view, got {count}")
     centres = torch.stack([frame.camera.centre for frame in frames])
     chosen = [int((centres - centres.mean(dim=0)).norm(dim=1).argmin())]
-    distances = (centres - centres[chosen[0]]).norm(dim=1)
     while len(chosen) < min(count, len(frames)):
+        distances = torch.cdist(centres, centres[chosen]).amin(dim=1)
         distances[chosen] = -1.0
         chosen.append(int(distances.argmax()))
-        distances = torch.minimum(distances, (centres - centres[chosen[-1]]).norm(dim=1))
+    for _ in range(LOOKS):
+        nearest = torch.cdist(centres, centres[chosen]).argmin(dim=1)
+        nearest[chosen] = torch.arange(len(chosen))  # of cameras at one place, too, each has one
+        before, chosen = chosen, [_middle(centres, nearest == k) for k in range(len(chosen))]
+        if chosen == before:
+            break
     return [frames[i].name for i in chosen]
+
+
+def _middle(centres: Float[Tensor, "n 3"], members: Bool[Tensor, " n"]) -> int:
+    """The member nearest to the mean of all."""
+    distances = (centres - centres[members].mean(dim=0)).norm(dim=1)
+    return int(distances.masked_fill(~members, float("inf")).argmin())
 
 
 def explicit_split(names: Sequence[str], train: Sequence[str | int], test: Sequence[str | int] | None = None) -> Split:

@@ -114,6 +114,7 @@ class _Training:
     step: steps made; extent: radius of the scene's cameras, world units.  sh_degree, flat: the Gaussians, bands in use and (p,)
     stored parameters.  generator: state of the random generator, uint8; order: views still to come in this epoch.
     regularizer: `Method.state`, a training in it (a second field) in this same form.  config: `TrainConfig` as plain types.
+    filter_widths: of the Gaussians, where they have any.
     """
 
     step: Count
@@ -126,6 +127,7 @@ class _Training:
     order: list[Count]
     regularizer: dict[str, Any]
     config: dict[str, Any]
+    filter_widths: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -143,8 +145,9 @@ class _File:
 
 def training_state(training: Training) -> dict[str, Any]:
     """All that a training depends on, as tensors and plain types: the fields of `_Training`."""
-    adam, screen = training.adam, training.screen_gradients
+    adam, screen, widths = training.adam, training.screen_gradients, training.gaussians.filter_widths
     return {
+        **({} if widths is None else {"filter_widths": widths}),
         "step": training.step,
         "extent": training.extent,
         "sh_degree": training.gaussians.sh_degree,
@@ -304,6 +307,8 @@ def restored_training(content: dict[str, Any]) -> Training:
     adam, screen, p, dtype = saved.adam, saved.screen_gradients, saved.flat.numel(), saved.flat.dtype
     gaussians = Gaussians(_numbers("flat", saved.flat, p, dtype), saved.sh_degree)
     n = len(gaussians)
+    if saved.filter_widths is not None:
+        gaussians = gaussians.with_filter(_numbers("filter_widths", saved.filter_widths, n, dtype))
     gaussians.require_finite()
     config = _config(saved.config)
     if saved.step > config.iterations:

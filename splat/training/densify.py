@@ -33,6 +33,7 @@ from landscape.errors import InputError
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.typed import Count, Length, Positive, Settings, Share
+from splat.projection.antialias import filter_factor
 from splat.projection.reference import Splats, on_screen, rotation_matrices
 
 SPLIT_INTO = 2
@@ -193,5 +194,9 @@ def draw_from_parents(gaussians: Gaussians, start: int, generator: torch.Generat
 
 @torch.no_grad()
 def reset_opacities(gaussians: Gaussians, opacity: float) -> None:
-    """Lower every opacity to at most this, in place."""
-    gaussians.opacity_logits.clamp_max_(log(opacity / (1 - opacity)))
+    """Lower every opacity to at most this, in place; with a 3-D filter, as Mip-Splatting does, the opacity under it."""
+    if gaussians.filter_widths is None:
+        gaussians.opacity_logits.clamp_max_(log(opacity / (1 - opacity)))
+        return
+    highest = torch.logit((opacity / filter_factor(gaussians)).clamp_max(1.0))  # infinite where no opacity is above it
+    gaussians.opacity_logits.copy_(torch.minimum(gaussians.opacity_logits, highest))

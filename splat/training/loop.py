@@ -8,6 +8,8 @@ Steps are counted from 1.  Views come in epochs, each a new random order.  All r
 
 The Gaussians hold only the SH bands in use; a band joins as zeros, which is the same as one whose gradient was zero.
 
+Where Gaussians have Mip-Splatting's 3-D filter (`render.antialias`), `Training.update_filter` keeps it up to date.
+
 The published code (graphdeco-inria/gaussian-splatting, train.py) orders a step in another way:
 
     update      after density control, whose new tensors have no gradient yet: a step that clones, splits and prunes updates
@@ -56,6 +58,7 @@ def prepare(training: Training, views: Sequence[View]) -> None:
             f"expected a training in which the method acts, got {config.method.name} which never does in "
             f"{config.iterations} steps ({late}); take more steps, let it begin earlier, or use the method 3dgs"
         )
+    training.update_filter(0, [view.camera for view in views])
     training.method.on_start(training, views)
 
 
@@ -74,6 +77,7 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
     prepare(training, views)
     config, method, dtype = training.config, training.method, training.gaussians.flat.dtype
     losses = [config.loss_against(view.image, training.gaussians.flat) for view in views]
+    cameras = [view.camera for view in views]
     while training.step < config.iterations:
         # what the step is about: a view, a background, the loss against that view
         number = training.step + 1
@@ -86,19 +90,29 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
             background, loss = drawn, config.loss_against(target, training.gaussians.flat)
         step = Step(number, training, training.gaussians, views, chosen, background, loss)
 
-        # the photometric gradient, and what the method makes of it
-        scale = method.opacity_scale(step)
-        base = loss_and_gradient(step.gaussians, step.camera, loss, background, config.render, scale)
-        _require_finite("loss", base.loss, step)
-        found = method.gradient(step, base)
-        _require_finite("gradient", float(found.gradient.sum()), step)
-
-        # update, then clone, split and prune
-        training.descend(found.gradient, number)
-        training.control_density(number, step.camera, found)
+        value = method.own_step(step)
+        value = photometric_step(step) if value is None else value
+        _require_finite("loss", value, step)
         method.after_step(step)
+        training.update_filter(number, cameras)
         training.step = number
-        yield StepResult(number, base.loss, len(training.gaussians), view.name)
+        yield StepResult(number, value, len(training.gaussians), view.name)
+
+
+def photometric_step(step: Step) -> float:
+    """A step of 3DGS on the sampled view, with what the method adds; the loss before it."""
+    training, config, method = step.training, step.config, step.training.method
+    # the photometric gradient, and what the method makes of it
+    scale = method.opacity_scale(step)
+    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background, config.render, scale)
+    _require_finite("loss", base.loss, step)
+    found = method.gradient(step, base)
+    _require_finite("gradient", float(found.gradient.sum()), step)
+
+    # update, then clone, split and prune
+    training.descend(found.gradient, step.number)
+    training.control_density(step.number, step.camera, found)
+    return base.loss
 
 
 def with_background(view: View, old: Float[Tensor, "3"], new: Float[Tensor, "3"]) -> Float[Tensor, "3 h w"]:

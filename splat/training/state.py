@@ -27,11 +27,13 @@ from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.model.typed import Count, Length, NonNegative, Positive, Settings, Share, typed
+from splat.projection.antialias import sampling_widths
 from splat.render.loss_and_gradient import LossAndGradient
 from splat.scenes.view import View
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.training.optim.adam import Adam
 
+FILTER_EVERY = 100  # steps
 Protocol = Literal["common", "llff"]
 Row = dict[str, Count | float | bool | str]  # of a history
 
@@ -66,9 +68,11 @@ class MethodSettings(Settings):
     """Settings of a method; `create` makes a `Method` from them.  name: its key in `methods.METHODS`.
 
     BEFORE: values for settings that older checkpoints lack, with which the method does the same as it did then.
+    ITERATIONS: steps of a training that is not told how many.
     """
 
     name: str = ""
+    ITERATIONS: ClassVar[int] = 2000
     BEFORE: ClassVar[dict[str, Any]] = {}
 
     def create(self, seed: int) -> "Method":
@@ -96,6 +100,7 @@ class Method(Generic[S]):
 
     hook            runs                                      arguments          result
     on_start        before the first step, after a resume     training, views    InputError where views lack what it needs
+    own_step        in place of all up to after_step          step               the loss before it; None: as 3DGS does
     opacity_scale   before the sampled view is rendered       step               (n,) factors on the opacities, or None
     gradient        after its backward pass, before Adam      step, base         loss and gradient to go on with
     on_densify      after each change of the Gaussians        change             which old one each new one comes from
@@ -116,6 +121,10 @@ class Method(Generic[S]):
 
     def on_start(self, training: "Training", views: Sequence[View]) -> None:
         """A second call changes nothing."""
+
+    def own_step(self, step: Step) -> float | None:
+        """Change step.training.gaussians, in place, without the sampled view, Adam and density control."""
+        return None
 
     def opacity_scale(self, step: Step) -> Float[Tensor, " n"] | None:
         return None
@@ -318,6 +327,21 @@ class Training(Brief):
         flat = change.gaussians.flat
         self.screen_gradients = ScreenGradients.zero(len(change.gaussians), flat.dtype, flat.device)
         self.method.on_densify(change)
+
+    def update_filter(self, step: int, cameras: Sequence[Camera]) -> None:
+        """Give the Gaussians the 3-D filter of Mip-Splatting's training after a step, if that is how they are antialiased.
+
+        As its published code does: at the start, whenever density control has changed the Gaussians, and after that every
+        FILTER_EVERY steps but the last ones.
+        """
+        config = self.config
+        if config.render.antialias != "mip-splatting":
+            return
+        schedule, iterations = config.method.density_control(config), config.iterations
+        settled = not schedule.collects(step, iterations) and step < iterations - FILTER_EVERY
+        due = schedule.densifies(step, iterations) or (settled and step > 0 and step % FILTER_EVERY == 0)
+        if due or self.gaussians.filter_widths is None:
+            self.gaussians = self.gaussians.with_filter(sampling_widths(self.gaussians, cameras))
 
     def raise_sh_degree(self, degree: int) -> None:
         """Add bands of zeros up to this degree."""

@@ -17,14 +17,18 @@ from tests.hostile.mutations import Random
 
 
 class Format:
-    """name: in the table of outcomes.  broken: the files that cases break, of those in `root`."""
+    """name: in the table of outcomes.  broken: the files that cases break, of those in `root`.
+
+    refuses: whether the reader refuses what is broken, rather than do without.
+    """
 
     name: ClassVar[str]
+    refuses: ClassVar[bool] = True
 
     def __init__(self, root: Path) -> None:
         self.root, self.chance = root, Random(0)
         self.write()
-        self.files = {name: (root / name).read_bytes() for name in self.broken()}
+        self.files = {name: (self.root / name).read_bytes() for name in self.broken()}
         self.use()
 
     def write(self) -> None:

@@ -25,9 +25,11 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import psutil
+
 SECONDS, MOST_BYTES = 5.0, 2**30  # of a processor; beyond what the process holds at its start
 GOOD = ("clean", "harmless")
-PATIENCE = 120.0  # seconds by the clock without a word, on a machine that does other work too
+PATIENCE = 60.0  # seconds by the clock without a word, in which a process may have had no processor
 ROOT = Path(__file__).parents[2]
 
 
@@ -72,22 +74,30 @@ def _watched(name: str, first: int, cases: int, seed: int, found: Found) -> int:
         subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, env=environment) as process,
     ):
         assert process.stdout is not None
-        case, waiting = first - 1, b""
+        case, waiting, spent, silent, begun = first - 1, b"", 0.0, 0, False
         while True:
             ready, _, _ = select.select([process.stdout], [], [], PATIENCE)
             if not ready:
+                silent += 1
+                if _seconds(process.pid) - spent < 4 * SECONDS and silent < 20:
+                    continue
                 process.kill()
-                found.add(case + 1, "hang", f"longer than {PATIENCE:g} s")
+                found.add(case + 1, "hang", f"silent for {_seconds(process.pid) - spent:.0f} s of a processor")
                 return case + 2
+            spent, silent = _seconds(process.pid), 0
             content = os.read(process.stdout.fileno(), 1 << 16)
             if not content:
                 break
             *lines, waiting = (waiting + content).split(b"\n")
             for line in lines:
                 case, outcome, said = json.loads(line)
+                begun = True
                 if outcome != "begun":
                     found.add(case, outcome, said)
         process.wait()
+        if not begun:
+            errors.seek(0)
+            raise RuntimeError(f"no example of {name}: {errors.read().decode(errors='replace')[-2000:]}")
         if case + 1 < cases:
             errors.seek(0)
             found.add(
@@ -95,6 +105,12 @@ def _watched(name: str, first: int, cases: int, seed: int, found: Found) -> int:
             )
             return case + 2
     return cases
+
+
+def _seconds(process: int) -> float:
+    """That it has had of a processor."""
+    times = psutil.Process(process).cpu_times()
+    return times.user + times.system
 
 
 def work(name: str, first: int, cases: int, seed: int) -> None:

@@ -133,13 +133,13 @@ def of_array(chance: Random, array: np.ndarray) -> np.ndarray:
         match chance.randrange(7):
             case 0 | 1:
                 kind = np.dtype(chance.choice(KINDS))
-                return np.zeros(array.shape, kind) if kind.kind in "VMOUS" else array.astype(kind)
+                return np.zeros(array.shape, kind) if {kind.kind, array.dtype.kind} & {*"VMOUS"} else array.astype(kind)
             case 2:
                 return array.reshape(chance.choice([(-1,), (1, *array.shape), (*array.shape, 1), (array.size, 1)]))
             case 3:
                 return array[..., :0] if array.ndim else array.reshape(1)[:0]
             case 4:
-                return np.asfortranarray(array[::-1])
+                return np.asfortranarray(np.atleast_1d(array)[::-1])
             case 5:
                 return np.concatenate([array, array]) if array.ndim else np.stack([array, array])
             case _:

@@ -14,6 +14,7 @@ from tests.hostile import mutations
 from tests.hostile.broken import Format
 from tests.hostile.mutations import Random
 from tests.splat.scenes import folders
+from tests.splat.scenes.formats.test_dtu import write_dtu
 
 
 class SceneFolder(Format):
@@ -76,6 +77,26 @@ class Transforms(SceneFolder):
 
     def broken(self) -> list[str]:
         return [self.name]
+
+
+class Blender(SceneFolder):
+    name = "transforms_train.json, transforms_test.json"
+
+    def write(self) -> None:
+        folders.write_blender(self.root, (0, 1), (2,))
+
+    def broken(self) -> list[str]:
+        return self.name.split(", ")
+
+
+class Dtu(SceneFolder):
+    name = "DTU's pos_NNN.txt"
+
+    def write(self) -> None:
+        self.parts, self.root = self.root, write_dtu(self.root, views=3)
+
+    def broken(self) -> list[str]:
+        return [f"../../Calibration/cal18/pos_{i:03d}.txt" for i in (1, 2, 3)]
 
 
 class Ply(SceneFolder):

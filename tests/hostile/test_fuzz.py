@@ -7,12 +7,13 @@ import pytest
 from tests.hostile.formats import FORMATS
 from tests.hostile.fuzz import fuzzed
 
-CASES = {"checkpoint.pt": 60, "probe.json": 60, "*.npz": 60, "PNG, JPEG, mask, depth": 60}
+CASES, SLOW = 60, {"study.csv": 20}
 MOST = int(os.environ.get("LANDSCAPE_FUZZ_CASES", 0))  # such as 10000; 0: as many as a minute has room for
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_broken_file_is_refused_in_a_sentence_or_read(name):
-    found = fuzzed(name, MOST or CASES.get(name, 100))
+    found = fuzzed(name, MOST or SLOW.get(name, CASES))
     assert not found.failures, "\n".join(found.failures[:20])
-    assert found.outcomes["clean"] > 0.2 * found.outcomes.total()  # most cases break something
+    if FORMATS[name].refuses:
+        assert found.outcomes["clean"] > 0.2 * found.outcomes.total()  # most cases break something

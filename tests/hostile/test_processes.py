@@ -198,37 +198,26 @@ def test_without_a_home_or_a_folder_beside_the_code_kernels_are_kept_with_tempor
         kernel_cache.kernel_folder(256)
 
 
-def test_a_cut_file_of_a_kernel_is_compiled_anew(tmp_path):
+def test_two_compile_a_kernel_at_once_and_a_cut_file_is_compiled_anew(tmp_path):
     (tmp_path / "small.py").write_text(
         "from splat.backend.cpu import simd\nfrom splat.backend.cpu.jit import kernel\n"
         "@kernel\ndef twice(x):\n    return 2 * x\nprint(twice(4.0))\n"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
 
-    def ran() -> str:
-        return subprocess.run(
-            [sys.executable, str(tmp_path / "small.py")],
-            cwd=ROOT,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
+    def begun(**settings) -> subprocess.Popen[str]:
+        words = [sys.executable, str(tmp_path / "small.py")]
+        pipe = subprocess.PIPE
+        return subprocess.Popen(words, cwd=ROOT, env=environment, stdout=pipe, stderr=pipe, text=True, **settings)
 
-    full = subprocess.run(
-        [sys.executable, str(tmp_path / "small.py")],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        preexec_fn=limited(100),
-    )
-    assert "File too large" in full.stderr and str(tmp_path / "cache") in full.stderr.splitlines()[-1]
-    assert ran() == "8.0\n"
+    said = begun(preexec_fn=limited(100)).communicate()[1]
+    assert "File too large" in said and str(tmp_path / "cache") in said.splitlines()[-1]
+    cold = [begun(), begun()]
+    assert [process.communicate() for process in cold] == [("8.0\n", "")] * 2
     for suffix in ("nbi", "nbc"):
         for file in (tmp_path / "cache").rglob(f"small.twice-*.{suffix}"):
             file.write_bytes(file.read_bytes()[:40])
-        assert ran() == "8.0\n"
+        assert begun().communicate() == ("8.0\n", "")
 
 
 @pytest.mark.parametrize("words", [["train", "--help"], ["train", "nowhere"]])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
+from splat.model.settings import Antialias, RenderSettings
 
 IMAGE = {torch.float32: 1e-6, torch.float64: 1e-12}
 DERIVATIVE = {torch.float32: 1e-5, torch.float64: 1e-12}
@@ -50,6 +51,22 @@ def random_gaussians(
         "sh": 0.3 * normal(n, (sh_degree + 1) ** 2, 3),
     }
     return Gaussians.pack(attributes).to(dtype).to(torch.float64)
+
+
+ANTIALIASED: dict[Antialias, RenderSettings] = {
+    "mip": RenderSettings(antialias="mip"),
+    "mip-plain": RenderSettings(antialias="mip-plain", blur=0.1),
+    "mip-splatting": RenderSettings(antialias="mip-splatting", blur=0.1),
+}
+MODES: dict[Antialias, RenderSettings] = {"none": RenderSettings(), **ANTIALIASED}
+
+
+def filtered(gaussians: Gaussians, antialias: Antialias) -> Gaussians:
+    """The Gaussians with a 3-D filter about as wide as they are, where the mode has one."""
+    if antialias != "mip-splatting":
+        return gaussians
+    generator = torch.Generator().manual_seed(9)
+    return gaussians.with_filter(0.15 * torch.rand(len(gaussians), generator=generator).double())
 
 
 def random_like(shape: tuple[int, ...] | torch.Size, seed: int) -> Tensor:

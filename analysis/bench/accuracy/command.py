@@ -190,7 +190,7 @@ def run_accuracy(options: BenchOptions) -> int:
             if isinstance(case.operator, DenseOperator) and not options.quantity:
                 runs += [run for seed in range(PRECISION_SEEDS) for run in precision_runs(case, SEED + seed)]
     for sentence in missing:
-        console.print(sentence, style="yellow", highlight=False, soft_wrap=True)
+        console.print(sentence, style="yellow", highlight=False, soft_wrap=True, markup=False)
     _report(pd.DataFrame(vars(run) for run in runs), options, cases, console)
     return 0
 
@@ -229,8 +229,8 @@ def _report(table: pd.DataFrame, options: BenchOptions, cases: Sequence[Case], c
         console.print(rich_table(shown, "what rounding adds to z.Hz, over |z| |Hz|"))
     for name, data in {"accuracy": table, "accuracy_points": means, "accuracy_ratios": found}.items():
         write_table(data, options.out / f"{name}.csv", console)
-    draw("accuracy", options.out / "accuracy_points.csv")
-    console.print(f"{options.out}/accuracy_*.png", soft_wrap=True, highlight=False)
+    for line in (*draw("accuracy", options.out / "accuracy_points.csv"), f"{options.out}/accuracy_*.png"):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
     verdicts = [row["holds"] for row in found.to_dict("records") if row["against"] == "peer" and row["holds"]]
     counts = (f"{verdicts.count(word)} {word}" for word in ("yes", "no", "open"))
     console.print(f"of {len(verdicts)} that are asked for: {', '.join(counts)}", highlight=False)

@@ -116,10 +116,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         )  # fmt: skip
         _write(folder, data)
         with stages.stage("pictures"):
-            try:
-                data.notes += drawn(folder)
-            except RuntimeError as error:  # the numbers stand without pictures
-                data.notes.append(" ".join(str(error).split()))
+            data.notes += drawn(folder)
         data.timing = {**stages.timing, "total": perf_counter() - start}
         _write(folder, data)
     if found.ends:

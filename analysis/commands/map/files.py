@@ -4,18 +4,17 @@ import numpy as np
 import pandas as pd
 import torch
 from jaxtyping import Bool, Float64
-from matplotlib import colormaps
 from torch import Tensor
 
-from analysis.records.quantities import Shade
+from analysis.records.quantities import GREY, Shade
 from splat.curvature.fields import Values
 from splat.curvature.objective import SceneObjective
 from splat.model.files.splat_ply import splat_ply
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
+from splat.projection.antialias import baked
 
 TOP = 100
-NOTHING = 0.5  # grey of what has no value
 
 
 def fields_ply(gaussians: Gaussians, seen: Bool[Tensor, " n"], values: Values) -> bytes:
@@ -29,18 +28,15 @@ def fields_ply(gaussians: Gaussians, seen: Bool[Tensor, " n"], values: Values) -
 
 def coloured_ply(gaussians: Gaussians, seen: Bool[Tensor, " n"], shade: Shade, values: Float64[Tensor, " m"]) -> bytes:
     """All Gaussians, each in the colour of its value, the same from everywhere."""
-    rgb = torch.full((len(gaussians), 3), NOTHING)
+    rgb = torch.full((len(gaussians), 3), GREY / 255)
     rgb[seen] = torch.from_numpy(colours(shade, values.numpy()))
     attributes = gaussians.attributes | {"sh": ((rgb - 0.5) / Y00)[:, None].to(gaussians.flat)}
-    return splat_ply(Gaussians.pack(attributes))
+    return splat_ply(baked(Gaussians.pack(attributes).with_filter(gaussians.filter_widths)))
 
 
 def colours(shade: Shade, values: np.ndarray) -> np.ndarray:
     """(n, 3) in [0, 1], float32."""
-    share = shade.share(values)
-    found = colormaps[shade.colours](np.nan_to_num(share))[:, :3].astype(np.float32)
-    found[np.isnan(share)] = NOTHING
-    return found
+    return (shade.palette[shade.bytes(values)] / 255).astype(np.float32)
 
 
 def top_table(objective: SceneObjective, values: Values, by: str) -> pd.DataFrame:

@@ -1,4 +1,4 @@
-"""Options of the commands that put exact curvature to use: `landscape prune` and `next-view`."""
+"""Options of the commands that put exact curvature to use: `landscape prune`, `next-view`, `uncertainty`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,4 +59,21 @@ class NextViewOptions:
     """Folder of the scene: where it has moved since the training, or of another tool's file."""
     out: Unset[Path] = None
     """Folder of the results.  Default: next-view, beside the checkpoint; of a study as its file says."""
+    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+
+
+@dataclass(frozen=True)
+class UncertaintyOptions:
+    """Show what a scene does not know of its held-out views beside its true errors there, and how well the two agree."""
+
+    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
+    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    samples: int = 64
+    """Random vectors for the variance of a pixel, which is known to a share of sqrt(2 / samples)."""
+    seed: int = 0
+    """Seed of these."""
+    scene: Unset[Path] = None
+    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    out: Unset[Path] = None
+    """Folder of the results.  Default: uncertainty, beside the checkpoint."""
     foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)

@@ -41,10 +41,8 @@ def run_claims(options: ClaimsOptions) -> int:
     for name, table in {FILE: rows, "claims.csv": effect_table(found), "predictors.csv": related}.items():
         write_atomically(out / name, table.to_csv(index=False).encode())
     write_atomically(out / "claims.json", json_text(plain([asdict(each) for each in found])).encode())
-    try:
-        draw("claims", out)
-    except RuntimeError as error:  # the verdicts stand without pictures
-        console.print(" ".join(str(error).split()), style="yellow", highlight=False, markup=False, soft_wrap=True)
+    for note in draw("claims", out):
+        console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
     write_atomically(out / "claims.html", render_page(rows, found, out).encode())
     _print(rows, found, console)
     console.print(

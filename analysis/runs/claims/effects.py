@@ -103,8 +103,7 @@ def decide(effect: Effect) -> Verdict:
 def numbers(rows: pd.DataFrame, name: str, method: str | None = None) -> pd.Series:
     """A quantity of all runs, or of one method's, by scene and seed; none where no run has it."""
     part = rows if method is None else rows[rows["method"] == method]
-    if name not in part:
-        return pd.Series(dtype=float)
+    part = part if name in part else part[:0].assign(**{name: 0.0})
     found = pd.Series(part[name].to_numpy(float), pd.MultiIndex.from_frame(pd.DataFrame(part[["scene", "seed"]])))
     return found[np.isfinite(found)]
 

@@ -23,6 +23,7 @@
 A number that a run does not have is empty.
 """
 
+import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from math import log, nan, sqrt
@@ -46,6 +47,7 @@ from splat.training.state import LearningRates, TrainConfig
 
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
+TEXTS = ("scene", "method", "size", "date", "machine", "commit")  # of the columns; the others hold numbers
 SAMPLES = 10  # the paper's B
 
 
@@ -54,10 +56,7 @@ def study(paths: Sequence[Path]) -> pd.DataFrame:
 
     InputError where there is no run, or one twice.
     """
-    tables = [pd.read_csv(path) if path.is_file() else pd.DataFrame(map(row_of, _runs(path))) for path in paths]
-    for path, table in zip(paths, tables, strict=True):
-        if missing := [key for key in KEYS if key not in table]:
-            raise InputError(f"expected the table of a study in {path}, got one without the column {missing[0]}")
+    tables = [_stored(path) if path.is_file() else pd.DataFrame(map(row_of, _runs(path))) for path in paths]
     rows = pd.concat(tables, ignore_index=True)
     if rows.duplicated(list(KEYS)).any():
         twice = rows[rows.duplicated(list(KEYS))].iloc[0]
@@ -65,6 +64,22 @@ def study(paths: Sequence[Path]) -> pd.DataFrame:
             f"expected every run once, got {twice['method']} with seed {twice['seed']} of {twice['scene']} twice"
         )
     return rows
+
+
+def _stored(path: Path) -> pd.DataFrame:
+    """The rows of a table that was written as FILE.  InputError where a column is missing, or has other than numbers."""
+    try:
+        table = pd.read_csv(path, dtype=dict.fromkeys(TEXTS, str), keep_default_na=False, na_values=[""])
+    except (ValueError, OverflowError) as error:  # pandas names no file
+        raise InputError(f"expected the table of a study in {path}, got {error}") from None
+    if missing := [key for key in KEYS if key not in table]:
+        raise InputError(f"expected the table of a study in {path}, got one without the column {missing[0]}")
+    for name in table.columns.difference(TEXTS):
+        numbers = pd.Series(pd.to_numeric(table[name], errors="coerce"))
+        if len(wrong := table[name][numbers.isna() & (table[name].notna() | (name in KEYS))]):
+            raise InputError(f"expected numbers as {name} in {path}, got {reprlib.repr(wrong.iloc[0])}")
+        table[name] = numbers
+    return table
 
 
 def _runs(path: Path) -> Iterator[Path]:

@@ -10,14 +10,11 @@ What is there already is not done again: the next start continues where the last
 number of threads, only the seconds do.
 """
 
-import fcntl
 import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -39,6 +36,7 @@ from analysis.runs.sweep.sweep_results import PROBE, of_other_threads, summarize
 from analysis.train.command import planned, resumed
 from landscape.errors import InputError
 from splat.losses.reference import LossSettings
+from splat.model.untrusted import locked
 
 CELL_FAILED = 1
 LOCK = ".lock"
@@ -53,7 +51,9 @@ def run_sweep(options: SweepOptions) -> int:
     sweep = read_sweep(options.file, options.out, options.probe)
     to_do = {cell.name: missing(cell, sweep) for cell in sweep.cells}
     sweep.out.mkdir(parents=True, exist_ok=True)
-    with locked(sweep.out) as lock, interruption() as interrupted:
+    # its commands inherit the lock: one that was killed alone leaves them at work
+    alone = f"no other sweep in {sweep.out}, nor a command that one left behind"
+    with locked(sweep.out / LOCK, alone) as lock, interruption() as interrupted:
         cells = _Cells(sweep, to_do, options.jobs, interrupted, lock)
         cells.run()
     return _conclude(cells, interrupted.exit_code)
@@ -83,19 +83,6 @@ def _probed(cell: Cell, options: ProbeOptions, loss: LossSettings) -> bool:
     asked = loss_name(LossSettings() if options.loss == "3dgs" else loss)
     whole = bool(data.split_control) or not options.split_control
     return data.provenance.iteration == cell.steps and whole and (data.objective.loss or asked) == asked
-
-
-@contextmanager
-def locked(out: Path) -> Iterator[int]:
-    """A lock on the folder, as a file that the commands of a sweep inherit: one killed alone leaves them at work."""
-    with (out / LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"expected no other sweep at work in {out}, got one, or a command that it left behind; wait until it ends"
-            ) from None
-        yield file.fileno()
 
 
 class _Cells:

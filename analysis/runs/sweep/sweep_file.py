@@ -18,9 +18,9 @@
     method = "stablegs"                      # and any option of `landscape train`, for this method
     set = { vsp_weight = 0, probe.attributes = ["means"] }
 
-Paths are relative to the file.  An option of a method goes before one of a scene, and that before one of the top.  A cell is
-one run of `landscape train` in OUT/SCENE/METHOD/SEED; all of the first seed come before those of the second, so that a sweep
-that is stopped has compared like with like.
+Paths are relative to the file; {seed} in `from`, a checkpoint to start from, stands for the cell's seed.  An option of a method
+goes before one of a scene, and that before one of the top.  A cell is one run of `landscape train` in OUT/SCENE/METHOD/SEED;
+all of the first seed come before those of the second, so that a sweep that is stopped has compared like with like.
 """
 
 import re
@@ -34,13 +34,13 @@ from analysis.console.overrides import leaves, read_value
 from analysis.probe.options import ProbeOptions
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError
+from splat.training.methods.methods import METHODS
 from splat.training.methods.protocols import presets
-from splat.training.state import TrainConfig
 
 FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
 OF_THE_CELL = {"checkpoint", "out", "scene", "foreign"}  # options of probe that the cell decides
-TRAINING = {name: hint for name, hint in get_type_hints(TrainOptions).items() if name not in OF_THE_SWEEP}
+TRAINING = {name.strip("_"): hint for name, hint in get_type_hints(TrainOptions).items() if name not in OF_THE_SWEEP}
 PROBING = {name: hint for name, hint in get_type_hints(ProbeOptions).items() if name not in OF_THE_CELL}
 TOP = {"out": Path, "seeds": tuple[int, ...]}
 SCENE, METHOD = {"path": Path}, {"method": str}
@@ -56,7 +56,8 @@ class Cell:
 
     @property
     def steps(self) -> int:
-        preset = presets(self.training.method, self.training.protocol).get("iterations", TrainConfig.iterations)
+        usual = METHODS[self.training.method].ITERATIONS
+        preset = presets(self.training.method, self.training.protocol).get("iterations", usual)
         return int(preset if self.training.iterations is None else self.training.iterations)
 
     @property
@@ -121,11 +122,18 @@ def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -
         for method, method_table in tables["methods"].items()
     }
     cells = tuple(
-        Cell(scene, method, TrainOptions(**options, seed=seed, out=folder / scene / method / str(seed)))
+        Cell(scene, method, _options(options, seed, folder / scene / method / str(seed)))
         for seed in seeds
         for (scene, method), options in pairs.items()
     )
     return Sweep(file, folder, cells, None if table is None else _probe(table, file))
+
+
+def _options(options: Mapping[str, Any], seed: int, out: Path) -> TrainOptions:
+    """Of a cell; {seed} in the checkpoint that it starts from is its seed."""
+    start = options.get("from")
+    rest = {name: value for name, value in options.items() if name != "from"}
+    return TrainOptions(**rest, seed=seed, out=out, from_=start and Path(str(start).replace("{seed}", str(seed))))
 
 
 def _probe(table: Any, file: Path) -> ProbeOptions:
@@ -201,7 +209,7 @@ def arguments(command: str, options: TrainOptions | ProbeOptions) -> list[str]:
     words = [command, str(getattr(options, positional.name))]
     for field in named:
         value = getattr(options, field.name)
-        option = field.name.replace("_", "-")
+        option = field.name.strip("_").replace("_", "-")
         if value == (field.default if field.default_factory is MISSING else field.default_factory()):
             continue
         if isinstance(value, bool):

@@ -176,9 +176,13 @@ def _jacobian_rows(views: Sequence[ProjectionJacobian], start: int, stop: int, b
         i, at = index[here] - start, 9 * m
         geometry = torch.as_tensor(held.jacobian)[here].double()
         harmonic = torch.as_tensor(held.harmonic)[here, :bands].double()
+        opacity = torch.as_tensor(held.opacity_slope)[here].double()
         slope, visible = (torch.as_tensor(part)[here].double() for part in (held.colour_slope, held.visible))
         rows[i, at : at + 5, :GEOMETRY] = geometry
-        rows[i, at + 5, GEOMETRY] = 1.0
+        rows[i, at + 5, GEOMETRY] = 1.0  # a logit counts as seen however flat the sigmoid is
+        if opacity.shape[1]:
+            rows[i, at + 5, :GEOMETRY] = opacity
+            rows[i, at + 5, GEOMETRY] = torch.as_tensor(held.logit_slope)[here].double()
         for c in range(3):
             first = GEOMETRY + 1 + c
             rows[i, at + 6 + c, :3] = visible[:, c, None] * slope[:, c]

@@ -104,7 +104,7 @@ def channel_sum(gaussians: Gaussians) -> Gaussians:
     sh = torch.zeros_like(gaussians.sh)
     sh[:, :, 0] = gaussians.sh.sum(dim=2)
     sh[:, 0] += torch.tensor([1.0, -0.5, -0.5]).to(sh) / Y00  # a channel is 1/2 + Y00 times its first coefficient
-    return Gaussians.pack(gaussians.attributes | {"sh": sh})
+    return Gaussians.pack(gaussians.attributes | {"sh": sh}).with_filter(gaussians.filter_widths)
 
 
 def _red(value: Float[Tensor, ""]) -> Float[Tensor, "3"]:

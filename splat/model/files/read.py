@@ -2,6 +2,7 @@
 
 import ast
 import io
+import re
 import zipfile
 import zlib
 from dataclasses import replace
@@ -13,9 +14,14 @@ from splat.model.files import quantised, tensor_files
 from splat.model.files.ply import MAGIC, read_header
 from splat.model.files.splat_file import SplatFile
 from splat.model.files.splat_ply import read_splat_ply
+from splat.model.untrusted import require_modest
 
 ZIP_MAGIC, LICHTFELD = b"PK\x03\x04", (b"LFKP", b"PKFL")
 LONGEST_SETTINGS = 1 << 16
+ANTIALIASED = (  # of gsplat's and nerfstudio's settings, in the folder above that of the checkpoint
+    ("cfg.yml", re.compile(rb"^antialiased: true\s*$", re.M)),
+    ("config.yml", re.compile(rb"^\s+rasterize_mode: antialiased\s*$", re.M)),
+)
 KINDS = "PLY, a checkpoint of graphdeco, gsplat or nerfstudio, .splat, compressed PLY, .spz or .sog"
 
 
@@ -30,6 +36,7 @@ def is_foreign(path: Path) -> bool:
             return start.startswith(known) or path.suffix.lower() == ".splat"
         try:
             with zipfile.ZipFile(file) as archive:
+                require_modest(archive)
                 return not tensor_files.is_own(archive) and (
                     tensor_files.is_tensor_file(archive) or quantised.is_sog(archive)
                 )
@@ -79,7 +86,8 @@ def _with_settings(found: SplatFile, path: Path) -> SplatFile:
     model = path.resolve().parents[2] if parts[-3:-2] == ("point_cloud",) else path.resolve().parent
     settings = read_cfg_args(model / "cfg_args") if found.format in ("PLY", "graphdeco checkpoint") else {}
     if not settings:
-        return found
+        said = any(_says(path.resolve().parents[1] / name, line) for name, line in ANTIALIASED)
+        return replace(found, antialiased=found.antialiased or said)
     step = found.step
     if step is None and parts[-2].removeprefix("iteration_").isdigit():
         step = int(parts[-2].removeprefix("iteration_")[:9])
@@ -90,6 +98,11 @@ def _with_settings(found: SplatFile, path: Path) -> SplatFile:
         antialiased=found.antialiased or settings.get("antialiasing") is True,
         settings=settings,
     )
+
+
+def _says(path: Path, line: re.Pattern[bytes]) -> bool:
+    """Whether a file of settings has this line.  It is YAML with tags that would make Python objects, so it is not parsed."""
+    return path.is_file() and path.stat().st_size <= LONGEST_SETTINGS and bool(line.search(path.read_bytes()))
 
 
 def read_cfg_args(path: Path) -> dict[str, Any]:

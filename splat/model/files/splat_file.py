@@ -35,8 +35,8 @@ class SplatFile:
     notes: tuple[str, ...] = ()
 
 
-def packed(attributes: Mapping[str, np.ndarray]) -> Gaussians:
-    """Gaussians from the five attributes, of which `sh` has all bands.
+def packed(attributes: Mapping[str, np.ndarray], filter_widths: np.ndarray | None = None) -> Gaussians:
+    """Gaussians from the five attributes, of which `sh` has all bands, and the widths of their 3-D filter.
 
     InputError where their shapes or the SH degree cannot be.  Numbers that are not finite are found by `require_finite`.
     """
@@ -54,6 +54,8 @@ def packed(attributes: Mapping[str, np.ndarray]) -> Gaussians:
         gaussians = Gaussians.pack(tensors)
     except ValueError as error:
         raise InputError(f"its attributes do not fit together: {error}") from error
+    if filter_widths is not None:
+        gaussians = gaussians.with_filter(torch.from_numpy(filter_widths))
     gaussians.require_finite()
     return gaussians
 

@@ -5,8 +5,7 @@ Postshot, OpenSplat, Mip-Splatting.
     opacity               logits                     f_dc_0..2     the constant band of SH
     f_rest_0..(3 m - 1)   the other bands, all of red, then of green, then of blue
     red green blue        in place of f_dc: colours of 8 bits
-    filter_3D             Mip-Splatting's 3-D filter f, which is baked in:
-                          s' = sqrt(s^2 + f^2),   opacity' = opacity prod(s / s')
+    filter_3D             the width of Mip-Splatting's 3-D filter, world units (`splat/projection/antialias.py`)
 
 nx ny nz are dropped; every other number rides along.  What a tool says about itself stands in the comments.
 """
@@ -18,7 +17,7 @@ import numpy as np
 
 from landscape.errors import InputError
 from splat.model.files.ply import Header, Rows, ply_bytes, read_header, read_rows
-from splat.model.files.splat_file import SplatFile, logit, packed
+from splat.model.files.splat_file import SplatFile, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 
@@ -44,21 +43,17 @@ def read_splat_ply(content: bytes) -> SplatFile:
         "opacity_logits": _columns(rows, ["opacity"])[:, 0],
         "sh": _harmonics(rows),
     }
-    notes: list[str] = []
-    if "filter_3D" in rows.names:
-        attributes |= _filtered(attributes, _columns(rows, ["filter_3D"]))
-        notes.append("Mip-Splatting's 3-D filter was baked into scales and opacities: curvature is in the baked ones")
-    if "f_dc_0" not in rows.names:
-        notes.append("it has colours of 8 bits and no spherical harmonics")
+    widths = _columns(rows, ["filter_3D"])[:, 0] if "filter_3D" in rows.names else None
+    plain = "f_dc_0" not in rows.names
     further = [name for name in rows.names if name not in KNOWN and not NAMED.fullmatch(name)]
     return SplatFile(
-        packed(attributes),
+        packed(attributes, widths),
         "PLY",
         tool=_tool(header, rows),
-        antialiased="filter_3D" in rows.names or any(ANTIALIASED.match(line.strip()) for line in header.comments),
-        lossy="f_dc_0" not in rows.names,
+        antialiased=widths is not None or any(ANTIALIASED.match(line.strip()) for line in header.comments),
+        lossy=plain,
         extra={name: rows.numbers[name].astype(np.float32) for name in further},
-        notes=tuple(notes),
+        notes=("it has colours of 8 bits and no spherical harmonics",) if plain else (),
     )
 
 
@@ -91,16 +86,6 @@ def _harmonics(rows: Rows) -> np.ndarray:
     return np.concatenate([constant, rest.reshape(len(rows), 3, count // 3).transpose(0, 2, 1)], axis=1)
 
 
-def _filtered(attributes: Mapping[str, np.ndarray], width: np.ndarray) -> dict[str, np.ndarray]:
-    """Log-scales and logits with the 3-D filter of this width (n, 1) in them."""
-    with np.errstate(all="ignore"):  # what is not finite is refused with all else
-        squared = np.exp(2 * attributes["log_scales"].astype(np.float64))
-        log_scales = 0.5 * np.log(squared + width.astype(np.float64) ** 2)
-        opacity = 1 / (1 + np.exp(-attributes["opacity_logits"].astype(np.float64)))
-        opacity = opacity * np.exp((attributes["log_scales"] - log_scales).sum(axis=1))
-    return {"log_scales": log_scales, "opacity_logits": logit(opacity)[0]}
-
-
 def _tool(header: Header, rows: Rows) -> str | None:
     if "filter_3D" in rows.names:
         return "mip-splatting"
@@ -116,6 +101,8 @@ def _tool(header: Header, rows: Rows) -> str | None:
 def splat_ply(gaussians: Gaussians, extra: Mapping[str, np.ndarray] | None = None, tool: str | None = None) -> bytes:
     """A file with graphdeco's properties in graphdeco's order, float32, and then those of `extra`, (n,) each by name.
 
+    Gaussians with a 3-D filter get Mip-Splatting's property for it too.
+
     InputError where a further property has the name of one of the Gaussians', or another length.
     """
     n, values = len(gaussians), {k: v.detach().cpu().float().numpy() for k, v in gaussians.attributes.items()}
@@ -129,6 +116,8 @@ def splat_ply(gaussians: Gaussians, extra: Mapping[str, np.ndarray] | None = Non
         **{f"scale_{i}": column for i, column in enumerate(values["log_scales"].T)},
         **{f"rot_{i}": column for i, column in enumerate(values["quats"].T)},
     }
+    if gaussians.filter_widths is not None:
+        columns["filter_3D"] = gaussians.filter_widths.detach().cpu().float().numpy()
     for name, column in (extra or {}).items():
         if name in columns or not re.fullmatch(r"\w+", name) or np.shape(column) != (n,):
             raise InputError(

@@ -26,6 +26,7 @@ from landscape.errors import InputError, lacks_memory
 from splat.model.files.splat_file import SplatFile, packed
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
+from splat.model.untrusted import require_modest
 
 RANK = re.compile(r"(.*_rank)(\d+)(\.pt)")
 OWN = b"splat-landscape checkpoint"
@@ -63,6 +64,7 @@ def load_tensors(content: bytes) -> Any:
     """What `torch.save` wrote, on the CPU.  Its members are as large as in the file, and their checksums right."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            require_modest(archive)
             if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
                 raise InputError("its members are compressed, which torch.save does not do")
             if wrong := archive.testzip():
@@ -90,13 +92,14 @@ def _numpy_scalars() -> list[Any]:
 def _array(values: Any, key: Any, *shape: int | None) -> np.ndarray:
     """A tensor of finite size as float32; None in the shape: any length."""
     value = values[key] if not isinstance(values, Mapping) or key in values else None
-    if not isinstance(value, Tensor) or value.layout is not torch.strided or not value.dtype.is_floating_point:
+    plain = isinstance(value, Tensor) and value.layout is torch.strided and not value.is_nested
+    if not plain or value.device.type != "cpu" or not value.dtype.is_floating_point:
         raise InputError(f"it has no tensor of numbers {key!r}")
     if value.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, value.shape)):
         raise InputError(f"its {key!r} has the shape {tuple(value.shape)}, expected {shape} (None: any)")
     if value.numel() * value.element_size() > value.untyped_storage().nbytes():
         raise InputError(f"its {key!r} repeats its numbers instead of holding them")
-    return value.detach().float().numpy()
+    return value.detach().resolve_neg().float().numpy()
 
 
 def _step(value: Any) -> int | None:
@@ -143,7 +146,7 @@ def _gsplat(ranks: list[Any]) -> SplatFile:
     parts: list[dict[str, np.ndarray]] = []
     for content in ranks:
         splats = content.get("splats") if isinstance(content, dict) else None
-        if not isinstance(splats, Mapping) or content.get("step") != ranks[0].get("step"):
+        if not isinstance(splats, Mapping) or _step(content.get("step")) != _step(ranks[0].get("step")):
             raise InputError("a rank beside it is of another kind or of another step")
         if "sh0" not in splats and ("features" in splats or "colors" in splats):
             raise InputError(

@@ -11,8 +11,8 @@ the row, the columns are blurred first, of D f, D f v, D f v^2 and w f; along th
 
     blur(u F) = u B_0 + along B_1       blur(u^2 F) = u^2 B_0 + 2 u along B_1 + along^2 B_2       B_j = sum_t t^j g_t F(x + t)
 
-A splat's rows go through a ring, as in `losses/cpu/window.py`, which holds every row twice so that those of a window lie one
-after the other.  Sums leave single precision every FLUSH rows.
+A splat's rows go through a ring, in columns that begin with the first window that reaches a pixel of the splat.  Sums leave
+single precision every FLUSH rows.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ FIELDS = FACTORS * POWERS
 SLOPES = 7  # of a channel, in the order of `BLOCK`: six of geometry, one of its colour
 PAIRS = SLOPES * (SLOPES + 1) // 2
 RING = 16  # rows, at least the window's
-EDGE = 32  # floats at either side of a row: a vector and the window's reach
+EDGE = 16  # floats at either side of a row: at least a vector, and the window's reach
 FLUSH = 16
 MIDDLE, *TAPS = (float(tap) for tap in window(torch.float64)[REACH:])
 TAPS = tuple(TAPS)
@@ -47,32 +47,67 @@ def coupled_blocks(counter, index, params, frame, size, footprints, begin, found
     seconds: as of `Coupling`.
     """
     L = lanes(params)
-    pitch = frame.stride + 2 * EDGE
-    ring, rows = scratch(params, 2 * RING * FIELDS * frame.stride), scratch(params, FIELDS * pitch)
-    low, high = np.empty(RING, np.int64), np.empty(RING, np.int64)
+    widest = FIELDS * (frame.stride + 2 * EDGE)
+    ring, rows = scratch(params, RING * widest), scratch(params, widest)
+    spans, own = np.empty((frame.size // frame.stride, 2), np.int64), scratch(params, L)
+    corners = np.empty((frame.size // (TILE_ROWS * L), 2), np.int64)
     moved, sums, total = scratch(params, FACTORS * SLOPES * L), scratch(params, PAIRS * L), np.empty(PAIRS)
     part = np.empty(PAIRS, params.dtype)
     turn = fetch_and_increment(counter)
     while turn < index.size:
         splat = index[turn]
-        box = box_of_rows(footprints, splat, frame, L)
-        for channel in range(3):
-            planes = (image, target, seconds, channel * frame.size)
-            work = (ring, rows, low, high, moved, sums)
-            couple(params, splat, channel, box, frame, size, footprints, begin, found, planes, work, part, total)
-            spread(total, channel, blocks[turn])
+        y0, y1 = find_spans(params, splat, frame, size[1], footprints, begin, found, corners, spans, own)
+        if y0 <= y1:
+            box = box_of_windows(spans, y0, y1, frame, size[1], L)
+            for channel in range(3):
+                planes = (image, target, seconds, channel * frame.size)
+                work = (ring, rows, corners, spans, moved, sums)
+                couple(params, splat, channel, box, frame, size, footprints, begin, found, planes, work, part, total)
+                spread(total, channel, blocks[turn])
         turn = fetch_and_increment(counter)
 
 
 @formula
-def box_of_rows(footprints, splat, frame, L):
-    """First and last row of a splat, and its first and last column of tiles, in pixels."""
-    y0, y1, x0, x1 = np.int64(1 << 40), np.int64(-1), np.int64(1 << 40), np.int64(-1)
-    for a in range(footprints.splat_start[splat], footprints.splat_start[splat + 1]):
-        top, bottom = row_range(footprints.rows[a])
+def find_spans(params, splat, frame, width, footprints, begin, found, corners, spans, own):
+    """First and last column in which a splat has weight, for each of its rows; its first and last row that have one.
+
+    corners: of the tiles of its intersections, row and column.
+    """
+    L = lanes(params)
+    first, last = footprints.splat_start[splat], footprints.splat_start[splat + 1]
+    y0, y1, done = frame.size, np.int64(-1), np.int64(0)
+    for a in range(first, last):
         row, column = footprints.tiles[a] // frame.columns * TILE_ROWS, footprints.tiles[a] % frame.columns * L
-        y0, y1, x0, x1 = min(y0, row + top), max(y1, row + bottom - 1), min(x0, column), max(x1, column)
-    return y0, y1, x0, x1
+        corners[a - first, 0], corners[a - first, 1] = row, column
+        for y in range(max(row, done), row + TILE_ROWS):
+            spans[y, 0], spans[y, 1] = frame.stride, -1
+        done = row + TILE_ROWS
+        top, bottom = row_range(footprints.rows[a])
+        for y in range(top, bottom):
+            store(own, 0, load(found, (footprints.place[a] - footprints.place[begin] + y - top) * FOOTPRINT * L))
+            for x in range(min(L, width - column)):
+                if own[x] > 0:
+                    spans[row + y, 0], spans[row + y, 1] = min(spans[row + y, 0], column + x), column + x
+                    y0, y1 = min(y0, row + y), max(y1, row + y)
+    return y0, y1
+
+
+@formula
+def hull_of(spans, first, last):
+    """First and last column of some rows."""
+    lo, hi = spans[first, 0], spans[first, 1]
+    for y in range(first + 1, last + 1):
+        lo, hi = min(lo, spans[y, 0]), max(hi, spans[y, 1])
+    return lo, hi
+
+
+@formula
+def box_of_windows(spans, y0, y1, frame, width, L):
+    """First and last row of a splat, the first column of its windows, and how many vectors of them there are."""
+    lo, hi = hull_of(spans, y0, y1)
+    left = max(lo - REACH, 0)
+    vectors = (min(hi + REACH, width - 1) - left) // L + 1
+    return y0, y1, min(left, frame.stride - vectors * L), vectors
 
 
 @formula
@@ -92,32 +127,28 @@ def spread(total, channel, block):
 @formula
 def couple(params, splat, channel, box, frame, size, footprints, begin, found, planes, work, part, total):
     """The sums over all windows of a channel's M . S'' M, for every pair of slopes: total (PAIRS,)."""
-    ring, rows, low, high, moved, sums = work
-    y0, y1, x0, x1 = box
+    ring, _rows, _corners, spans, _moved, sums = work
+    y0, y1, left, vectors = box
     L = lanes(params)
-    width = x1 + L - x0
-    low[:], high[:] = frame.stride, -1
-    ring[: 2 * RING * FIELDS * width] = 0
+    pitch = vectors * L + 2 * EDGE
     sums[:], total[:] = 0, 0
+    for y in range(y0 - 2 * REACH, y0):
+        clear_row(ring, y, vectors, pitch, L)
     behind, a = 0, footprints.splat_start[splat]
     for ahead in range(y0, y1 + 2 * REACH + 1):
-        slot = ahead & (RING - 1)
-        to = slot * FIELDS * width
-        low[slot], high[slot] = frame.stride, -1
+        clear_row(ring, ahead, vectors, pitch, L)
         if ahead <= y1:
             a = feed_row(params, splat, channel, ahead, box, frame, size[1], footprints, a, begin, found, planes, work)
-        else:
-            for j in range(to, to + FIELDS * width, L):
-                store(ring, j, 0.0)
-                store(ring, j + RING * FIELDS * width, 0.0)
         row = ahead - REACH
         if row < 0 or row >= size[0]:
             continue
-        lo, hi = low.min(), high.max()
+        lo, hi = hull_of(spans, max(row - REACH, y0), min(row + REACH, y1))
         if hi < 0:
             continue
-        blur_columns(ring, ((row - REACH) & (RING - 1)) * FIELDS * width - x0, width, lo, hi, rows, frame, L)
-        add_windows(params, splat, row, lo, hi, frame, planes, rows, moved, sums)
+        lo, hi = lo - left, hi - left
+        window = (max(lo - REACH, 0) // L * L, min((hi + REACH) // L, vectors - 1) * L)
+        blur_columns(work, row, lo // L * L, hi, window, pitch, L)
+        add_windows(params, splat, row, left, window, frame, planes, pitch, work)
         behind += 1
         if behind == FLUSH:
             flush(sums, L, part, total)
@@ -126,45 +157,38 @@ def couple(params, splat, channel, box, frame, size, footprints, begin, found, p
 
 
 @formula
+def clear_row(ring, y, vectors, pitch, L):
+    base = slot(y) * FIELDS * pitch + EDGE
+    for at in range(base, base + FIELDS * pitch, pitch):
+        for x in range(at, at + vectors * L, L):
+            store(ring, x, 0.0)
+
+
+@formula
 def feed_row(params, splat, channel, y, box, frame, image_width, footprints, a, begin, found, planes, work):
     """A row of the fields to the ring; a: an accumulator of the splat, at or before this row of tiles; where to begin next."""
-    ring, _rows, low, high, _moved, _sums = work
-    _y0, _y1, x0, x1 = box
+    ring, _rows, corners, spans, _moved, _sums = work
+    _y0, _y1, left, vectors = box
     L = lanes(params)
-    width, slot = x1 + L - x0, y & (RING - 1)
-    last, tile_row = footprints.splat_start[splat + 1], y // TILE_ROWS
-    while footprints.tiles[a] // frame.columns < tile_row:
+    pitch, row = vectors * L + 2 * EDGE, y & -TILE_ROWS
+    base = slot(y) * FIELDS * pitch + EDGE - left
+    first, last = footprints.splat_start[splat], footprints.splat_start[splat + 1]
+    while corners[a - first, 0] < row:
         a += 1
-    at, done = a, x0
-    lo, hi = frame.stride, np.int64(-1)
-    base = slot * FIELDS * width - x0
-    while at < last and footprints.tiles[at] // frame.columns == tile_row:
+    at = a
+    while at < last and corners[at - first, 0] == row:
         top, bottom = row_range(footprints.rows[at])
-        inside = y - tile_row * TILE_ROWS
-        if top <= inside < bottom:
-            x = np.int64(footprints.tiles[at] % frame.columns) * L
-            lo, hi = min(lo, x), x
-            clear_columns(ring, base, done, x, width, L)
+        inside, x = y - row, corners[at - first, 1]
+        if top <= inside < bottom and x <= spans[y, 1] and x + L > spans[y, 0]:
             where = (footprints.place[at] - footprints.place[begin] + inside - top) * FOOTPRINT * L
-            feed(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, base + x, width)
-            done = x + L
+            feed(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, base + x, pitch)
         at += 1
-    clear_columns(ring, base, done, x1 + L, width, L)
-    low[slot], high[slot] = lo, hi
     return a
 
 
 @formula
-def clear_columns(ring, base, start, stop, width, L):
-    for field in range(FIELDS):
-        for x in range(start, stop, L):
-            store(ring, base + field * width + x, 0.0)
-            store(ring, base + (RING * FIELDS + field) * width + x, 0.0)
-
-
-@formula
-def feed(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, to, width):
-    """The fields of the lanes at x, to both copies of their row."""
+def feed(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, to, pitch):
+    """The fields of the lanes at x."""
     L = lanes(params)
     image, target, _seconds, top = planes
     _u, terms = alpha_terms(params, splat * PARAMS, x, y)
@@ -173,11 +197,9 @@ def feed(params, splat, x, y, channel, frame, image_width, where, found, planes,
     w, D = select(inside, load(found, where), 0.0), select(inside, load(found, where + (1 + channel) * L), 0.0)
     aim = load(target, top + y * frame.stride + x)
     residual = load(image, top + y * frame.stride + x) - aim
-    for _copy in range(2):
-        put_powers(ring, to, width, w, D, v)
-        put_powers(ring, to + POWERS * width, width, 2.0 * residual * w, 2.0 * residual * D, v)
-        put_powers(ring, to + 2 * POWERS * width, width, (aim - CENTRE) * w, (aim - CENTRE) * D, v)
-        to += RING * FIELDS * width
+    put_powers(ring, to, pitch, w, D, v)
+    put_powers(ring, to + POWERS * pitch, pitch, 2.0 * residual * w, 2.0 * residual * D, v)
+    put_powers(ring, to + 2 * POWERS * pitch, pitch, (aim - CENTRE) * w, (aim - CENTRE) * D, v)
 
 
 @formula
@@ -187,6 +209,12 @@ def put_powers(ring, to, width, w, D, v):
     store(ring, to + width, Dv)
     store(ring, to + 2 * width, Dv * v)
     store(ring, to + 3 * width, w)
+
+
+@formula
+def slot(y):
+    """The place of a row in the ring."""
+    return y & (RING - 1)
 
 
 @formula
@@ -217,31 +245,43 @@ def differences_around(array, at):
 
 
 @formula
-def blur_columns(ring, base, width, lo, hi, rows, frame, L):
-    """The window down the columns lo .. hi + L - 1 of every field, to bordered rows; base: of the window's first row."""
-    step, pitch, beyond = FIELDS * width, frame.stride + 2 * EDGE, 2 * max(L, 8)
-    for field in range(FIELDS):
-        to, at = field * pitch + EDGE, base + field * width + REACH * step
-        for x in range(lo, hi + L, L):
-            store(rows, to + x, load(ring, at + x) * MIDDLE + dot5(sums_around(ring, at + x, step), TAPS))
-        for x in range(0, beyond, L):
-            store(rows, to + lo - L - x, 0.0)
-            store(rows, to + hi + L + x, 0.0)
+def sums_over_rows(ring, at, row, step):
+    """The rows at either side of a row, added, at a place of each."""
+    return (
+        load(ring, at + slot(row + 1) * step) + load(ring, at + slot(row - 1) * step),
+        load(ring, at + slot(row + 2) * step) + load(ring, at + slot(row - 2) * step),
+        load(ring, at + slot(row + 3) * step) + load(ring, at + slot(row - 3) * step),
+        load(ring, at + slot(row + 4) * step) + load(ring, at + slot(row - 4) * step),
+        load(ring, at + slot(row + 5) * step) + load(ring, at + slot(row - 5) * step),
+    )
 
 
 @formula
-def add_windows(params, splat, row, lo, hi, frame, planes, rows, moved, sums):
-    """Add a row's windows to the sums; lo, hi: the columns of pixels that the splat moves."""
+def blur_columns(work, row, lo, hi, window, pitch, L):
+    """The window down the columns lo .. hi of every field; 0 in the other columns of the windows and beside them."""
+    ring, rows, _corners, _spans, _moved, _sums = work
+    step, (first, last) = FIELDS * pitch, window
+    for at in range(EDGE, EDGE + step, pitch):
+        for x in range(first - max(L, 8), last + max(L, 8) + L, L):
+            if lo <= x <= hi:
+                middle = load(ring, at + x + slot(row) * step) * MIDDLE
+                store(rows, at + x, middle + dot5(sums_over_rows(ring, at + x, row, step), TAPS))
+            else:
+                store(rows, at + x, 0.0)
+
+
+@formula
+def add_windows(params, splat, row, left, window, frame, planes, pitch, work):
+    """Add a row's windows to the sums."""
     _image, _target, seconds, top = planes
+    _ring, rows, _corners, _spans, moved, sums = work
     L = lanes(params)
-    along, pitch, size = broadcast(params, params[splat * PARAMS + ALONG]), frame.stride + 2 * EDGE, 3 * frame.size
-    first = max((lo - REACH) // L * L, 0)
-    last = min((hi + L - 1 + REACH) // L * L, frame.stride - L)
-    for x in range(first, last + L, L):
-        u, _terms = alpha_terms(params, splat * PARAMS, x, row)
+    along, size = broadcast(params, params[splat * PARAMS + ALONG]), 3 * frame.size
+    for x in range(window[0], window[1] + L, L):
+        u, _terms = alpha_terms(params, splat * PARAMS, left + x, row)
         for factor in range(FACTORS):
             blur_row(rows, POWERS * factor * pitch + EDGE + x, pitch, u, along, moved, SLOPES * factor * L)
-        p = top + row * frame.stride + x
+        p = top + row * frame.stride + left + x
         second = (
             load(seconds, p), load(seconds, p + size), load(seconds, p + 2 * size),
             load(seconds, p + 3 * size), load(seconds, p + 4 * size), load(seconds, p + 5 * size),

@@ -54,6 +54,8 @@ def read_dtu(root: Path) -> list[Photo]:
             matrix = np.loadtxt(position, dtype=np.float64).reshape(3, 4)
         except ValueError as error:
             raise InputError(f"expected a 3 x 4 matrix in {position}, cannot read it: {error}") from error
+        if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix[:, :3]) < 3:
+            raise InputError(f"expected a finite matrix of a camera in {position}, got {matrix.tolist()}")
         calibration, rotation, centre = decompose(matrix)
         size = image_header(path)[0]
         skew = abs(calibration[0, 1]) * size[1] / calibration[1, 1]

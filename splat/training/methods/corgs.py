@@ -94,6 +94,7 @@ class CoRGSMethod(Method[CoRGS]):
                 other = replace(other, gradient=other.gradient + settings.weight * found[1])
         partner.descend(other.gradient, step.number)
         partner.control_density(step.number, step.camera, other)
+        partner.update_filter(step.number, [view.camera for view in step.views])
         partner.step = step.number
         return base
 

@@ -8,6 +8,8 @@ dropoutgs       the image without a random share of the Gaussians agrees with th
 fsgs            new Gaussians between distant neighbours; depth correlates with the user's depth maps
 dngaussian      depth has the shape of the user's depth maps, globally and in small patches
 cor-gs          two fields: each keeps the Gaussians that the other confirms, and agrees with it between the views
+newton-blocks   in place of Adam: every Gaussian's own damped Newton step, all views at once, no density control
+gn-cg           in place of Adam: Gauss-Newton by conjugate gradients over all parameters, likewise
 
 >>> METHODS["stablegs"](warm_up=100).warm_up
 100
@@ -19,9 +21,23 @@ from splat.training.methods.depth.fsgs import FSGS
 from splat.training.methods.dropout.dropgaussian import DropGaussian
 from splat.training.methods.dropout.dropoutgs import DropoutGS
 from splat.training.methods.sam import SAM
+from splat.training.methods.second_order.gn_cg import GaussNewtonCG
+from splat.training.methods.second_order.newton_blocks import NewtonBlocks
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.state import MethodSettings, ThreeDGS
 
 METHODS: dict[str, type[MethodSettings]] = {
-    method.name: method for method in (ThreeDGS, StableGS, SAM, DropGaussian, DropoutGS, FSGS, DNGaussian, CoRGS)
+    method.name: method
+    for method in (
+        ThreeDGS,
+        StableGS,
+        SAM,
+        DropGaussian,
+        DropoutGS,
+        FSGS,
+        DNGaussian,
+        CoRGS,
+        NewtonBlocks,
+        GaussNewtonCG,
+    )
 }

@@ -24,12 +24,13 @@ from splat.losses.reference import psnr
 from splat.model.files.read import read_splats
 from splat.model.files.splat_file import SplatFile
 from splat.model.gaussians import Gaussians
+from splat.model.settings import RenderSettings
 from splat.render.render import render
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import Split, explicit_split, split_scene
 from splat.scenes.view import View
 from splat.training.origin.frames import Similarity, gsplat_frames, nerfstudio_frame, posed
-from splat.training.origin.presets import PRESETS, Preset, preset_of
+from splat.training.origin.presets import PRESETS, Preset, preset_of, render_of
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig, Training
 
@@ -45,7 +46,7 @@ class Foreign:
     """What a file of another tool does not say.
 
     scene: folder.  views: how many, by the scene's protocol; train_list: names of the training views.  trained_by: a name of
-    `PRESETS`.  images, downscale: as for `load_scene`.
+    `PRESETS`.  images, downscale: as for `load_scene`.  antialiased: whether its renderer was, where the file does not know.
     """
 
     scene: Path | None = None
@@ -54,6 +55,7 @@ class Foreign:
     trained_by: str | None = None
     images: str | None = None
     downscale: float | None = None
+    antialiased: bool | None = None
 
 
 def foreign_training(path: Path, ask: Foreign, picture: Path) -> tuple[Training, SceneReference, dict[str, Any]]:
@@ -67,15 +69,12 @@ def foreign_training(path: Path, ask: Foreign, picture: Path) -> tuple[Training,
     found = read_splats(path)
     name, source = preset_of(found.tool, ask.trained_by)
     preset = PRESETS[name]
-    if found.antialiased:
-        raise InputError(
-            f"expected Gaussians whose renderer was not antialiased, got {path}, which says that it was: this program "
-            "does not have that filter yet, and without it the picture is another"
-        )
+    antialiased = found.antialiased if ask.antialiased is None else ask.antialiased
+    render = render_of(preset, found.settings, antialiased=antialiased)
     scene, images, downscale = _scene(found, ask, preset)
     split, how = _split(scene, found, ask, path)
     reference = SceneReference.to(scene, path, split, images, downscale)
-    config = _config(scene, found, preset)
+    config = _config(scene, found, preset, render)
     world, level = _world(found.gaussians, scene, reference, config, _worlds(preset, scene, path), picture, name)
     similarity = None if world is None else world.tolist()
     reference = replace(reference, similarity=similarity, centred=preset.centred)
@@ -84,7 +83,8 @@ def foreign_training(path: Path, ask: Foreign, picture: Path) -> tuple[Training,
     training.step = found.step or 0
     notes = [*found.notes, *preset.different, *([LOSSY] if found.lossy else [])]
     said = {"format": found.format, "trained_by": name, "trained_by_source": source, "views": how, "notes": notes}
-    return training, reference, {**said, "psnr": level, "similarity": similarity, "preset": asdict(preset)}
+    conventions = asdict(replace(preset, render=render))
+    return training, reference, {**said, "psnr": level, "similarity": similarity, "preset": conventions}
 
 
 def _scene(found: SplatFile, ask: Foreign, preset: Preset) -> tuple[Scene, str | None, float]:
@@ -151,11 +151,11 @@ def _used(path: Path, scene: Scene) -> set[str]:
     return {name for name in scene.names if Path(name).stem in listed}
 
 
-def _config(scene: Scene, found: SplatFile, preset: Preset) -> TrainConfig:
-    """3DGS, with the preset's renderer and loss, on the scene's background."""
+def _config(scene: Scene, found: SplatFile, preset: Preset, render: RenderSettings) -> TrainConfig:
+    """3DGS, with the trainer's renderer and loss, on the scene's background."""
     red, green, blue = scene.background.tolist()
     return TrainConfig(
-        iterations=max(1, found.step or 1), background=(red, green, blue), render=preset.render, loss=preset.loss
+        iterations=max(1, found.step or 1), background=(red, green, blue), render=render, loss=preset.loss
     )
 
 

@@ -136,7 +136,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _rigid(matrix: np.ndarray, path: Path) -> Similarity:
-    matrix = matrix[:3]
+    matrix = np.atleast_1d(matrix)[:3]
     good = matrix.shape == (3, 4) and np.isfinite(matrix).all()
     if (
         not good

@@ -71,7 +71,7 @@ def test_a_splat_has_the_colour_of_its_value_and_none_is_grey(folder):
     shade = read_map(folder / "map").shades["largest"]
     written = read_splats(folder / "map" / "largest.ply").gaussians
     values = read_splats(folder / "map" / "fields.ply").extra["largest"]
-    assert written.sh_degree == 0 and written.sh[-1].abs().max() == 0
+    assert written.sh_degree == 0 and written.sh[-1].abs().max() < 0.01
     assert np.allclose(0.5 + Y00 * written.sh[:, 0].numpy(), colours(shade, values), atol=1e-6)
 
 

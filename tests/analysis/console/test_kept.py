@@ -51,7 +51,7 @@ def test_a_stage_that_was_kept_is_read_and_not_done_again(tmp_path):
     assert torch.equal(first.vector, read.vector) and read.error == inf and read.names == {"a": 0.1}
     assert read.inner.vector.dtype == torch.float32 and read.parts[0].shape == (2, 3)
     assert two.notes == one.notes == ["a note"] and two.counts == one.counts == [1]
-    assert kept_stages(tmp_path / "kept") == ["first"]
+    assert kept_stages(tmp_path / "kept") == ["first"] and two.has("first") and not two.has("second")
     second = two.run("second", Found, again)  # as if nothing had been kept
     assert second is not None and torch.equal(second.vector, _alone("second").vector)
 
@@ -62,12 +62,14 @@ def _alone(name) -> Found:
     return found
 
 
-@pytest.mark.parametrize("harm", ["another command", "damaged", "another type"])
+@pytest.mark.parametrize("harm", ["another command", "cut", "one bit", "another type"])
 def test_what_is_not_this_command_s_is_measured_again(tmp_path, harm):
     kept(tmp_path).run("first", Found, Work())
     file = tmp_path / "first.msgpack"
-    if harm == "damaged":
-        file.write_bytes(file.read_bytes()[:-3])
+    if harm in ("cut", "one bit"):
+        content = bytearray(file.read_bytes())
+        content[-9] ^= 1
+        file.write_bytes(file.read_bytes()[:-3] if harm == "cut" else bytes(content))
     work = Work()
     if harm == "another type":
         kept(tmp_path).run("first", dict[str, int], lambda *_: {"a": 1})

@@ -1,10 +1,11 @@
 """The eigenvectors of a scene with one needle are on the needle, and its picture, outline and sentence are of it."""
 
+import msgspec
 import numpy as np
 import pytest
 import torch
 
-from analysis.measures.steepest import End, crop_around, outline_of, steepest
+from analysis.measures.steepest import End, crop_around, outline_of, sentence, steepest
 from splat.curvature.fields import scene_fields
 from splat.curvature.hessian import SceneHessian
 from splat.projection.reference import project
@@ -33,6 +34,15 @@ def test_the_carrier_is_the_needle_and_the_sentence_says_so(shown):
     assert share == pytest.approx(float(end.vector[3:6].square().sum()))
     assert found.sentence.startswith(f"{share:.0%} of e₁, the steepest direction, moves Gaussian 1, a needle of ")
     assert "in the lower right of" in found.sentence and "seen by both views" in found.sentence
+
+
+def test_a_carrier_beyond_the_edge_is_said_to_be_there(shown):
+    objective, end, found, _ = shown
+    first, view = found.carriers[0], objective.views[0]
+    assert "outside" not in found.sentence
+    for x, said in ((-8.0, "in the lower left of"), (1e4, "in the lower right of")):
+        moved = msgspec.structs.replace(first, outline=[x, *first.outline[1:]])
+        assert f"{said} {view.name}, its centre outside of the picture, " in sentence(end, [moved], 1.0, view, 2)
 
 
 def test_steps_change_the_loss_as_the_curvature_has_it(shown):

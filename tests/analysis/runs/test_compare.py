@@ -186,7 +186,7 @@ def test_pictures_are_drawn_from_the_records_and_lie_in_the_page(trained, tmp_pa
     assert main(["compare", str(trained / "plain/0"), str(trained / "sam/0"), "--out", str(tmp_path)]) == 0
     drawn = sorted(path.stem for path in tmp_path.glob("*.png"))
     assert drawn == ["compare_densities", "compare_sections", "compare_slices", "compare_traces"]
-    assert (tmp_path / "compare.html").read_text().count("data:image/png;base64,") == 4
+    assert (tmp_path / "compare.html").read_text().count("data:image/webp;base64,") == 4
 
 
 def test_other_functions_are_not_compared(runs, capsys):

@@ -17,12 +17,15 @@ from analysis.commands.cli import main
 from analysis.records.records import read_record
 from analysis.train.command import planned
 from analysis.train.options import TrainOptions
-from analysis.train.remarks import HOW_IT_STARTS, HOW_TO_START, _not_reached, poor_start
+from analysis.train.remarks import HOW_IT_STARTS, HOW_TO_START, _not_reached, _of_second_order, poor_start
+from splat.losses.reference import LossSettings
 from splat.scenes.scene import load_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint
+from splat.training.densify import DensifySettings
 from splat.training.methods.corgs import CoRGS
+from splat.training.methods.second_order.gn_cg import GaussNewtonCG
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.start import Source
 from splat.training.state import TrainConfig
@@ -233,3 +236,12 @@ def test_photographs_that_were_replaced_are_noticed_by_probe_and_resume(original
     assert train(scene, out, "--resume") == main(probe) == 0
     seen = read_record(out / "probe-quick").data.provenance.photographs
     assert isinstance(seen, list) and len(set(seen)) == 3
+
+
+def test_a_method_in_place_of_adam_says_what_it_leaves_out():
+    assert _of_second_order(TrainConfig(method=CoRGS())) == []
+    density, loss = _of_second_order(TrainConfig(method=GaussNewtonCG()))
+    assert density.startswith("gn-cg: no Gaussian is cloned, split or removed") and "smooth l1" in loss
+    config = TrainConfig(loss=LossSettings("l2"), densify=DensifySettings(enabled=False), method=GaussNewtonCG())
+    assert _of_second_order(config) == []
+    assert not config.method.density_control(TrainConfig()).enabled

@@ -17,9 +17,10 @@ from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
+from splat.model.settings import Antialias, RenderSettings
 from splat.render.render import render
 from splat.scenes.view import View
-from tests.splat.random_scenes import random_camera, random_gaussians, random_like
+from tests.splat.random_scenes import ANTIALIASED, MODES, filtered, random_camera, random_gaussians, random_like
 
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")
 PIXEL_SUMS = [LossSettings(kind, ssim_weight=0) for kind in ("l1", "charbonnier", "l2")]
@@ -40,16 +41,20 @@ def awkward_gaussians(sh_degree: int = 1) -> Gaussians:
 
 
 def objective_of(
-    gaussians: Gaussians, loss: LossSettings, noise: float, size: tuple[int, int] = (32, 28)
+    gaussians: Gaussians,
+    loss: LossSettings,
+    noise: float,
+    size: tuple[int, int] = (32, 28),
+    settings: RenderSettings = RenderSettings(),
 ) -> SceneObjective:
     """Two views whose targets are the renders themselves plus noise: small noise is a good fit."""
     generator, views = torch.Generator().manual_seed(5), []
     for seed in (0, 1):
         camera: Camera = random_camera(*size, seed=seed, focal=34.0)
-        image = render(gaussians, camera, BACKGROUND).image
+        image = render(gaussians, camera, BACKGROUND, settings).image
         target = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype)
         views.append(View(str(seed), camera, target.float()))
-    return SceneObjective(gaussians, views, loss, BACKGROUND)
+    return SceneObjective(gaussians, views, loss, BACKGROUND, settings)
 
 
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
@@ -69,13 +74,20 @@ def geometry_rows(objective: SceneObjective) -> Tensor:
 
 
 @pytest.mark.parametrize(
-    ("loss", "sh_degree"),
-    [*((loss, 1) for loss in PIXEL_SUMS + WITH_SSIM), *((WITH_SSIM[1], degree) for degree in (0, 2, 3))],
+    ("loss", "sh_degree", "mode"),
+    [
+        *((loss, 1, "none") for loss in PIXEL_SUMS + WITH_SSIM),
+        *((WITH_SSIM[1], degree, "none") for degree in (0, 2, 3)),
+        *((loss, 1, mode) for mode in ANTIALIASED for loss in (PIXEL_SUMS[2], WITH_SSIM[1])),
+    ],
     ids=str,
 )
 @pytest.mark.parametrize("gauss_newton", [False, True])
-def test_own_blocks_are_those_of_the_dense_hessian(loss: LossSettings, sh_degree: int, gauss_newton: bool) -> None:
-    objective = objective_of(awkward_gaussians(sh_degree), loss, noise=0.3, size=(33, 27))
+def test_own_blocks_are_those_of_the_dense_hessian(
+    loss: LossSettings, sh_degree: int, mode: Antialias, gauss_newton: bool
+) -> None:
+    gaussians = filtered(awkward_gaussians(sh_degree), mode)
+    objective = objective_of(gaussians, loss, noise=0.3, size=(33, 27), settings=MODES[mode])
     own = objective.block_diagonal(gauss_newton=gauss_newton)
     H = dense(SceneHessian(objective, gauss_newton=gauss_newton, keep_null=True))
     expected = torch.stack([H[index][:, index] for index in geometry_rows(objective)])
@@ -125,7 +137,7 @@ def test_traces_of_exact_blocks_are_within_the_error_of_sampled_ones() -> None:
 
 def test_memory_decides_which_views_are_kept_and_changes_no_bit(monkeypatch) -> None:
     gaussians, loss, widths, hvp = awkward_gaussians(), LossSettings(), [], LinearizedView.hvp
-    monkeypatch.setattr(LinearizedView, "hvp", lambda view, U: widths.append(U.shape[1]) or hvp(view, U))
+    monkeypatch.setattr(LinearizedView, "hvp", lambda view, U, **how: widths.append(U.shape[1]) or hvp(view, U, **how))
     roomy = objective_of(gaussians, loss, noise=0.3)
     tight = SceneObjective(gaussians, roomy.views, loss, BACKGROUND, memory=0)
     assert (tight.linearized.kept, roomy.linearized.kept) == (1, 2)

@@ -13,17 +13,20 @@ from splat.curvature.linearize import LinearizedView
 from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import LossSettings, photometric_loss
 from splat.model.gaussians import Gaussians
-from splat.model.settings import SMOOTH, RenderSettings
+from splat.model.settings import SMOOTH, Antialias, RenderSettings
 from splat.render.render import render
 from splat.scenes.view import View
 from tests.oracles import central_difference
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, mean_loss, two_views
 from tests.splat.random_scenes import (
+    ANTIALIASED,
     DERIVATIVE,
     DTYPES,
     IMAGE,
+    MODES,
     NUMPY,
     errors_by_block,
+    filtered,
     random_gaussians,
     random_like,
     relative_error,
@@ -36,8 +39,13 @@ LOSSES = [
     LossSettings("l2", ssim_weight=0),
 ]
 each_loss = pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: f"{loss.pixel} {loss.ssim_weight}")
+each_mode = pytest.mark.parametrize("mode", MODES)
 each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
 OPAQUE = RenderSettings(contour_sigma=3.0)
+
+
+def smooth(mode: Antialias) -> RenderSettings:
+    return replace(SMOOTH, antialias=MODES[mode].antialias, blur=MODES[mode].blur)
 
 
 def hold(
@@ -51,14 +59,15 @@ def hold(
     return LinearizedView(gaussians.to(dtype), view.camera, target, BACKGROUND, settings)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize(("degree", "mode"), [*((d, "none") for d in range(4)), *((1, mode) for mode in ANTIALIASED)])
 @each_loss
-def test_value_gradient_and_hessian_products_are_those_of_the_specification(loss, degree):
-    gaussians, view = random_gaussians(40, degree, logit=1.0), two_views()[0]
-    U = random_like((gaussians.flat.numel(), 3), 1)
-    gradient, products = gradient_and_products(gaussians, [view], loss, U)
-    held = hold(gaussians, view, loss)
-    assert held.value == pytest.approx(float(mean_loss(gaussians, [view], loss)), rel=1e-13)
+def test_value_gradient_and_hessian_products_are_those_of_the_specification(loss, degree, mode):
+    gaussians, view = filtered(random_gaussians(40, degree, logit=1.0), mode), two_views()[0]
+    gaussians.log_scales[:3] -= torch.tensor([[2.0], [4.0], [6.0]])  # C at its floor, where there is one
+    settings, U = MODES[mode], random_like((gaussians.flat.numel(), 3), 1)
+    gradient, products = gradient_and_products(gaussians, [view], loss, U, settings)
+    held = hold(gaussians, view, loss, settings=settings)
+    assert held.value == pytest.approx(float(mean_loss(gaussians, [view], loss, settings)), rel=1e-13)
     assert max(errors_by_block(held.gradient, gradient, gaussians.blocks).values()) < 1e-12
     for k in (1, 3):
         errors = errors_by_block(held.hvp(U[:, :k]), products[:, :k], gaussians.blocks)
@@ -78,10 +87,14 @@ def test_every_kind_of_threshold_is_held_as_the_specification_holds_it(settings,
     assert max(errors_by_block(held.hvp(U), products, gaussians.blocks).values()) < 1e-12
 
 
-def test_float32_keeps_its_digits_through_the_whole_chain():
+@each_mode
+def test_float32_keeps_its_digits_through_the_whole_chain(mode):
     # no thresholds and no kinks: both precisions make the same decisions
-    loss, settings = LossSettings("l2"), SMOOTH
-    gaussians, view = random_gaussians(40, 3, logit=-1.0), two_views()[0]
+    loss, settings = LossSettings("l2"), smooth(mode)
+    gaussians, view = (
+        filtered(random_gaussians(40, 3, logit=-1.0), mode).to(torch.float32).to(torch.float64),
+        two_views()[0],
+    )
     U = random_like((gaussians.flat.numel(), 3), 1).float().double()
     gradient, products = gradient_and_products(gaussians, [view], loss, U, settings)
     held = hold(gaussians, view, loss, torch.float32, settings)
@@ -91,16 +104,20 @@ def test_float32_keeps_its_digits_through_the_whole_chain():
     assert max(errors_by_block(held.hvp(U.float()), products, gaussians.blocks).values()) < DERIVATIVE[torch.float32]
 
 
-def image_and_alpha(gaussians: Gaussians, view: View, flat: Tensor) -> Tensor:
-    rendering = render(gaussians.with_flat(flat), view.camera, BACKGROUND, backend="reference")
+def image_and_alpha(gaussians: Gaussians, view: View, flat: Tensor, settings: RenderSettings) -> Tensor:
+    rendering = render(gaussians.with_flat(flat), view.camera, BACKGROUND, settings, backend="reference")
     return torch.cat([rendering.image, rendering.alpha[None]])
 
 
+@each_mode
 @each_loss
-def test_gauss_newton_is_the_dense_product_of_its_three_factors(loss):
-    gaussians, view = random_gaussians(4, 1, logit=1.0, spread=0.4), two_views(10, 8)[0]
-    held, identity = hold(gaussians, view, loss), torch.eye(gaussians.flat.numel(), dtype=torch.float64)
-    J = torch.autograd.functional.jacobian(lambda flat: image_and_alpha(gaussians, view, flat), gaussians.flat)
+def test_gauss_newton_is_the_dense_product_of_its_three_factors(loss, mode):
+    gaussians, view = filtered(random_gaussians(4, 1, logit=1.0, spread=0.4), mode), two_views(10, 8)[0]
+    held = hold(gaussians, view, loss, settings=MODES[mode])
+    identity = torch.eye(gaussians.flat.numel(), dtype=torch.float64)
+    J = torch.autograd.functional.jacobian(
+        lambda flat: image_and_alpha(gaussians, view, flat, MODES[mode]), gaussians.flat
+    )
     assert relative_error(held.jvp(identity), J.movedim(-1, 0)) < 1e-12  # pyright: ignore
     cotangents = random_like((2, 4, 8, 10), 1)
     assert relative_error(held.vjp(cotangents), torch.einsum("chwp,kchw->pk", J, cotangents)) < 1e-12
@@ -111,21 +128,23 @@ def test_gauss_newton_is_the_dense_product_of_its_three_factors(loss):
     assert relative_error(held.ggn(identity), J.T @ middle @ J) < 1e-12
 
 
+@each_mode
 @each_loss
-def test_the_hessian_is_that_of_dense_autograd_column_by_column(loss):
-    gaussians, view = random_gaussians(3, 1, logit=1.0, spread=0.4), two_views(14, 11)[0]
+def test_the_hessian_is_that_of_dense_autograd_column_by_column(loss, mode):
+    gaussians, view = filtered(random_gaussians(3, 1, logit=1.0, spread=0.4), mode), two_views(14, 11)[0]
     identity = torch.eye(gaussians.flat.numel(), dtype=torch.float64)
-    _, dense = gradient_and_products(gaussians, [view], loss, identity)
-    H = hold(gaussians, view, loss).hvp(identity)
+    _, dense = gradient_and_products(gaussians, [view], loss, identity, MODES[mode])
+    H = hold(gaussians, view, loss, settings=MODES[mode]).hvp(identity)
     scale = dense.norm()
     for column, expected in zip(H.T, dense.T, strict=True):
         assert (column - expected).norm() < 1e-13 * scale
     assert (H - H.T).norm() < 1e-13 * scale
 
 
-def test_products_agree_with_finite_differences_of_the_kernels_own_gradient():
-    loss, settings = LossSettings("charbonnier", eps=0.1), SMOOTH
-    gaussians, view = random_gaussians(20, 2, logit=-1.0, spread=0.7), two_views()[0]
+@each_mode
+def test_products_agree_with_finite_differences_of_the_kernels_own_gradient(mode):
+    loss, settings = LossSettings("charbonnier", eps=0.1), smooth(mode)
+    gaussians, view = filtered(random_gaussians(20, 2, logit=-1.0, spread=0.7), mode), two_views()[0]
     direction = 0.1 * random_like(gaussians.flat.shape, 1)
 
     def at(t: float) -> LinearizedView:
@@ -138,10 +157,11 @@ def test_products_agree_with_finite_differences_of_the_kernels_own_gradient():
     assert relative_error(held.hvp(direction[:, None])[:, 0], bend) < 1e-7
 
 
+@each_mode
 @each_dtype
-def test_products_are_symmetric_to_round_off(dtype):
-    gaussians, view = random_gaussians(60, 3, logit=2.0), two_views()[0]
-    held = hold(gaussians, view, LossSettings("charbonnier"), dtype)
+def test_products_are_symmetric_to_round_off(dtype, mode):
+    gaussians, view = filtered(random_gaussians(60, 3, logit=2.0), mode), two_views()[0]
+    held = hold(gaussians, view, LossSettings("charbonnier"), dtype, MODES[mode])
     U = random_like((gaussians.flat.numel(), 2), 1).to(dtype)
     for product in (held.hvp(U), held.ggn(U)):
         one, other = (U[:, 1] * product[:, 0]).double(), (U[:, 0] * product[:, 1]).double()

@@ -18,7 +18,15 @@ from splat.scenes.view import View
 from splat.training.loop import train
 from splat.training.state import Training
 from tests.splat.held_scenes import BACKGROUND, gradient_and_products, two_views
-from tests.splat.random_scenes import DERIVATIVE, DTYPES, errors_by_block, random_gaussians, random_like, relative_error
+from tests.splat.random_scenes import (
+    DERIVATIVE,
+    MODES,
+    errors_by_block,
+    filtered,
+    random_gaussians,
+    random_like,
+    relative_error,
+)
 from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
 
 LOSS = LossSettings("charbonnier")
@@ -49,15 +57,17 @@ def on(gaussians: Gaussians, device: torch.device) -> Gaussians:
     return gaussians.with_flat(gaussians.flat.to(device))
 
 
-@pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
-def test_gradient_and_products_of_a_view_on_the_gpu_are_those_of_the_specification(dtype, gpu):
+@pytest.mark.parametrize(
+    ("dtype", "mode"), [(torch.float32, "none"), (torch.float64, "none"), (torch.float64, "mip-splatting")]
+)
+def test_gradient_and_products_of_a_view_on_the_gpu_are_those_of_the_specification(dtype, mode, gpu):
     vectors = 3 if dtype == torch.float64 else 1
     view, U = views()[0], random_like((scene(dtype).flat.numel(), vectors), 1).float()
-    gradient, products = gradient_and_products(scene(torch.float64), [view], LOSS, U.double())
-    gaussians = on(scene(dtype), gpu)
-    held = LinearizedView(
-        gaussians, view.camera, loss_against(view.image, LOSS, gaussians.flat), BACKGROUND, RenderSettings()
-    )
+    given, settings = filtered(scene(torch.float64), mode), MODES[mode]
+    gradient, products = gradient_and_products(given, [view], LOSS, U.double(), settings)
+    gaussians = on(given.to(dtype), gpu)
+    loss = loss_against(view.image, LOSS, gaussians.flat)
+    held = LinearizedView(gaussians, view.camera, loss, BACKGROUND, settings)
     assert max(errors_by_block(held.gradient.cpu(), gradient, gaussians.blocks).values()) < DERIVATIVE[dtype]
     hvp = held.hvp(U.to(gpu, dtype))
     assert max(errors_by_block(hvp.cpu(), products, gaussians.blocks).values()) < DERIVATIVE[dtype]

@@ -8,17 +8,19 @@ from torch import Tensor
 pytest.importorskip("triton", reason="the kernels for GPUs need triton")
 
 from splat.model.gaussians import Gaussians
-from splat.model.settings import RenderSettings
+from splat.model.settings import Antialias, RenderSettings
 from splat.projection import cpu
 from splat.projection.cuda import CudaProjection, convert, project, project_adjoint
 from splat.projection.formulas import lens_of
 from splat.projection.reference import project as specified
 from splat.projection.whitening import COEFFICIENTS, MOMENTS, PLAIN_GRADIENT, PLAIN_TANGENT
-from tests.splat.projection.test_projection import SETTINGS, SPLAT_BLOCKS, N, camera_and_gaussians, truth
+from tests.splat.projection.test_projection import SPLAT_BLOCKS, N, camera_and_gaussians, settings_of, truth
 from tests.splat.random_scenes import (
+    ANTIALIASED,
     DERIVATIVE,
     DTYPES,
     IMAGE,
+    MODES,
     errors_by_block,
     random_camera,
     random_gaussians,
@@ -29,31 +31,39 @@ from tests.splat.random_scenes import (
 each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
 
 
-def on(device: torch.device, degree: int, dtype: torch.dtype) -> tuple[Gaussians, tuple]:
-    camera, gaussians = camera_and_gaussians(degree)
-    gaussians = Gaussians(gaussians.flat.to(device, dtype), degree)
-    lens = lens_of(camera, SETTINGS)
+def on(device: torch.device, degree: int, dtype: torch.dtype, mode: Antialias = "none") -> tuple[Gaussians, tuple]:
+    camera, gaussians = camera_and_gaussians(degree, mode)
+    gaussians = gaussians.with_flat(gaussians.flat.to(device, dtype))
+    lens = lens_of(camera, settings_of(mode))
     return gaussians, (lens, *project(gaussians, lens))
 
 
-@each_dtype
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_splats_and_their_adjoint_are_those_of_the_specification(degree, dtype, device):
-    gaussians, (lens, splats, depths, drawn) = on(device, degree, dtype)
-    expected, camera = truth(degree), camera_and_gaussians(degree)[0]
+@pytest.mark.parametrize(
+    ("degree", "dtype", "mode"),
+    [
+        *((degree, dtype, "none") for degree in range(4) for dtype in DTYPES),
+        *((3, torch.float64, mode) for mode in ANTIALIASED),
+        (3, torch.float32, "mip-splatting"),
+    ],
+)
+def test_splats_and_their_adjoint_are_those_of_the_specification(degree, dtype, mode, device):
+    gaussians, (lens, splats, depths, drawn) = on(device, degree, dtype, mode)
+    expected, (camera, given) = truth(degree, mode), camera_and_gaussians(degree, mode)
     errors = errors_by_block(splats.T.cpu(), expected.splats.T, SPLAT_BLOCKS)
     assert max(errors.values()) < IMAGE[dtype]
-    whole = specified(camera_and_gaussians(degree)[1], camera, SETTINGS)
+    whole = specified(given, camera, settings_of(mode))
     assert torch.equal(drawn.cpu(), whole.drawn) and depths.dtype == dtype
     assert relative_error(depths.cpu()[whole.drawn], whole.depths[whole.drawn]) < IMAGE[dtype]
     gradient = project_adjoint(gaussians, lens, splats, drawn, expected.bar.to(device))
     assert max(errors_by_block(gradient.cpu(), expected.gradient, gaussians.blocks).values()) < DERIVATIVE[dtype]
 
 
-def linearized(device: torch.device, degree: int, dtype: torch.dtype) -> tuple[CudaProjection, Gaussians, Tensor]:
+def linearized(
+    device: torch.device, degree: int, dtype: torch.dtype, mode: Antialias = "none"
+) -> tuple[CudaProjection, Gaussians, Tensor]:
     """The projection at the truth's adjoint, its Gaussians, and the splats."""
-    gaussians, (lens, splats, _, drawn) = on(device, degree, dtype)
-    moments = convert(MOMENTS, splats, truth(degree).bar.detach().to(device)).to(dtype)
+    gaussians, (lens, splats, _, drawn) = on(device, degree, dtype, mode)
+    moments = convert(MOMENTS, splats, truth(degree, mode).bar.detach().to(device)).to(dtype)
     return CudaProjection(gaussians, lens, splats, moments, drawn.nonzero()[:, 0]), gaussians, splats
 
 
@@ -62,10 +72,18 @@ def each_converted(way: int, splats: Tensor, numbers: Tensor) -> Tensor:
     return torch.stack([convert(way, splats, each.contiguous()) for each in numbers.unbind(1)], dim=1)
 
 
-@pytest.mark.parametrize(("degree", "dtype"), [(1, torch.float64), (3, torch.float32), (3, torch.float64)])
-def test_products_and_blocks_are_those_of_the_specification(degree, dtype, device):
-    projection, gaussians, splats = linearized(device, degree, dtype)
-    expected = truth(degree)
+@pytest.mark.parametrize(
+    ("degree", "dtype", "mode"),
+    [
+        *((1, torch.float64, mode) for mode in MODES),
+        (3, torch.float32, "none"),
+        (3, torch.float64, "none"),
+        (1, torch.float32, "mip-splatting"),
+    ],
+)
+def test_products_and_blocks_are_those_of_the_specification(degree, dtype, mode, device):
+    projection, gaussians, splats = linearized(device, degree, dtype, mode)
+    expected = truth(degree, mode)
     U, C = expected.U.to(device, dtype), each_converted(MOMENTS, splats, expected.C.to(device)).to(dtype)
     pushed, pulled = projection.jvp(U), projection.vjp(C, U).cpu()
     plain = each_converted(PLAIN_TANGENT, splats, pushed).cpu()

@@ -13,8 +13,8 @@ from splat.backend.cpu.threads import over_range
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import harmonics
-from splat.model.settings import RenderSettings
-from splat.projection.cpu import attribute_arrays, project_adjoint, project_arrays
+from splat.model.settings import Antialias, RenderSettings
+from splat.projection.cpu import attribute_arrays, project_adjoint, project_arrays, width_array
 from splat.projection.dispatch import moments_of, plain_tangents
 from splat.projection.formulas import GEOMETRY, lens_of
 from splat.projection.linear_cpu import CpuProjection
@@ -27,11 +27,14 @@ from tests.oracles import (
     splat_of_gaussian,
 )
 from tests.splat.random_scenes import (
+    ANTIALIASED,
     DERIVATIVE,
     DTYPES,
     IMAGE,
+    MODES,
     NUMPY,
     errors_by_block,
+    filtered,
     random_camera,
     random_gaussians,
     random_like,
@@ -42,6 +45,10 @@ N, K, SETTINGS = 80, 3, RenderSettings(fov_clamp=0.9)
 SPLAT_BLOCKS = {"means": slice(0, 2), "conics": slice(2, 5), "opacities": slice(5, 6), "colours": slice(6, 9)}
 each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
 each_degree = pytest.mark.parametrize("degree", [0, 1, 2, 3])
+each_case = pytest.mark.parametrize(
+    ("degree", "mode"), [*((degree, "none") for degree in range(4)), *((3, m) for m in ANTIALIASED)]
+)
+THINNED = 6  # Gaussians of a scene that are too small for a pixel, where it is antialiased
 
 
 def joined(splats: Splats) -> Tensor:
@@ -50,11 +57,17 @@ def joined(splats: Splats) -> Tensor:
     return torch.cat(parts, dim=1) * splats.drawn[:, None]
 
 
-def camera_and_gaussians(degree: int) -> tuple[Camera, Gaussians]:
+def camera_and_gaussians(degree: int, mode: Antialias = "none") -> tuple[Camera, Gaussians]:
     """Gaussians in front of the camera and behind it, inside the field of view and outside, some with a black channel."""
     gaussians = random_gaussians(N, degree, spread=2.5)
     gaussians.sh[:, 0] *= 4
-    return random_camera(75, 53, focal=60.0), gaussians.to(torch.float32).to(torch.float64)
+    if mode != "none":
+        gaussians.log_scales[:THINNED] -= torch.linspace(1, 6, THINNED)[:, None]
+    return random_camera(75, 53, focal=60.0), filtered(gaussians, mode).to(torch.float32).to(torch.float64)
+
+
+def settings_of(mode: Antialias) -> RenderSettings:
+    return replace(MODES[mode], fov_clamp=SETTINGS.fov_clamp)
 
 
 @dataclass(frozen=True)
@@ -71,10 +84,10 @@ class Truth:
 
 
 @cache
-def truth(degree: int) -> Truth:
-    camera, gaussians = camera_and_gaussians(degree)
+def truth(degree: int, mode: Antialias = "none") -> Truth:
+    camera, gaussians = camera_and_gaussians(degree, mode)
     flat = gaussians.flat.clone().requires_grad_()
-    splats = joined(project(gaussians.with_flat(flat), camera, SETTINGS))
+    splats = joined(project(gaussians.with_flat(flat), camera, settings_of(mode)))
     scale = torch.tensor([1, 1, 100, 100, 100, 1, 1, 1, 1], dtype=torch.float64)
     bar = (random_like((N, 9), 1) * scale).float().double().requires_grad_()
     C = (random_like((N, K, 9), 2) * scale).float().double()
@@ -137,41 +150,39 @@ def test_rotations_do_not_depend_on_a_quaternions_length_or_sign():
 
 
 @each_dtype
-@each_degree
-def test_the_kernel_projects_as_the_specification_does(degree, dtype):
-    camera, gaussians = camera_and_gaussians(degree)
-    splats, depths, drawn = project_arrays(gaussians.to(dtype), lens_of(camera, SETTINGS))
-    expected = project(gaussians, camera, SETTINGS)
+@each_case
+def test_the_kernel_projects_as_the_specification_does(degree, mode, dtype):
+    camera, gaussians = camera_and_gaussians(degree, mode)
+    splats, depths, drawn = project_arrays(gaussians.to(dtype), lens_of(camera, settings_of(mode)))
+    expected = project(gaussians, camera, settings_of(mode))
     assert (drawn == expected.drawn.numpy()).all()
-    errors = errors_by_block(torch.from_numpy(splats).T, truth(degree).splats.T, SPLAT_BLOCKS)
+    errors = errors_by_block(torch.from_numpy(splats).T, truth(degree, mode).splats.T, SPLAT_BLOCKS)
     assert max(errors.values()) < IMAGE[dtype]
     assert relative_error(depths[drawn], expected.depths[expected.drawn]) < IMAGE[dtype]
 
 
 @each_dtype
-@each_degree
-def test_the_adjoint_is_the_gradient_of_the_specification(degree, dtype):
-    camera, gaussians = camera_and_gaussians(degree)
+@each_case
+def test_the_adjoint_is_the_gradient_of_the_specification(degree, mode, dtype):
+    camera, gaussians = camera_and_gaussians(degree, mode)
     gaussians = gaussians.to(dtype)
-    lens = lens_of(camera, SETTINGS)
+    lens = lens_of(camera, settings_of(mode))
     splats, _, drawn = project_arrays(gaussians, lens)
     gradient = gaussians.with_flat(torch.zeros_like(gaussians.flat))
-    means, log_scales, quats, _, sh = attribute_arrays(gaussians)
-    bar = truth(degree).bar.to(dtype).numpy()
-    over_range(
-        N, project_adjoint, lens, means, log_scales, quats, sh, splats, drawn, bar, *attribute_arrays(gradient)
-    )  # fmt: skip
-    errors = errors_by_block(gradient.flat, truth(degree).gradient, gaussians.blocks)
+    inputs = (*attribute_arrays(gaussians), width_array(gaussians, lens))
+    bar = truth(degree, mode).bar.to(dtype).numpy()
+    over_range(N, project_adjoint, lens, *inputs, splats, drawn, bar, *attribute_arrays(gradient))
+    errors = errors_by_block(gradient.flat, truth(degree, mode).gradient, gaussians.blocks)
     assert max(errors.values()) < DERIVATIVE[dtype], errors
 
 
-def linearized(degree: int, dtype: torch.dtype) -> tuple[CpuProjection, Gaussians, Tensor]:
+def linearized(degree: int, dtype: torch.dtype, mode: Antialias = "none") -> tuple[CpuProjection, Gaussians, Tensor]:
     """The projection at the truth's adjoint, its Gaussians, and the splats."""
-    camera, gaussians = camera_and_gaussians(degree)
+    camera, gaussians = camera_and_gaussians(degree, mode)
     gaussians = gaussians.to(dtype)
-    lens = lens_of(camera, SETTINGS)
+    lens = lens_of(camera, settings_of(mode))
     splats, _, drawn = map(torch.from_numpy, project_arrays(gaussians, lens))
-    moments = moments_of(splats, truth(degree).bar.detach()).to(dtype)
+    moments = moments_of(splats, truth(degree, mode).bar.detach()).to(dtype)
     return CpuProjection(gaussians, lens, splats, moments, drawn.nonzero()[:, 0]), gaussians, splats
 
 
@@ -181,10 +192,10 @@ def each_converted(convert: Callable[[Tensor, Tensor], Tensor], splats: Tensor, 
 
 
 @each_dtype
-@each_degree
-def test_jacobian_and_curvature_are_those_of_the_specification(degree, dtype):
-    projection, gaussians, splats = linearized(degree, dtype)
-    expected = truth(degree)
+@each_case
+def test_jacobian_and_curvature_are_those_of_the_specification(degree, mode, dtype):
+    projection, gaussians, splats = linearized(degree, dtype, mode)
+    expected = truth(degree, mode)
     U, C = expected.U.to(dtype), each_converted(moments_of, splats, expected.C).to(dtype)
     pushed = each_converted(plain_tangents, splats, projection.jvp(U))
     errors = errors_by_block(pushed.permute(2, 0, 1), expected.pushed.permute(2, 0, 1), SPLAT_BLOCKS)
@@ -194,16 +205,18 @@ def test_jacobian_and_curvature_are_those_of_the_specification(degree, dtype):
 
 
 @each_dtype
-def test_pulling_back_without_directions_is_the_transpose_of_pushing_forward(dtype):
-    projection, _, _ = linearized(3, dtype)
+@pytest.mark.parametrize("mode", MODES)
+def test_pulling_back_without_directions_is_the_transpose_of_pushing_forward(mode, dtype):
+    projection, _, _ = linearized(3, dtype, mode)
     U, C = truth(3).U.to(dtype), truth(3).C.to(dtype)
     there, back = (projection.jvp(U) * C).double(), (projection.vjp(C) * U).double()
     eps = 30 * float(np.finfo(NUMPY[dtype]).eps)
     assert abs(there.sum() - back.sum()) < eps * (np.linalg.norm(there) + np.linalg.norm(back))
 
 
-def test_jacobian_and_curvature_agree_with_finite_differences():
-    camera, gaussians = camera_and_gaussians(3)
+@pytest.mark.parametrize("mode", MODES)
+def test_jacobian_and_curvature_agree_with_finite_differences(mode):
+    camera, gaussians = camera_and_gaussians(3, mode)
     visible = project(gaussians, camera, SETTINGS)
     inside = visible.drawn & (visible.colours > 0.05).all(dim=1)
     x, y, z = ((gaussians.means - camera.centre) @ camera.rotation.T).unbind(1)
@@ -211,7 +224,8 @@ def test_jacobian_and_curvature_agree_with_finite_differences():
         inside &= ((ratio.abs() - SETTINGS.fov_clamp * limit / 2).abs() > 0.02) & (z > 1)
     gaussians = gaussians.select(inside)
     assert len(gaussians) > 20
-    lens, bar = lens_of(camera, SETTINGS), truth(3).bar[inside].numpy()
+    gaussians.log_scales[:] = gaussians.log_scales.clamp_min(-4)  # a step would cross the floor
+    lens, bar = lens_of(camera, settings_of(mode)), truth(3).bar[inside].numpy()
     direction = random_like(gaussians.flat.shape, 4) * 0.3
 
     def splats(t: float) -> np.ndarray:
@@ -220,9 +234,9 @@ def test_jacobian_and_curvature_agree_with_finite_differences():
     def gradient(t: float) -> np.ndarray:
         moved = gaussians.with_flat(gaussians.flat + t * direction)
         result = moved.with_flat(torch.zeros_like(moved.flat))
-        means, log_scales, quats, _, sh = attribute_arrays(moved)
+        inputs = (*attribute_arrays(moved), width_array(moved, lens))
         values, _, drawn = project_arrays(moved, lens)
-        arguments = (lens, means, log_scales, quats, sh, values, drawn, bar, *attribute_arrays(result))
+        arguments = (lens, *inputs, values, drawn, bar, *attribute_arrays(result))
         over_range(len(moved), project_adjoint, *arguments)
         return result.flat.numpy()
 
@@ -279,14 +293,15 @@ HUGE = {
 
 
 @each_dtype
+@pytest.mark.parametrize("mode", ["none", "mip-plain"])
 @pytest.mark.parametrize("shape", HUGE)
-def test_the_curvature_of_splats_beyond_all_measure_keeps_its_digits(shape, dtype):
+def test_the_curvature_of_splats_beyond_all_measure_keeps_its_digits(shape, mode, dtype):
     camera, bar = random_camera(focal=50.0), random_like((1, 9), 3).to(dtype).numpy()
     gaussians = random_gaussians(1, spread=0.2)
     gaussians.log_scales[:] = torch.tensor(HUGE[shape])
     gaussians.quats[:] = torch.tensor([0.7, -0.4, 0.5, 0.3])
     gaussians = gaussians.to(dtype)
-    lens = lens_of(camera, RenderSettings())
+    lens = lens_of(camera, MODES[mode])
     splats = torch.from_numpy(project_arrays(gaussians, lens)[0])
     moments = moments_of(splats, torch.from_numpy(bar)).to(dtype)
     packed = (
@@ -296,9 +311,13 @@ def test_the_curvature_of_splats_beyond_all_measure_keeps_its_digits(shape, dtyp
     curvature[np.tril_indices(GEOMETRY)] = packed
     pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
 
+    opacity = float(gaussians.opacity_logits.double().sigmoid())
+    factor_bar = 0.0 if mode == "none" else opacity * float(bar[0, 5])
+
     def along(point: list) -> object:
-        splat = splat_in_many_digits(point, camera.rotation.numpy(), camera.centre.numpy(), pinhole, 0.3)
-        return sum(float(b) * y for b, y in zip(bar[0, :5], splat, strict=True))
+        splat = splat_in_many_digits(point, camera.rotation.numpy(), camera.centre.numpy(), pinhole, MODES[mode].blur)
+        weights = [*map(float, bar[0, :5]), factor_bar]
+        return sum(b * y for b, y in zip(weights, splat, strict=True))
 
     point = [*gaussians.means[0].tolist(), *gaussians.log_scales[0].tolist(), *gaussians.quats[0].tolist()]
     expected = np.tril(hessian_in_many_digits(along, point, 160))

@@ -11,12 +11,14 @@ import pytest
 import torch
 
 from splat.losses.reference import LossSettings, photometric_loss
+from splat.model.settings import RenderSettings
+from splat.projection.antialias import sampling_widths
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings, densify
-from splat.training.loop import train, with_background
+from splat.training.loop import prepare, train, with_background
 from splat.training.optim.adam import EPS
 from splat.training.score.evaluate import evaluate
 from splat.training.state import LearningRates, TrainConfig, Training, learning_rates, position_rate
@@ -28,6 +30,31 @@ ONLY_ADAM = DensifySettings(enabled=False)
 def run(config: TrainConfig, dtype: torch.dtype = torch.float32):
     training = Training.start(tiny_gaussians(dtype=dtype), EXTENT, config)
     return training, list(train(training, tiny_views(dtype)))
+
+
+def test_mip_splattings_filter_is_renewed_when_its_training_does_and_resumes(monkeypatch, tmp_path):
+    monkeypatch.setattr("splat.training.state.FILTER_EVERY", 2)
+    config = replace(tiny_config(16), render=RenderSettings(antialias="mip-splatting", blur=0.1))
+    views, saved = tiny_views(), tmp_path / "saved.pt"
+    cameras = [view.camera for view in views]
+    training = Training.start(tiny_gaussians(), EXTENT, config)
+    prepare(training, views)
+    widths, renewed = training.gaussians.filter_widths, []
+    torch.testing.assert_close(widths, sampling_widths(training.gaussians, cameras))
+    for done in train(training, views):
+        now = training.gaussians.filter_widths
+        assert now is not None and widths is not None
+        if not torch.equal(now, widths):
+            torch.testing.assert_close(now, sampling_widths(training.gaussians, cameras))
+            renewed.append(done.step)
+        widths = now
+        if done.step == 9:
+            save_checkpoint(saved, training, REFERENCE)
+    assert renewed == [6, 8, 10, 12]  # clones and splits until 10, and once more between there and the end
+    resumed = load_checkpoint(saved).training
+    assert list(train(resumed, views)) and torch.equal(resumed.gaussians.flat, training.gaussians.flat)
+    assert resumed.gaussians.filter_widths is not None and widths is not None
+    assert torch.equal(resumed.gaussians.filter_widths, widths)
 
 
 def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands():

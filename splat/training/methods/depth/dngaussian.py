@@ -93,7 +93,8 @@ class DNGaussianMethod(Method[DNGaussian]):
         leaf = parts[attribute] = parts[attribute].clone().requires_grad_()
         if attribute == "means":
             parts["opacity_logits"] = torch.full_like(parts["opacity_logits"], HARD)
-        rendered, _alpha = render_depth(Gaussians.pack(parts), step.camera, step.config.render)
+        gaussians = Gaussians.pack(parts).with_filter(step.gaussians.filter_widths)
+        rendered, _alpha = render_depth(gaussians, step.camera, step.config.render)
         target = prior(step.views[step.chosen], self.settings.depths, rendered)
         loss = self._loss(rendered, target)
         if loss.requires_grad:

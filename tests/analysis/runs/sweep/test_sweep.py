@@ -19,13 +19,14 @@ import tyro
 from analysis.commands.cli import main
 from analysis.probe.record import loss_name
 from analysis.records.provenance import usable_cores
-from analysis.runs.sweep.sweep import _Cells, locked, missing, probe_arguments
+from analysis.runs.sweep.sweep import LOCK, _Cells, missing, probe_arguments
 from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import results
 from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from splat.losses.reference import LossSettings
+from splat.model.untrusted import locked
 from splat.render.render import render
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -266,9 +267,9 @@ def test_damaged_scores_end_a_sweep_before_it_starts(finished, folder, tmp_path,
 
 
 def test_two_sweeps_do_not_work_in_one_folder(folder, tmp_path, no_commands, capsys):
-    with locked(tmp_path):
+    with locked(tmp_path / LOCK, "no other sweep"):
         assert main(["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path)]) == 2
-    assert "expected no other sweep at work in" in " ".join(capsys.readouterr().err.split()) and no_commands == []
+    assert "expected no other sweep in" in " ".join(capsys.readouterr().err.split()) and no_commands == []
 
 
 def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, folder):

@@ -25,13 +25,19 @@ def kernels() -> list[tuple]:
     bands, ssim, pixels = {"BANDS": 4}, {"KIND": 1, "SSIM": True}, {"BLOCK": 256}
     both = {"SLOPES": True, "SECOND": True}
     return [
-        (projection.project_splats, (), few | bands),
-        (projection.project_adjoint, (), few | bands),
-        (projection.linearize_geometry, (), lanes),
+        *(
+            (kernel, (), common | {"ANTIALIASED": antialiased})
+            for antialiased in (False, True)
+            for kernel, common in (
+                (projection.project_splats, few | bands),
+                (projection.project_adjoint, few | bands),
+                (projection.linearize_geometry, lanes),
+                (projection.push_forward, wide | bands),
+                (projection.pull_back, wide | bands | {"SECOND_ORDER": True}),
+            )
+        ),
         (projection.linearize_colour, (), lanes | bands),
         (projection.convert, ("out",), few | {"WAY": 3}),
-        (projection.push_forward, (), wide | bands),
-        (projection.pull_back, (), wide | bands | {"SECOND_ORDER": True}),
         (losses.blur_along, (), pixels),
         (losses.feed, (), pixels | {"FIELDS": 3}),
         (losses.feed, (), pixels | {"FIELDS": 2}),
@@ -52,7 +58,7 @@ def kernels() -> list[tuple]:
 
 def test_every_kernel_of_projection_and_losses_compiles():
     lines = run_as_script(__file__)
-    assert len(lines) == 22
+    assert len(lines) == 27
     for line in lines:
         name, registers, _ = line.split()
         assert 16 <= int(registers) <= 255, name

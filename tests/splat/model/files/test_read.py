@@ -1,5 +1,8 @@
 """The same Gaussians come out of every tool's file, to the last bit of a float32; what cannot be rendered is refused."""
 
+import io
+import zipfile
+from copy import copy
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,7 +13,8 @@ import torch
 from landscape.errors import InputError
 from splat.model.files.read import is_foreign, read_cfg_args, read_splats
 from splat.model.files.splat_ply import splat_ply
-from splat.model.files.tensor_files import gsplat_bytes
+from splat.model.files.tensor_files import gsplat_bytes, load_tensors
+from splat.projection.antialias import baked
 from tests.splat.model.files import written
 from tests.splat.model.files.written import FILES, columns, ply, scene
 
@@ -107,16 +111,33 @@ def test_splatfactos_constant_colours_are_logits(tmp_path):
     torch.testing.assert_close(colour, scene(0).sh[:, 0].double().sigmoid(), rtol=1e-6, atol=0)
 
 
-def test_mip_splattings_filter_is_baked_as_its_own_exporter_does(tmp_path):
+def test_mip_splattings_filter_is_kept_and_baked_as_its_own_exporter_does(tmp_path):
     width = np.linspace(0.01, 0.3, written.N)
     found = read_splats(stored(tmp_path, "m.ply", ply({**columns(scene()), "filter_3D": width})))
+    assert found.gaussians.filter_widths is not None and torch.equal(found.gaussians.flat, scene().flat)
+    np.testing.assert_allclose(found.gaussians.filter_widths, width, rtol=1e-6)
+    again = read_splats(stored(tmp_path, "again.ply", splat_ply(found.gaussians))).gaussians
+    assert again.filter_widths is not None and torch.equal(again.filter_widths, found.gaussians.filter_widths)
+    merged = baked(found.gaussians)
     s = scene().log_scales.double().exp()
     expected = (s**2 + torch.from_numpy(width[:, None]) ** 2).sqrt()
     determinants = (s**2).prod(dim=1) / (expected**2).prod(dim=1)
-    torch.testing.assert_close(found.gaussians.log_scales.double().exp(), expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(merged.log_scales.double().exp(), expected, rtol=1e-6, atol=0)
     opacity = scene().opacity_logits.double().sigmoid() * determinants.sqrt()
-    torch.testing.assert_close(found.gaussians.opacity_logits.double().sigmoid(), opacity, rtol=1e-5, atol=0)
-    assert found.tool == "mip-splatting" and found.antialiased and "filter" in found.notes[0]
+    torch.testing.assert_close(merged.opacity_logits.double().sigmoid(), opacity, rtol=1e-5, atol=0)
+    assert found.tool == "mip-splatting" and found.antialiased and not found.extra
+
+
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [("cfg.yml", "antialiased"), ("config.yml", "    rasterize_mode")],
+    ids=["gsplat", "nerfstudio"],
+)
+def test_a_line_of_the_trainers_settings_says_that_it_was_antialiased(tmp_path, settings, line):
+    path = stored(tmp_path, "ckpts/ckpt_6_rank0.pt", written.gsplat_pt(scene()))
+    for word, said in (("true" if settings == "cfg.yml" else "antialiased", True), ("false", False)):
+        stored(tmp_path, settings, f"a: !!python/object:os.system\n{line}: {word}\nb: 1\n".encode())
+        assert read_splats(path).antialiased is said
 
 
 def test_graphdecos_settings_are_read_beside_the_model_and_never_run(tmp_path):
@@ -161,6 +182,8 @@ def with_rest(count: int) -> bytes:
         (written.saved({"step": 1, "pipeline": {"_model.field": torch.zeros(3)}}), "splatfacto"),
         (written.saved({"a": 1}), "no Gaussians of graphdeco, gsplat or nerfstudio"),
         (written.saved({"splats": {"means": torch.zeros(1).expand(5, 3)}}), "repeats its numbers"),
+        (written.saved({"step": torch.zeros(3), "splats": {"means": torch.zeros(3, device="meta")}}), "no tensor of"),
+        (written.saved({"splats": {"means": torch.nested.nested_tensor([torch.zeros(3)])}}), "no tensor of numbers"),
     ],
     ids=lambda value: None if isinstance(value, bytes) else value[:20],
 )
@@ -168,6 +191,18 @@ def test_what_cannot_be_rendered_is_refused_in_a_sentence(tmp_path, content, mes
     with pytest.raises(InputError, match=message) as caught:
         read_splats(stored(tmp_path, "file", content))
     assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_members_that_share_their_bytes_are_no_more_than_the_file_may_hold(tmp_path):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("a/data.pkl", bytes(10**6))
+        for i in range(100):
+            archive.filelist.append(copy(archive.filelist[0]))
+            archive.filelist[-1].filename = f"a/data/{i}"
+    with pytest.raises(InputError, match=r"promises 101,000,000 bytes"):
+        load_tensors(buffer.getvalue())
+    assert not is_foreign(stored(tmp_path, "bomb.pt", buffer.getvalue()))
 
 
 class Trap:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
+from landscape.errors import InputError
 from splat.scenes.formats.dtu import decompose
 from splat.scenes.scene import Scene, load_scene
 from splat.scenes.splits import dtu_split, split_scene
@@ -131,6 +132,14 @@ def test_a_missing_calibration_of_dtu_is_refused_with_its_place(tmp_path: Path) 
         load_scene(scene)
     path.unlink()
     with pytest.raises(FileNotFoundError, match=r"calibration of rect_003_3_r5000\.png in .*pos_003\.txt"):
+        load_scene(scene)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+def test_a_matrix_that_is_no_cameras_is_refused(tmp_path: Path, value: float) -> None:
+    scene = write_dtu(tmp_path, views=1)
+    np.savetxt(tmp_path / "Calibration/cal18/pos_001.txt", value * matrix(0))
+    with pytest.raises(InputError, match=r"finite matrix of a camera in .*pos_001.txt"):
         load_scene(scene)
 
 

@@ -16,6 +16,8 @@ from splat.training.methods.dropout.dropgaussian import DropGaussian
 from splat.training.methods.dropout.dropoutgs import DropoutGS
 from splat.training.methods.methods import METHODS, ThreeDGS
 from splat.training.methods.sam import SAM
+from splat.training.methods.second_order.gn_cg import GaussNewtonCG
+from splat.training.methods.second_order.newton_blocks import NewtonBlocks
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.state import MethodSettings, Training
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
@@ -29,6 +31,8 @@ SHORT: dict[str, MethodSettings] = {
     "fsgs": FSGS(threshold=0.1, large=0.01),
     "dngaussian": DNGaussian(soft_start=3),
     "cor-gs": CoRGS(prune_every=4, prune_start=3, distance=0.3, pseudo_start=5),
+    "newton-blocks": NewtonBlocks(curvature="hessian"),
+    "gn-cg": GaussNewtonCG(products=3),
 }  # schedules that fit into a dozen steps
 
 
@@ -69,7 +73,7 @@ def test_any_method_continues_from_a_checkpoint_to_the_same_bits(tmp_path, name)
 def saved(tmp_path_factory) -> dict[str, bytes]:
     """Checkpoints under way, each with rows in its history."""
     path, found = tmp_path_factory.mktemp("saved") / "checkpoint.pt", {}
-    for name in ("stablegs", "cor-gs"):
+    for name in ("stablegs", "cor-gs", "newton-blocks"):
         training = Training.start(tiny_gaussians(), EXTENT, replace(tiny_config(), method=SHORT[name]))
         while training.step < 6:
             next(train(training, views()))
@@ -98,6 +102,8 @@ NO_WHOLE_NUMBERS = ["many", -1, 2.5, None, 10**400, torch.zeros(3)]
             ["much", -1, None, 10**400, float("nan")],
             "magnitude|finite tau and",
         ),
+        ("newton-blocks", ("damping",), ["much", -1.0, 0.0, None, float("nan")], "'damping'"),
+        ("newton-blocks", ("last",), [3, [2.0], torch.zeros(2, 2), torch.full((3,), float("nan"))], "'last'"),
         ("stablegs", ("normals",), [{}, 3, [2], [torch.zeros(3)]], "'normals.* expected"),
     ],
 )

@@ -58,7 +58,7 @@ def test_no_preset_goes_before_an_option():
         assert not row["llff"] or getattr(TrainOptions, OPTIONS.get(row["setting"], ""), None) is None, row
 
 
-@pytest.mark.parametrize("name", ["3dgs", "sam"])
+@pytest.mark.parametrize("name", ["3dgs", "sam", "gn-cg"])
 def test_methods_without_a_published_training_are_refused(name):
     assert presets(name, "common") == {}
     with pytest.raises(InputError, match="expected a method with a published training for llff"):

@@ -14,6 +14,7 @@ import torch
 from landscape.errors import InputError
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
+from splat.model.files.splat_ply import splat_ply
 from splat.model.gaussians import Gaussians
 from splat.scenes.scene import load_scene
 from splat.scenes.splits import split_scene, spread_views
@@ -121,7 +122,6 @@ def test_what_is_not_the_scenes_picture_is_not_measured_and_shown(folder):
         (("trained by someone",), {}, "which says 'someone'"),
         ((), {"trained_by": "nobody"}, "got nobody"),
         ((), {"trained_by": OURS, "scene": None}, "expected --scene FOLDER"),
-        (("Exported from Brush", "SplatRenderMode: mip"), {}, "antialiased"),
         ((), {"trained_by": OURS, "views": 2, "train_list": ("view_001",)}, "--views or --train-list"),
         ((), {"trained_by": OURS, "train_list": ("nothing",)}, "name of one view"),
         ((), {"trained_by": "nerfstudio"}, "dataparser_transforms.json"),
@@ -131,6 +131,40 @@ def test_what_the_file_does_not_say_is_asked_for(folder, comments, ask, message)
     path = stored(folder / "a.ply", written.ply(written.columns(gaussians()), comments))
     with pytest.raises(InputError, match=message):
         opened(path, **ask)
+
+
+@pytest.mark.parametrize(
+    ("comments", "ask", "expected"),
+    [
+        (("Exported from Brush", "SplatRenderMode: mip"), {}, ("mip-plain", 0.1)),
+        (("Exported from Brush", "SplatRenderMode: default"), {}, ("none", 0.3)),
+        ((), {"trained_by": "gsplat-raw", "antialiased": True}, ("mip-plain", 0.3)),
+        ((), {"trained_by": "graphdeco", "antialiased": True}, ("mip", 0.3)),
+        (("antialiased 1",), {"trained_by": "graphdeco"}, ("mip", 0.3)),
+    ],
+)
+def test_what_was_antialiased_is_rendered_as_its_tool_does(folder, comments, ask, expected):
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians()), comments))
+    found = opened(path, **ask)
+    render = found.training.config.render
+    assert (render.antialias, render.blur) == expected
+    assert found.origin and found.origin["preset"]["render"]["antialias"] == expected[0]
+
+
+def test_mip_splattings_ply_is_the_same_as_our_own_checkpoint_with_its_filter(folder):
+    g = gaussians()
+    g = g.with_filter(0.02 + 0.05 * torch.rand(len(g), generator=torch.Generator().manual_seed(1)))
+    path = stored(folder / "m.ply", splat_ply(g))
+    theirs = opened(path)
+    render = theirs.training.config.render
+    assert (render.antialias, render.blur) == ("mip-splatting", 0.1)
+    save_checkpoint(folder / "own.pt", theirs.training, theirs.scene)
+    ours = open_checkpoint(folder / "own.pt", Foreign(), path)
+    both = [objective(each, path) for each in (theirs, ours)]
+    assert both[0].active.filter_widths is not None
+    assert torch.equal(both[0].gradient, both[1].gradient)
+    plain = theirs.training.config.objective(g.with_filter(None), both[0].views)
+    assert float((plain.gradient - both[0].gradient).norm()) > 1e-3 * float(plain.gradient.norm())
 
 
 def test_our_own_checkpoint_is_given_nothing_that_it_holds(folder):
@@ -213,3 +247,13 @@ def test_fewer_views_are_spread_over_the_cameras(folder):
     assert found.thinned(scene, None) is found.thinned(scene, 99) is found
     with pytest.raises(InputError, match="at least 1 view"):
         spread_views(scene.frames, 0)
+
+
+def test_few_views_stand_for_their_neighbours_and_are_not_the_outermost(folder):
+    frame = MADE.scene.frames[0]
+    places = [torch.tensor([10.0 * (k // 3) + k % 3, 0.0, 0.0], dtype=torch.float64) for k in range(9)]  # three groups
+    frames = [replace(frame, name=str(k), camera=replace(frame.camera, centre=at)) for k, at in enumerate(places)]
+    assert sorted(spread_views(frames, 3)) == ["1", "4", "7"] and spread_views(frames, 1) == ["4"]
+    assert sorted(spread_views(frames, 9)) == [str(k) for k in range(9)]
+    together = [replace(frame, name=str(k)) for k in range(4)]
+    assert len({*spread_views(together, 3)}) == 3

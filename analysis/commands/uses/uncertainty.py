@@ -1,0 +1,113 @@
+"""`landscape uncertainty`: variances of held-out views' pixels (`splat.curvature.scores.uncertainty`) beside their true errors.
+
+    agreement.csv       by view and by precision (the blocks of the Gaussians, or their diagonal alone): Spearman's rank
+                        correlation of variance and |error| over the pixels, and AUSE
+    view-NNN.npz, .png  photograph, |error|, and the standard deviations by both
+    uncertainty.json    where it comes from
+
+AUSE: the mean |error| of the pixels that are left when those of the largest variance are taken away, over that of all, less the
+same where those of the largest error are taken, averaged over the shares taken; 0 at best.  `ause_random` is that of an order
+that knows nothing.
+"""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import pandas as pd
+import torch
+from jaxtyping import Float
+from rich.console import Console
+
+from analysis.commands.uses.next_view import informations
+from analysis.commands.uses.options import UncertaintyOptions
+from analysis.console.drawing import draw_or_say
+from analysis.console.stages import Stages
+from analysis.probe.command import opened
+from analysis.probe.record import provenance_of
+from analysis.records.json_files import json_text, plain
+from analysis.records.records import record_folder, require_replaceable
+from landscape.errors import InputError
+from splat.curvature.linearize import LinearizedView
+from splat.curvature.scores.information import prior_of
+from splat.curvature.scores.uncertainty import pixel_variance
+from splat.losses.autograd import loss_against
+from splat.losses.reference import LossSettings
+
+PRECISIONS = {"block": False, "diagonal": True}
+SHARES = 100
+
+
+class UncertaintyRecord:
+    """What marks a folder of this command."""
+
+    FILE: ClassVar[str] = "uncertainty.json"
+
+
+def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
+    """Measure and draw; returns the exit code.  command: as typed, for the record."""
+    if options.samples < 2:
+        raise InputError(f"expected --samples of at least 2, got {options.samples}")
+    out = options.out or options.checkpoint.parent / "uncertainty"
+    require_replaceable(out, UncertaintyRecord)
+    stages, generator, rows = Stages(Console(stderr=True)), torch.Generator().manual_seed(options.seed), []
+    with stages.stage("load"):
+        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
+        if not checkpoint.scene.test:
+            raise InputError("expected a scene with held-out views, whose errors are the truth, got none")
+        held_out, training = scene.load(checkpoint.scene.test), checkpoint.training
+        gaussians, config = training.gaussians.aligned_to(training.gaussians), training.config
+        background = config.background_colour(gaussians.flat.dtype)
+    with record_folder(out, UncertaintyRecord) as folder, stages:
+        with stages.stage("information") as report:
+            cameras = {frame.name: frame.camera for frame in scene.select(checkpoint.scene.train)}
+            seen = [*informations(gaussians, cameras, background, config.render, report).values()]
+            total = sum(seen[1:], seen[0])
+            total = total + prior_of(total)
+        with stages.stage("views") as report:
+            for place, view in enumerate(held_out):
+                loss = loss_against(view.image, LossSettings("l2", ssim_weight=0), gaussians.flat)
+                linearized = LinearizedView(gaussians, view.camera, loss, background, config.render)
+                error = (linearized.image.clamp(0, 1) - view.image).abs().mean(dim=0).double().numpy()
+                maps = {"photograph": view.image.permute(1, 2, 0).numpy(), "error": error}
+                for name, diagonal in PRECISIONS.items():
+                    variance = pixel_variance(linearized, total, generator, options.samples, diagonal=diagonal).numpy()
+                    maps[name] = np.sqrt(variance)
+                    rows.append({"view": view.name, "precision": name, **agreement(variance, error)})
+                arrays: dict[str, Any] = {key: each.astype(np.float32) for key, each in maps.items()}
+                np.savez(folder / f"view-{place:03d}.npz", **arrays)
+                report(place + 1, len(held_out), "held-out views")
+        table = pd.DataFrame(rows)
+        table.to_csv(folder / "agreement.csv", index=False)
+        made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
+        (folder / UncertaintyRecord.FILE).write_text(json_text(plain(made)), encoding="utf-8")
+        notes = draw_or_say("uses", folder)
+    console = Console()
+    means = table.drop(columns="view").pivot_table(index="precision")  # by default means
+    console.print(means.round(3).to_string(), highlight=False, markup=False)
+    words = f"means over {len(held_out)} held-out views; agreement.csv, view-*.png in {out}"
+    console.print(words, *notes, sep="\n", highlight=False, markup=False, soft_wrap=True)
+    return 0
+
+
+def agreement(variance: Float[np.ndarray, "h w"], error: Float[np.ndarray, "h w"]) -> dict[str, float]:
+    """Of a map that predicts with one that is true.
+
+    >>> perfect = agreement(np.arange(1000.0).reshape(50, 20), np.arange(1000.0).reshape(50, 20))
+    >>> {name: round(value, 2) for name, value in perfect.items()}
+    {'rank_correlation': 1.0, 'ause': 0.0, 'ause_random': 0.5}
+    """
+    predicted, true = variance.ravel(), error.ravel()
+    best = _left(true, true)
+    return {
+        "rank_correlation": float(pd.Series(predicted).corr(pd.Series(true), method="spearman")),
+        "ause": float((_left(true, predicted) - best).mean()),
+        "ause_random": float((1 - best).mean()),
+    }
+
+
+def _left(error: Float[np.ndarray, " p"], order: Float[np.ndarray, " p"]) -> Float[np.ndarray, " s"]:
+    """The mean error when each share of the pixels is taken away, the largest in order first, over the mean of all."""
+    ascending = error[np.argsort(order, kind="stable")]
+    counts = np.ceil(len(error) * (1 - np.arange(SHARES) / SHARES)).astype(int)
+    return np.cumsum(ascending)[counts - 1] / counts / max(error.mean(), np.finfo(float).tiny)

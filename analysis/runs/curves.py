@@ -1,0 +1,98 @@
+"""`python -m analysis.runs.curves RUNS`: loss and scores along trainings that kept their checkpoints.
+
+RUNS/SCENE/METHOD/SEED/curve.csv    of every run of a sweep with `keep_checkpoints = "all"`: a row for each checkpoint
+
+    step, cpu       steps so far, and the seconds of all processors that they took (train.csv)
+    passes          over the pixels of one view: two a step of Adam, else as history.csv has them
+    loss, psnr      of all training views: the mean of the training's loss, and dB
+    held_out        dB of the held-out views
+
+What is there already is not made again.  `python -m figures.second_order RUNS` draws them.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from rich.console import Console
+from rich.progress import track
+
+from analysis.records.run_files import CHECKPOINT
+from landscape.errors import InputError
+from splat.scenes.view import View
+from splat.training.checkpoint import load_checkpoint, write_atomically
+from splat.training.score.evaluate import evaluate
+
+CURVE, LOG, HISTORY = "curve.csv", "train.csv", "history.csv"
+OF_ADAM = 2  # forward and backward
+
+
+def curve(run: Path) -> pd.DataFrame:
+    """The rows of a run that has ended.  InputError where it kept no checkpoints or logged none of their steps."""
+    log = pd.read_csv(run / LOG).set_index("step")
+    kept = sorted((int(path.parent.name.removeprefix("step-")), path) for path in run.glob(f"step-*/{CHECKPOINT}"))
+    if not kept:
+        raise InputError(f"expected checkpoints along {run}, found none; train with --keep-checkpoints all")
+    if missing := [step for step, _ in kept if step not in log.index or "cpu" not in log]:
+        raise InputError(
+            f"expected the step {missing[0]} in {run / LOG}, found no time of it; train with --log-every 1"
+        )
+    views, held_out = _views(kept[0][1])
+    passes = _passes(run)
+    rows: list[dict[str, Any]] = []
+    for step, path in kept:
+        training = load_checkpoint(path).training
+        config, gaussians = training.config, training.gaussians
+        background = config.background_colour(gaussians.flat.dtype)
+        objective = config.objective(gaussians, views)
+        known, unknown = (evaluate(gaussians, each, background, config.render).psnr for each in (views, held_out))
+        rows.append(
+            {
+                "step": step,
+                "cpu": float(log.loc[step, "cpu"]),  # pyright: ignore[reportArgumentType]
+                "passes": OF_ADAM * step if passes is None else int(passes[:step].sum()),
+                "loss": objective.loss(objective.active.flat),
+                "psnr": known,
+                "held_out": unknown,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _views(path: Path) -> tuple[list[View], list[View]]:
+    loaded = load_checkpoint(path)
+    scene = loaded.load_scene(path)
+    if not loaded.scene.test:
+        raise InputError(f"expected held-out views in {path}, got none")
+    return scene.load(loaded.scene.train), scene.load(loaded.scene.test)
+
+
+def _passes(run: Path) -> "pd.Series | None":
+    """Of each step, where the method counts them."""
+    if not (run / HISTORY).is_file():
+        return None
+    return pd.read_csv(run / HISTORY).get("passes")
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="analysis.runs.curves", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", type=Path, metavar="RUNS")
+    runs = parser.parse_args(words).runs
+    ended = sorted(path.parent for path in runs.glob("*/*/*/metrics.json"))
+    console = Console(stderr=True)
+    try:
+        if not ended:
+            raise InputError(f"expected runs that have ended in {runs}, got none; landscape sweep makes them")
+        for run in track([run for run in ended if not (run / CURVE).is_file()], "curves", console=console):
+            write_atomically(run / CURVE, curve(run).to_csv(index=False).encode())
+    except (InputError, FileNotFoundError) as error:
+        console.print(f"analysis.runs.curves: {error}", soft_wrap=True, highlight=False, markup=False)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

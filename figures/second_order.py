@@ -1,0 +1,67 @@
+"""Figure: training loss and held-out PSNR of steps of second order beside Adam, over seconds and over passes.
+
+`python -m figures.second_order RUNS` draws what `analysis.runs.curves` wrote beside every run of a sweep; one picture for each
+scene, RUNS/SCENE.png.  Lines: means over the seeds that have ended, at equal steps; bands: from the lowest seed to the highest.
+"""
+
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from figures.style import RUNS, folder_script, literal, new_figure, save, style
+from landscape.errors import InputError
+
+ACROSS = {"cpu": "seconds of one processor", "passes": "passes over the pixels of a view"}
+UP = {"loss": "training loss", "held_out": "held-out PSNR, dB"}
+PAGE = 6.9
+
+
+def gathered(runs: Path) -> pd.DataFrame:
+    """The curves of every run, with "scene", "method" and "seed".  InputError where there is none."""
+    found = [
+        pd.read_csv(path).assign(scene=scene, method=method, seed=seed)
+        for path in sorted(runs.glob("*/*/*/curve.csv"))
+        for scene, method, seed in [path.parts[-4:-1]]
+    ]
+    if not found:
+        raise InputError(f"expected curve.csv in runs of {runs}, found none; python -m analysis.runs.curves {runs}")
+    return pd.concat(found, ignore_index=True)
+
+
+def draw_scene(table: pd.DataFrame) -> Figure:
+    """table: the rows of one scene of `gathered`."""
+    with style():
+        figure = new_figure(4.2)
+        figure.set_figwidth(PAGE)
+        panels = figure.subplots(2, 2, sharex="col", sharey="row")
+        for colour, (name, rows) in zip(RUNS, table.groupby("method", sort=False), strict=False):
+            by_step = rows.groupby("step")
+            for i, y in enumerate(UP):
+                for j, x in enumerate(ACROSS):
+                    across = by_step[x].mean()
+                    panels[i, j].plot(across, by_step[y].mean(), color=colour, label=literal(str(name)))
+                    panels[i, j].fill_between(
+                        across, by_step[y].min(), by_step[y].max(), color=colour, alpha=0.2, linewidth=0
+                    )
+        for i, (y, words) in enumerate(UP.items()):
+            panels[i, 0].set_ylabel(words)
+            for axes in panels[i]:
+                axes.grid(True)
+                if y == "loss":
+                    axes.set_yscale("log")
+        for j, words in enumerate(ACROSS.values()):
+            panels[1, j].set_xlabel(words)
+        panels[0, 0].legend()
+    return figure
+
+
+def draw(runs: Path, suffix: str) -> list[Path]:
+    return [
+        save(draw_scene(pd.DataFrame(rows)), runs / f"{scene}.{suffix}")
+        for scene, rows in gathered(runs).groupby("scene")
+    ]
+
+
+if __name__ == "__main__":
+    folder_script(draw, "loss and scores along trainings", "sweep")

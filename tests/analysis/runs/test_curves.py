@@ -1,0 +1,74 @@
+"""Curves of a sweep: loss and scores of every checkpoint that was kept, and the picture of them."""
+
+import pandas as pd
+import pytest
+
+from analysis.commands.cli import main
+from analysis.runs.curves import CURVE
+from analysis.runs.curves import main as curves
+from figures.second_order import draw
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint
+from splat.training.score.evaluate import evaluate
+
+SWEEP = """
+seeds = [1]
+views = 2
+iterations = 4
+log_every = 2
+checkpoint_every = 2
+keep_checkpoints = "all"
+ssim_weight = 0.0
+[scenes.still]
+path = "still"
+pixel_loss = "l2"
+[scenes.polish]
+path = "still"
+from = "runs/still/gn-cg/{seed}/checkpoint.pt"
+[methods.gn-cg]
+[methods.3dgs]
+"""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("curves")
+    made = synthetic_scene(SyntheticSettings(gaussians=60, views=3, width=20, height=14))
+    write_transforms_scene(made.scene, folder / "still")
+    (folder / "sweep.toml").write_text(SWEEP)
+    assert main(["sweep", str(folder / "sweep.toml"), "--out", str(folder / "runs"), "--jobs", "1"]) == 0
+    assert curves([str(folder / "runs")]) == 0
+    return folder / "runs"
+
+
+def test_a_curve_has_loss_scores_and_passes_of_the_checkpoints(runs):
+    run = runs / "still" / "gn-cg" / "1"
+    rows, history = pd.read_csv(run / CURVE), pd.read_csv(run / "history.csv")
+    assert list(rows["step"]) == [2, 4] and list(rows["passes"]) == [
+        history["passes"][:2].sum(),
+        history["passes"].sum(),
+    ]
+    assert rows["loss"][0] == pytest.approx(history["loss"][2], rel=1e-6)  # before the third step
+    assert list(pd.read_csv(runs / "still" / "3dgs" / "1" / CURVE)["passes"]) == [4, 8]
+    path = run / "step-4" / "checkpoint.pt"
+    loaded = load_checkpoint(path)
+    held_out, config = loaded.load_scene(path).load(loaded.scene.test), loaded.training.config
+    score = evaluate(loaded.training.gaussians, held_out, None, config.render).psnr
+    assert rows["held_out"][1] == pytest.approx(score, rel=1e-6)
+
+
+def test_a_cell_starts_from_the_checkpoint_of_its_seed(runs):
+    first, polished = (runs / scene / "gn-cg" / "1" for scene in ("still", "polish"))
+    assert f"from {first / 'checkpoint.pt'}" in (polished.parent / "1.log").read_text()
+    begun = pd.read_csv(polished / "train.csv")
+    assert begun["loss"][0] != pd.read_csv(first / "train.csv")["loss"][0]
+
+
+def test_the_picture_is_drawn_for_every_scene(runs):
+    assert [path.name for path in draw(runs, "png")] == ["polish.png", "still.png"]
+
+
+def test_runs_without_checkpoints_are_refused(tmp_path, capsys):
+    assert curves([str(tmp_path)]) == 2
+    assert "expected runs that have ended" in capsys.readouterr().err

@@ -1,0 +1,98 @@
+"""The pages in a real browser: the report and `landscape view`, driven as a user drives them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from analysis.commands import view
+from analysis.commands.map.command import measured_fields
+from analysis.commands.map.pictures import rendered
+from splat.curvature.objective import SceneObjective
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from tests.analysis.records.test_report import with_views
+from tests.browser import chromium, errors_in, requests_of, until
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+def keys_to(browser: Any, selector: str, *keys: str) -> None:
+    browser.find_element("css selector", selector).send_keys(*keys)
+
+
+def test_the_report_draws_moves_and_asks_for_nothing(browser, tmp_path):
+    path = with_views(tmp_path / "probe", ["a.png", "b.png"])
+    requests_of(browser)
+    browser.get(path.as_uri())
+    until(browser, "document.querySelector('#surface .main-svg') !== null")
+    assert until(browser, "[...document.images].every(image => image.complete && image.naturalWidth > 0)")
+    keys_to(browser, "#chosen", "\ue014")  # the right arrow
+    assert until(browser, "document.querySelector('#views img').alt.endsWith('b.png')")
+    assert until(browser, "document.querySelectorAll('#views img')[1].naturalWidth") == 8
+    assert errors_in(browser) == [] and requests_of(browser) == [path.as_uri()]
+
+
+def test_the_wheel_scrolls_the_page_until_the_surface_was_clicked(browser, tmp_path):
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
+
+    browser.get(with_views(tmp_path / "probe", ["a.png"]).as_uri())
+    until(browser, "document.querySelector('#surface .main-svg') !== null")
+    guard = browser.find_element("id", "guard")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", guard)
+    turn = ActionChains(browser).scroll_from_origin(ScrollOrigin.from_element(guard), 0, -100)
+    before = browser.execute_script("return window.scrollY")
+    turn.perform()
+    until(browser, f"window.scrollY < {before}")
+    ActionChains(browser).move_to_element(guard).click().perform()
+    until(browser, "document.getElementById('guard').className === 'on'")
+    before = browser.execute_script("return window.scrollY")
+    turn.perform()
+    browser.execute_async_script("setTimeout(arguments[0], 500)")
+    assert browser.execute_script("return window.scrollY") == before
+
+
+@pytest.fixture(scope="module")
+def viewer() -> Iterator[view.Viewer]:
+    viser = pytest.importorskip("viser", reason="needs viser; pip install -e '.[view]'")
+    made = synthetic_scene(SyntheticSettings(gaussians=150, views=2, width=32, height=24))
+    objective = SceneObjective(made.truth, made.scene.load())
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    found = view.Viewer(server, objective)
+    found.add_fields(measured_fields(objective, Path("nowhere"), [], lambda *_: None), "largest")
+    direction = torch.zeros_like(objective.active.flat)
+    direction[objective.blocks["sh"]] = 1.0
+    found.add_steps({"e₁": (direction, 0.05)})
+    yield found
+    server.stop()
+
+
+def test_a_click_a_field_and_a_step_reach_the_viewer(browser, viewer):
+    from selenium.webdriver import ActionChains
+
+    browser.get(f"http://127.0.0.1:{viewer.server.get_port()}")
+    until(browser, "document.body.innerText.includes('training view')")
+    canvas = browser.find_element("tag name", "canvas")
+    ActionChains(browser).move_to_element_with_offset(canvas, -130, 0).click().perform()
+    until(browser, "/Gaussian \\d+, \\d+% of this pixel/.test(document.body.innerText)")
+    assert "largest curvature" in viewer.numbers.content
+    field = next(
+        each for each in browser.find_elements("tag name", "input") if each.get_attribute("value") == "largest"
+    )
+    field.click()
+    field.send_keys("\ue009a")  # all of it
+    field.send_keys("condition", "\ue015", "\ue007")  # the first of what is left, by the arrow down and Enter
+    until(browser, "document.body.innerText.includes('condition of its splat')")
+    assert viewer.field.value == "condition"
+    browser.find_elements("css selector", "[role=slider]")[-1].send_keys("\ue010")  # to the end
+    (direction, reach), active = viewer.steps["e₁"], viewer.objective.active
+    there = active.with_flat(active.flat + reach * direction)
+    until(browser, f"document.body.innerText.includes('loss {view.quantity(viewer.objective.loss(there.flat))}')")
+    image = view.in_bytes(rendered(viewer.objective, 0, there))
+    assert (viewer.render.image == image.transpose(1, 2, 0)).all()
