@@ -16,7 +16,7 @@ Loss, gradient, blocks and products with the Hessian are then those of all views
 call the objective's methods in the same order.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -238,12 +238,16 @@ class SceneObjective:
     @cached_property
     def linearized(self) -> KeptViews:
         """This rank's views, linearized at the active Gaussians; made on first use."""
-        return KeptViews(self.linearize, len(self.views), self._memory)
+        return KeptViews(self.linearizer(self.active), len(self.views), self._memory)
 
-    def linearize(self, index: int, gaussians: Gaussians | None = None) -> LinearizedView:
-        """A view linearized at the active Gaussians or, for comparison, at others; it is not kept."""
-        camera, at = self.views[index].camera, self.active if gaussians is None else gaussians
-        return LinearizedView(at, camera, self._losses[index], self.background, self.settings)
+    def linearizer(self, gaussians: Gaussians) -> Callable[[int], LinearizedView]:
+        """What linearizes a view, by its index, at the active Gaussians or, for comparison, at others.
+
+        It does not refer to this objective, which would otherwise be freed only when Python looks for circles.
+        """
+        cameras, losses = [view.camera for view in self.views], self._losses
+        background, settings = self.background, self.settings
+        return lambda index: LinearizedView(gaussians, cameras[index], losses[index], background, settings)
 
     @cached_property
     def losses(self) -> Float64[Tensor, " m"]:

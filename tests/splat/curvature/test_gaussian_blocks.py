@@ -109,7 +109,7 @@ def test_own_blocks_with_ssim_are_differences_of_gradients() -> None:
             for sign in (1, -1):
                 moved = flat.clone()
                 moved[row] += sign * step
-                views = [objective.linearize(index, objective.active.with_flat(moved)) for index in range(2)]
+                views = list(map(objective.linearizer(objective.active.with_flat(moved)), range(2)))
                 ends.append((views[0].gradient + views[1].gradient)[rows] / 2)
             columns.append((ends[0] - ends[1]) / (2 * step))
         # the truncation is step^2 / 6 times a third derivative: one more factor of some 1 / (a splat's size) each

@@ -1,6 +1,8 @@
 """The Hessian of a scene as an operator: what is removed, what is averaged, what is refused."""
 
+import gc
 from dataclasses import replace
+from weakref import ref
 
 import pytest
 import torch
@@ -248,3 +250,21 @@ def test_free_memory_of_a_gpu_is_also_what_torch_holds_for_tensors_to_come(monke
         monkeypatch.setattr(torch.cuda, name, lambda _device, found=found: found)
     assert free_memory(torch.device("cuda")) == 140
     assert free_memory(torch.device("cpu")) > 1000
+
+
+def test_what_was_linearized_is_freed_with_its_objective():
+    """Training makes a new objective at every diagnosis: in a circle of references they would pile up."""
+
+    def used() -> list[ref]:
+        scene = objective(random_gaussians(6, 1, logit=1.0))
+        hessian = SceneHessian(scene)
+        hessian.apply(random_like((hessian.dim, 1), 0))
+        scene.block_diagonal()
+        return [ref(scene), ref(scene.linearized.first), ref(hessian)]
+
+    used()  # what is compiled at first refers to its arguments
+    gc.disable()
+    try:
+        assert [left() for left in used()] == [None, None, None]
+    finally:
+        gc.enable()
