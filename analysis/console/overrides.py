@@ -58,10 +58,13 @@ def _unknown(key: str, config: TrainConfig) -> str:
     """The setting that was meant, of whatever method; else all."""
     common, own, method = _names(config), _names(config.method), config.method.name
     words = f"expected a setting of the training or of the method {method}, got {key!r}"
+    others = {name: _names(kind()) for name, kind in METHODS.items()}
+    if of := [name for name, settings in others.items() if key in settings]:
+        return f"{words}, which is one of --method {' and '.join(of)}"
     if meant := did_you_mean(key, [*common, *own]):
         return words + meant
-    for name, kind in METHODS.items():
-        if meant := did_you_mean(key, _names(kind())):
+    for name, settings in others.items():
+        if meant := did_you_mean(key, settings):
             return f"{words}{meant.removesuffix('?')} of the method {name}?"
     return f"{words} (of the training: {', '.join(common)}; of {method}: {', '.join(own) or 'none'})"
 

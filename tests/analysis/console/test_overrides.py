@@ -42,7 +42,8 @@ def test_each_type_is_read_from_text_and_from_a_plain_value():
     ("key", "value", "message"),
     [
         ("warmup", "1", r"the method stablegs, got 'warmup'; did you mean warm_up\?$"),
-        ("rho", "1", r"the method stablegs, got 'rho'; did you mean rho of the method sam\?$"),
+        ("rho", "1", r"the method stablegs, got 'rho', which is one of --method sam$"),
+        ("rhoo", "1", r"the method stablegs, got 'rhoo'; did you mean rho of the method sam\?$"),
         ("probe.gama", "1", "expected a setting among .*gamma.*, got 'gama' in 'probe.gama'; did you mean gamma"),
         ("name", "sam", "expected a setting of the training"),
         ("teapot", "1", r"or of the method stablegs, got 'teapot' \(of the training: iterations, "),
@@ -66,8 +67,8 @@ def test_what_does_not_fit_is_refused_with_what_was_expected(key, value, message
 
 
 def test_a_method_without_settings_is_said_to_have_none():
-    with pytest.raises(ValueError, match=r"or of the method 3dgs, got 'vsp_weight'.*; of 3dgs: none\)"):
-        overridden(TrainConfig(), {"vsp_weight": 0})
+    with pytest.raises(ValueError, match=r"or of the method 3dgs, got 'teapot' .*; of 3dgs: none\)"):
+        overridden(TrainConfig(), {"teapot": 0})
 
 
 def test_an_assignment_has_a_key_and_an_equals_sign():
