@@ -84,7 +84,7 @@ def test_every_point_stands_at_its_step_and_the_band_is_its_bracket():
     assert list(np.asarray(line.get_xdata())) == list(measured["step"])
     assert np.array_equal(line.get_transform().transform((1000, 4.0)), axes.transData.transform((1000, 4.0)))
     corners = np.asarray(axes.collections[0].get_paths()[0].vertices)
-    ends = measured[["literal_low", "literal_high"]].abs().to_numpy()
+    ends = np.abs(np.asarray(measured[["literal_low", "literal_high"]], float))
     assert corners[:, 1].min() == pytest.approx(ends.min()) and corners[:, 1].max() == pytest.approx(ends.max())
 
 

@@ -107,11 +107,10 @@ def decide(effect: Effect) -> Verdict:
 def numbers(rows: pd.DataFrame, name: str, method: str | None = None, keys: Sequence[str] = PAIR) -> pd.Series:
     """A quantity of all runs, or of one method's, by scene and seed, the mean of those alike; none where no run has it."""
     part = rows if method is None else rows[rows["method"] == method]
-    values = part[name].to_numpy(float) if name in part else np.full(len(part), np.nan)
+    values = np.asarray(part[name], float) if name in part else np.full(len(part), np.nan)
     found = pd.Series(values, pd.MultiIndex.from_frame(pd.DataFrame(part[list(keys)])))
-    if method is None:
-        return found[np.isfinite(found)]
-    return pd.Series(found[np.isfinite(found)].groupby(level=list(keys)).mean())
+    found = pd.Series(found[np.isfinite(values)])
+    return found if method is None else pd.Series(found.groupby(level=list(keys)).mean())
 
 
 def gains(rows: pd.DataFrame, method: str) -> pd.Series:

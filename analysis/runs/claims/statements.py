@@ -87,7 +87,8 @@ def needles(rows: pd.DataFrame) -> Judgement:
     columns = {words: name for words, name in blocks.items() if len(numbers(rows, name, BASE))}
     columns["share of the steepest eigenvector on needles"] = "needles"
     effects = tuple(Effect(words, Interval.of(numbers(rows, name, BASE)), null, 0.5) for words, name in columns.items())
-    verdicts = [decide(effect) for effect in effects][: len(STRETCHED) if len(effects) > len(STRETCHED) else 1]
+    verdicts: list[Verdict] = [decide(effect) for effect in effects]
+    verdicts = verdicts[: len(STRETCHED) if len(effects) > len(STRETCHED) else 1]
     verdict: Verdict = verdicts[0] if len(set(verdicts)) == 1 else "holds in part"
     if "cannot be tested here" in verdicts:
         verdict = "cannot be tested here"

@@ -81,8 +81,8 @@ def _stored(path: Path) -> pd.DataFrame:
         raise InputError(f"expected the table of a study in {path}, got one without the column {missing[0]}")
     for name in table.columns.difference(TEXTS):
         numbers = pd.Series(pd.to_numeric(table[name], errors="coerce"))
-        if len(wrong := table[name][numbers.isna() & (table[name].notna() | (name in KEYS))]):
-            raise InputError(f"expected numbers as {name} in {path}, got {reprlib.repr(wrong.iloc[0])}")
+        if wrong := list(table[name][numbers.isna() & (table[name].notna() | (name in KEYS))]):
+            raise InputError(f"expected numbers as {name} in {path}, got {reprlib.repr(wrong[0])}")
         table[name] = numbers
     return table
 

@@ -92,8 +92,13 @@ def _numpy_scalars() -> list[Any]:
 def _array(values: Any, key: Any, *shape: int | None) -> np.ndarray:
     """A tensor of finite size as float32; None in the shape: any length."""
     value = values[key] if not isinstance(values, Mapping) or key in values else None
-    plain = isinstance(value, Tensor) and value.layout is torch.strided and not value.is_nested
-    if not plain or value.device.type != "cpu" or not value.dtype.is_floating_point:
+    if (
+        not isinstance(value, Tensor)
+        or value.layout is not torch.strided
+        or value.is_nested
+        or value.device.type != "cpu"
+        or not value.dtype.is_floating_point
+    ):
         raise InputError(f"it has no tensor of numbers {key!r}")
     if value.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, value.shape)):
         raise InputError(f"its {key!r} has the shape {tuple(value.shape)}, expected {shape} (None: any)")

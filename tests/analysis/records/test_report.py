@@ -131,8 +131,8 @@ def test_the_map_beside_the_record_says_where(tmp_path, step):
     found["sentences"] = ["80% of e₁ turns Gaussian 3,778.", "Position: half of all pairs."]
     (tmp_path / "map").mkdir()
     (tmp_path / "map" / "map.json").write_text(json.dumps(found))
-    maps = {"largest": np.full((6, 8), 254, np.uint8), "error": np.zeros((6, 8), np.uint8)}
-    np.savez(tmp_path / "map" / "view-000.npz", **maps)
+    largest, error = np.full((6, 8), 254, np.uint8), np.zeros((6, 8), np.uint8)
+    np.savez(tmp_path / "map" / "view-000.npz", largest=largest, error=error)
     for name in ("steepest-e1.png", "fragility-000.png"):
         Image.new("RGB", (8, 6)).save(tmp_path / "map" / name)
     text = with_views(tmp_path / "probe", ["a.png"], data).read_text(encoding="utf-8")

@@ -44,11 +44,9 @@ def runs(tmp_path_factory):
 
 def test_a_curve_has_loss_scores_and_passes_of_the_checkpoints(runs):
     run = runs / "still" / "gn-cg" / "1"
-    rows, history = pd.read_csv(run / CURVE), pd.read_csv(run / "history.csv")
-    assert list(rows["step"]) == [2, 4] and list(rows["passes"]) == [
-        history["passes"][:2].sum(),
-        history["passes"].sum(),
-    ]
+    rows, history = (pd.read_csv(run / name).to_dict("list") for name in (CURVE, "history.csv"))
+    assert rows["step"] == [2, 4]
+    assert rows["passes"] == [sum(history["passes"][:2]), sum(history["passes"])]
     assert rows["loss"][0] == pytest.approx(history["loss"][2], rel=1e-6)  # before the third step
     assert list(pd.read_csv(runs / "still" / "3dgs" / "1" / CURVE)["passes"]) == [4, 8]
     path = run / "step-4" / "checkpoint.pt"
@@ -61,8 +59,8 @@ def test_a_curve_has_loss_scores_and_passes_of_the_checkpoints(runs):
 def test_a_cell_starts_from_the_checkpoint_of_its_seed(runs):
     first, polished = (runs / scene / "gn-cg" / "1" for scene in ("still", "polish"))
     assert f"from {first / 'checkpoint.pt'}" in (polished.parent / "1.log").read_text()
-    begun = pd.read_csv(polished / "train.csv")
-    assert begun["loss"][0] != pd.read_csv(first / "train.csv")["loss"][0]
+    losses = [pd.read_csv(run / "train.csv").to_dict("list")["loss"][0] for run in (polished, first)]
+    assert losses[0] != losses[1]
 
 
 def test_the_picture_is_drawn_for_every_scene(runs):

@@ -21,9 +21,10 @@ def plain(r: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("damping", [0.0, 0.7])
 def test_the_solution_is_the_dense_one_and_products_are_counted(damping):
-    A = CountingOperator(DenseOperator(matrix(0.1, 5.0)))
+    whole = matrix(0.1, 5.0)
+    A = CountingOperator(DenseOperator(whole))
     found = conjugate_gradients(A, B, plain, damping, rtol=1e-13, most=40)
-    dense = torch.linalg.solve(A.inner.matrix + damping * torch.eye(12).double(), B)
+    dense = torch.linalg.solve(whole + damping * torch.eye(12).double(), B)
     assert (found.x - dense).norm() < 1e-11 * dense.norm()
     assert found.reason == "tolerance" and found.products == A.matvecs <= 16
     assert torch.allclose(found.Ax, B, rtol=0, atol=1e-10)

@@ -47,8 +47,8 @@ def test_candidates_are_judged_and_picked_one_after_the_other(folder):
     assert {*table.index} == {names[i] for i in (2, 3, 5, 6)}
     known = informations(MADE.truth, {f.name: f.camera for f in MADE.scene.frames}, torch.zeros(3), RenderSettings())
     seen = [known[names[i]] for i in (1, 4, 7)]
-    for name, row in table.iterrows():
-        assert row.d == pytest.approx(gains_over(seen, [], known[name])["d"], rel=1e-4)
+    for name, gain in table["d"].to_dict().items():
+        assert gain == pytest.approx(gains_over(seen, [], known[str(name)])["d"], rel=1e-4)
     chosen = picked(seen, known, list(table.index), 2, "d")
     assert table.pick.dropna().sort_values().index.tolist() == chosen
     assert chosen[0] == table.d.idxmax()
