@@ -105,8 +105,8 @@ def sampling_error(terms: Float64[Tensor, " m"], population: int) -> Number:
 
     >>> import torch
     >>> terms = torch.tensor([1.0, 3.0], dtype=torch.float64)
-    >>> sampling_error(terms, 2), sampling_error(terms, 4), sampling_error(terms[:1], 4)
-    (0.0, 0.7071067811865476, None)
+    >>> sampling_error(terms, 2), round(sampling_error(terms, 4), 12), sampling_error(terms[:1], 4)
+    (0.0, 0.707106781187, None)
     """
     m = len(terms)
     if m >= population:

@@ -58,6 +58,8 @@ def _unknown(key: str, config: TrainConfig) -> str:
     """The setting that was meant, of whatever method; else all."""
     common, own, method = _names(config), _names(config.method), config.method.name
     words = f"expected a setting of the training or of the method {method}, got {key!r}"
+    if key in LABELS:
+        return f"{words}, which is an option of its own"
     others = {name: _names(kind()) for name, kind in METHODS.items()}
     if of := [name for name, settings in others.items() if key in settings]:
         return f"{words}, which is one of --method {' and '.join(of)}"

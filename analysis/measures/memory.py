@@ -70,13 +70,13 @@ def expected_peak(objective: SceneObjective) -> int:
         raise InputError(
             f"expected at least {_gb(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
             f"{camera.width} x {camera.height} px, got {_gb(used + free)}, of which {_gb(used)} are taken; --memory "
-            f"{ceil((used + least) / 1e8) / 10:g}GB would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
+            f"{ceil((used + least) / 1e7) / 100:g}GB would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
         )
     return used + min(free, len(objective.views) * needs.view + needs.beside)
 
 
 def _gb(size: float) -> str:
-    return f"{size / 1e9:.2g} GB"
+    return f"{size / 1e9:.3g} GB"
 
 
 @contextmanager

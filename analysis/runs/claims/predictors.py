@@ -27,12 +27,15 @@ DRAWS, LIMITS, LEAST = 2000, (0.025, 0.975), 5
 
 
 def predictors(rows: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
-    """A row for each quantity and kind: quantity, kind, rho, low, high, n.  Fewer than LEAST runs or methods give none."""
+    """A row for each quantity and kind: quantity, kind, rho, low, high, n.  Fewer than LEAST runs or methods give none.
+
+    Nor does a quantity that most runs lack: it would be compared with others over other runs than theirs.
+    """
     rng = np.random.default_rng(seed)
 
     def lines() -> Iterator[dict]:
         for name in QUANTITIES:
-            if name not in rows:
+            if name not in rows or 2 * int(rows[name].notna().sum()) < len(rows):
                 continue
             known = pd.DataFrame(rows[["scene", "method", name, SCORE]].dropna())
             for kind, pairs in _pairs(known, name).items():

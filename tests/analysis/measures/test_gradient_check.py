@@ -29,13 +29,13 @@ def test_the_exact_product_agrees_with_the_gradient_of_the_views_compared(views)
 def test_a_wrong_view_is_found_where_it_is_among_those_compared(monkeypatch) -> None:
     hessian = SceneHessian(SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LOSS, BACKGROUND))
     first, second = hessian.objective.linearized
-    monkeypatch.setattr(second, "hvp", lambda V: 2 * type(second).hvp(second, V))
+    monkeypatch.setattr(second, "hvp", lambda V, **coupled: 2 * type(second).hvp(second, V, **coupled))
     errors = [
         check_against_gradient(hessian, torch.Generator().manual_seed(0), views=views).difference.error
         for views in (1, None)
     ]
     assert errors[0] < 1e-4 and errors[1] > 0.1
-    monkeypatch.setattr(first, "hvp", lambda V: 2 * type(first).hvp(first, V))
+    monkeypatch.setattr(first, "hvp", lambda V, **coupled: 2 * type(first).hvp(first, V, **coupled))
     assert check_against_gradient(hessian, torch.Generator().manual_seed(0), views=1).difference.error > 0.1
 
 

@@ -140,6 +140,10 @@ def test_what_predicts_the_score_is_found_and_noise_is_not():
     assert (found.loc["lambda_max", "high"] < 0).all()
     assert (found.loc["lambda_min", "low"] < 0).all()
     assert (found.loc["lambda_min", "high"] > 0).all()
+    most = pd.Series(np.arange(40) < 20)
+    for name, asked in (("needles", most), ("saddle", most & (most.index > 0))):
+        rows[name] = rows["lambda_max"].where(asked)
+    assert {"needles"} == {"needles", "saddle"} & {*predictors(rows)["quantity"]}  # most runs lack the other
 
 
 @pytest.mark.parametrize(("attribute", "extent", "seen"), [("quats", 2.0, 2.0), ("means", 60.0, 3.0)])
