@@ -35,7 +35,7 @@ def predictors(rows: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
 
     def lines() -> Iterator[dict]:
         for name in QUANTITIES:
-            if name not in rows or 2 * int(rows[name].notna().sum()) < len(rows):
+            if name not in rows or 2 * len(pd.Series(rows[name]).dropna()) < len(rows):
                 continue
             known = pd.DataFrame(rows[["scene", "method", name, SCORE]].dropna())
             for kind, pairs in _pairs(known, name).items():
