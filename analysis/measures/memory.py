@@ -76,7 +76,7 @@ def expected_peak(objective: SceneObjective) -> int:
 
 
 def _gb(size: float) -> str:
-    return f"{size / 1e9:.3g} GB"
+    return f"{size / 1e9:.2f} GB"
 
 
 @contextmanager

@@ -69,7 +69,7 @@ def test_less_memory_keeps_fewer_views_and_too_little_is_refused(objective, monk
     few = SceneObjective(objective.active, objective.views, memory=needs.view)
     assert few.linearized.kept == 1 and objective.linearized.kept == 2
     free(monkeypatch, needs.view)
-    with pytest.raises(InputError, match=r"expected at least \d\.\d+ GB .* got .*; --memory \d\.\d+GB would fit"):
+    with pytest.raises(InputError, match=r"expected at least \d+\.\d\d GB .* got .*; --memory [\d.]+GB would fit"):
         expected_peak(objective)
     free(monkeypatch, 1e6)
     with pytest.raises(InputError, match=r"--max-views 6 would fit"):
