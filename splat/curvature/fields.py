@@ -89,17 +89,9 @@ def scene_fields(objective: SceneObjective, progress: Progress | None = None) ->
     """
     if objective.ranks.size > 1:
         raise InputError("expected one process, got several that share the views; run without torchrun")
-    gaussians, sights, total = objective.active, [], list[PerGaussianBlocks]()
-    for index, (view, linearized) in enumerate(zip(objective.views, objective.linearized, strict=True)):
-        sights.append(sight(gaussians, view.camera, objective.settings))
-        parts = linearized.block_diagonals()
-        for whole, part in zip(total, parts, strict=False):  # none before the first view
-            whole.add(part)
-        total = total or parts
-        if progress:
-            progress(index + 1, len(objective.views), "blocks of every Gaussian")
-    count = len(objective.views)
-    hessian, gauss_newton = (PerGaussianBlocks(part.geometry / count, part.sh / count) for part in total)
+    gaussians = objective.active
+    sights = [sight(gaussians, view.camera, objective.settings) for view in objective.views]
+    hessian, gauss_newton = objective.block_diagonals(progress=progress)
     rays = mean_rays(objective, sights)
     found = block_fields(hessian, gauss_newton, gaussians.quats, rays, gaussians.flat.dtype) | sight_fields(sights)
     return {name: found[name] for name in FIELDS}, sights

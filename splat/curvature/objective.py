@@ -26,6 +26,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
+from landscape.results import Progress
 from splat.backend.memory import free_memory
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import KeptViews, LinearizedView
@@ -267,17 +268,19 @@ class SceneObjective:
         return self.block_diagonals(approximate=approximate, parts=(gauss_newton,))[0]
 
     def block_diagonals(
-        self, *, approximate: bool = False, parts: Sequence[bool] = (False, True)
+        self, *, approximate: bool = False, parts: Sequence[bool] = (False, True), progress: Progress | None = None
     ) -> list[PerGaussianBlocks]:
         """`block_diagonal` of several parts at once; parts: which are Gauss-Newton."""
         totals: list[PerGaussianBlocks] = []
         traces: list[list[dict[str, float]]] = []
-        for view in self.linearized:
+        for done, view in enumerate(self.linearized, start=1):
             found = view.block_diagonals(approximate=approximate, parts=parts)
             traces.append([each.traces(self.active.quats) for each in found])
             for total, each in zip(totals, found, strict=False):  # none before the first view
                 total.add(each)
             totals = totals or found
+            if progress:
+                progress(done, len(self.views), "blocks of every Gaussian")
         return [self._mean_of_blocks(total, [each[i] for each in traces]) for i, total in enumerate(totals)]
 
     def _mean_of_blocks(self, total: PerGaussianBlocks, traces: Sequence[Mapping[str, float]]) -> PerGaussianBlocks:

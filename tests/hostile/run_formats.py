@@ -92,6 +92,17 @@ class CheckpointFile(Format):
         load_checkpoint(self.root / "again.pt")
 
 
+def of_arrays(chance: Random, content: bytes, changes: int = 1, zipped_anew: float = 0.2) -> bytes:
+    """An archive of NumPy with so many changes of an array, some of them `rezipped`."""
+    arrays: dict[str, Any] = dict(np.load(io.BytesIO(content)))
+    for _ in range(changes):
+        key = chance.choice(list(arrays))
+        arrays[key] = mutations.of_array(chance, arrays[key])
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return rezipped(chance, buffer.getvalue()) if chance.random() < zipped_anew else buffer.getvalue()
+
+
 def rezipped(chance: Random, content: bytes) -> bytes:
     """The same members compressed, in another order, one doubled, or one of a bomb's size."""
     result = io.BytesIO()
@@ -184,13 +195,7 @@ class ProbeArrays(Records):
         if chance.random() < 0.4:
             self.by_bytes = True
             return mutations.of_bytes(chance, content)
-        arrays: dict[str, Any] = dict(np.load(io.BytesIO(content)))
-        for _ in range(chance.choice((1, 1, 2))):
-            key = chance.choice(list(arrays))
-            arrays[key] = mutations.of_array(chance, arrays[key])
-        buffer = io.BytesIO()
-        np.savez(buffer, **arrays)
-        return rezipped(chance, buffer.getvalue()) if chance.random() < 0.3 else buffer.getvalue()
+        return of_arrays(chance, content, changes=chance.choice((1, 1, 2)), zipped_anew=0.3)
 
     def check(self, arrays: dict[str, dict[str, np.ndarray]]) -> None:
         if not self.by_bytes:

@@ -9,7 +9,7 @@ import torch
 from tests.hostile import mutations
 from tests.hostile.broken import Format
 from tests.hostile.mutations import Random
-from tests.hostile.run_formats import DRAWN, rezipped
+from tests.hostile.run_formats import DRAWN, of_arrays
 
 
 class SliceFiles(Format):
@@ -28,12 +28,7 @@ class SliceFiles(Format):
     def mutated(self, chance: Random, name: str, content: bytes) -> bytes:
         if name.endswith(".json") or chance.random() < 0.3:
             return super().mutated(chance, name, content)
-        arrays = dict(np.load(io.BytesIO(content)))
-        key = chance.choice(list(arrays))
-        arrays[key] = mutations.of_array(chance, arrays[key])
-        buffer = io.BytesIO()
-        np.savez(buffer, **arrays)
-        return rezipped(chance, buffer.getvalue()) if chance.random() < 0.2 else buffer.getvalue()
+        return of_arrays(chance, content)
 
     def use(self) -> None:
         import matplotlib.pyplot as plt
@@ -127,12 +122,7 @@ class KeptPoints(Format):
         if chance.random() < 0.5:
             self.by_bytes = True
             return mutations.of_bytes(chance, content)
-        arrays = dict(np.load(io.BytesIO(content)))
-        key = chance.choice(list(arrays))
-        arrays[key] = mutations.of_array(chance, arrays[key])
-        buffer = io.BytesIO()
-        np.savez(buffer, **arrays)
-        return rezipped(chance, buffer.getvalue()) if chance.random() < 0.2 else buffer.getvalue()
+        return of_arrays(chance, content)
 
     def use(self) -> None:
         from landscape.slices.grid_evaluations import GridEvaluations
