@@ -5,8 +5,10 @@ that list, never from one after, for types alone neither.  `figures` draws what 
 """
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -114,6 +116,18 @@ def test_the_kernels_of_one_device_import_nothing_of_the_other(one, other):
             part for each in sources(name) for part in each.split(".")[2:] if not each.startswith("splat.backend.")
         ]
         assert not [part for part in others if part.startswith(other) or part.endswith(f"_{other}")], name
+
+
+def test_what_is_imported_as_a_module_loads_is_a_dependency():
+    """A plain installation has these alone; what an option brings is imported inside functions, or by files for a GPU."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = {re.split(r"[^\w-]", each)[0].lower() for each in project["dependencies"]}
+    known = {"PIL": "pillow", "mpl_toolkits": "matplotlib", "llvmlite": "numba", "triton": "of a gpu"}
+    for name, path in modules().items():
+        nodes = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Import | ast.ImportFrom)]
+        loaded = {node.module if isinstance(node, ast.ImportFrom) else node.names[0].name for node in nodes}
+        outside = {str(each).split(".")[0] for each in loaded} - sys.stdlib_module_names - {*ORDER[""].split()}
+        assert {known.get(each, each) for each in outside} <= declared | {"of a gpu"}, name
 
 
 def test_no_source_imports_tests_and_oracles_import_no_source():
