@@ -38,9 +38,9 @@ def run_demo(options: DemoOptions) -> int:
     _announce(console, typed)
     if code := run_training(training, ["landscape", *typed]):
         return code
-    typed = ["probe", str(checkpoint), "--seconds", str(SECONDS)]
+    typed = ["probe", str(checkpoint)]
     _announce(console, typed)
-    return run_probe(ProbeOptions(checkpoint, seconds=SECONDS), ["landscape", *typed])
+    return run_probe(ProbeOptions(checkpoint), ["landscape", *typed])
 
 
 def _announce(console: Console, arguments: list[str]) -> None:
