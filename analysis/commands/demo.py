@@ -20,7 +20,7 @@ from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 
 SCENE = SyntheticSettings(width=160, height=120)
-VIEWS, ITERATIONS, SECONDS = 3, 600, 40
+VIEWS, ITERATIONS = 3, 600
 
 
 def run_demo(options: DemoOptions) -> int:

@@ -13,7 +13,6 @@ from splat.training.checkpoint import load_checkpoint
 def small(monkeypatch):
     monkeypatch.setattr("analysis.commands.demo.SCENE", SyntheticSettings(gaussians=60, views=5, width=24, height=18))
     monkeypatch.setattr("analysis.commands.demo.ITERATIONS", 12)
-    monkeypatch.setattr("analysis.commands.demo.SECONDS", 1)
     monkeypatch.setattr("analysis.console.recording.draw", lambda module, target: [])
 
 
