@@ -200,7 +200,10 @@ def _conclude(
     console, said = Console(), dict[str, Any](highlight=False, markup=False, soft_wrap=True)
     columns = [] if curve is None else [(removed, steps) for removed in REFINED for steps in sorted({*curve.steps})]
     measure = "test_psnr" if "test_psnr" in result else "train_psnr"
-    table = Table(caption=f"rank: Spearman's correlation with the true rise; dB: {measure.split('_')[0]} PSNR lost")
+    console.print("rank: Spearman's correlation with the true rise of the loss", **said)
+    if columns:
+        console.print(f"further columns: {measure.split('_')[0]} PSNR lost at that share removed, dB", **said)
+    table = Table()
     for title in (
         "score",
         "rank",
