@@ -202,7 +202,7 @@ def _run(options: Options, arguments: Sequence[str]) -> int:
 
                 return run_map(options, ["landscape", *arguments], drawn)
         case ViewOptions():
-            from analysis.commands.view import run_view
+            from analysis.commands.view.command import run_view
 
             return run_view(options)
         case PruneOptions():

@@ -21,7 +21,7 @@ from plotly.offline import get_plotlyjs
 
 from analysis.records.findings import Line, attribute_name, findings, headline, is_open
 from analysis.records.json_files import plain
-from analysis.records.quantities import BYTES, Shade, limits, measured, percent, quantity
+from analysis.records.quantities import limits, measured, percent, quantity
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map
 from analysis.records.schema import INDICES
@@ -54,10 +54,10 @@ def write_report(folder: str | Path, surface: str | None = None) -> Path:
     return path
 
 
-def template_environment() -> jinja2.Environment:
-    """Of the pages whose templates lie beside this file."""
+def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environment:
+    """Of the pages whose templates lie in a folder, by default beside this file."""
     return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        loader=jinja2.FileSystemLoader(folder),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -157,7 +157,7 @@ def views_in(record: Record[ProbeRecord]) -> list[dict[str, Any]]:
                     coloured = Image.fromarray(shade.palette[arrays[shade.name]])
                     coloured.thumbnail(Image.open(pairs[i][0]).size)
                     uri = picture_uri(coloured, COARSE)
-                    pictures.append({"words": f"{shade.words}, {shade.unit}", "uri": uri, "legend": legend(shade)})
+                    pictures.append({"words": shade.title, "uri": uri, "legend": shade.legend})
         views.append({"name": names[i], "pictures": pictures})
     return views
 
@@ -187,16 +187,6 @@ def carriers_in_words(end: Steepest) -> str:
     )
     view = end.view.rpartition("/")[2]
     return f"{end.name} in {view}, its carriers outlined, and renders one step back and forth along it. {carriers}."
-
-
-def legend(shade: Shade) -> str:
-    """The scale of colours with its ends and its unit, as a part of a page."""
-    stops = ", ".join("rgb({}, {}, {})".format(*colour) for colour in shade.palette[:BYTES:30])
-    ends = [quantity(shade.value(t)) for t in (shade.low, shade.high)]
-    return (
-        f'<span style="display:block;height:.5em;background:linear-gradient(to right, {stops})"></span><span '
-        f'style="display:flex;justify-content:space-between"><span>{ends[0]}</span><span>{ends[1]}</span></span>'
-    )
 
 
 def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:

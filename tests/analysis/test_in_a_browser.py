@@ -1,15 +1,19 @@
 """The pages in a real browser: the report and `landscape view`, driven as a user drives them."""
 
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from analysis.commands import view
 from analysis.commands.map.command import measured_fields
 from analysis.commands.map.pictures import rendered
+from analysis.commands.view import viewer as view
+from analysis.commands.view.page import offline_page
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from tests.analysis.records.test_report import with_views
@@ -58,7 +62,7 @@ def test_the_wheel_scrolls_the_page_until_the_surface_was_clicked(browser, tmp_p
     assert browser.execute_script("return window.scrollY") == before
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def viewer() -> Iterator[view.Viewer]:
     viser = pytest.importorskip("viser", reason="needs viser; pip install -e '.[view]'")
     made = synthetic_scene(SyntheticSettings(gaussians=150, views=2, width=32, height=24))
@@ -83,16 +87,49 @@ def test_a_click_a_field_and_a_step_reach_the_viewer(browser, viewer):
     until(browser, "/Gaussian \\d+, \\d+% of this pixel/.test(document.body.innerText)")
     assert "largest curvature" in viewer.numbers.content
     field = next(
-        each for each in browser.find_elements("tag name", "input") if each.get_attribute("value") == "largest"
+        each for each in browser.find_elements("tag name", "input") if "largest" in each.get_attribute("value")
     )
     field.click()
     field.send_keys("\ue009a")  # all of it
     field.send_keys("condition", "\ue015", "\ue007")  # the first of what is left, by the arrow down and Enter
     until(browser, "document.body.innerText.includes('condition of its splat')")
-    assert viewer.field.value == "condition"
+    assert viewer.names[viewer.field.value] == "condition"
     browser.find_elements("css selector", "[role=slider]")[-1].send_keys("\ue010")  # to the end
     (direction, reach), active = viewer.steps["e₁"], viewer.objective.active
     there = active.with_flat(active.flat + reach * direction)
     until(browser, f"document.body.innerText.includes('loss {view.quantity(viewer.objective.loss(there.flat))}')")
     image = view.in_bytes(rendered(viewer.objective, 0, there))
     assert (viewer.render.image == image.transpose(1, 2, 0)).all()
+
+
+def test_the_page_of_the_splats_needs_no_network_and_switches_colours(browser, viewer, tmp_path):
+    path = tmp_path / "view.html"
+    path.write_text(offline_page(viewer, "condition"), encoding="utf-8")
+    requests_of(browser), errors_in(browser)
+    browser.execute_cdp_cmd("Network.enable", {})
+    browser.execute_cdp_cmd(
+        "Network.emulateNetworkConditions",
+        {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1},
+    )
+    browser.get(path.as_uri())
+    shown = colours_of(browser)
+    assert "λ max / λ min" in browser.find_element("id", "legend").text
+    keys_to(browser, "#fields select", "appearance")
+    appearance = colours_of(browser, unlike=shown)
+    assert browser.find_element("id", "legend").text == ""
+    keys_to(browser, "#fields select", "condition")
+    assert np.abs(colours_of(browser, unlike=appearance) - shown).mean() < 1
+    assert requests_of(browser) == [path.as_uri()] and errors_in(browser) == []
+
+
+def colours_of(browser: Any, unlike: np.ndarray | None = None) -> np.ndarray:
+    """The picture of the splats once they are drawn, and differ from another picture."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    def drawn(_: Any) -> np.ndarray | bool:
+        image = Image.open(BytesIO(browser.find_element("tag name", "canvas").screenshot_as_png)).convert("RGB")
+        pixels = np.asarray(image, float)[:, image.width // 2 :]  # beside the panel
+        other = unlike is None or np.abs(pixels - unlike).mean() > 3
+        return pixels if other and len(image.getcolors(2**24) or []) > 2000 else False
+
+    return WebDriverWait(browser, 60, 0.5).until(drawn)

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from analysis.commands.map.files import coloured_ply, fields_ply, top_table
+from analysis.commands.map.files import coloured_ply, csv_text, fields_ply, top_table
 from analysis.commands.map.pictures import error_shade, view_maps, write_maps
 from analysis.commands.options import MapOptions
 from analysis.console.drawing import Draw
@@ -107,7 +107,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
             coloured = coloured_ply(gaussians, objective.mask, shade, found.values[options.shown])
             (folder / f"{options.shown}.ply").write_bytes(coloured)
             top = top_table(objective, found.values, options.shown)
-            (folder / "top.csv").write_text(top.to_csv(index=False, float_format="%.6g"), encoding="utf-8")
+            (folder / "top.csv").write_text(csv_text(top), encoding="utf-8")
         made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
         data = MapRecord(
             gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
@@ -123,7 +123,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         from analysis.records.report import write_report  # a quarter of a second of imports
 
         write_report(options.checkpoint.parent / PROBE)  # its page has the map's pictures too
-    _conclude(data, top.iloc[0].to_dict(), found.kinds[options.shown], out)
+    _conclude(data, {name: column[0] for name, column in top.items()}, found.kinds[options.shown], out)
     return 0
 
 
@@ -155,7 +155,7 @@ def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], re
                     ENDS[name][len("share of ") :], title, torch.from_numpy(vectors[group][:, 0]), end.value
                 )
                 values[name] = masses(ends[name].vector, objective.active)
-                kinds[name] = Field(ENDS[name], "share", "log")
+                kinds[name] = Field(ENDS[name], "", "log")
     return Fields(values, kinds, ends, sights)
 
 
@@ -207,14 +207,13 @@ def _write(folder: Path, data: MapRecord) -> None:
 
 def _conclude(data: MapRecord, first: Mapping[str, Any], kind: Field, out: Path) -> None:
     say = Console().print
-    unit = f" {kind.unit}" if kind.unit not in ("share", "1") else ""
     say(f"{data.seen:,} of {data.gaussians:,} Gaussians are in sight", **SAID)
     for text in data.sentences:
         say(text, **SAID)
     if not data.steepest:
         say("for the Gaussians that carry the steepest directions: landscape probe, then map again", **SAID)
     say(
-        f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {quantity(float(first[data.field]))}{unit}",
+        f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {quantity(float(first[data.field]))} {kind.unit}",
         **SAID,
     )
     for note in data.notes:
