@@ -25,10 +25,10 @@ from analysis.records.quantities import limits, measured, percent, quantity
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map
 from analysis.records.schema import INDICES
-from analysis.records.tables import family_lines
+from analysis.records.tables import bracketed, family_lines
 
 FILE, SPLATS = "report.html", "view.html"  # in the record's folder, and beside it: the page of `landscape view --html`
-FINE, COARSE = 82, 60  # quality of WebP: of photographs and drawings, and of maps, which are noisy
+FINE, COARSE, QUICK = 82, 60, 2  # quality of WebP: of drawings, and of maps, which are noisy; effort, of 6
 PICTURES = {
     "slice2d": "The loss on the plane of the two steepest directions. Dots: renders, blue where the order of the splats or the "
     "set of visible ones is not the checkpoint's; dashed: the quadratic model.",
@@ -77,7 +77,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "capitalise": lambda words: words[:1].upper() + words[1:],
         "open_ended": is_open,
     }
-    surface = embedded_surface(record) if surface is None else surface
+    surface, views = embedded_surface(record) if surface is None else surface, views_in(record)
     return environment.get_template("report.html.jinja").render(
         data=record.data,
         counts=plain(record.data.counts),
@@ -85,14 +85,16 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         numbers=numbers(record.data),
         headline=opening(record),
         findings=findings(record.data),
-        views=views_in(record),
+        views=views,
+        listed_views=[{**view, "pictures": [{**each, "uri": ""} for each in view["pictures"]]} for view in views[:1]]
+        + views[1:],
         pictures=pictures_in(record.folder, PICTURES, shown_numbers(record)),
         where=where(record),
         splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
         families=family_lines(record.data),
         indices=INDICES,
         surface=surface,
-        plotly_js=base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode() if surface else "",
+        plotly_js=base64.b64encode(gzip.compress(get_plotlyjs().encode(), 6, mtime=0)).decode() if surface else "",
     )
 
 
@@ -105,7 +107,7 @@ def opening(record: Record[ProbeRecord]) -> list[Line]:
 def numbers(data: ProbeRecord) -> list[dict[str, str]]:
     """The five numbers at the top: value with its error or bracket, and what it is."""
     ends, found = data.eigenvalues, []
-    for end, words in ((ends.max, "largest curvature"), (ends.min, "smallest curvature")):
+    for end, words in ((ends.max, "largest curvature, λ max"), (ends.min, "smallest curvature, λ min")):
         found.append({"value": measured(end.value, end.residual), "words": words})
     traces = {
         name: trace for name, trace in data.traces.items() if trace.value is not None and math.isfinite(trace.value)
@@ -115,9 +117,9 @@ def numbers(data: ProbeRecord) -> list[dict[str, str]]:
         words = f"trace of {attribute_name(name)}, the largest of five"
         found.append({"value": measured(trace.value, trace.standard_error), "words": words})
     if index := data.anisotropy.literal:
-        bracket = " to ".join(limits(index.low, index.high))
-        known = index.low is not None and index.high is not None
-        found.append({"value": quantity(index.value if known else None), "words": f"largest over smallest ({bracket})"})
+        cell = bracketed(None if is_open(index) else index)
+        words = "largest over smallest curvature" + (f" ({cell.bracket})" if cell.bracket else "")
+        found.append({"value": cell.value, "words": words})
     if lives := ends.max.lives_on:
         words = f"Gaussians carry the steepest direction, of {data.counts.visible_gaussians:,} in sight"
         found.append({"value": quantity(lives.participation), "words": words})
@@ -148,7 +150,7 @@ def views_in(record: Record[ProbeRecord]) -> list[dict[str, Any]]:
     views = []
     for i in sorted(panels) or drawn:
         pictures = [
-            {"words": words, "uri": picture_uri(path), "legend": ""}
+            {"words": words, "uri": data_uri(path.read_bytes(), "jpeg"), "legend": ""}
             for words, path in zip(("photograph", "render"), pairs[i])
         ]
         if found and panels:
@@ -192,8 +194,12 @@ def carriers_in_words(end: Steepest) -> str:
 def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:
     """A picture as a data URI; WebP takes a quarter of the bytes of PNG."""
     content, image = io.BytesIO(), Image.open(picture) if isinstance(picture, Path) else picture
-    image.convert("RGB").save(content, "WEBP", quality=quality)
-    return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
+    image.convert("RGB").save(content, "WEBP", quality=quality, method=QUICK)
+    return data_uri(content.getvalue(), "webp")
+
+
+def data_uri(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def interactive_surface(record: Record[ProbeRecord]) -> go.Figure | None:
