@@ -177,6 +177,8 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
     alone = end.curvature * end.step**2 / 2 / end.losses[1]
     words = f"By its curvature alone a step of {quantity(end.step)} changes the loss by {_signed(alone)}; rendered, by "
     words += f"{_signed(changes[0])} (back) and {_signed(changes[2])} (forth)."
+    if max(change * alone for change in (changes[0], changes[2])) < 0:
+        words += " It holds for shorter steps."
     with style():
         sheet = Sheet(2, 3, maps["view"].shape[:2], (False, True), above=0.5)
         text = "\n".join(textwrap.fill(line, 115) for line in (end.sentence, words))

@@ -187,8 +187,13 @@ def carriers_in_words(end: Steepest) -> str:
         f"{', '.join(map(quantity, each.sigmas))}, splat of {each.aspect:.3g} : 1, opacity {each.opacity:.2f}"
         for each in end.carriers
     )
-    view = end.view.rpartition("/")[2]
-    return f"{end.name} in {view}, its carriers outlined, and renders one step back and forth along it. {carriers}."
+    view, (back, here, forth) = end.view.rpartition("/")[2], end.losses
+    alone = end.curvature * end.step**2 / 2
+    changes = [f"{100 * change / here:+.2f}%".replace("-", "−") for change in (back - here, forth - here, alone)]
+    return (
+        f"{end.name} in {view}, its carriers outlined, and renders one step of {quantity(end.step)} back and forth along it, "
+        f"which change the loss by {changes[0]} and {changes[1]} ({changes[2]} by the curvature alone). {carriers}."
+    )
 
 
 def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:

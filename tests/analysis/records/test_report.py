@@ -165,7 +165,10 @@ def test_every_picture_has_words_with_its_numbers(tmp_path):
 def test_the_five_numbers_carry_their_errors_and_one_without_bracket_is_none():
     data, _ = synthetic()
     found = {each["words"]: each["value"] for each in numbers(probe_of(data))}
-    assert found["largest curvature"] == "(3.1000 ± 0.0012) × 10⁴" and found["smallest curvature"] == "−220.0 ± 3.0"
+    assert (
+        found["largest curvature, λ max"] == "(3.1000 ± 0.0012) × 10⁴"
+        and found["smallest curvature, λ min"] == "−220.0 ± 3.0"
+    )
     assert found["trace of position, the largest of five"] == "(3.991 ± 0.093) × 10⁵"
     data["anisotropy"]["literal"] |= {"value": -361.0, "low": 0.0, "high": None}
     found = {each["words"]: each["value"] for each in numbers(probe_of(data))}
