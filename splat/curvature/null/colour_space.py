@@ -38,16 +38,20 @@ class ColourSpace:
 
     def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         """x without its null components."""
+        return self._by_kernel(x) if x.device.type == "cpu" else self._by_products(x)
+
+    def _by_kernel(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         (n, d, k), bands = x.shape, self.harmonics.basis.shape[2]
-        if x.device.type == "cpu":
-            x, slopes = x.reshape(n, bands, 3 * k), self.slopes.basis.view(n, -1, bands, 3)
-            out = torch.empty_like(x)
-            spaces = self.harmonics.basis, self.harmonics.rank, self.row, slopes, self.slopes.rank
-            over_range(n, project_colours, *(each.numpy() for each in (*spaces, x, out)))
-            return out.view(n, d, k)
+        x, slopes = x.reshape(n, bands, 3 * k), self.slopes.basis.view(n, -1, bands, 3)
+        out = torch.empty_like(x)
+        spaces = self.harmonics.basis, self.harmonics.rank, self.row, slopes, self.slopes.rank
+        over_range(n, project_colours, *(each.numpy() for each in (*spaces, x, out)))
+        return out.view(n, d, k)
+
+    def _by_products(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         kept = [space.project(x[:, c::3]) for c, space in enumerate(self._channels)]
         slopes = self.slopes.basis
-        return torch.stack(kept, dim=2).view(n, d, k) + slopes.mT @ (slopes @ x)
+        return torch.stack(kept, dim=2).view(x.shape) + slopes.mT @ (slopes @ x)
 
     def without(self, rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n r d"]:
         """The part of rows at right angles to the space."""
@@ -105,8 +109,8 @@ def seen_colours(
 
     def part(start: int) -> ColourSpace:
         some = slice(start, start + CHUNK)
-        parts = (each[some].double() for each in (rows, slopes, sizes))
-        return _colours_of(*parts, TOLERANCE[like.dtype]).to(like.dtype)
+        found = _colours_of(rows[some].double(), slopes[some].double(), sizes[some].double(), TOLERANCE[like.dtype])
+        return found.to(like.dtype)
 
     return _joined([part(start) for start in range(0, n, CHUNK)])
 

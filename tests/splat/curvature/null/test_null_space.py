@@ -278,4 +278,6 @@ def test_colours_seen_channel_by_channel_are_seen_as_all_at_once() -> None:
     wide = found.scaled(torch.ones(len(found.rank), 27, dtype=torch.float64))
     x = torch.randn(len(found.rank), 27, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert torch.equal(wide.rank, found.rank)
-    assert torch.allclose(found.project(x), wide.basis.mT @ (wide.basis @ x), atol=1e-13)
+    whole = wide.basis.mT @ (wide.basis @ x)
+    assert torch.allclose(found.project(x), whole, atol=1e-13)
+    assert torch.allclose(found._by_products(x), whole, atol=1e-13)  # as on a GPU
