@@ -12,6 +12,9 @@ Before that sort the intersections of a splat lie side by side: their places the
 Two sizes are read back: the numbers of strips and of intersections.
 """
 
+# pyright: reportGeneralTypeIssues=false
+# (Triton tells type checkers little of its language)
+
 from typing import NamedTuple
 
 import torch
