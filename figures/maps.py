@@ -32,6 +32,7 @@ from figures.style import BLACK, BLUE, VERMILION, folder_script, literal, save, 
 NEAR = 0.03  # of a scale's length, from its end
 WIDTH, TALLEST = 7.0, 9.0  # inches
 MARGIN, HEAD, LEGEND = 0.12, 0.22, 0.5  # inches: between pictures, above one, beneath one
+LINE = 0.15  # inches: of the words above all
 BAR, ARROW, TICK = 0.09, 0.07, 0.03  # inches: of a scale, how high it is, and of its ends and its ticks
 FEWEST, DOTS = 110, 160  # an inch: as many as the photograph has pixels there, where these are between both, or DOTS
 
@@ -179,10 +180,10 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
     words += f"{_signed(changes[0])} (back) and {_signed(changes[2])} (forth)."
     if max(change * alone for change in (changes[0], changes[2])) < 0:
         words += " It holds for shorter steps."
+    lines = [line for text in (end.sentence, words) for line in textwrap.wrap(text, 115)]
     with style():
-        sheet = Sheet(2, 3, maps["view"].shape[:2], (False, True), above=0.5)
-        text = "\n".join(textwrap.fill(line, 115) for line in (end.sentence, words))
-        sheet.text(MARGIN, 0.08, text, fontsize=7.5, linespacing=1.4)
+        sheet = Sheet(2, 3, maps["view"].shape[:2], (False, True), above=0.08 + LINE * len(lines))
+        sheet.text(MARGIN, 0.08, "\n".join(lines), fontsize=7.5, linespacing=1.4)
         whole = sheet.show(0, 0, maps["view"], f"Photograph, {end.view.rpartition('/')[2]}")
         part = sheet.show(0, 1, maps["photograph"], f"Which Gaussians are {percent(sum(shares))} of it")
         frame = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BLACK, linewidth=1.0)
