@@ -72,7 +72,7 @@ def opacity_one_view(values: Values) -> float:
     columns = [values[name].numpy() for name in ("trace_opacity_logits", "one_view")]
     if any(np.ptp(column) == 0 for column in columns):
         return float("nan")
-    return float(np.corrcoef(*map(_ranks, columns))[0, 1])
+    return float(np.corrcoef([_ranks(column) for column in columns])[0, 1])
 
 
 def _ranks(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
