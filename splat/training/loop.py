@@ -28,7 +28,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
-from splat.render.loss_and_gradient import loss_and_gradient
 from splat.scenes.view import View
 from splat.training.state import Step, Training
 
@@ -101,10 +100,10 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
 
 def photometric_step(step: Step) -> float:
     """A step of 3DGS on the sampled view, with what the method adds; the loss before it."""
-    training, config, method = step.training, step.config, step.training.method
-    # the photometric gradient, and what the method makes of it
+    training, method = step.training, step.training.method
+    # the gradient of the loss, and what the method makes of it
     scale = method.opacity_scale(step)
-    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background, config.render, scale)
+    base = step.loss_and_gradient(step.gaussians, scale)
     _require_finite("loss", base.loss, step)
     found = method.gradient(step, base)
     _require_finite("gradient", float(found.gradient.sum()), step)

@@ -8,7 +8,7 @@ The loop (`splat/training/loop.py`) makes the steps; a checkpoint (`splat/traini
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
@@ -23,12 +23,13 @@ from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import Clamped, loss_against
 from splat.losses.protocols import ViewLoss
 from splat.losses.reference import LossSettings
+from splat.losses.regularizers import Regularizers
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.model.typed import Count, Length, NonNegative, Positive, Settings, Share, typed
 from splat.projection.antialias import sampling_widths
-from splat.render.loss_and_gradient import LossAndGradient
+from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
 from splat.scenes.view import View
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.training.optim.adam import Adam
@@ -56,6 +57,14 @@ class Step:
     @property
     def config(self) -> "TrainConfig":
         return self.training.config
+
+    def loss_and_gradient(
+        self, gaussians: Gaussians, opacity_scale: Float[Tensor, " n"] | None = None
+    ) -> LossAndGradient:
+        """Of the sampled view, with the regularisers, at these Gaussians.  opacity_scale: see `render`."""
+        found = loss_and_gradient(gaussians, self.camera, self.loss, self.background, self.config.render, opacity_scale)
+        regularizers = Regularizers(gaussians, self.config.loss, len(gaussians))
+        return replace(found, loss=found.loss + regularizers.value, gradient=regularizers.add_gradient(found.gradient))
 
     @property
     def camera(self) -> Camera:

@@ -57,8 +57,9 @@ def test_mip_splattings_filter_is_renewed_when_its_training_does_and_resumes(mon
     assert torch.equal(resumed.gaussians.filter_widths, widths)
 
 
-def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands():
-    config = TrainConfig(10, seed=3, sh_degree=1, sh_degree_every=4, densify=ONLY_ADAM)
+@pytest.mark.parametrize("loss", [LossSettings(), LossSettings(opacity_reg=0.3, scale_reg=0.5)], ids=["3DGS", "MCMC"])
+def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands(loss):
+    config = TrainConfig(10, seed=3, sh_degree=1, sh_degree_every=4, densify=ONLY_ADAM, loss=loss)
     training, progress = run(config, torch.float64)
 
     views = {view.name: view for view in tiny_views(torch.float64)}
@@ -75,11 +76,13 @@ def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands():
         mask = 0.0 if done.step <= 4 else 1.0
         model = gaussians.pack({**leaves, "sh": torch.cat([constant, mask * higher], dim=1)})
         view = views[done.view]
-        loss = photometric_loss(render(model, view.camera).image, view.image)
+        value = photometric_loss(render(model, view.camera).image, view.image, loss)
+        value = value + loss.opacity_reg * leaves["opacity_logits"].sigmoid().mean()
+        value = value + loss.scale_reg * leaves["log_scales"].exp().mean()
         adam.zero_grad()
-        loss.backward()
+        value.backward()
         adam.step()
-        assert abs(done.loss - loss.item()) < 1e-12
+        assert abs(done.loss - value.item()) < 1e-12
     expected = gaussians.pack({**leaves, "sh": torch.cat([constant, higher], dim=1)}).flat
     assert training.gaussians.sh_degree == 1
     assert (training.gaussians.flat - expected).abs().max() < 1e-12
