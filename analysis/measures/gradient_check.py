@@ -78,7 +78,7 @@ def _in_double(objective: SceneObjective, views: int | None) -> SceneObjective:
     """The same objective of these views, in float64."""
     return SceneObjective(
         objective.active.to(torch.float64),
-        [replace(view, image=view.image.double()) for view in objective.views[:views]],
+        [view.with_image(view.image.double()) for view in objective.views[:views]],
         objective.loss_of_active,
         objective.background.double(),
         objective.settings,

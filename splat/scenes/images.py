@@ -160,7 +160,7 @@ def checked_lens(model: str, size: tuple[float, float], params: Sequence[float],
 
 def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Frame:
     """The final camera of a photograph, and how to read it.  ValueError where file and lens cannot belong together."""
-    size, _ = image_header(photo.path)
+    size, transparent = image_header(photo.path)
     stored, across = (photo.lens.width, photo.lens.height), (size[1], size[0])
     turned = not _same_shape(stored, size) and _same_shape(stored, across) and _quarter_turned(photo.path)
     size = across if turned else size
@@ -180,7 +180,9 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
     camera = full.resized(width, height)
     warp = partial(_warp, lens, pinhole, (width, height))
     view = partial(_view, photo, turned, camera, warp, background)
-    return Frame(photo.name, camera, view, photo.subset, photo.depth_range, photo.path)
+    layers = {"alpha": transparent, "mask": photo.mask, "depth": photo.depth}
+    named = frozenset(name for name, there in layers.items() if there)
+    return Frame(photo.name, camera, view, photo.subset, photo.depth_range, photo.path, named)
 
 
 def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> pycolmap.Camera:

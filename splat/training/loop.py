@@ -75,18 +75,20 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
     """
     prepare(training, views)
     config, method, dtype = training.config, training.method, training.gaussians.flat.dtype
-    losses = [config.loss_against(view.image, training.gaussians.flat) for view in views]
+    loss_of = config.losses_against(views, training.gaussians.flat)
     cameras = [view.camera for view in views]
     while training.step < config.iterations:
         # what the step is about: a view, a background, the loss against that view
         number = training.step + 1
         training.raise_sh_degree(min(config.sh_degree, (number - 1) // config.sh_degree_every))
         chosen = training.next_view(len(views))
-        view, background, loss = views[chosen], config.background_colour(dtype), losses[chosen]
+        view, background = views[chosen], config.background_colour(dtype)
         if config.random_background:
             drawn = torch.rand(3, generator=training.generator, dtype=dtype)
             target = with_background(view, background, drawn)
             background, loss = drawn, config.loss_against(target, training.gaussians.flat)
+        else:
+            loss = loss_of(chosen)
         step = Step(number, training, training.gaussians, views, chosen, background, loss)
 
         value = method.own_step(step)

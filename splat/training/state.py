@@ -7,8 +7,9 @@ Step                           one step: its number, its view, its loss
 The loop (`splat/training/loop.py`) makes the steps; a checkpoint (`splat/training/checkpoint.py`) holds all of it.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
 from landscape.results import Brief
+from splat.backend.memory import free_memory
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import Clamped, loss_against
 from splat.losses.protocols import ViewLoss
@@ -35,6 +37,7 @@ from splat.training.densify import Densified, DensifySettings, ScreenGradients, 
 from splat.training.optim.adam import Adam
 
 FILTER_EVERY = 100  # steps
+LOSS_PLANES, LOSSES = 9, 0.25  # of a target and its moments; a share of the free memory
 Protocol = Literal["common", "llff"]
 Row = dict[str, Count | float | bool | str]  # of a history
 
@@ -228,6 +231,12 @@ class TrainConfig(Settings):
         """The loss that a step descends, against a view's image; like: see `loss_against`."""
         loss = loss_against(image, self.loss, like)
         return Clamped(loss) if self.clamp_image else loss
+
+    def losses_against(self, views: Sequence[View], like: Tensor) -> Callable[[int], ViewLoss | Clamped]:
+        """The same of the view of an index, where those that were used last are kept: as many as have room."""
+        each = LOSS_PLANES * like.element_size() * max(view.camera.width * view.camera.height for view in views)
+        most = max(1, int(LOSSES * free_memory(like.device)) // each)
+        return lru_cache(min(most, len(views)))(lambda index: self.loss_against(views[index].image, like))
 
     def objective(
         self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False, ranks: Ranks = ALONE

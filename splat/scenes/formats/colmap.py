@@ -2,7 +2,8 @@
 
 A model is three files, cameras, images and points3D (.bin or .txt), in `sparse/0`, `sparse` or the scene folder itself, where
 nerfstudio puts it (`colmap/sparse/0`), or in the `sparse/N` of most images: COLMAP's mapper makes a model for each part of a
-scene that it cannot join.  COLMAP's conventions are those of this package: world to camera, +x right, +y down, +z forward, pixel centres at + 0.5.
+scene that it cannot join.
+COLMAP's conventions are those of this package: world to camera, +x right, +y down, +z forward, pixel centres at + 0.5.
 """
 
 import re
