@@ -309,6 +309,7 @@ class CpuProjection:
     ):
         inputs, widths = attribute_arrays(gaussians), width_array(gaussians, lens)
         self.n, self.sh_degree, self.parameters = len(gaussians), gaussians.sh_degree, gaussians.flat.numel()
+        self._shapes = tuple(attribute_shapes(self.n, self.sh_degree).values())
         rows = row_shapes(antialiased=widths is not None)
         self._at = ProjectionJacobian(index.numpy(), *(np.empty((len(index), *row), inputs[0].dtype) for row in rows))
         arguments = (lens, *inputs, widths, splats.numpy(), moments.numpy())
@@ -360,7 +361,7 @@ class CpuProjection:
     def _split(self, block: np.ndarray) -> tuple[np.ndarray, ...]:
         """Views of a (p, K) block laid out like the flat vector: (n, 3, K), (n, 3, K), (n, 4, K), (n, K), (n, b, 3, K)."""
         block, views, start = np.ascontiguousarray(block), [], 0
-        for shape in attribute_shapes(self.n, self.sh_degree).values():
+        for shape in self._shapes:
             size = prod(shape)
             views.append(block[start : start + size].reshape(*shape, block.shape[1]))
             start += size
