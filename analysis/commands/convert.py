@@ -86,7 +86,9 @@ def _to_tool(options: ConvertOptions, to: str) -> list[str]:
 
 def _unsaid(back: SplatFile, seen: Seen | None) -> list[str]:
     """A sentence on how the file has to be read, where it does not say so itself.  back: as it is read; seen: as it was."""
-    if seen is None or (back.tool in PRESETS and seen.is_that_of(back.tool, antialiased=back.antialiased)):
+    if seen is None or (
+        back.tool and back.tool in PRESETS and seen.is_that_of(back.tool, antialiased=back.antialiased)
+    ):
         return []
     render = seen.render
     how = f"antialiasing {render.antialias}, blur {render.blur:g}, alpha cap {render.alpha_max:g}, near {render.near:g}"

@@ -32,8 +32,8 @@ def twice(view: LinearizedView) -> Callable[..., torch.Tensor]:
     """Its products, wrong by a factor of 2."""
     right = view.hvp
 
-    def wrong(V: torch.Tensor, total: torch.Tensor | None = None, **coupled: bool) -> torch.Tensor:
-        product = 2 * right(V, **coupled)
+    def wrong(V: torch.Tensor, total: torch.Tensor | None = None, *, coupled: bool = True) -> torch.Tensor:
+        product = 2 * right(V, coupled=coupled)
         return product if total is None else total.add_(product)
 
     return wrong
