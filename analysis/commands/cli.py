@@ -27,6 +27,7 @@ from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, T
 from analysis.slice.options import SliceOptions
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError, did_you_mean
+from splat.backend.memory import RESERVE, require_room
 
 DEBUG, CHECKPOINT = "--debug", "checkpoint.pt"
 COMMANDS = {
@@ -160,6 +161,7 @@ def at_files(options: Options) -> Options:
 
 def run(options: Options, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand."""
+    require_room(RESERVE, libraries=True)
     of_curvature = ProbeOptions | SliceOptions | MapOptions | PruneOptions | NextViewOptions | UncertaintyOptions
     if isinstance(options, TrainOptions | DemoOptions | of_curvature):
         from analysis.commands.compiling import compiling_is_said
