@@ -9,7 +9,7 @@ import torch
 
 from landscape import EigenSettings
 from landscape.errors import InputError, TooLittleMemory, lacks_memory
-from splat.backend.memory import RESERVE, free_memory, is_told, require_room, resident_memory
+from splat.backend.memory import RESERVE, SLACK, free_memory, is_told, require_room, resident_memory
 from splat.curvature.linearize import VECTORS, KeptViews
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
@@ -70,7 +70,11 @@ def expected_peak(objective: SceneObjective) -> int:
     least, camera = needs.view + needs.beside, objective.views[0].camera
     if least > free:
         fit = int(len(objective.active) * free / least)
-        enough = f"--memory {ceil((used + least) / 1e7) / 100:g}GB" if is_told() else f"{_gb(least - free + 5e6)} more"
+        enough = (
+            f"--memory {ceil((used + least) / (1 - SLACK) / 1e7) / 100:g}GB"
+            if is_told()
+            else f"{_gb(least - free + 5e6)} more"
+        )
         raise TooLittleMemory(
             f"expected at least {_gb(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
             f"{camera.width} x {camera.height} px, got {_gb(used + free)}, of which {_gb(used)} are taken; "

@@ -29,14 +29,16 @@ LIMITED = {  # what the process may be told to stay within, and the option of ul
 RESERVE = 2**29  # bytes of these that no plan counts on: for threads, compiled code and libraries that are loaded late
 LEAST = RESERVE // 4  # of which is left where something goes on
 
-_most: int | None = None  # bytes that this process shall stay within
+SLACK = 0.05  # of a limit that is asked for: what allocators and libraries hold beside what is counted
+
+_most: float | None = None  # bytes that this process shall stay within
 
 
 @contextmanager
 def staying_within(size: int | None) -> Iterator[None]:
-    """Let `free_memory` count so many bytes, in memory at a time, as all that this process may have; None: no such limit."""
+    """Let `free_memory` count so many bytes, in memory at a time and less SLACK, as all there are; None: no such limit."""
     global _most
-    _most, before = size, _most
+    _most, before = None if size is None else (1 - SLACK) * size, _most
     try:
         yield
     finally:
@@ -66,7 +68,7 @@ def free_memory(device: "torch.device") -> int:
 def _of_process() -> Iterator[int]:
     """What the limits of this process leave, of memory, and of addresses and data beside the reserve."""
     if _most is not None:
-        yield _most - resident_memory()
+        yield int(_most) - resident_memory()
     yield from (left - RESERVE for left in _left().values())
 
 
