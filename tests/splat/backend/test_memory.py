@@ -47,7 +47,7 @@ def test_little_room_in_limits_is_refused_before_what_cannot_say_that_it_lacks_i
             Stages().stage("another").__enter__()
     leave(memory.RESERVE - 1)
     with pytest.raises(TooLittleMemory, match="at least 537 MB"):
-        _Once(Console(quiet=True)).on_start(event.Event("numba:compile"))
+        _Once(Console(quiet=True)).on_start(event.Event("numba:compile", event.EventStatus.START))
 
 
 def group(folder: Path, limit: str, usage: int, version: int, cached: int = 0) -> None:
