@@ -29,7 +29,6 @@ from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, T
 from analysis.slice.options import SliceOptions
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError, did_you_mean
-from splat.backend.memory import RESERVE, require_room
 
 DEBUG, CHECKPOINT = "--debug", "checkpoint.pt"
 
@@ -166,6 +165,8 @@ def at_files(options: Any) -> Any:
 
 def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand; returns the exit code."""
+    from splat.backend.memory import RESERVE, require_room  # not for --help
+
     require_room(RESERVE, libraries=True)
     module, function = command.runs.split(":")
     with ExitStack() as around:
