@@ -36,7 +36,7 @@ def draw_claims(table: pd.DataFrame) -> Figure:
 
 
 def _effects(axes: Axes, part: pd.DataFrame) -> None:
-    """Hollow: one training, which has no interval.  Without any, words."""
+    """Effects of one statement, or words where there is none.  Hollow: of a single training, which has no interval."""
     places, unit, verdict = np.arange(len(part))[::-1], part["unit"].iloc[0], part["verdict"].iloc[0]
     value, low, high, claimed = (part[name].to_numpy(float) for name in ("value", "low", "high", "claimed"))
     several = part["n"].to_numpy() >= 2

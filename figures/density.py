@@ -1,4 +1,4 @@
-"""Figure: the density of the spectrum, as a histogram that a broadening makes smooth.
+"""Figure: the density of the spectrum over curvature, smoothed by a Gaussian.
 
 `python -m figures.density RUN/probe` draws density.png beside the record.  From Python, `draw_density(found)` draws a
 `landscape.SpectralDensity` of any objective.  It is the mean of the start vectors' quadratures, each node a Gaussian of width

@@ -126,7 +126,7 @@ def draw_budget(rows: pd.DataFrame) -> Figure:
 def _label(
     axes: Axes, places: list[tuple[float, float, str, str]], lines: list[tuple[float, float, float, float]]
 ) -> None:
-    """Each name at its point or as near as the others leave room, joined to it by a line where that is not at its side.
+    """Write each name at its point or as near as others leave room, with a line to the point where it is not beside it.
 
     places: x, y, name, colour; lines: ends x, y, x, y of what they keep clear of.  A letter is half as wide as high.
     """
@@ -238,7 +238,7 @@ def _of_predictors(related: pd.DataFrame) -> str:
 
 
 def _of_budget(rows: pd.DataFrame, short: bool = False) -> str:
-    """short: of the best method and StableGS, without intervals."""
+    """Caption of the budget.  short: best method and StableGS alone, without intervals."""
     scores = {method: Interval.of(numbers(rows, SCORE, method)) for method in _methods(rows)}
     if BASE not in scores:
         return "3DGS was not run."

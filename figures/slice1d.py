@@ -1,10 +1,11 @@
 """Figure: the loss along a line through the checkpoint, and the curvature there that steps of finite length see.
 
 Above: dots are true renders, blue where the order of the splats or the set of visible ones is not the checkpoint's; between
-them the loss is interpolated.  Dashed: the quadratic model.  Below: second differences of renders at steps to both sides, with
-the bounds of their round-off (grey where it hides them; a triangle where a value lies beyond the axis); hollow where an end is
-crossed.  The line is the infinitesimal curvature.  What steps to another order of splats see beside it is the loss's shape at
-that distance: its kinks and jumps, smoothed.
+them the loss is interpolated.  Dashed: the quadratic model.
+
+Below: second differences of renders at steps to both sides, over the squared step, with the bounds of their round-off.
+Grey: round-off hides the value; a triangle: it lies beyond the axis; hollow: an end has another order of splats than the
+checkpoint, so that the difference holds kinks and jumps of the loss too.  The line is the infinitesimal curvature.
 """
 
 from typing import Any

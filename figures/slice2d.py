@@ -86,7 +86,10 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
 
 
 def _finding(field: Plane) -> str:
-    """Whether the loss rises from the centre to all sides, and by how much.  A hundredth of the range is no lower ground."""
+    """Sentence: whether the loss rises from the centre to all sides, and by how much.
+
+    Points count as lower than the centre where they are so by more than a hundredth of the range.
+    """
     low, high, power = float(field.change.min()), float(field.change.max()), 10.0**field.exponent
     if not high > low:
         return "The loss is the same everywhere"

@@ -1,10 +1,11 @@
-"""Figure: the spectrum: its density, who has the curvature, and what the search for its ends met.
+"""Figure: the spectrum of the Hessian in up to three panels.
 
-First, where a density was recorded, it is drawn as `figures.density` does; then the same quadrature without broadening: the
-share of directions whose curvature is at most x, and the share of sum |lambda| that they have, a line for each start vector:
-the further apart the two, the less isotropic the loss.  Last, or alone, the Ritz values of the search, the eigenvalues
-seen through so many products: value against rank on a symmetric logarithmic axis (linear within the band about 0), bars:
-residual norms, within each of which lies a true eigenvalue.  Filled: the residual is under a tenth of the value.
+density        where one was recorded, as `figures.density` draws it
+distribution   of the same quadrature, without broadening: the share of directions whose curvature is at most x, and the share
+               of sum |lambda| that these have, a line for each start vector; the further apart the two, the less isotropic the
+               loss
+Ritz values    of the search for both ends: value against rank, on a symmetric logarithmic axis (linear in the band about 0).
+               Bars are residual norms: within each lies a true eigenvalue.  Filled: the residual is under a tenth of the value
 """
 
 import math

@@ -1,8 +1,8 @@
-"""Figure: which attribute is steep, in what compares, with the trace of the Hessian's diagonal block of each beside its name.
+"""Figure: how steep each attribute is, in a unit that all share, beside the trace of its block of the Hessian as a number.
 
-Traces have the units of their attributes.  What compares is s^2 tr / 2, the mean change of the loss by curvature when every
-parameter of the attribute moves by +-s at random, s the length of the optimiser's first step; as a share of the loss.  A record
-that does not know s has the traces themselves, and says that they do not compare.
+Traces have the units of their attributes, so they do not compare.  What is drawn is s^2 tr / 2 as a share of the loss: the mean
+change of the loss by curvature when every parameter of the attribute moves by +-s at random, s the length of the optimiser's
+first step.  Of a record without s the traces themselves are drawn, and the title says that they do not compare.
 
 Magnitudes are on a logarithmic axis; the sign is in the marker (filled circle: positive; open square: negative; open
 diamond: the interval does not decide it).  An arrow at the left edge is a zero, or an interval that reaches 0.
@@ -69,7 +69,7 @@ def scaled(trace: Trace, factor: float) -> Trace:
 
 
 def _title(entries: dict[str, Trace], shares: dict[str, float]) -> str:
-    """Which attribute is steepest, and how much more than the next, where the intervals part them."""
+    """Name of the steepest attribute, and its ratio to the next where their intervals do not overlap."""
     ends = {
         name: [abs(shares[name] * x) for x in _interval(entry)] for name, entry in entries.items() if name in shares
     }

@@ -1,9 +1,9 @@
 """Figure: the landscape along one or several trainings, from the table that `landscape trajectory` wrote.
 
-`python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Bands: 95% intervals of the traces, residuals of
-the eigenvalues; of the indices: brackets; triangles: lower bounds, where that is all that is known.  An axis is
-logarithmic where all of its values are positive and span more than a decade.  |lambda_max / lambda_min| has open markers where
-it is negative.
+`python -m figures.trajectory OUT/trajectories.csv` draws beside the table.  Bands show 95% intervals of the traces, residuals
+of the eigenvalues, and brackets of the indices; a triangle is a lower bound, where no more is known of an index.  An axis is
+logarithmic where all of its values are positive and span more than a decade.  |lambda_max / lambda_min| has hollow markers
+where the quotient is negative.
 """
 
 import argparse
@@ -68,7 +68,7 @@ def draw(table: pd.DataFrame) -> Figure:
 
 
 def step_ticks() -> MaxNLocator:
-    """A few ticks at round steps, such as are recorded: 100, 200, 300 and not 120, 180, 240."""
+    """Locator of a few ticks at steps as round as recorded ones: 100, 200, 300 instead of 120, 180, 240."""
     return MaxNLocator(4, integer=True, steps=[1, 2, 2.5, 5, 10])
 
 
@@ -112,7 +112,7 @@ def marker_words(measured: pd.DataFrame, *names: str) -> list[Line2D]:
 
 
 def _bands(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], columns: tuple[str, str, str], title: str) -> None:
-    """columns: of the values and of both ends of their bands."""
+    """Curves of every run with their bands.  columns: of the values, and of both ends of the bands."""
     lowest = float(np.nanmin(measured[columns[1]].to_numpy(float)))
     highest = float(np.nanmax(measured[columns[2]].to_numpy(float)))
     logarithmic = lowest > 0 and highest > 10 * lowest

@@ -37,7 +37,7 @@ MEASURES = {"train_psnr": "training views, PSNR (dB)", "test_psnr": "held-out vi
 
 
 def _rows(table: pd.DataFrame, **known: str | bool) -> Any:
-    """Those with these values."""
+    """Rows of a table with these values."""
     for name, value in known.items():
         table = table.loc[table[name] == value]
     return table
@@ -137,7 +137,7 @@ def draw_uncertainty(path: Path) -> Figure:
 
 
 def draw(folder: Path, suffix: str = "png") -> list[Path]:
-    """Those whose numbers are in the folder."""
+    """Draw the pictures whose numbers are in the folder; returns their files."""
     views = [save(draw_uncertainty(path), path.with_suffix(f".{suffix}")) for path in sorted(folder.glob("view-*.npz"))]
     return views + [
         save(make(pd.read_csv(folder / f"{name}.csv")), folder / f"{name}.{suffix}")

@@ -9,7 +9,7 @@ OUT/bench.png     the scaling, drawn by `figures.bench` from bench.csv
 `accuracy.command`.  On a GPU (--device cuda) scenes are measured by its kernels, beside gsplat's gradient; the other studies
 are the CPU's.
 
-Times are minima and medians of repetitions in turns (`console.timing`), by the clock of the device (`meters`); ratios are of
+Times are minima and medians of repetitions in turns (`speed.timing`), by the clock of the device (`meters`); ratios are of
 minima.  Products are per vector.
 """
 
@@ -27,14 +27,15 @@ from analysis.bench.accuracy.command import run_accuracy
 from analysis.bench.options import BenchOptions
 from analysis.bench.precision import precision
 from analysis.bench.speed.kernels import run_kernels
-from analysis.bench.speed.meters import Meter, bandwidth, meter_of
+from analysis.bench.speed.meters import Meter, bandwidth, fma_peak, meter_of
 from analysis.bench.speed.reference import ReferenceCost, reference_cost
 from analysis.bench.speed.scene import OPERATIONS, VECTORS, ViewBench, per_vector, scaling
+from analysis.bench.speed.timing import Timing, interleaved, time_lines
 from analysis.bench.stress.command import run_stress
 from analysis.bench.tables import rich_table, write_table
 from analysis.bench.workloads import Size, Workload, synthetic_workload, workload_of
 from analysis.console.drawing import draw
-from analysis.console.timing import Timing, interleaved
+from analysis.console.plain import say
 from analysis.records.provenance import machine
 from landscape.errors import InputError
 from splat.backend.cpu.simd import lanes_of
@@ -70,7 +71,7 @@ def run_bench(options: BenchOptions) -> int:
     console, device = Console(), torch.device("cpu") if options.subject == "kernels" else device_named(options.device)
     sizes = [Size.parse(text) for text in options.sizes]
     options.out.mkdir(parents=True, exist_ok=True)
-    console.print(_about(device), highlight=False)
+    say(_about(device), console=console)
     if options.subject == "kernels":
         run_kernels(
             sizes or [Size.parse(text) for text in (*SIZES, LARGEST)], options.repetitions, options.out, console
@@ -121,16 +122,15 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
     sizes = options.sizes or (() if workloads else SIZES)
     workloads += [synthetic_workload(Size.parse(text)) for text in sizes]
     workloads = [workload.to(meter.device) for workload in workloads]
-    ceilings = meter.fma_peak(), bandwidth(meter)
+    ceilings = fma_peak(meter), bandwidth(meter)
     times, bounds = [], []
     for workload in workloads:
         bench = ViewBench(workload)
-        console.print(
+        say(
             f"{workload.name}: {len(workload.gaussians)} Gaussians, {bench.view.camera.width} x "
             f"{bench.view.camera.height} px, {bench.linearized.touched} visible, {bench.linearized.intersections} tile entries",
             style="bold",
-            highlight=False,
-            markup=False,
+            console=console,
         )
         calls = {**bench.stages(), **bench.wholes(), **bench.peers()}
         measured = interleaved(calls, options.repetitions, clock=meter.seconds)
@@ -143,7 +143,7 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
         held = _bounds(workload, bench, measured, cost, meter)
         console.print(rich_table(held.drop(columns="scene"), "asked for"))
         if bench.lack:
-            console.print(f"no gradient to compare with: {bench.lack}", soft_wrap=True, highlight=False, markup=False)
+            say(f"no gradient to compare with: {bench.lack}", console=console)
         times.append(lines)
         bounds.append(held)
         for tables, name in ((times, "bench.csv"), (bounds, "bounds.csv")):  # what comes next may fail
@@ -153,8 +153,7 @@ def bench_scenes(options: BenchOptions, meter: Meter, console: Console) -> None:
     times.append(pd.DataFrame(_scaling(workloads[0], max(1, options.repetitions // SCALING_SHARE), meter)))
     write_table(pd.concat(times, ignore_index=True), options.out / "bench.csv", console)
     write_table(pd.concat(bounds, ignore_index=True), options.out / "bounds.csv", console)
-    for line in (*draw("bench", options.out / "bench.csv"), str(options.out / "bench.png")):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    say(*draw("bench", options.out / "bench.csv"), str(options.out / "bench.png"), console=console)
 
 
 def _precision(workload: Workload, path: Path, console: Console) -> None:
@@ -184,10 +183,7 @@ def _lines(study: str, workload: Workload, times: dict[str, Timing], value: int 
     }
     if study in about:
         about[study] = value
-    return [
-        {**about, "stage": name, "minimum_ms": 1e3 * time.minimum, "median_ms": 1e3 * time.median}
-        for name, time in per_vector(times).items()
-    ]
+    return time_lines(about, per_vector(times))
 
 
 def _scaling(workload: Workload, repetitions: int, meter: Meter) -> list[dict]:

@@ -37,10 +37,10 @@ from rich.console import Console
 from torch import Tensor
 
 from analysis.bench.speed.meters import Meter, meter_of
+from analysis.bench.speed.timing import interleaved
 from analysis.bench.tables import rich_table
 from analysis.bench.workloads import Size, Workload, synthetic_checkpoint, synthetic_workload, workload_of
 from analysis.console.options import DeviceName
-from analysis.console.timing import interleaved
 from analysis.probe.command import run_probe
 from analysis.probe.options import ProbeOptions
 from landscape.errors import InputError

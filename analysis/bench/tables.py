@@ -9,6 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from analysis.console.plain import say
 from splat.training.checkpoint import write_atomically
 
 
@@ -37,4 +38,4 @@ def write_table(table: pd.DataFrame, path: Path, console: Console | None = None)
     """Write a CSV file, and say where on the console."""
     write_atomically(path, table.to_csv(index=False).encode())
     if console is not None:
-        console.print(str(path), soft_wrap=True, highlight=False, markup=False)
+        say(str(path), console=console)

@@ -8,11 +8,13 @@ import gc
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from importlib import import_module
 from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, NoReturn
+from typing import IO, Any, NoReturn
 
 import tyro
 from rich.console import Console
@@ -30,42 +32,43 @@ from analysis.train.options import TrainOptions
 from landscape.errors import InputError, did_you_mean
 
 DEBUG, CHECKPOINT = "--debug", "checkpoint.pt"
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand.  options: what is parsed; runs: MODULE:FUNCTION, imported when it runs, called with the options.
+
+    recorded: the function is also given the command as typed; draws: and a `Draw` of this module of figures, whose process
+    starts at once; compiles: it says so when kernels are compiled.
+    """
+
+    options: type
+    runs: str
+    recorded: bool = False
+    draws: str | None = None
+    compiles: bool = False
+
+
 COMMANDS = {
-    "sfm": SfmOptions,
-    "train": TrainOptions,
-    "sweep": SweepOptions,
-    "probe": ProbeOptions,
-    "slice": SliceOptions,
-    "map": MapOptions,
-    "view": ViewOptions,
-    "prune": PruneOptions,
-    "next-view": NextViewOptions,
-    "uncertainty": UncertaintyOptions,
-    "compare": CompareOptions,
-    "claims": ClaimsOptions,
-    "convert": ConvertOptions,
-    "demo": DemoOptions,
-    "trajectory": TrajectoryOptions,
-    "bench": BenchOptions,
+    "sfm": Command(SfmOptions, "analysis.commands.sfm:run_sfm"),
+    "train": Command(TrainOptions, "analysis.train.command:run_training", recorded=True, compiles=True),
+    "sweep": Command(SweepOptions, "analysis.runs.sweep.sweep:run_sweep"),
+    "probe": Command(ProbeOptions, "analysis.probe.command:run_probe", recorded=True, draws="make_all", compiles=True),
+    "slice": Command(SliceOptions, "analysis.slice.command:run_slice", recorded=True, compiles=True),
+    "map": Command(MapOptions, "analysis.commands.map.command:run_map", recorded=True, draws="maps", compiles=True),
+    "view": Command(ViewOptions, "analysis.commands.view:run_view"),
+    "prune": Command(PruneOptions, "analysis.commands.uses.prune:run_prune", recorded=True, compiles=True),
+    "next-view": Command(NextViewOptions, "analysis.commands.uses.study:run_next", recorded=True, compiles=True),
+    "uncertainty": Command(
+        UncertaintyOptions, "analysis.commands.uses.uncertainty:run_uncertainty", recorded=True, compiles=True
+    ),
+    "compare": Command(CompareOptions, "analysis.runs.compare:run_compare"),
+    "claims": Command(ClaimsOptions, "analysis.runs.claims.command:run_claims"),
+    "convert": Command(ConvertOptions, "analysis.commands.convert:run_convert"),
+    "demo": Command(DemoOptions, "analysis.commands.demo:run_demo", compiles=True),
+    "trajectory": Command(TrajectoryOptions, "analysis.runs.trajectories:run_trajectory"),
+    "bench": Command(BenchOptions, "analysis.bench.command:run_bench"),
 }
-Options = (
-    SfmOptions
-    | TrainOptions
-    | SweepOptions
-    | ProbeOptions
-    | SliceOptions
-    | MapOptions
-    | ViewOptions
-    | PruneOptions
-    | NextViewOptions
-    | UncertaintyOptions
-    | CompareOptions
-    | ClaimsOptions
-    | ConvertOptions
-    | DemoOptions
-    | TrajectoryOptions
-    | BenchOptions
-)
 
 
 def command() -> NoReturn:
@@ -120,32 +123,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug, arguments = DEBUG in arguments, [word for word in arguments if word != DEBUG]
     try:
         with raising():
-            return run(at_files(_parsed(arguments)), arguments)
+            command, options = _parsed(arguments)
+            return run(command, at_files(options), arguments)
     except (Exception, KeyboardInterrupt) as error:
         return report(error, ["landscape", *arguments], debug)
 
 
-def _parsed(arguments: Sequence[str]) -> Options:
-    """The options of a command, which are parsed alone: what an error advises is of that command.
+def _parsed(arguments: Sequence[str]) -> tuple[Command, Any]:
+    """A command and its options, which are parsed alone: what an error advises is of that command.
 
     SystemExit for help, and where they cannot be parsed; InputError for a command that there is not.
     """
     name, config = (*arguments, "")[0], (tyro.conf.DisallowNone,)
-    if name in COMMANDS:
-        return tyro.cli(COMMANDS[name], prog=f"landscape {name}", args=arguments[1:], config=config, registry=REGISTRY)
+    if found := COMMANDS.get(name):
+        return found, tyro.cli(
+            found.options, prog=f"landscape {name}", args=arguments[1:], config=config, registry=REGISTRY
+        )
     if name and not name.startswith("-"):
         raise InputError(f"expected a command among {', '.join(COMMANDS)}, got {name!r}{did_you_mean(name, COMMANDS)}")
-    return tyro.extras.subcommand_cli_from_dict(
-        COMMANDS,  # pyright: ignore[reportArgumentType]
+    options = tyro.extras.subcommand_cli_from_dict(
+        {name: each.options for name, each in COMMANDS.items()},
         prog="landscape",
         description=f"See the loss landscape of a 3D Gaussian Splatting scene.\n{DEBUG}, before or after the subcommand, shows "
         "where in the program an error came up.  --version alone shows the version.",
         args=arguments,
         config=config,
     )
+    return next(each for each in COMMANDS.values() if isinstance(options, each.options)), options
 
 
-def at_files(options: Options) -> Options:
+def at_files(options: Any) -> Any:
     """A run folder stands for its checkpoint where one is asked for, and a checkpoint for its run."""
     changes: dict[str, object] = {}
     for name in ("checkpoint", "subject", "from_", "source"):
@@ -159,93 +166,20 @@ def at_files(options: Options) -> Options:
     return replace(options, **changes) if changes else options
 
 
-def run(options: Options, arguments: Sequence[str]) -> int:
-    """Hand over to the subcommand."""
-    of_curvature = ProbeOptions | SliceOptions | MapOptions | PruneOptions | NextViewOptions | UncertaintyOptions
-    if isinstance(options, TrainOptions | DemoOptions | of_curvature):
-        from analysis.commands.compiling import compiling_is_said
+def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
+    """Hand over to the subcommand; returns the exit code."""
+    module, function = command.runs.split(":")
+    with ExitStack() as around:
+        given = [options, ["landscape", *arguments]] if command.recorded else [options]
+        if command.compiles:
+            from analysis.commands.compiling import compiling_is_said
 
-        with compiling_is_said(Console(stderr=True)):
-            return _run(options, arguments)
-    return _run(options, arguments)
-
-
-def _run(options: Options, arguments: Sequence[str]) -> int:
-    match options:
-        case SfmOptions():
-            from analysis.commands.sfm import run_sfm
-
-            return run_sfm(options)
-        case TrainOptions():
-            from analysis.train.command import run_training
-
-            return run_training(options, ["landscape", *arguments])
-        case SweepOptions():
-            from analysis.runs.sweep.sweep import run_sweep
-
-            return run_sweep(options)
-        case ProbeOptions():
+            around.enter_context(compiling_is_said(Console(stderr=True)))
+        if command.draws:
             from analysis.console.drawing import drawing
 
-            with drawing("make_all") as drawn:
-                from analysis.probe.command import run_probe
-
-                return run_probe(options, ["landscape", *arguments], drawn)
-        case SliceOptions():
-            from analysis.slice.command import run_slice
-
-            return run_slice(options, ["landscape", *arguments])
-        case MapOptions():
-            from analysis.console.drawing import drawing
-
-            with drawing("maps") as drawn:
-                from analysis.commands.map.command import run_map
-
-                return run_map(options, ["landscape", *arguments], drawn)
-        case ViewOptions():
-            from analysis.commands.view import run_view
-
-            return run_view(options)
-        case PruneOptions():
-            from analysis.commands.uses.prune import run_prune
-
-            return run_prune(options, ["landscape", *arguments])
-        case NextViewOptions() if options.checkpoint.suffix == ".toml":
-            from analysis.commands.uses.study import run_study
-
-            return run_study(options.checkpoint)
-        case NextViewOptions():
-            from analysis.commands.uses.next_view import run_next_view
-
-            return run_next_view(options, ["landscape", *arguments])
-        case UncertaintyOptions():
-            from analysis.commands.uses.uncertainty import run_uncertainty
-
-            return run_uncertainty(options, ["landscape", *arguments])
-        case TrajectoryOptions():
-            from analysis.runs.trajectories import run_trajectory
-
-            return run_trajectory(options)
-        case CompareOptions():
-            from analysis.runs.compare import run_compare
-
-            return run_compare(options)
-        case ClaimsOptions():
-            from analysis.runs.claims.command import run_claims
-
-            return run_claims(options)
-        case ConvertOptions():
-            from analysis.commands.convert import run_convert
-
-            return run_convert(options)
-        case DemoOptions():
-            from analysis.commands.demo import run_demo
-
-            return run_demo(options)
-        case BenchOptions():
-            from analysis.bench.command import run_bench
-
-            return run_bench(options)
+            given.append(around.enter_context(drawing(command.draws)))
+        return getattr(import_module(module), function)(*given)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import torch
 from rich.console import Console
 
 from analysis.commands.options import ConvertOptions
+from analysis.console.plain import say
 from analysis.probe.command import opened
 from landscape.errors import InputError
 from splat.model.files.read import is_foreign, read_splats
@@ -33,9 +34,7 @@ def run_convert(options: ConvertOptions) -> int:
     to = options.to or ("graphdeco" if options.out.suffix.lower() == ".ply" else "own")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     notes = _to_own(options) if to == "own" else _to_depths(options) if to == "depths" else _to_tool(options, to)
-    console = Console(stderr=True)
-    for note in notes:
-        console.print(note, style="yellow", soft_wrap=True, highlight=False, markup=False)
+    say(*notes, style="yellow", console=Console(stderr=True))
     return 0
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from analysis.commands.options import DemoOptions
+from analysis.console.plain import say
 from analysis.probe.command import run_probe
 from analysis.probe.options import ProbeOptions
 from analysis.records.run_files import CHECKPOINT
@@ -25,29 +26,27 @@ VIEWS, ITERATIONS = 3, 600
 
 def run_demo(options: DemoOptions) -> int:
     """Make, train, probe; returns the exit code."""
-    out, console = free_folder(options.out), Console()
+    out = free_folder(options.out)
     if out != options.out:
-        console.print(f"{options.out} exists, so this run goes to {out}", highlight=False, soft_wrap=True, markup=False)
-    console.print("the first run compiles the kernels, which takes about a minute; later runs find them in a cache")
+        say(f"{options.out} exists, so this run goes to {out}")
+    say("the first run compiles the kernels, which takes about a minute; later runs find them in a cache")
     with Console(stderr=True).status("making a synthetic scene"):
         write_transforms_scene(synthetic_scene(SCENE).scene, out / "scene")
     training = TrainOptions(out / "scene", out=out / "run", views=VIEWS, iterations=ITERATIONS)
     typed = ["train", str(training.scene), "--out", str(training.out), "--views", str(VIEWS)]
     typed += ["--iterations", str(ITERATIONS)]
     checkpoint = out / "run" / CHECKPOINT
-    _announce(console, typed)
+    _announce(typed)
     if code := run_training(training, ["landscape", *typed]):
         return code
     typed = ["probe", str(checkpoint)]
-    _announce(console, typed)
+    _announce(typed)
     return run_probe(ProbeOptions(checkpoint), ["landscape", *typed])
 
 
-def _announce(console: Console, arguments: list[str]) -> None:
+def _announce(arguments: list[str]) -> None:
     """The command that does the same."""
-    console.print(
-        f"\n$ {shlex.join(['landscape', *arguments])}", style="bold", highlight=False, soft_wrap=True, markup=False
-    )
+    say(f"\n$ {shlex.join(['landscape', *arguments])}", style="bold")
 
 
 def free_folder(wanted: Path) -> Path:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from analysis.console.options import ForeignOptions, Unset
+from analysis.console.options import CheckpointPath, Foreign, ForeignOptions, SceneFolder, Unset
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,14 @@ class ConvertOptions:
     """What to write.  Default: graphdeco's PLY where OUT ends in .ply, else our own checkpoint."""
     scene: Unset[Path] = None
     """Folder of the scene, for our own checkpoint or depths of another tool's file."""
-    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+    foreign: Foreign = field(default_factory=ForeignOptions)
 
 
 @dataclass(frozen=True)
 class MapOptions:
     """Show where a scene is curved: numbers of every Gaussian as PLY and CSV, and as pictures over every training view."""
 
-    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    checkpoint: CheckpointPath
     shown: Annotated[str, arg(name="field")] = "largest"
     """The number that pictures, colours and the top of the table are of; any of those in fields.ply.
     Where RUN/probe holds eigenvectors, also e1 and e_min: the Gaussians' shares of them."""
@@ -51,19 +50,17 @@ class MapOptions:
     """A training view to draw, by name or by place (0 is the first); may be given again.  Default: all of them."""
     seed: int = 0
     """Seed of the pairs of neighbours whose swap is rendered."""
-    scene: Unset[Path] = None
-    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    scene: SceneFolder = None
     out: Unset[Path] = None
     """Folder of the results.  Default: map, beside the checkpoint."""
-    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+    foreign: Foreign = field(default_factory=ForeignOptions)
 
 
 @dataclass(frozen=True)
 class ViewOptions:
     """Show a scene in the browser in the colours of any field of its Gaussians, and follow the steepest directions."""
 
-    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    checkpoint: CheckpointPath
     shown: Annotated[str, arg(name="field")] = "largest"
     """What colours the splats at first: a field as of landscape map, or appearance."""
     port: int = 8080
@@ -73,9 +70,8 @@ class ViewOptions:
     html: Unset[Path] = None
     """Write a page that needs no server to this file instead: splats in the field's colours and cameras, without controls.
     RUN/view.html is linked to by the probe's report."""
-    scene: Unset[Path] = None
-    """Folder of the scene: where it has moved since the training, or of another tool's file."""
-    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+    scene: SceneFolder = None
+    foreign: Foreign = field(default_factory=ForeignOptions)
 
 
 @dataclass(frozen=True)

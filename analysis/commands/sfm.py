@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from analysis.commands.options import SfmOptions
+from analysis.console.plain import say
 from splat.scenes.sfm.sfm import Mapped, Stage, scene_from_photos
 
 STAGES: dict[Stage, str] = {
@@ -49,11 +50,6 @@ def _progress() -> Progress:
 
 
 def _report(mapped: Mapped, out: Path) -> None:
-    console = Console()
-
-    def say(text: str) -> None:
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
-
     total = mapped.placed + len(mapped.left_out)
     say(
         f"{out}: {mapped.placed} of {total} photographs placed, {mapped.points} points, "

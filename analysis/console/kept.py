@@ -70,7 +70,7 @@ class Kept:
 
     @property
     def left(self) -> float:
-        """Seconds."""
+        """Seconds until the deadline."""
         return max(self.deadline - monotonic(), 0.0)
 
     def run(
@@ -128,7 +128,7 @@ class Kept:
         self.counts = [sum(both) for both in zip(self.counts or [0] * len(entry.counts), entry.counts, strict=True)]
 
     def _read(self, name: str) -> Entry | None:
-        """None also for what is damaged: it is measured again."""
+        """What a stage found; None where nothing is kept, or it is damaged or another command's: it is then measured again."""
         if self.folder is None:
             return None
         with suppress(OSError, msgspec.DecodeError):
@@ -145,7 +145,7 @@ class Kept:
         write_atomically(self._file(name), self._key(content) + content)
 
     def _key(self, content: bytes) -> bytes:
-        """Of what one command found, whole: a digest, with which its file begins."""
+        """Digest of the command and of the content, with which a file begins: it shows that both are the same and whole."""
         return hashlib.sha256(self.told + b"\0" + content).digest()
 
     def _file(self, name: str) -> Path:

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 DeviceName = Literal["auto", "cpu", "cuda"]
@@ -58,3 +58,23 @@ class ForeignOptions:
     """Of another tool's file: factor by which its images were reduced.  Default: what its tool does."""
     max_views: Unset[int] = None
     """Measure on at most so many training views, spread evenly over the cameras.  Default: all."""
+
+
+CheckpointPath = Annotated[
+    Positional[Path],
+    arg(
+        metavar="CHECKPOINT",
+        help="RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply.",
+    ),
+]
+SceneFolder = Annotated[
+    Unset[Path], arg(help="Folder of the scene: where it has moved since the training, or of another tool's file.")
+]
+MostMemory = Annotated[
+    Unset[str],
+    arg(
+        help="The most memory that the command takes, such as 8GB; one that cannot be done in it says what would fit.\n"
+        "Default: what is free.  On the CPU."
+    ),
+]
+Foreign = Annotated[ForeignOptions, arg(name="")]  # its options as the command's own

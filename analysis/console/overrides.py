@@ -55,7 +55,7 @@ def overridden(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
 
 
 def _unknown(key: str, config: TrainConfig) -> str:
-    """The setting that was meant, of whatever method; else all."""
+    """Sentence for a key that is no setting: with the one that was meant, of whatever method, else with all that there are."""
     common, own, method = _names(config), _names(config.method), config.method.name
     words = f"expected a setting of the training or of the method {method}, got {key!r}"
     if key in LABELS:
@@ -72,7 +72,7 @@ def _unknown(key: str, config: TrainConfig) -> str:
 
 
 def _names(settings: TrainConfig | MethodSettings) -> list[str]:
-    """Of every single setting, but for the method's among the training's."""
+    """Dotted names of all single settings; of the training without those of its method."""
     return [name for name in leaves(asdict(settings)) if name not in LABELS and not name.startswith("method.")]
 
 

@@ -23,14 +23,14 @@ STRAYS = 4.0  # by which the time of a unit may be wrong
 
 
 class Work(NamedTuple):
-    """What a stage is expected to take: seconds, and the units of which its progress is told; 0: of different kinds."""
+    """What a stage is expected to take.  seconds: in all; units: of its progress, 0 where these take unlike times."""
 
     seconds: float
     units: float = 0.0
 
 
 def pace(done: int, seconds: float) -> str:
-    """How fast it goes, in words; empty where that is not known yet.
+    """The rate of a stage in words, after so many units in so many seconds; empty where that is not known yet.
 
     >>> pace(20, 10.0), pace(1, 130.0), pace(0, 5.0)
     (', 2 a second', ', 130 s each', '')
@@ -98,15 +98,16 @@ class Stages:
         self._say(f"{name}: {self.timing[name]:.1f} s{left}")
 
     def known(self, name: str, seconds: float) -> None:
-        """A stage whose result is there from before, when it took so long."""
+        """Show a stage as done whose result an earlier run has kept; seconds: that it took then."""
         self.timing[name] = seconds
         self._progress.update(self._progress.add_task(name, total=1, state="kept from before"), completed=1)
         self._say(f"{name}: kept from before")
 
     def left(self, name: str = "", spent: float = 0.0, done: float = 0.0) -> str:
-        """The time left for all in words, while a stage has done so many units in so many seconds.
+        """Time left for all stages in words; empty for a stage without a plan.
 
-        A stage goes on at its rate; those to come are as much slower than planned.  Empty for a stage without a plan.
+        name, spent, done: of the stage under way, with its seconds and units so far.  It is taken to go on at that rate, and
+        those to come to be slower than planned by as much as it is.
         """
         if name and name not in self.plan:
             return ""

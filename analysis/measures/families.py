@@ -183,7 +183,9 @@ def measure_families(
 
 def expected_families(options: FamilyOptions) -> dict[str, tuple[int, float, float]]:
     """What every stage takes: units, as its progress counts them, products of as many vectors as a batch has, and renders."""
-    scenes: dict[SceneName, float] = {"trained": 1.0} | ({"split": SPLIT} if options.split_control else {})
+    scenes: dict[SceneName, float] = {"trained": 1.0}
+    if options.split_control:
+        scenes["split"] = SPLIT
     return {
         _stage_of(scene, operator): (PARTS, PARTS * PRODUCTS * more, 0)
         for scene, more in scenes.items()

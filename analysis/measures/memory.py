@@ -9,7 +9,7 @@ import torch
 
 from landscape import EigenSettings
 from landscape.errors import InputError, lacks_memory
-from splat.backend.memory import free_memory, resident_memory
+from splat.backend.memory import SLACK, free_memory, resident_memory
 from splat.curvature.linearize import VECTORS, KeptViews
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
@@ -66,11 +66,11 @@ def expected_peak(objective: SceneObjective) -> int:
     free, used = max(free_memory(device), 0), resident_memory() if device.type == "cpu" else 0
     least, camera = needs.view + needs.beside, objective.views[0].camera
     if least > free:
-        fit = int(len(objective.active) * free / least)
+        fit, ask = int(len(objective.active) * free / least), ceil((used + least) / (1 - SLACK) / 1e7) / 100
         raise InputError(
             f"expected at least {_gb(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
-            f"{camera.width} x {camera.height} px, got {_gb(used + free)}, of which {_gb(used)} are taken; --memory "
-            f"{ceil((used + least) / 1e7) / 100:g}GB would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
+            f"{camera.width} x {camera.height} px, got {_gb(used + free)}, of which {_gb(used)} are taken; --memory {ask:g}GB "
+            f"would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
         )
     return used + min(free, len(objective.views) * needs.view + needs.beside)
 

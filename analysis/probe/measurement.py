@@ -18,11 +18,12 @@ stop at their accuracy or after so many products as settings allow at most; each
 deadline, which ends what is under way.  The numbers depend on the seed alone, also where stages were kept from a run before.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from statistics import median
+from time import monotonic
 from types import MappingProxyType
 
 import torch
@@ -31,7 +32,6 @@ from torch import Tensor
 
 from analysis.console.kept import Kept
 from analysis.console.stages import Stages, Work
-from analysis.console.timing import wall_clock
 from analysis.measures.depth import measure_depth
 from analysis.measures.gradient_check import ProductCheck, check_against_gradient
 from analysis.measures.memory import basis_within, vectors_within
@@ -272,12 +272,21 @@ def _compile_blocks(objective: SceneObjective) -> None:
 def _seconds_of_product(hessian: SceneHessian) -> float:
     """With MOST_AT_ONCE vectors."""
     V = torch.ones_like(hessian.objective.active.flat)[:, None].expand(-1, MOST_AT_ONCE).contiguous()
-    return median(wall_clock(lambda: finished(hessian.apply(V))) for _ in range(TIMED))
+    return _seconds_of(lambda: finished(hessian.apply(V)))
 
 
 def seconds_of_render(objective: SceneObjective) -> float:
     """Of all views, with all threads; compiles nothing only where one has been made before."""
-    return median(wall_clock(lambda: objective.loss(objective.active.flat)) for _ in range(TIMED))
+    return _seconds_of(lambda: objective.loss(objective.active.flat))
+
+
+def _seconds_of(call: Callable[[], object]) -> float:
+    taken = []
+    for _ in range(TIMED):
+        start = monotonic()
+        call()
+        taken.append(monotonic() - start)
+    return median(taken)
 
 
 def _plan(settings: ProbeSettings, product: float, render: float, after: Expected = NOTHING) -> Mapping[str, Work]:

@@ -2,21 +2,19 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff
 
-from analysis.console.options import DeviceName, ForeignOptions, Unset
+from analysis.console.options import CheckpointPath, DeviceName, Foreign, ForeignOptions, MostMemory, SceneFolder, Unset
 
 
 @dataclass(frozen=True)
 class ProbeOptions:
     """Measure the loss landscape at a checkpoint: traces, extreme eigenvalues, anisotropy, a slice."""
 
-    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
-    scene: Unset[Path] = None
-    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    checkpoint: CheckpointPath
+    scene: SceneFolder = None
     out: Unset[Path] = None
     """Folder of the results.  Default: probe, beside the checkpoint."""
     seed: int = 0
@@ -64,7 +62,5 @@ class ProbeOptions:
     Any but parameters measures the families, as --families does."""
     family_seconds: float = 1800.0
     """Time for the families together, in seconds, beside that of --seconds.  inf: no limit."""
-    memory: Unset[str] = None
-    """The most memory that the command takes, such as 8GB; one that cannot be done in it says what would fit.
-    Default: what is free.  On the CPU."""
-    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+    memory: MostMemory = None
+    foreign: Foreign = field(default_factory=ForeignOptions)

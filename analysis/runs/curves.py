@@ -20,6 +20,7 @@ import pandas as pd
 from rich.console import Console
 from rich.progress import track
 
+from analysis.console.plain import say
 from analysis.records.run_files import CHECKPOINT
 from landscape.errors import InputError
 from splat.scenes.view import View
@@ -89,7 +90,7 @@ def main(words: Sequence[str] | None = None) -> int:
         for run in track([run for run in ended if not (run / CURVE).is_file()], "curves", console=console):
             write_atomically(run / CURVE, curve(run).to_csv(index=False).encode())
     except (InputError, FileNotFoundError) as error:
-        console.print(f"analysis.runs.curves: {error}", soft_wrap=True, highlight=False, markup=False)
+        say(f"analysis.runs.curves: {error}", console=console)
         return 2
     return 0
 

@@ -17,6 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from analysis.console.drawing import draw
+from analysis.console.plain import say
 from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.quantities import measured, quantity
 from analysis.records.run_files import CHECKPOINT, ENDS, NO_TIME, RECORDS, TRAJECTORY_INDICES, read_trajectory
@@ -42,10 +43,9 @@ def run_trajectory(options: TrajectoryOptions) -> int:
     temporary.replace(path)
     console.print(first_and_last(table))
     (out / PICTURE).unlink(missing_ok=True)
-    for note in draw("trajectory", path):
-        console.print(note, style="yellow", highlight=False, soft_wrap=True, markup=False)
+    say(*draw("trajectory", path), style="yellow", console=console)
     drawn = f"picture: {out / PICTURE}; " if (out / PICTURE).is_file() else ""
-    console.print(f"{drawn}numbers: {path}", soft_wrap=True, highlight=False, markup=False)
+    say(f"{drawn}numbers: {path}", console=console)
     return 0
 
 

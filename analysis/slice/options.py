@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from analysis.console.options import DeviceName, ForeignOptions, Unset
+from analysis.console.options import DeviceName, Foreign, ForeignOptions, MostMemory, SceneFolder, Unset
 
 Along = Literal["eigenvectors", "random", "gradient", "line"]
 
@@ -52,11 +52,8 @@ class SliceOptions:
     """Where to work.  auto: on the GPU where there is one that can be used, else on the CPU."""
     seed: int = 0
     """Seed of random directions, of the start of Lanczos, and of the points that judge the interpolation."""
-    scene: Unset[Path] = None
-    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    scene: SceneFolder = None
     out: Unset[Path] = None
     """Folder of the results.  Default: beside the checkpoint, such as slice-eigenvectors-2d or slice-line-1d."""
-    memory: Unset[str] = None
-    """The most memory that the command takes, such as 8GB; one that cannot be done in it says what would fit.
-    Default: what is free.  On the CPU."""
-    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+    memory: MostMemory = None
+    foreign: Foreign = field(default_factory=ForeignOptions)

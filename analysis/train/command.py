@@ -30,11 +30,12 @@ from rich.console import Console
 
 from analysis.console.interruption import interruption
 from analysis.console.overrides import assignments, overridden
+from analysis.console.plain import say
 from analysis.records.run_files import CHECKPOINT
 from analysis.train.options import TrainOptions
 from analysis.train.progress import TrainingProgress, scalar_writer
 from analysis.train.remarks import begins, remarks
-from analysis.train.scores import PLAIN, report
+from analysis.train.scores import report
 from analysis.train.source import from_checkpoint
 from analysis.train.training_time import TrainingTime
 from analysis.train.trajectory import START, Trajectory, TrajectorySettings
@@ -70,7 +71,6 @@ OPTIONS = {  # settings of the training that have an option of their own
     "densify.enabled": "densify",
 }
 AGAIN = "repeat its command with --resume, or choose another --out"
-WARNING: dict[str, Any] = PLAIN | {"style": "yellow"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,20 +166,19 @@ def run_training(options: TrainOptions, command: Sequence[str]) -> int:
 def _run(run: Run, options: TrainOptions, command: Sequence[str], along: TrajectorySettings | None) -> int:
     """Train to the end and score, in a folder that exists; as `run_training`."""
     training, console = run.training, Console(stderr=True)
-    console.print(
-        begins(run.scene, run.views, len(run.held_out), training, options.from_ or run.reference.start), **PLAIN
-    )
+    first = begins(run.scene, run.views, len(run.held_out), training, options.from_ or run.reference.start)
+    say(first, console=console)
     begun = None if options.resume or options.from_ else (run.reference.start, len(training.gaussians))
-    for remark in remarks(run.scene, _asked(options, run.scene), training.config, begun):
-        console.print(remark, **WARNING)
+    found = remarks(run.scene, _asked(options, run.scene), training.config, begun)
+    say(*found, style="yellow", console=console)
     trajectory = None if along is None else Trajectory(run.out, training, run.views, along)
     if code := _follow(run, options, trajectory, console):
         again = shlex.join([*command, *([] if options.resume else ["--resume"])])
-        console.print(f"stopped after step {training.step}; to continue: {again}", **PLAIN)
+        say(f"stopped after step {training.step}; to continue: {again}", console=console)
         return code
     report(training, run.views, run.held_out, run.out)
     if trajectory and (thinned := trajectory.thinned):
-        console.print(thinned, **WARNING)
+        say(thinned, style="yellow", console=console)
     return 0
 
 

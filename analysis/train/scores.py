@@ -23,6 +23,7 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
+from analysis.console.plain import say
 from analysis.records.json_files import json_text, plain
 from analysis.records.provenance import provenance
 from analysis.records.run_files import CHECKPOINT, METRICS
@@ -37,7 +38,6 @@ from splat.training.state import Training
 RENDERS, PANELS = "test", "panels"
 ERROR_SHOWN = 0.25  # of the range of a colour
 GAP = 4  # white pixels between the pictures of a panel
-PLAIN: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}  # paths and names may hold brackets
 
 
 def report(training: Training, views: Sequence[View], held_out: Sequence[View], out: Path) -> None:
@@ -56,7 +56,7 @@ def report(training: Training, views: Sequence[View], held_out: Sequence[View], 
         lpips = load_lpips()
     except MissingPerceptual as error:
         lpips = None
-        console.print(str(error), **PLAIN)
+        say(str(error), console=console)
     seen = evaluate(training.gaussians, views, background, config.render, lpips=lpips)
     tested = None
     if held_out:
@@ -79,8 +79,8 @@ def report(training: Training, views: Sequence[View], held_out: Sequence[View], 
         if tested
         else "no view was held out, so nothing was tested; "
     )
-    for line in (f"{rendered}scores: {out / METRICS}", f"next: landscape probe {shlex.quote(str(out))}"):
-        console.print(line, **PLAIN)
+    next_step = f"next: landscape probe {shlex.quote(str(out))}"
+    say(f"{rendered}scores: {out / METRICS}", next_step, console=console)
 
 
 def render_name(view: str) -> str:

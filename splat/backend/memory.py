@@ -15,14 +15,16 @@ VERSIONS = {  # of control groups: folder, limit, usage
 }
 
 
-_most: int | None = None  # bytes that this process shall stay within
+SLACK = 0.05  # of a limit that is asked for: what allocators and libraries hold beside what is counted
+
+_most: float | None = None  # bytes that this process shall stay within
 
 
 @contextmanager
 def staying_within(size: int | None) -> Iterator[None]:
-    """Let `free_memory` count so many bytes, in memory at a time, as all that this process may have; None: no such limit."""
+    """Let `free_memory` count so many bytes, in memory at a time and less SLACK, as all there are; None: no such limit."""
     global _most
-    _most, before = size, _most
+    _most, before = None if size is None else (1 - SLACK) * size, _most
     try:
         yield
     finally:
@@ -45,7 +47,7 @@ def free_memory(device: torch.device) -> int:
 def _of_process() -> Iterator[int]:
     """What the limits of this process leave, of memory, of addresses and of data."""
     if _most is not None:
-        yield _most - resident_memory()
+        yield int(_most) - resident_memory()
     used = psutil.Process().memory_info()
     for kind, bytes_used in ((resource.RLIMIT_AS, used.vms), (resource.RLIMIT_DATA, getattr(used, "data", used.rss))):
         limit = resource.getrlimit(kind)[0]

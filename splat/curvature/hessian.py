@@ -39,17 +39,16 @@ class ViewSum:
 
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         require_vectors(V, self.dim)
-        total = torch.zeros_like(V, dtype=self.dtype)
+        parts = [part.contiguous() for part in V.split(VECTORS, dim=1)]
+        totals = [torch.zeros_like(part, dtype=self.dtype) for part in parts]
         for view in islice(self.objective.linearized, self.count):
-            for start in range(0, V.shape[1], VECTORS):
-                columns = slice(start, start + VECTORS)
-                some = V[:, columns]
-                if view.affects(some):
-                    product = view.ggn if self.gauss_newton else view.hvp
-                    total[:, columns] += product(some, coupled=self.coupled)
+            product = view.ggn if self.gauss_newton else view.hvp
+            for part, total in zip(parts, totals, strict=True):
+                if view.affects(part):
+                    product(part, total, coupled=self.coupled)
                 else:
-                    self.spared += some.shape[1]
-        return total
+                    self.spared += part.shape[1]
+        return torch.cat(totals, dim=1) if len(totals) > 1 else totals[0]
 
     def forms(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:
         """v . H_m v of each of this process's views and each column."""
@@ -107,14 +106,18 @@ class SceneHessian:
     def apply(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
         require_vectors(V, self.dim)
         self.objective.ranks.require_same_vectors(V)
-        PV = self.project(V.to(self.objective.active.flat.device))
+        PV = self._argument(V)
         total = self._recordings(self.views.apply, PV) if self.recordable(V.shape[1]) else self.views.apply(PV)
         return self.project(self.objective.mean_over_views(total)).to(V.device)
 
+    def _argument(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+        """What H is applied to in place of P V, with the same result."""
+        V = V.to(self.objective.active.flat.device)
+        return V if self.keep_null else self.projector.without_lengths(V)
+
     def by_view(self, V: Float[Tensor, "p k"]) -> Float64[Tensor, "m k"]:
         """v . P H_m P v of every view's part of H and each column: their mean over the views is v . P H P v."""
-        PV = self.project(V.to(self.objective.active.flat.device))
-        return self.objective.of_all_views(self.views.forms(PV))
+        return self.objective.of_all_views(self.views.forms(self._argument(V)))
 
     def recordable(self, vectors: int) -> bool:
         """Whether products with so many vectors are worth a CUDA graph: of views on a GPU that are all kept, and small."""

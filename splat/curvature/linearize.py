@@ -139,14 +139,18 @@ class LinearizedView:
         """J^T G for cotangents of colour and accumulated alpha."""
         return self._pulled([self._raster.backward(self._raster.pad(g)) for g in G])
 
-    def hvp(self, U: Float[Tensor, "p k"], *, coupled: bool = True) -> Float[Tensor, "p k"]:
-        """H U of the view's loss.  coupled: False for the pixel-diagonal of l'' in place of l''."""
-        return self._projection.vjp(self._adjoint_tangent(U, coupled), U)
+    def hvp(
+        self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, coupled: bool = True
+    ) -> Float[Tensor, "p k"]:
+        """H U of the view's loss.  total: what it is added to.  coupled: False for the pixel-diagonal of l''."""
+        return self._projection.vjp(self._adjoint_tangent(U, coupled), U, total)
 
-    def ggn(self, U: Float[Tensor, "p k"], *, coupled: bool = True) -> Float[Tensor, "p k"]:
-        """G U, the Gauss-Newton part of H U."""
+    def ggn(
+        self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, coupled: bool = True
+    ) -> Float[Tensor, "p k"]:
+        """G U, the Gauss-Newton part of H U; total, coupled: see `hvp`."""
         cotangents = self._curved(self._tangent(U), coupled)
-        return self._pulled([self._raster.backward(cotangent) for cotangent in cotangents])
+        return self._pulled([self._raster.backward(cotangent) for cotangent in cotangents], total)
 
     def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
         """Every Gaussian's diagonal block of the Hessian, or of its Gauss-Newton part, exactly.
@@ -200,9 +204,9 @@ class LinearizedView:
         planes[:, 3] = 0
         return planes
 
-    def _pulled(self, adjoints: Sequence[Adjoint]) -> Float[Tensor, "p k"]:
+    def _pulled(self, adjoints: Sequence[Adjoint], total: Float[Tensor, "p k"] | None = None) -> Float[Tensor, "p k"]:
         """P'^T of adjoints of the splats."""
-        return self._projection.vjp(torch.stack([adjoint.moments for adjoint in adjoints], dim=1))
+        return self._projection.vjp(torch.stack([adjoint.moments for adjoint in adjoints], dim=1), total=total)
 
 
 class KeptViews:

@@ -258,7 +258,10 @@ class SceneObjective:
     @cached_property
     def gradient(self) -> Float[Tensor, " p"]:
         """The gradient of L at the active Gaussians."""
-        return self.mean_over_views(torch.stack([view.gradient for view in self.linearized]).sum(dim=0))
+        total = torch.zeros_like(self.active.flat)
+        for view in self.linearized:
+            total += view.gradient
+        return self.mean_over_views(total)
 
     def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
         """The block of every Gaussian in the Hessian of L, or in its Gauss-Newton part: exact, on the CPU.

@@ -132,9 +132,12 @@ class CudaProjection:
         return out
 
     def vjp(
-        self, cotangents: Float[Tensor, "n k 9"], block: Float[Tensor, "p k"] | None = None
+        self,
+        cotangents: Float[Tensor, "n k 9"],
+        block: Float[Tensor, "p k"] | None = None,
+        total: Float[Tensor, "p k"] | None = None,
     ) -> Float[Tensor, "p k"]:
-        """P'^T cotangents, plus (a . P'') block where a block is given."""
+        """P'^T cotangents, plus (a . P'') block where a block is given, added to total."""
         vectors, m = cotangents.shape[1], self._at.index.numel()
         out = self._at.jacobian.new_zeros(self.parameters, vectors)
         grid, rows, wide = self._grid(vectors)
@@ -143,7 +146,7 @@ class CudaProjection:
             cotangents.to(out.dtype).contiguous(), out if block is None else block.contiguous(), *self._at, out,
             self.n, m, vectors, block is not None, self._antialiased, self.bands, rows, wide
         )  # fmt: skip
-        return out
+        return out if total is None else total.add_(out)
 
     def blocks(
         self, blocks: Float64[Tensor, "m 9 9"], second_order: bool

@@ -69,32 +69,24 @@ def adjoint_of(lens, mean, log_scales, quat, width, antialiased, bar, weight, ba
 
 
 @triton_formula
-def linearized_geometry(lens, mean, log_scales, quat, splat, moments, lane):
-    """The Jacobian (5 rows) and the Hessian of adjoint . geometry (10 rows), one direction at each place of `lane`."""
+def linearized_geometry(lens, mean, log_scales, quat, own, width, antialiased, splat, moments, lane):
+    """The Jacobian (5 rows) and the Hessian of adjoint . geometry (10 rows), one direction at each place of `lane`.
+
+    Where antialiased the opacity is own F, and the slope ln' F comes third.
+    """
     camera = lens_from(lens)
-    numbers = (*mean, *log_scales, *quat)
-    variables = [variable(number, lane, i) for i, number in enumerate(numbers)]
+    variables = [variable(number, lane, i) for i, number in enumerate((*mean, *log_scales, *quat))]
     x, s, q = variables[:3], variables[3:6], variables[6:]
     W = whitening(splat)
-    jacobian = geometry_coefficients(W, [tangent_of(value) for value in geometry(camera, x, s, q)])
-    m, t, r = geometry_adjoint(camera, x, s, q, plain_gradient(W, splat[5], moments))
-    return jacobian, [tangent_of(row) for row in (*m, *t, *r)]
-
-
-@triton_formula
-def linearized_antialiased(lens, mean, log_scales, quat, own, width, splat, moments, lane):
-    """`linearized_geometry` where the opacity is own F, with its slope ln' F."""
-    camera = lens_from(lens)
-    numbers = (*mean, *log_scales, *quat)
-    variables = [variable(number, lane, i) for i, number in enumerate(numbers)]
-    x, s, q = variables[:3], variables[3:6], variables[6:]
-    W = whitening(splat)
-    *values, F = antialiased_geometry(camera, x, s, q, width)
-    jacobian = geometry_coefficients(W, [tangent_of(value) for value in values])
     bar = plain_gradient(W, splat[5], moments)
-    m, t, r = antialiased_adjoint(camera, x, s, q, width, (*bar[:5], own * bar[5]))
-    slope = tangent_of(F) / select(value_of(F) > 0, value_of(F), 1.0)
-    return jacobian, [tangent_of(row) for row in (*m, *t, *r)], slope
+    if antialiased:
+        *values, F = antialiased_geometry(camera, x, s, q, width)
+        bars = antialiased_adjoint(camera, x, s, q, width, (*bar[:5], own * bar[5]))
+        more = (tangent_of(F) / select(value_of(F) > 0, value_of(F), 1.0),)
+    else:
+        values, bars, more = geometry(camera, x, s, q), geometry_adjoint(camera, x, s, q, bar), ()
+    jacobian = geometry_coefficients(W, [tangent_of(value) for value in values])
+    return jacobian, [tangent_of(row) for part in bars for row in part], *more
 
 
 @triton_formula
@@ -160,6 +152,19 @@ def row(pointer, i, width: tl.constexpr, count: tl.constexpr, mask):
 
 
 @jit
+def geometry_at(flat, i, n, mask):
+    """Means, log-scales and quaternions of Gaussians, in double precision."""
+    log_scales, quats = row(flat + start_of(1, n), i, 3, 3, mask), row(flat + start_of(2, n), i, 4, 4, mask)
+    return row(flat, i, 3, 3, mask), log_scales, quats
+
+
+@jit
+def place_of(j: tl.constexpr, i, n):
+    """Where number j of the ten of mean, log-scales and quaternion lies in the flat vector."""
+    return start_of(2, n) + i * 4 + (j - 6) if j >= 6 else start_of(j // 3, n) + i * 3 + j % 3
+
+
+@jit
 def columns(pointer, e, m, count: tl.constexpr, mask):
     """The numbers at place e of so many arrays of m, one after the other."""
     found = ()
@@ -198,16 +203,13 @@ def project_splats(
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < n
     camera = numbers(lens, LENS)
-    mean = row(flat, i, 3, 3, here)
+    mean, log_scales, quat = geometry_at(flat, i, n, here)
     depth = depth_of(camera, mean).to(depths.dtype.element_ty)
     ahead = here & (depth.to(tl.float64) > camera[LENS - 1])
     tl.store(depths + i, depth, here)
     tl.store(drawn + i, ahead, here)
     logit = tl.load(flat + start_of(3, n) + i, here, other=0.0).to(tl.float64)
-    found, harmonic = splat_of(
-        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here),
-        row(widths, i, 1, 1, here)[0], ANTIALIASED,
-    )  # fmt: skip
+    found, harmonic = splat_of(camera, mean, log_scales, quat, row(widths, i, 1, 1, here)[0], ANTIALIASED)
     for j in tl.static_range(5):
         tl.store(splats + i * 9 + j, tl.where(ahead, found[j], 0.0), here)
     opacity = sigmoid(logit)
@@ -257,7 +259,7 @@ def project_adjoint(
     here = i < n
     ahead = here & (tl.load(drawn + i, here, other=0) != 0)
     camera = numbers(lens, LENS)
-    mean = row(flat, i, 3, 3, here)
+    mean, log_scales, quat = geometry_at(flat, i, n, here)
     colour_bar, _visible = colour_bars(bar, splats, i, here)
     weight = harmonic_weights(flat, colour_bar, i, n, BANDS, here)
     opacity = tl.load(splats + i * 9 + 5, here, other=0.0)
@@ -268,20 +270,12 @@ def project_adjoint(
         logit_slope = sigmoid(-logit)
         splat_bar = splat_bar + (sigmoid(logit) * tl.load(bar + i * 9 + 5, here, other=0.0),)
     width = row(widths, i, 1, 1, here)[0]
-    pulled = adjoint_of(
-        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here),
-        width, ANTIALIASED, splat_bar, weight, BANDS,
-    )  # fmt: skip
-    for j in tl.static_range(3):
-        tl.store(gradient + i * 3 + j, tl.where(ahead, pulled[j], 0.0), here)
-        tl.store(gradient + start_of(1, n) + i * 3 + j, tl.where(ahead, pulled[3 + j], 0.0), here)
-    for j in tl.static_range(4):
-        tl.store(gradient + start_of(2, n) + i * 4 + j, tl.where(ahead, pulled[6 + j], 0.0), here)
+    pulled = adjoint_of(camera, mean, log_scales, quat, width, ANTIALIASED, splat_bar, weight, BANDS)
+    for j in tl.static_range(10):
+        tl.store(gradient + place_of(j, i, n), tl.where(ahead, pulled[j], 0.0), here)
     logit_bar = opacity * logit_slope * tl.load(bar + i * 9 + 5, here, other=0.0)
     tl.store(gradient + start_of(3, n) + i, tl.where(ahead, logit_bar, 0.0), here)
-    _found, harmonic = splat_of(
-        camera, mean, row(flat + start_of(1, n), i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here), width, False
-    )
+    _found, harmonic = splat_of(camera, mean, log_scales, quat, width, False)
     for b in tl.static_range(BANDS):
         for c in tl.static_range(3):
             value = tl.where(ahead, harmonic[b] * colour_bar[c], 0.0)
@@ -300,21 +294,20 @@ def linearize_geometry(
     e, lane = places(BLOCK, 16)
     here = e < m
     i = tl.load(index + e, here, other=0)
-    camera, mean, quat = numbers(lens, LENS), row(flat, i, 3, 3, here), row(flat + start_of(2, n), i, 4, 4, here)
-    log_scales = row(flat + start_of(1, n), i, 3, 3, here)
+    camera, (mean, log_scales, quat) = numbers(lens, LENS), geometry_at(flat, i, n, here)
     splat, adjoint = row(splats, i, 9, 6, here), row(moments, i, 9, 6, here)
     S = tl.load(moments + i * 9, here, other=0.0).to(tl.float64)
+    logit, width = tl.load(flat + start_of(3, n) + i, here, other=0.0).to(tl.float64), row(widths, i, 1, 1, here)[0]
+    found = linearized_geometry(
+        camera, mean, log_scales, quat, sigmoid(logit), width, ANTIALIASED, splat, adjoint, lane
+    )
+    rows, bends = found[0], found[1]
     if ANTIALIASED:
-        logit, width = tl.load(flat + start_of(3, n) + i, here, other=0.0).to(tl.float64), row(widths, i, 1, 1, here)[0]
         slope = sigmoid(-logit)
-        rows, bends, thinning = linearized_antialiased(
-            camera, mean, log_scales, quat, sigmoid(logit), width, splat, adjoint, lane
-        )
-        tl.store(opacity_slope + lane * m + e, thinning, here & (lane < 10))
-        tl.store(opacity_curvature + lane * m + e, S * slope * thinning, here & (lane < 10))
+        tl.store(opacity_slope + lane * m + e, found[2], here & (lane < 10))
+        tl.store(opacity_curvature + lane * m + e, S * slope * found[2], here & (lane < 10))
     else:
         slope = 1.0 - tl.load(splats + i * 9 + 5, here, other=0.0)
-        rows, bends = linearized_geometry(camera, mean, log_scales, quat, splat, adjoint, lane)
     tl.store(logit_slope + e, slope, here & (lane == 0))
     tl.store(logit_curvature + e, slope * (2.0 * slope - 1.0) * S, here & (lane == 0))
     for r in tl.static_range(5):
@@ -358,12 +351,8 @@ def linearize_colour(
 def tangents_at(block, i, k, K, n, here):
     """The ten tangents of mean, log-scales and quaternion."""
     found = ()
-    for j in tl.static_range(3):
-        found = found + (tl.load(block + (i * 3 + j) * K + k, here, other=0.0),)
-    for j in tl.static_range(3):
-        found = found + (tl.load(block + (start_of(1, n) + i * 3 + j) * K + k, here, other=0.0),)
-    for j in tl.static_range(4):
-        found = found + (tl.load(block + (start_of(2, n) + i * 4 + j) * K + k, here, other=0.0),)
+    for j in tl.static_range(10):
+        found = found + (tl.load(block + place_of(j, i, n) * K + k, here, other=0.0),)
     return found
 
 
@@ -441,7 +430,7 @@ def pull_back(
                 bent = bent + (h[j] + across * logit,)
                 logit_bar += across * u[j]
             h = bent
-    first, second, third = h[0], h[1], h[2]
+    mean = (h[0], h[1], h[2])
     for b in range(BANDS):
         at = (start_of(4, n) + (i * BANDS + b) * 3) * K + k
         s = columns(slope + b * 3 * m, e, m, 3, kept)
@@ -454,12 +443,7 @@ def pull_back(
                 weight += coloured * tl.load(block + at + c * K, here, other=0.0)
                 value += coloured * along
             tl.store(out + at + c * K, value, here)
-        first, second, third = first + s[0] * weight, second + s[1] * weight, third + s[2] * weight
-    tl.store(out + i * 3 * K + k, first, here)
-    tl.store(out + (i * 3 + 1) * K + k, second, here)
-    tl.store(out + (i * 3 + 2) * K + k, third, here)
-    for j in tl.static_range(3):
-        tl.store(out + (start_of(1, n) + i * 3 + j) * K + k, h[3 + j], here)
-    for j in tl.static_range(4):
-        tl.store(out + (start_of(2, n) + i * 4 + j) * K + k, h[6 + j], here)
+        mean = (mean[0] + s[0] * weight, mean[1] + s[1] * weight, mean[2] + s[2] * weight)
+    for j in tl.static_range(10):
+        tl.store(out + place_of(j, i, n) * K + k, mean[j] if j < 3 else h[j], here)
     tl.store(out + (start_of(3, n) + i) * K + k, logit_bar, here)

@@ -45,9 +45,12 @@ class Projection(Protocol):
         ...
 
     def vjp(
-        self, cotangents: Float[Tensor, "n k 9"], block: Float[Tensor, "p k"] | None = None
+        self,
+        cotangents: Float[Tensor, "n k 9"],
+        block: Float[Tensor, "p k"] | None = None,
+        total: Float[Tensor, "p k"] | None = None,
     ) -> Float[Tensor, "p k"]:
-        """P'^T cotangents, plus (a . P'') block where a block is given."""
+        """P'^T cotangents, plus (a . P'') block where a block is given; added to total, where that is given, in its place."""
         ...
 
     def blocks(

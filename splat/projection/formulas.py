@@ -1,16 +1,27 @@
 """EWA projection and SH colour of one Gaussian, and their adjoints: formulas for floats and for dual numbers.
 
-The notation is that of `projection.py`; a bar marks an adjoint (the derivative of a scalar in the barred quantity).
-Applied to duals, `geometry` gives its Jacobian, `geometry_adjoint` the Hessian of `adjoint . geometry`; likewise for SH.
-3 x 3 matrices are tuples of three rows; rows and points are tuples.
+The values are those of `reference.py`, with the 2 x 2 covariance of a splat as a product of two rows:
 
-A splat may be larger than the image by many orders of magnitude, and a needle is so along one direction only.  For both:
+    (x, y, z) = R (mean - centre)             the mean in the camera's frame; in the image (fx x / z + cx, fy y / z + cy)
+    u, v      = x / z, y / z                  clamped to a little beyond the image, in the covariance alone
+    m0 m1 m2                                  the Gaussian's axes in the camera's frame, as long as its scales
+    r1        = fx / z (row_x - u row_z)      rows over the three axes: row_x = (m0.x, m1.x, m2.x), ...
+    r2        = fy / z (row_y - v row_z)
+    Sigma     = [[r1.r1, r1.r2], [r1.r2, r2.r2]] + blur 1,   conic Q = Sigma^-1 = [[a, b], [b, c]]
 
-- r1, r2 are computed times `shrink` = 1 / max(1, size of the splat in px), so that their fourth powers, in det, stay in the
-  range of float32; blur becomes beta = blur shrink^2, and the conic is shrink^2 times that of the shrunken rows.
-- The adjoint needs Q r.  For r along a needle of length s that is 1/s, but summing a r1 + b r2 leaves s times round-off, and
-  another s comes with r.  With n = r1 x r2 and det = n.n + beta (r1.r1 + r2.r2) + beta^2, nothing cancels in
-  Q (r1; r2) = (beta r1 + r2 x n; beta r2 + n x r1) / det.
+A bar marks an adjoint: the derivative of some scalar in the barred quantity.  Applied to dual numbers, `geometry` gives its
+Jacobian, and `geometry_adjoint` the Hessian of `adjoint . geometry`; likewise for SH.  3 x 3 matrices are tuples of three rows;
+rows and points are tuples.
+
+A splat may be larger than the image by many orders of magnitude, and a needle is so along one direction only.  Two measures
+keep the digits of both:
+
+- r1 and r2 are computed times `shrink` = 1 / max(1, size of the splat in px), so that their fourth powers, in the determinant,
+  stay in the range of float32.  The blur becomes beta = blur shrink^2, and the conic is shrink^2 times that of these rows.
+- The adjoint needs the rows of Q (r1; r2), of a length of 1 / s for a needle of length s.  Summed as a r1 + b r2 they would be
+  differences of numbers of size s.  With n = r1 x r2 and det = n.n + beta (r1.r1 + r2.r2) + beta^2, nothing cancels in
+
+      q1 = (beta r1 + r2 x n) / det,   q2 = (beta r2 + n x r1) / det
 """
 
 from typing import Any, NamedTuple
@@ -172,10 +183,9 @@ def scales_of(log_scales):
 
 @formula
 def projected_axes(lens, mean, scales, quat):
-    """Everything that `geometry` and its adjoint share.
+    """What `geometry` and its adjoint share; scales: standard deviations.
 
-    x y z, 1 / z, the clamped u = x / z and v = y / z, the unit quaternion and 1 / |quat|, the three scales, the Gaussian's axes
-    in the camera frame (three columns, scaled), shrink, and r1, r2 times shrink.  scales: standard deviations.
+    (x, y, z), 1 / z, (u, v), the unit quaternion, 1 / |quat|, the scales, (m0, m1, m2), shrink, and r1, r2 times shrink.
     """
     x, y, z = to_camera(lens, offset_from(lens, mean))
     depth = 1.0 / z
@@ -195,7 +205,7 @@ def projected_axes(lens, mean, scales, quat):
 
 @formula
 def conic_of(r1, r2, blur, shrink):
-    """The conic a, b, c, and Q (r1; r2) for the shrunken rows and their Q."""
+    """The conic a, b, c; and q1, q2 of the shrunken rows, with their own Q."""
     beta = blur * shrink * shrink
     xx, xy, yy = dot(r1, r1), dot(r1, r2), dot(r2, r2)
     normal = cross(r1, r2)

@@ -204,7 +204,7 @@ def pull_back(
     start, stop, at, second_order, cotangents, d_means, d_log_scales, d_quats, d_logits, d_sh,
     out_means, out_log_scales, out_quats, out_logits, out_sh,
 ):  # fmt: skip
-    """P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order; outputs start at 0."""
+    """Add P'^T of cotangents (n, K, 9), plus (a . P'') u where second_order, to the outputs."""
     K, bands = cotangents.shape[1], out_sh.shape[1]
     u, h, bar = np.empty(GEOMETRY, out_means.dtype), np.empty(GEOMETRY, out_means.dtype), np.empty(3, out_means.dtype)
     curvature = np.empty((GEOMETRY, GEOMETRY), out_means.dtype)
@@ -228,31 +228,34 @@ def pull_back(
             for c in range(3):
                 for j in range(3):
                     h[j] += at.colour_slope[e, c, j] * bar[c]
-            out_logits[i, k] = at.logit_slope[e] * y[0]
+            logit = at.logit_slope[e] * y[0]
             for j in range(at.opacity_slope.shape[1]):
                 h[j] += at.opacity_slope[e, j] * y[0]
                 if second_order:
                     h[j] += at.opacity_curvature[e, j] * d_logits[i, k]
-                    out_logits[i, k] += at.opacity_curvature[e, j] * u[j]
+                    logit += at.opacity_curvature[e, j] * u[j]
             if second_order:
                 for j in range(GEOMETRY):
                     for l in range(GEOMETRY):
                         h[l] += curvature[j, l] * u[j]
-                out_logits[i, k] += at.logit_curvature[e] * d_logits[i, k]
+                logit += at.logit_curvature[e] * d_logits[i, k]
+            out_logits[i, k] += logit
             for b in range(bands):
                 slope, weight = at.slope[e, b], out_means.dtype.type(0)
                 along = slope[0] * u[0] + slope[1] * u[1] + slope[2] * u[2]
                 for c in range(3):
-                    out_sh[i, b, c, k] = at.harmonic[e, b] * bar[c]
+                    total = at.harmonic[e, b] * bar[c]
                     if second_order:
-                        out_sh[i, b, c, k] += at.colour_bar[e, c] * along
+                        total += at.colour_bar[e, c] * along
                         weight += at.colour_bar[e, c] * d_sh[i, b, c, k]
+                    out_sh[i, b, c, k] += total
                 for j in range(3):
                     h[j] += slope[j] * weight
             for j in range(3):
-                out_means[i, j, k], out_log_scales[i, j, k] = h[j], h[3 + j]
+                out_means[i, j, k] += h[j]
+                out_log_scales[i, j, k] += h[3 + j]
             for j in range(4):
-                out_quats[i, j, k] = h[6 + j]
+                out_quats[i, j, k] += h[6 + j]
 
 
 @kernel
@@ -306,6 +309,7 @@ class CpuProjection:
     ):
         inputs, widths = attribute_arrays(gaussians), width_array(gaussians, lens)
         self.n, self.sh_degree, self.parameters = len(gaussians), gaussians.sh_degree, gaussians.flat.numel()
+        self._shapes = tuple(attribute_shapes(self.n, self.sh_degree).values())
         rows = row_shapes(antialiased=widths is not None)
         self._at = ProjectionJacobian(index.numpy(), *(np.empty((len(index), *row), inputs[0].dtype) for row in rows))
         arguments = (lens, *inputs, widths, splats.numpy(), moments.numpy())
@@ -331,15 +335,19 @@ class CpuProjection:
         return torch.from_numpy(out)
 
     def vjp(
-        self, cotangents: Float[Tensor, "n k 9"], block: Float[Tensor, "p k"] | None = None
+        self,
+        cotangents: Float[Tensor, "n k 9"],
+        block: Float[Tensor, "p k"] | None = None,
+        total: Float[Tensor, "p k"] | None = None,
     ) -> Float[Tensor, "p k"]:
-        """P'^T cotangents, plus (a . P'') block where a block is given."""
-        out = np.zeros((self.parameters, cotangents.shape[1]), self._at.jacobian.dtype)
-        outputs = self._split(out)
+        """P'^T cotangents, plus (a . P'') block where a block is given, added to total."""
+        if total is None:
+            total = torch.from_numpy(np.zeros((self.parameters, cotangents.shape[1]), self._at.jacobian.dtype))
+        outputs = self._split(total.numpy())
         tangents = outputs if block is None else self._split(block.numpy())
         arguments = (block is not None, cotangents.numpy(), *tangents, *outputs)
         over_range(len(self._at.index), pull_back, self._at, *arguments)
-        return torch.from_numpy(out)
+        return total
 
     def blocks(
         self, blocks: Float64[Tensor, "m 9 9"], second_order: bool
@@ -353,7 +361,7 @@ class CpuProjection:
     def _split(self, block: np.ndarray) -> tuple[np.ndarray, ...]:
         """Views of a (p, K) block laid out like the flat vector: (n, 3, K), (n, 3, K), (n, 4, K), (n, K), (n, b, 3, K)."""
         block, views, start = np.ascontiguousarray(block), [], 0
-        for shape in attribute_shapes(self.n, self.sh_degree).values():
+        for shape in self._shapes:
             size = prod(shape)
             views.append(block[start : start + size].reshape(*shape, block.shape[1]))
             start += size

@@ -40,6 +40,7 @@ from analysis.bench.accuracy.ratios import points, ratio_table, ratios
 from analysis.bench.options import BenchOptions, Quantity
 from analysis.bench.tables import rich_table, write_table
 from analysis.console.drawing import draw
+from analysis.console.plain import say
 from landscape.errors import InputError
 from landscape.operators.operator import DenseOperator, SymmetricOperator
 from landscape.probes import draw_probes
@@ -189,8 +190,7 @@ def run_accuracy(options: BenchOptions) -> int:
         for case in cases:
             if isinstance(case.operator, DenseOperator) and not options.quantity:
                 runs += [run for seed in range(PRECISION_SEEDS) for run in precision_runs(case, SEED + seed)]
-    for sentence in missing:
-        console.print(sentence, style="yellow", highlight=False, soft_wrap=True, markup=False)
+    say(*missing, style="yellow", console=console)
     _report(pd.DataFrame(vars(run) for run in runs), options, cases, console)
     return 0
 
@@ -229,8 +229,7 @@ def _report(table: pd.DataFrame, options: BenchOptions, cases: Sequence[Case], c
         console.print(rich_table(shown, "what rounding adds to z.Hz, over |z| |Hz|"))
     for name, data in {"accuracy": table, "accuracy_points": means, "accuracy_ratios": found}.items():
         write_table(data, options.out / f"{name}.csv", console)
-    for line in (*draw("accuracy", options.out / "accuracy_points.csv"), f"{options.out}/accuracy_*.png"):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    say(*draw("accuracy", options.out / "accuracy_points.csv"), f"{options.out}/accuracy_*.png", console=console)
     verdicts = [row["holds"] for row in found.to_dict("records") if row["against"] == "peer" and row["holds"]]
     counts = (f"{verdicts.count(word)} {word}" for word in ("yes", "no", "open"))
-    console.print(f"of {len(verdicts)} that are asked for: {', '.join(counts)}", highlight=False)
+    say(f"of {len(verdicts)} that are asked for: {', '.join(counts)}", console=console)

@@ -1,10 +1,11 @@
 """Meters of a device: a clock, the memory of a call, and the machine's ceilings.
 
-HostMeter   wall clock; memory of NumPy's arrays, by tracemalloc; ceilings of every thread together
+HostMeter   wall clock; memory of NumPy's arrays, by tracemalloc
 GpuMeter    time between two CUDA events around a call's launches, once the device has nothing else to do; memory of torch's
             allocator.  What a call does on the host counts as far as the device waits for it
 
-ceilings    fused multiply-adds a second on registers; bytes a second, read and written, of a copy that fits no cache
+ceilings    fused multiply-adds a second, those of a product of two matrices; bytes a second, read and written, of a copy that
+            fits no cache.  Both by every thread together
 """
 
 import tracemalloc
@@ -13,24 +14,22 @@ from typing import Protocol
 
 import torch
 
-from analysis.bench.speed.peak import fma_peak
-from analysis.console.timing import interleaved, wall_clock
+from analysis.bench.speed.timing import interleaved, wall_clock
 
 COPIED = 1 << 28  # bytes of each of the two arrays of a copy: five times an H200's second-level cache
+ROWS = {"cpu": 2048, "cuda": 8192}  # of the matrices that are multiplied
 REPETITIONS = 7  # of the calls that measure a ceiling
 
 
 class Meter(Protocol):
     """device: where calls run; seconds(call): the time that a call takes; allocated(call): the most bytes that it allocates at
-    a time, when it is made for the second time: some things are allocated once; fma_peak(): fused multiply-adds a second."""
+    a time, when it is made for the second time: some things are allocated once."""
 
     device: torch.device
 
     def seconds(self, call: Callable[[], object]) -> float: ...
 
     def allocated(self, call: Callable[[], object]) -> int: ...
-
-    def fma_peak(self) -> float: ...
 
 
 class HostMeter:
@@ -48,9 +47,6 @@ class HostMeter:
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return peak
-
-    def fma_peak(self) -> float:
-        return fma_peak()
 
 
 class GpuMeter:
@@ -77,20 +73,23 @@ class GpuMeter:
         call()
         return torch.cuda.max_memory_allocated(self.device) - before
 
-    def fma_peak(self) -> float:
-        from analysis.bench.speed.peak_cuda import PROGRAMS, STEPS, multiply_adds
-
-        programs = PROGRAMS * torch.cuda.get_device_properties(self.device).multi_processor_count
-        call, made = multiply_adds(self.device, programs, STEPS)
-        return made / interleaved({"peak": call}, REPETITIONS, clock=self.seconds)["peak"].minimum
-
 
 def meter_of(device: torch.device) -> Meter:
     return HostMeter() if device.type == "cpu" else GpuMeter(device)
 
 
+def fma_peak(meter: Meter) -> float:
+    """float32 fused multiply-adds a second."""
+    n = ROWS[meter.device.type]
+    A, B, C = (torch.rand(n, n, device=meter.device) for _ in range(3))
+    return n**3 / _least_seconds(meter, lambda: torch.mm(A, B, out=C))
+
+
 def bandwidth(meter: Meter, size: int = COPIED) -> float:
     """Bytes a second that a copy of so many bytes reads and writes."""
     source, target = (torch.zeros(size // 4, device=meter.device) for _ in range(2))
-    copies = {"copy": lambda: target.copy_(source)}
-    return 2 * size / interleaved(copies, REPETITIONS, clock=meter.seconds)["copy"].minimum
+    return 2 * size / _least_seconds(meter, lambda: target.copy_(source))
+
+
+def _least_seconds(meter: Meter, call: Callable[[], object]) -> float:
+    return interleaved({"call": call}, REPETITIONS, clock=meter.seconds)["call"].minimum

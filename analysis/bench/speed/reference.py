@@ -5,18 +5,14 @@ import resource
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from analysis.bench.speed.meters import GpuMeter
 from analysis.bench.workloads import Workload
-from splat.losses.reference import LossSettings, photometric_loss
-from splat.model.camera import Camera
-from splat.model.gaussians import Gaussians
-from splat.model.settings import RenderSettings
+from splat.losses.reference import photometric_loss
 from splat.render.render import render
 
 
@@ -32,33 +28,21 @@ class ReferenceCost:
 
 def reference_cost(workload: Workload) -> ReferenceCost:
     """One gradient and one H v of the first view, where its Gaussians are, with as many threads as here."""
-    view, flat = workload.views[0], workload.gaussians.flat
-    arrays = (flat.cpu().numpy(), view.image.numpy(), workload.background.numpy())
-    settings = (workload.gaussians.sh_degree, view.camera, workload.loss, workload.settings)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(_measure, *arrays, *settings, torch.get_num_threads(), str(flat.device)).result()
+    alone = replace(workload, views=workload.views[:1]).to(torch.device("cpu"))  # a GPU's memory is not passed on
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_measure, alone, workload.gaussians.flat.device, torch.get_num_threads()).result()
 
 
-def _measure(
-    flat: Any,
-    image: Any,
-    background: Any,
-    sh_degree: int,
-    camera: Camera,
-    loss: LossSettings,
-    settings: RenderSettings,
-    threads: int,
-    device: str,
-) -> ReferenceCost:
+def _measure(workload: Workload, device: torch.device, threads: int) -> ReferenceCost:
     torch.set_num_threads(threads)
     torch.set_default_device(device)
-    theta, target = torch.from_numpy(flat).to(device).requires_grad_(), torch.from_numpy(image).to(device)
+    (view,), theta = workload.views, workload.gaussians.flat.detach().to(device).requires_grad_()
+    gaussians, target, background = workload.gaussians.with_flat(theta), view.image.to(theta), workload.background
 
     def gradient(create_graph: bool) -> torch.Tensor:
-        gaussians = Gaussians(theta, sh_degree)
-        rendered = render(gaussians, camera, torch.from_numpy(background), settings, backend="reference").image
-        return torch.autograd.grad(photometric_loss(rendered, target, loss), theta, create_graph=create_graph)[0]
+        image = render(gaussians, view.camera, background, workload.settings, backend="reference").image
+        loss = photometric_loss(image, target, workload.loss)
+        return torch.autograd.grad(loss, theta, create_graph=create_graph)[0]
 
     def product() -> None:
         torch.autograd.grad(gradient(create_graph=True), theta, torch.ones_like(theta))

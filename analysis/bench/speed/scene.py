@@ -1,26 +1,46 @@
-"""First and second order of a scene's loss by stage: time, memory, and what both are worth on this machine.
+"""Time and memory of the first and second order of a scene's loss, stage by stage.
 
-    project, ..., project adjoint   the stages of a gradient of one view, in the project's own kernels
-    rasterizer        splats to image, and cotangent of the image to adjoint of the splats: tile lists, forward, backward
-    compositing       forward and backward (with its sums) alone
-    gradient          stored parameters to the gradient in them: every stage
+The stages of a gradient of one view:
+
+    project             stored parameters to splats in the image
+    bin                 sort by depth, tile lists
+    pack                parameters of the splats as the passes over the pixels read them
+    forward             the image
+    slots               numbering of the (splat, tile) intersections that some pixel reaches
+    loss                the loss's gradient in the pixels
+    backward + reduce   from there to the splats, with the sum over each splat's intersections
+    project adjoint     and on to the stored parameters
+
+Those of a product with K vectors, beside the projection's:
+
+    J u K                   the image's change along K tangents of the splats
+    loss H v K              the loss's second derivative in the pixels
+    tangent of backward K   from there to the splats, with the sums
+
+Wholes:
+
+    compositing         forward and backward + reduce
+    rasterizer          bin to forward, slots, backward + reduce
+    gradient            every stage
     gradient, autograd  the same as a training makes it, through torch
-    gradient, atomic  ... with sums as they come (on a GPU)
-    gsplat            ... by that package's kernels (on a GPU)
-    linearize         what `LinearizedView` does once
-    H v K             a product with K vectors, per vector
-    block diagonal    approximate Hessian blocks of all attributes, one pass
-    exact blocks      the same with SSIM's coupling of pixels (on a CPU)
+    gradient, atomic    ... with sums as they come (on a GPU)
+    gsplat              ... by that package's kernels (on a GPU)
+    linearize           what `LinearizedView` does once
+    H v K               a product with K vectors, per vector
+    block diagonal      approximate Hessian blocks of all attributes, one pass
+    exact blocks        the same with SSIM's coupling of pixels (on a CPU)
 
 One code for the CPU and for GPUs: where the workload's Gaussians are decides which kernels run, and a `Meter` measures them.
 
 Arithmetic is counted from `raster/formulas.py`: additions, multiplications, fused multiply-adds, divisions and
 minima of one pixel and Gaussian, comparisons and integer operations left out, each worth one fused multiply-add.  Bytes are
 those that a pass reads and writes for each entry (its splat's 64, its index and slot, 48 a tangent, 36 of sums, written and
-added up) and for each pixel of the image, in single precision; they come from memory or a cache.
+added up) and for each pixel of the image, in single precision; they come from memory or a cache.  A pair is a (pixel, Gaussian)
+that a pass evaluates: on the CPU in every lane of every row of every intersection that is reached, on a GPU in every pixel of
+its tile.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -28,10 +48,9 @@ import numpy as np
 import torch
 
 from analysis.bench.speed.meters import Meter
-from analysis.bench.speed.passes import Calls, compositing_stages, pairs_of
 from analysis.bench.speed.peer import MissingPeer, gsplat_gradient
+from analysis.bench.speed.timing import Timing, interleaved
 from analysis.bench.workloads import Workload
-from analysis.console.timing import Timing, interleaved
 from landscape.probes import draw_probes
 from splat.backend.device import by_triton
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
@@ -40,6 +59,7 @@ from splat.losses.autograd import loss_against, view_loss
 from splat.model.settings import Accumulation
 from splat.projection.dispatch import plain_gradient, projected, projected_vjp
 from splat.projection.formulas import lens_of
+from splat.raster.cpu.raster import CpuRaster
 from splat.raster.dispatch import rasterize
 from splat.render.render import render
 
@@ -52,15 +72,16 @@ BYTES = {  # an entry, a pixel
     "J u 1": (4 + 64 + 48, 4 + 20),
     "tangent of backward 1": (8 + 64 + 48 + 2 * 36, 24 + 20),
 }
+Calls = dict[str, Callable[[], object]]
 
 
 class ViewBench:
-    """One view of a workload, ready to be timed: `calls`, and what they work on.
+    """One view of a workload, ready to be timed: calls by name, and what they work on.
 
-    lack: why there is no gradient by gsplat to compare with on a GPU.
+    vectors: the widths K of the products; lack: why there is no gradient by gsplat to compare with on a GPU.
     """
 
-    def __init__(self, workload: Workload, index: int = 0):
+    def __init__(self, workload: Workload, index: int = 0, vectors: tuple[int, ...] = VECTORS):
         self.workload, self.view = workload, workload.views[index]
         self.like, camera = workload.gaussians.flat.detach(), self.view.camera
         self.lens = lens_of(camera, workload.settings)
@@ -72,8 +93,7 @@ class ViewBench:
         self.adjoint = self.raster.backward(self.cotangent)
         self.linearized = self._linearize()
         generator = torch.Generator(self.like.device).manual_seed(0)
-        vectors = draw_probes(self.like.numel(), max(VECTORS), generator, self.like.dtype)
-        self.vectors = {K: vectors[:, :K].contiguous() for K in VECTORS}
+        self.vectors = {K: draw_probes(self.like.numel(), K, generator, self.like.dtype) for K in vectors}
         self.lack: str | None = None
 
     def _rasterize(self) -> Any:
@@ -108,21 +128,36 @@ class ViewBench:
 
     def stages(self) -> Calls:
         """The parts of a gradient and of a product with one vector, and compositing alone."""
-        w, raster, adjoint = self.workload, self.raster, self.adjoint
-        passes = compositing_stages(self.projected, raster, adjoint)
-        held, (splats, _, drawn) = self.linearized, self.projected
-        directions = held._projection.jvp(self.vectors[1])
-        tangent = raster.jvp(directions)
-        curved = held._loss.hvp(tangent.planes)
+        passes, (splats, _, drawn) = self.compositing(), self.projected
         return {
-            "project": lambda: projected(w.gaussians, self.lens),
+            "project": lambda: projected(self.workload.gaussians, self.lens),
             **passes,
-            "loss": lambda: self.loss.linearize(raster.planes),
-            "project adjoint": lambda: self._to_parameters(splats, drawn, adjoint),
+            "loss": lambda: self.loss.linearize(self.raster.planes),
+            "project adjoint": lambda: self._to_parameters(splats, drawn, self.adjoint),
             "compositing": lambda: (passes["forward"](), passes["backward + reduce"]()),
-            "J u 1": lambda: raster.jvp(directions),
-            "loss H v 1": lambda: held._loss.hvp(tangent.planes),
-            "tangent of backward 1": lambda: tangent.backward_tangent(adjoint, curved),
+            **self.product(1),
+        }
+
+    def compositing(self) -> Calls:
+        """The stages of a gradient from splats to image and back."""
+        raster = self.raster
+        return {
+            "bin": lambda: raster.bin(*self.projected[1:]),
+            "pack": raster.pack,
+            "forward": raster.forward,
+            "slots": raster.number_accumulators,
+            "backward + reduce": lambda: raster.backward(self.cotangent),
+        }
+
+    def product(self, K: int) -> Calls:
+        """The stages of a product with K vectors from tangents of the splats on."""
+        loss, directions = self.linearized._loss, self.linearized._projection.jvp(self.vectors[K])
+        tangent = self.raster.jvp(directions)
+        curved = loss.hvp(tangent.planes)
+        return {
+            f"J u {K}": lambda: self.raster.jvp(directions),
+            f"loss H v {K}": lambda: loss.hvp(tangent.planes),
+            f"tangent of backward {K}": lambda: tangent.backward_tangent(self.adjoint, curved),
         }
 
     def wholes(self) -> Calls:
@@ -156,7 +191,14 @@ class ViewBench:
     @property
     def pairs(self) -> int:
         """(pixel, Gaussian) pairs that a pass evaluates."""
-        return pairs_of(self.raster)
+        raster = self.raster
+        if not isinstance(raster, CpuRaster):
+            from splat.raster.cuda.binning import HEIGHT, WIDTH
+
+            return raster.intersections_reached * WIDTH * HEIGHT
+        packed = raster.reached[0].rows
+        rows = ((packed >> 8) & 255) - (packed & 255) + 1
+        return int(rows.sum()) * raster.plane[1] // raster.frame.columns
 
     def bytes_of(self, name: str) -> int:
         """Bytes that a pass reads and writes."""
@@ -233,8 +275,7 @@ def scaled_times(workload: Workload, repetitions: int, meter: Meter, views: int 
     return interleaved({name: over_views(name) for name in SCALED}, repetitions, clock=meter.seconds)
 
 
-def per_vector(times: dict[str, Timing]) -> dict[str, Timing]:
-    """Products as times per vector; the rest as it is."""
-    return {
-        name: time / int(name.split()[-1]) if name in PRODUCTS else time for name, time in times.items()
-    }  # fmt: skip
+def per_vector(times: Mapping[str, Timing]) -> dict[str, Timing]:
+    """Times of what is named after a number of vectors, "H v 4", per vector; the rest as it is."""
+    widths = {name: name.rsplit(" ", 1)[-1] for name in times}
+    return {name: time / int(widths[name]) if widths[name].isdigit() else time for name, time in times.items()}

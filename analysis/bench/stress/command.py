@@ -37,6 +37,7 @@ from analysis.bench.options import BenchOptions
 from analysis.bench.stress.cases import BACKGROUND, Case, Refusal, cases, refusals
 from analysis.bench.stress.condition import Condition, cancellation, specified
 from analysis.bench.tables import rich_table, write_table
+from analysis.console.plain import say
 from landscape.eigen.eigen import EigenSettings, extreme_eigenpairs
 from splat.backend.cpu.simd import EXP2_ERROR
 from splat.curvature.gaussian_blocks import GEOMETRY_COLUMNS
@@ -252,13 +253,13 @@ def run_stress(options: BenchOptions) -> int:
     for number, case in enumerate(track(todo, "stress (first compiling)", console=errors, transient=True), 1):
         findings += Study(case, SEED).run()
         if not errors.is_terminal:  # a log has no bar
-            errors.print(f"{number} of {len(todo)}: {case.name}", soft_wrap=True, highlight=False, markup=False)
+            say(f"{number} of {len(todo)}: {case.name}", console=errors)
     findings += [refused(refusal) for refusal in refusals(SEED)]
     table = pd.DataFrame(vars(finding) for finding in findings)
     options.out.mkdir(parents=True, exist_ok=True)
     console.print(rich_table(worst(table), "nearest to its bound"))
     missed = [finding for finding in findings if not finding.holds]
-    console.print(f"{len(findings)} comparisons, {len(missed)} outside their bounds", soft_wrap=True, highlight=False)
+    say(f"{len(findings)} comparisons, {len(missed)} outside their bounds", console=console)
     write_table(table, options.out / "stress.csv", console)
     return 1 if missed else 0
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from analysis.commands.uses.options import NextViewOptions
 from analysis.console.drawing import draw_or_say
+from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.probe.command import opened
 from analysis.probe.record import provenance_of
@@ -69,8 +70,7 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
         (folder / NextViewRecord.FILE).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     _conclude(table, options, out)
-    if notes:
-        Console(stderr=True).print(*notes, sep="\n", style="yellow", highlight=False, markup=False)
+    say(*notes, style="yellow", console=Console(stderr=True))
     return 0
 
 
@@ -129,5 +129,4 @@ def _conclude(table: pd.DataFrame, options: NextViewOptions, out: Path) -> None:
         shown.add_row(row["view"], *(f"{row[gain]:.4g}" for gain in GAINS), pick)
     console.print(shown)
     names = ", ".join(table.index[table.pick.notna()])
-    console.print(f"next, by {options.by}: {names}", highlight=False, markup=False, soft_wrap=True)
-    console.print(f"gains.csv, gains.png in {out}", highlight=False, markup=False, soft_wrap=True)
+    say(f"next, by {options.by}: {names}", f"gains.csv, gains.png in {out}", console=console)

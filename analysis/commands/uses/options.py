@@ -6,15 +6,14 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from analysis.console.options import ForeignOptions, Unset
+from analysis.console.options import CheckpointPath, Foreign, ForeignOptions, SceneFolder, Unset
 
 
 @dataclass(frozen=True)
 class PruneOptions:
     """Remove the Gaussians that matter least, by scores of exact curvature, and show what each score is worth."""
 
-    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    checkpoint: CheckpointPath
     keep: float = 0.5
     """Share of the Gaussians to keep, above 0."""
     score: str = "rise_l2"
@@ -32,11 +31,10 @@ class PruneOptions:
     """Gaussians that are really removed, one at a time, as the truth that scores are compared with."""
     seed: int = 0
     """Seed of the sample and of the refinement."""
-    scene: Unset[Path] = None
-    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    scene: SceneFolder = None
     out: Unset[Path] = None
     """Folder of the results.  Default: prune, beside the checkpoint."""
-    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+    foreign: Foreign = field(default_factory=ForeignOptions)
 
 
 @dataclass(frozen=True)
@@ -55,25 +53,22 @@ class NextViewOptions:
     by: str = "d"
     """By which gain: d (log-determinant of each Gaussian's block), t (trace), e (least eigenvalue), d_diagonal, or published
     (FisherRF's)."""
-    scene: Unset[Path] = None
-    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    scene: SceneFolder = None
     out: Unset[Path] = None
     """Folder of the results.  Default: next-view, beside the checkpoint; of a study as its file says."""
-    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+    foreign: Foreign = field(default_factory=ForeignOptions)
 
 
 @dataclass(frozen=True)
 class UncertaintyOptions:
     """Show what a scene does not know of its held-out views beside its true errors there, and how well the two agree."""
 
-    checkpoint: Annotated[Positional[Path], arg(metavar="CHECKPOINT")]
-    """RUN or RUN/checkpoint.pt, as written by landscape train, or a file of another tool, such as point_cloud.ply."""
+    checkpoint: CheckpointPath
     samples: int = 64
     """Random vectors for the variance of a pixel, which is known to a share of sqrt(2 / samples)."""
     seed: int = 0
     """Seed of these."""
-    scene: Unset[Path] = None
-    """Folder of the scene: where it has moved since the training, or of another tool's file."""
+    scene: SceneFolder = None
     out: Unset[Path] = None
     """Folder of the results.  Default: uncertainty, beside the checkpoint."""
-    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
+    foreign: Foreign = field(default_factory=ForeignOptions)

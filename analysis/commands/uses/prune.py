@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pandas as pd
@@ -28,6 +28,7 @@ from torch import Tensor
 from analysis.commands.uses.options import PruneOptions
 from analysis.console.drawing import draw_or_say
 from analysis.console.kept import Kept
+from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.probe.command import opened, scene_objective
 from analysis.probe.record import provenance_of
@@ -107,8 +108,7 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
         result = _scored(training.gaussians, objective, held_out)
     kept.remove()
     _conclude(ranks, curve, training.gaussians, result, out)
-    if notes:
-        console.print(*notes, sep="\n", style="yellow", highlight=False, markup=False)
+    say(*notes, style="yellow", console=console)
     return 0
 
 
@@ -197,12 +197,11 @@ def lost(curve: pd.DataFrame, removed: float, steps: int, column: str) -> dict[s
 def _conclude(
     ranks: pd.DataFrame, curve: pd.DataFrame | None, gaussians: Gaussians, result: dict[str, float], out: Path
 ) -> None:
-    console, said = Console(), dict[str, Any](highlight=False, markup=False, soft_wrap=True)
     columns = [] if curve is None else [(removed, steps) for removed in REFINED for steps in sorted({*curve.steps})]
     measure = "test_psnr" if "test_psnr" in result else "train_psnr"
-    console.print("rank: Spearman's correlation with the true rise of the loss", **said)
+    say("rank: Spearman's correlation with the true rise of the loss")
     if columns:
-        console.print(f"further columns: {measure.split('_')[0]} PSNR lost at that share removed, dB", **said)
+        say(f"further columns: {measure.split('_')[0]} PSNR lost at that share removed, dB")
     table = Table()
     for title in (
         "score",
@@ -213,17 +212,14 @@ def _conclude(
     losses = [lost(curve, *at, measure) for at in columns] if curve is not None else []
     for name in SCORES:
         table.add_row(name, f"{ranks.loc[TRUTH, name]:.3f}", *(f"{loss[name]:.2f} dB" for loss in losses))
-    console.print(table)
+    Console().print(table)
     for (removed, steps), loss in zip(columns, losses, strict=True):
         best = min(EXACT, key=lambda name, of=loss: of[name])
         verb = "less than" if loss[best] < loss["opacity"] else "NOT less than"
-        console.print(
+        say(
             f"{removed:.0%} removed, {steps} steps after: {best} loses {loss[best]:.2f} dB, {verb} opacity's "
-            f"{loss['opacity']:.2f} dB",
-            **said,
+            f"{loss['opacity']:.2f} dB"
         )
     scored = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in result.items() if np.isfinite(value))
-    console.print(f"kept {len(gaussians):,} Gaussians: {scored}", **said)
-    console.print(
-        f"checkpoint.pt, pruned.ply, scores.csv, correlations.csv{', curve.png' if columns else ''} in {out}", **said
-    )
+    say(f"kept {len(gaussians):,} Gaussians: {scored}")
+    say(f"checkpoint.pt, pruned.ply, scores.csv, correlations.csv{', curve.png' if columns else ''} in {out}")

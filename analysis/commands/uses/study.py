@@ -18,6 +18,7 @@ OUT/study.csv: a row for each round of each cell; study.png.
 """
 
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -25,8 +26,10 @@ import pandas as pd
 import torch
 from rich.console import Console
 
-from analysis.commands.uses.next_view import informations, picked
+from analysis.commands.uses.next_view import informations, picked, run_next_view
+from analysis.commands.uses.options import NextViewOptions
 from analysis.console.drawing import draw_or_say
+from analysis.console.plain import say
 from analysis.records.json_files import json_text
 from landscape.errors import InputError
 from splat.curvature.scores.information import GAINS
@@ -63,6 +66,12 @@ class Study(msgspec.Struct, forbid_unknown_fields=True):
 Row = dict[str, str | int | float]
 
 
+def run_next(options: NextViewOptions, command: Sequence[str]) -> int:
+    """The study of a TOML file, or the candidates of a checkpoint; returns the exit code."""
+    path = options.checkpoint
+    return run_study(path) if path.suffix == ".toml" else run_next_view(options, command)
+
+
 def run_study(file: Path) -> int:
     """Run the cells that are missing; returns the exit code."""
     try:
@@ -86,16 +95,13 @@ def run_study(file: Path) -> int:
             write_atomically(path, json_text({"told": told, "rows": found}).encode())
         rows += found
         last = f"{found[-1]['psnr']:.2f} dB on {found[-1]['views']} views"
-        console.print(f"{done + 1} of {len(cells)}: {name}, {rule}, seed {seed}: {last}", highlight=False, markup=False)
+        say(f"{done + 1} of {len(cells)}: {name}, {rule}, seed {seed}: {last}", console=console)
     table = pd.DataFrame(rows)
     table.to_csv(out / "study.csv", index=False)
     notes = draw_or_say("uses", out)
     last = table[table["round"] == study.rounds].groupby(["scene", "rule"])["psnr"].agg(["mean", "std", "count"])
-    if notes:
-        console.print(*notes, sep="\n", style="yellow", highlight=False, markup=False)
-    console = Console()
-    console.print(last.round(2).to_string(), highlight=False, markup=False)
-    console.print(f"study.csv, study.png in {out}", highlight=False, markup=False, soft_wrap=True)
+    say(*notes, style="yellow", console=console)
+    say(last.round(2).to_string(), f"study.csv, study.png in {out}")
     return 0
 
 

@@ -22,6 +22,7 @@ from rich.console import Console
 from analysis.commands.uses.next_view import informations
 from analysis.commands.uses.options import UncertaintyOptions
 from analysis.console.drawing import draw_or_say
+from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.probe.command import opened
 from analysis.probe.record import provenance_of
@@ -82,11 +83,9 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
         (folder / UncertaintyRecord.FILE).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
-    console = Console()
     means = table.drop(columns="view").pivot_table(index="precision")  # by default means
-    console.print(means.round(3).to_string(), highlight=False, markup=False)
     words = f"means over {len(held_out)} held-out views; agreement.csv, view-*.png in {out}"
-    console.print(words, *notes, sep="\n", highlight=False, markup=False, soft_wrap=True)
+    say(means.round(3).to_string(), words, *notes)
     return 0
 
 

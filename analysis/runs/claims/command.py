@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from analysis.console.drawing import draw
+from analysis.console.plain import say
 from analysis.records.json_files import json_text, plain
 from analysis.records.report import pictures_in, template_environment
 from analysis.runs.claims.predictors import predictors
@@ -40,13 +41,10 @@ def run_claims(options: ClaimsOptions) -> int:
     for name, table in {FILE: rows, "claims.csv": effect_table(found), "predictors.csv": related}.items():
         write_atomically(out / name, table.to_csv(index=False).encode())
     write_atomically(out / "claims.json", json_text(plain([asdict(each) for each in found])).encode())
-    for note in draw("claims", out):
-        console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
+    say(*draw("claims", out), style="yellow", console=console)
     write_atomically(out / "claims.html", render_page(rows, found, out).encode())
     _print(rows, found, console)
-    console.print(
-        f"open {escape(str(out / 'claims.html'))}; numbers: {FILE}, claims.csv, predictors.csv", soft_wrap=True
-    )
+    say(f"open {out / 'claims.html'}; numbers: {FILE}, claims.csv, predictors.csv", console=console)
     return 0
 
 
@@ -60,7 +58,7 @@ def _print(rows: pd.DataFrame, found: Sequence[Judgement], console: Console) -> 
     few = runs_of(rows).query("seeds < @LEAST")
     if len(few):
         names = ", ".join(f"{row['method']} ({row['seeds']})" for row in few.to_dict("records"))
-        console.print(f"fewer than {LEAST} seeds, which decide nothing: {names}", markup=False, highlight=False)
+        say(f"fewer than {LEAST} seeds, which decide nothing: {names}", console=console)
     for each in found:
         style = STYLES[each.verdict]
         console.print(f"\n[bold]{each.number}.[/] {escape(each.statement)} ({each.source})", highlight=False)

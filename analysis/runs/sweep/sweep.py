@@ -26,6 +26,7 @@ from rich.console import Console
 
 from analysis.console.drawing import module_environment
 from analysis.console.interruption import interruption
+from analysis.console.plain import say
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import loss_name
 from analysis.records.provenance import usable_cores
@@ -226,14 +227,10 @@ def _conclude(cells: _Cells, stopped: int) -> int:
     rows = cells.write()
     for table in tables(summarize(rows)):
         console.print(table)
-    for line in [*unfinished(rows), *of_other_threads(rows)]:
-        console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
-    for line in cells.failed.values():
-        console.print(line, style="red", soft_wrap=True, highlight=False, markup=False)
+    say(*unfinished(rows), *of_other_threads(rows), style="yellow", console=console)
+    say(*cells.failed.values(), style="red", console=console)
     done = sum(not cells.to_do[cell.name] for cell in sweep.cells)
-    console.print(
-        f"{done} of {len(sweep.cells)} cells done; tables: {sweep.out}", soft_wrap=True, highlight=False, markup=False
-    )
+    say(f"{done} of {len(sweep.cells)} cells done; tables: {sweep.out}", console=console)
     if done < len(sweep.cells):
-        console.print("the same command continues", highlight=False)
+        say("the same command continues", console=console)
     return stopped or (CELL_FAILED if cells.failed else 0)

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Column
 
+from analysis.console.plain import say
 from analysis.runs.sweep.sweep_file import Cell, Sweep
 from analysis.train.training_time import TrainingTime
 
@@ -65,7 +66,7 @@ class SweepProgress:
             return
         count = sum(status == "done" for status in statuses.values())
         line = f"{cell.name}: {statuses[cell.name]}; {count} of {len(statuses)} cells, {self.left()} left"
-        self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+        say(line, console=self._console)
 
     def update(self) -> None:
         """Look at the folders and redraw the bar."""

@@ -17,7 +17,9 @@ from torch import Tensor
 
 from landscape.spectrum.density import ActiveSpace
 from landscape.spectrum.families import WHOLE
-from splat.curvature.null.null_space import RowSpace, seen_colours, seen_parameters
+from splat.curvature.null.colour_space import ColourSpace, seen_colours
+from splat.curvature.null.null_space import seen_parameters
+from splat.curvature.null.row_space import RowSpace
 from splat.curvature.objective import SceneObjective
 
 
@@ -30,7 +32,7 @@ class Projector:
     """
 
     blocks: Mapping[str, slice]
-    seen: RowSpace
+    seen: RowSpace | ColourSpace
     radial: Float[Tensor, "n 4"] | None = None
 
     @property
@@ -46,10 +48,21 @@ class Projector:
             parts = [V[rows].reshape(n, -1, K) for rows in self.blocks.values()]
             kept = self.seen.project(torch.cat(parts, dim=1)).split([part.shape[1] for part in parts], dim=1)
             return torch.cat([part.reshape(-1, K) for part in kept])
-        V, radial = V.clone(), self.radial[:, :, None]
-        quats, colours = V[self.blocks["quats"]].view(n, 4, K), V[self.blocks["sh"]]
-        quats -= radial * (radial * quats).sum(dim=1, keepdim=True)
+        V = self.without_lengths(V)
+        colours = V[self.blocks["sh"]]
         colours.copy_(self.seen.project(colours.view(n, -1, K)).view(-1, K))
+        return V
+
+    def without_lengths(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+        """V without its components along `radial`; V itself where there is none.
+
+        H P is H of that alone: along all else that P leaves out, H is zero.
+        """
+        if self.radial is None:
+            return V
+        V, radial = V.clone(), self.radial[:, :, None]
+        quats = V[self.blocks["quats"]].view(len(radial), 4, -1)
+        quats -= radial * (radial * quats).sum(dim=1, keepdim=True)
         return V
 
     def scaled(self, scale: Float[Tensor, " p"]) -> "Projector":

@@ -12,6 +12,9 @@ Before that sort the intersections of a splat lie side by side: their places the
 Two sizes are read back: the numbers of strips and of intersections.
 """
 
+# pyright: reportGeneralTypeIssues=false
+# (Triton tells type checkers little of its language)
+
 from typing import NamedTuple
 
 import torch
@@ -61,17 +64,18 @@ class Accumulators(NamedTuple):
 
 
 @jit
+def load_six(array, at, inside):
+    """Six numbers side by side."""
+    found = ()
+    for j in tl.static_range(6):
+        found = found + (tl.load(array + at + j, inside, other=0.0),)
+    return found
+
+
+@jit
 def load_splat(splats, i, inside):
     """Mean, conic and opacity of the splats i; nowhere drawn outside."""
-    at = splats + i.to(tl.int64) * 9
-    return (
-        tl.load(at, inside, other=0.0),
-        tl.load(at + 1, inside, other=0.0),
-        tl.load(at + 2, inside, other=0.0),
-        tl.load(at + 3, inside, other=0.0),
-        tl.load(at + 4, inside, other=0.0),
-        tl.load(at + 5, inside, other=0.0),
-    )
+    return load_six(splats, i.to(tl.int64) * 9, inside)
 
 
 @sized("n")

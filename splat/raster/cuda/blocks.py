@@ -19,7 +19,7 @@ from splat.raster.cuda.compositing import (
     load3,
     load_background,
     load_planes,
-    pixels_of,
+    tile_of,
 )
 from splat.raster.cuda.packing import ALPHA_MAX, CAP, RED
 
@@ -48,19 +48,14 @@ def block_moments(
 ):  # fmt: skip
     """The 36 sums of every intersection or, added up, of every splat.  v_planes: g, 4 planes; curvature: h, 3 planes."""
     real: tl.constexpr = packed.dtype.element_ty
-    tile = tl.load(order + tl.program_id(0))
-    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
-    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    tile, place, p, inside = tile_of(order, columns, width, height, real, WIDTH, HEIGHT)
     cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
     first, count = tl.load(start + tile), tl.load(reached + tile)
     stopped = tl.load(stop + p, inside, other=0)
     T, g = tl.load(transmittance + p, inside, other=1.0), load_planes(v_planes, p, size, inside)
-    h0 = tl.load(curvature + p, inside, other=0.0)
-    h1 = tl.load(curvature + size + p, inside, other=0.0)
-    h2 = tl.load(curvature + 2 * size + p, inside, other=0.0)
-    background = load_background(frame, real)
-    R0, R1, R2 = T * background[0], T * background[1], T * background[2]
-    if not (any_lit(g) | any_lit((h0, h1, h2, h2))):
+    h, background = load_planes(curvature, p, size, inside, 3), load_background(frame, real)
+    R = (T * background[0], T * background[1], T * background[2])
+    if not (any_lit(g) | any_lit((h[0], h[1], h[2], h[2]))):
         if not ATOMIC:
             clear_sums(accumulators, first, count, sums, 36)
         count = 0
@@ -68,16 +63,15 @@ def block_moments(
         k = count - 1 - back
         s_index = tl.load(splat_of + first + k)
         splat = packed + s_index.to(tl.int64) * 16
-        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        u, v, terms = exponent_terms(splat, place)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         r = reciprocal(1.0 - alpha)
         T = T * r
         w = alpha * T
         below = uncapped <= tl.load(splat + CAP)
         free, beta = tl.where(below, w, 0.0), tl.where(below, alpha * r, 0.0)
-        D, R, weight = step_block(w, free, beta, (R0, R1, R2), g, (h0, h1, h2), load3(splat, RED))
-        R0, R1, R2 = R
-        total = block_sums(u, v, w, free, D, weight, g, (h0, h1, h2))
+        D, R, weight = step_block(w, free, beta, R, g, h, load3(splat, RED))
+        total = block_sums(u, v, w, free, D, weight, g, h)
         at = (s_index if ATOMIC else tl.load(accumulators + first + k)).to(tl.int64) * 36
         j = tl.arange(0, 64)[None, :]
         if ATOMIC:

@@ -79,20 +79,23 @@ column_terms = triton_formula(formulas.column_terms)
 
 
 @jit
-def pixels_of(tile, columns, width, height, WIDTH, HEIGHT):
-    """A tile's first pixel, its pixels' offsets from there, their indices in a plane, and whether they are in the image."""
+def tile_of(order, columns, width, height, real: tl.constexpr, WIDTH: tl.constexpr, HEIGHT: tl.constexpr):
+    """A program's tile: which; its first pixel and its pixels' offsets from there; their places in a plane; which exist."""
+    tile = tl.load(order + tl.program_id(0))
     x0, y0 = tile % columns * WIDTH, tile // columns * HEIGHT
     x, y = tl.arange(0, WIDTH)[None, None, :], tl.arange(0, HEIGHT)[None, :, None]
     inside = (x0 + x < width) & (y0 + y < height)
-    return x0, y0, x, y, (y0 + y) * width + (x0 + x), inside
+    return tile, (x0.to(real), y0.to(real), x.to(real), y.to(real)), (y0 + y) * width + (x0 + x), inside
 
 
 @jit
-def exponent_terms(params, x0, y0, x, y):
+def exponent_terms(params, place):
     """u of a tile's columns, v of its pixels, and what log2 alpha is made of: `alpha_terms` and `row_v` of the CPU.
 
-    Between pixels offsets are exact, so what the first fma leaves of a needle's v has its digits.
+    place: first pixel and offsets, as of `tile_of`.  Between pixels offsets are exact, so what the first fma leaves of a
+    needle's v has its digits.
     """
+    x0, y0, x, y = place
     along, across, shear = tl.load(params + ALONG), tl.load(params + ACROSS), tl.load(params + SHEAR)
     dx, dy = x0 - tl.load(params + X), y0 - tl.load(params + Y)
     u = tl.fma(x, along, tl.fma(along, dx, tl.load(params + U)))
@@ -107,14 +110,12 @@ def load3(array, at):
 
 
 @jit
-def load_planes(planes, p, size, inside):
-    """Four planes of a tile, 0 outside the image."""
-    return (
-        tl.load(planes + p, inside, other=0.0),
-        tl.load(planes + size + p, inside, other=0.0),
-        tl.load(planes + 2 * size + p, inside, other=0.0),
-        tl.load(planes + 3 * size + p, inside, other=0.0),
-    )
+def load_planes(planes, p, size, inside, COUNT: tl.constexpr = 4):
+    """Planes of a tile, 0 outside the image."""
+    found = ()
+    for j in tl.static_range(COUNT):
+        found = found + (tl.load(planes + j * size + p, inside, other=0.0),)
+    return found
 
 
 @jit
@@ -147,14 +148,9 @@ def nine_sums(v, u, s, w, h, K: tl.constexpr, HEIGHT: tl.constexpr):
     20 exchanges for nine sums instead of 45.
     """
     rows = row_terms(v, s, w, h)
-    columns = (
-        tl.sum(tl.reshape(rows[0], (K, HEIGHT // 2, 2, 16)), 1),
-        tl.sum(tl.reshape(rows[1], (K, HEIGHT // 2, 2, 16)), 1),
-        tl.sum(tl.reshape(rows[2], (K, HEIGHT // 2, 2, 16)), 1),
-        tl.sum(tl.reshape(rows[3], (K, HEIGHT // 2, 2, 16)), 1),
-        tl.sum(tl.reshape(rows[4], (K, HEIGHT // 2, 2, 16)), 1),
-        tl.sum(tl.reshape(rows[5], (K, HEIGHT // 2, 2, 16)), 1),
-    )
+    columns = ()
+    for j in tl.static_range(6):
+        columns = columns + (tl.sum(tl.reshape(rows[j], (K, HEIGHT // 2, 2, 16)), 1),)
     nine = column_terms(columns, u)
     lane = tl.reshape(tl.arange(0, 32), (1, 2, 2, 2, 2, 2))
     a = side_by_side(threads(nine[0], K), threads(nine[1], K), lane, 1)
@@ -211,9 +207,7 @@ def forward(
 ):  # fmt: skip
     """Render planes (4, h, w), the final T and where each pixel stopped; how many intersections each tile reached."""
     real: tl.constexpr = packed.dtype.element_ty
-    tile = tl.load(order + tl.program_id(0))
-    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
-    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    tile, place, p, inside = tile_of(order, columns, width, height, real, WIDTH, HEIGHT)
     cap, floor = tl.load(frame + ALPHA_MAX).to(real), tl.load(frame + FLOOR).to(real)
     first = tl.load(start + tile)
     count = tl.load(start + tile + 1) - first
@@ -227,7 +221,7 @@ def forward(
         for k in range(done, tl.minimum(done + CHUNK, count)):
             splat = packed + following.to(tl.int64) * 16
             following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
-            _u, v, terms = exponent_terms(splat, x0, y0, x, y)
+            _u, v, terms = exponent_terms(splat, place)
             alpha, _uncapped = alpha_row(v, terms, T > 0, cap)
             w, after = alpha * T, tl.fma(-alpha, T, T)
             ends = (after < floor) & (T > 0)
@@ -252,9 +246,7 @@ def backward(
 ):  # fmt: skip
     """The nine sums of every intersection or, added up, of every splat, from the cotangent of the planes."""
     real: tl.constexpr = packed.dtype.element_ty
-    tile = tl.load(order + tl.program_id(0))
-    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
-    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    tile, place, p, inside = tile_of(order, columns, width, height, real, WIDTH, HEIGHT)
     cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
     first, count = tl.load(start + tile), tl.load(reached + tile)
     T, v_pixel = tl.load(transmittance + p, inside, other=1.0), load_planes(v_planes, p, size, inside)
@@ -269,7 +261,7 @@ def backward(
         k, s_index = count - 1 - back, following
         following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
         splat = packed + s_index.to(tl.int64) * 16
-        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        u, v, terms = exponent_terms(splat, place)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         T, after, w, beta, _r, we = step_back(alpha, T, R, v_pixel, load3(splat, RED))
         s = tl.where(uncapped <= tl.load(splat + CAP), we - beta * R, 0.0)
@@ -320,9 +312,7 @@ def tangent(
     any in a tile.  Where none, all is 0.
     """
     real: tl.constexpr = packed.dtype.element_ty
-    tile = tl.load(order + tl.program_id(0))
-    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
-    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    tile, place, p, inside = tile_of(order, columns, width, height, real, WIDTH, HEIGHT)
     cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
     first, count = tl.load(start + tile), tl.load(reached + tile)
     stopped = tl.load(stop + p, inside, other=0)
@@ -338,7 +328,7 @@ def tangent(
         s_index = following
         following = tl.load(splat_of + first + tl.minimum(k + 1, count - 1))
         splat = packed + s_index.to(tl.int64) * 16
-        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        u, v, terms = exponent_terms(splat, place)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         w = alpha * T
         T = tl.fma(-alpha, T, T)
@@ -363,9 +353,7 @@ def backward_tangent(
     v_planes: the cotangent, 4 planes; dv_planes: its tangents, (K, 4, h, w); moves, transmittances: as `tangent` left them.
     """
     real: tl.constexpr = packed.dtype.element_ty
-    tile = tl.load(order + tl.program_id(0))
-    x0, y0, x, y, p, inside = pixels_of(tile, columns, width, height, WIDTH, HEIGHT)
-    x0, y0, x, y = x0.to(real), y0.to(real), x.to(real), y.to(real)
+    tile, place, p, inside = tile_of(order, columns, width, height, real, WIDTH, HEIGHT)
     cap, size = tl.load(frame + ALPHA_MAX).to(real), width * height
     first, count = tl.load(start + tile), tl.load(reached + tile)
     stopped = tl.load(stop + p, inside, other=0)
@@ -387,7 +375,7 @@ def backward_tangent(
         k, s_index = count - 1 - back, following
         following = tl.load(splat_of + first + tl.maximum(k - 1, 0))
         splat = packed + s_index.to(tl.int64) * 16
-        u, v, terms = exponent_terms(splat, x0, y0, x, y)
+        u, v, terms = exponent_terms(splat, place)
         alpha, uncapped = alpha_row(v, terms, k < stopped, cap)
         free = uncapped <= tl.load(splat + CAP)
         colour = load3(splat, RED)

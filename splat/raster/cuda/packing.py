@@ -17,7 +17,7 @@ from splat.backend.gpu.compile import jit, sized
 from splat.backend.gpu.formula import triton_formula
 from splat.projection import whitening
 from splat.raster import formulas
-from splat.raster.cuda.binning import load_splat
+from splat.raster.cuda.binning import load_six, load_splat
 
 PARAMS = 16
 X, Y, U, V, ALONG, ACROSS, SHEAR, SHEAR_REST, LO, RED, GREEN, BLUE, CUT, CAP = (tl.constexpr(i) for i in range(14))
@@ -35,16 +35,12 @@ def nearest(x):
 
 
 @jit
-def load_six(array, at, inside):
+def load_double(array, at, inside):
     """Six numbers side by side, in double precision."""
-    return (
-        tl.load(array + at, inside, other=0.0).to(tl.float64),
-        tl.load(array + at + 1, inside, other=0.0).to(tl.float64),
-        tl.load(array + at + 2, inside, other=0.0).to(tl.float64),
-        tl.load(array + at + 3, inside, other=0.0).to(tl.float64),
-        tl.load(array + at + 4, inside, other=0.0).to(tl.float64),
-        tl.load(array + at + 5, inside, other=0.0).to(tl.float64),
-    )
+    found, six = (), load_six(array, at, inside)
+    for j in tl.static_range(6):
+        found = found + (six[j].to(tl.float64),)
+    return found
 
 
 @jit
@@ -125,8 +121,8 @@ def reduce_tangents(tangents, moments, totals, product, n, K, begin, size, BLOCK
     inside = i < n
     k = tl.program_id(1)
     at, source = (i.to(tl.int64) * K + begin + k) * 9, (i.to(tl.int64) * size + k) * 9
-    q, total = load_six(tangents, at, inside), load_six(totals, source, inside)
-    found = second_order(q, load_six(moments, i.to(tl.int64) * 9, inside), total)
+    q, total = load_double(tangents, at, inside), load_double(totals, source, inside)
+    found = second_order(q, load_double(moments, i.to(tl.int64) * 9, inside), total)
     for j in tl.static_range(6):
         tl.store(product + at + j, found[j], inside)
     copy_colour(product, at, totals, source, inside)

@@ -1,5 +1,7 @@
 """The command: what it writes, and one sentence and exit code 2 for every bad input."""
 
+import importlib
+import inspect
 import json
 import os
 import re
@@ -19,7 +21,7 @@ import torch
 from PIL import Image
 
 from analysis.bench.options import BenchOptions
-from analysis.commands.cli import at_files, main
+from analysis.commands.cli import COMMANDS, at_files, main
 from analysis.commands.options import ConvertOptions
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import CompareOptions
@@ -441,6 +443,16 @@ def test_a_method_and_its_settings_are_named_on_the_command_line(original, tmp_p
     said = capsys.readouterr().err
     assert "expected a method among 3dgs, stablegs" in said and "got 'stablgs'; did you mean stablegs?" in said
     assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_a_function_that_takes_what_it_is_given(name):
+    command = COMMANDS[name]
+    module, function = command.runs.split(":")
+    given = [object()] * (1 + command.recorded + (command.draws is not None))
+    signature = inspect.signature(getattr(importlib.import_module(module), function))
+    signature.bind(*given)
+    assert next(iter(signature.parameters.values())).annotation is command.options
 
 
 def test_a_run_stands_for_its_checkpoint_and_a_checkpoint_for_its_run(tmp_path):

@@ -9,7 +9,7 @@ from analysis.commands.cli import main
 from analysis.measures import memory
 from analysis.measures.memory import GIB, MIB, expected_peak, require_pictures, size_of, telling_needs, vectors_within
 from landscape.errors import InputError
-from splat.backend.memory import free_memory, resident_memory, staying_within
+from splat.backend.memory import SLACK, free_memory, resident_memory, staying_within
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -78,8 +78,11 @@ def test_less_memory_keeps_fewer_views_and_too_little_is_refused(objective, monk
 
 def test_a_process_stays_within_what_it_was_told():
     cpu = torch.device("cpu")
-    with staying_within(resident_memory() + 50 * MIB):
+    room = int((resident_memory() + 50 * MIB) / (1 - SLACK))
+    with staying_within(room):
         assert 0 < free_memory(cpu) <= 50 * MIB
+    with staying_within(int((1 - SLACK) * room)):  # a part of what is asked for is for what is not counted
+        assert free_memory(cpu) < (50 - 0.5 * SLACK * 50) * MIB
     assert free_memory(cpu) > 60 * MIB
 
 

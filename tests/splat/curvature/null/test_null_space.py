@@ -19,7 +19,9 @@ from landscape.spectrum.density import SETTLED, ActiveSpace, spectral_density
 from landscape.spectrum.quantiles import absolute_quantile, quantile
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.null.active_spaces import projector_of
-from splat.curvature.null.null_space import CHUNK, TOLERANCE, RowSpace, _row_space, seen_colours, seen_parameters
+from splat.curvature.null.colour_space import ColourSpace, seen_colours
+from splat.curvature.null.null_space import seen_parameters
+from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, row_space
 from splat.curvature.objective import SceneObjective
 from splat.losses.reference import LossSettings
 from splat.model.camera import Camera
@@ -244,11 +246,11 @@ def test_a_gpu_takes_no_large_matrices_apart(
     generator = torch.Generator().manual_seed(0)
     A = torch.randn(CHUNK + 3, rows, 5, generator=generator, dtype=torch.float64)
     A = A @ torch.randn(CHUNK + 3, 5, columns, generator=generator, dtype=torch.float64)  # of rank 5
-    plain, sizes, brought, svd, cpu = _row_space(A, TOLERANCE[A.dtype]), [], [], torch.linalg.svd, torch.Tensor.cpu
+    plain, sizes, brought, svd, cpu = row_space(A, TOLERANCE[A.dtype]), [], [], torch.linalg.svd, torch.Tensor.cpu
     monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda tensor: not brought))
     monkeypatch.setattr(torch.Tensor, "cpu", lambda tensor: brought.append(tensor.shape) or cpu(tensor))
     monkeypatch.setattr(torch.linalg, "svd", lambda A, **options: sizes.append(A.shape) or svd(A, **options))
-    found = _row_space(A, TOLERANCE[A.dtype])
+    found = row_space(A, TOLERANCE[A.dtype])
     assert len(brought) == copies and max(size[0] for size in sizes) <= CHUNK
     assert copies or all(size[1] <= 16 for size in sizes)
     assert torch.equal(found.rank, plain.rank) and int(found.rank.max()) == int(found.rank.min()) == 5
@@ -264,5 +266,18 @@ def test_row_spaces_are_the_same_on_any_number_of_threads() -> None:
             found.append((seen_parameters(held, len(objective.active), 4), seen_colours(held, 3, objective.active)))
     finally:
         torch.set_num_threads(before)
-    for one, three in zip(*found, strict=True):
+    spaces = [(whole, colours.harmonics, colours.slopes) for whole, colours in found]
+    for one, three in zip(*spaces, strict=True):
         assert torch.equal(one.basis, three.basis) and torch.equal(one.rank, three.rank)
+
+
+def test_colours_seen_channel_by_channel_are_seen_as_all_at_once() -> None:
+    objective = scattered(3, 3, 2, 40, LOSSES[0], lightness=-0.2)
+    found = projector_of(objective).seen
+    assert isinstance(found, ColourSpace) and len(found.harmonics.rank) > len(found.rank)
+    wide = found.scaled(torch.ones(len(found.rank), 27, dtype=torch.float64))
+    x = torch.randn(len(found.rank), 27, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.equal(wide.rank, found.rank)
+    whole = wide.basis.mT @ (wide.basis @ x)
+    assert torch.allclose(found.project(x), whole, atol=1e-13)
+    assert torch.allclose(found._by_products(x), whole, atol=1e-13)  # as on a GPU

@@ -61,3 +61,11 @@ def interleaved(
             seconds[name].append(clock(calls[name]))
         on_round()
     return {name: Timing(tuple(times)) for name, times in seconds.items()}
+
+
+def time_lines(about: Mapping[str, object], times: Mapping[str, Timing]) -> list[dict]:
+    """A table's lines, one a stage: what is said of all of them, and the minimum and median of its times, ms."""
+    return [
+        {**about, "stage": name, "minimum_ms": 1e3 * time.minimum, "median_ms": 1e3 * time.median}
+        for name, time in times.items()
+    ]

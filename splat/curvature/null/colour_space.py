@@ -1,0 +1,146 @@
+"""What the Hessian sees of each Gaussian's SH coefficients (`null_space.py`): harmonics channel by channel, and slopes.
+
+The channels of a Gaussian see the same harmonics but where a view clamps one of them, so that one basis of `bands` columns
+serves all three; only the slopes, at most three, go across the channels.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splat.backend.cpu.threads import over_range
+from splat.curvature.null.colour_space_cpu import project_colours
+from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, joined, orthonormal, row_space, spanned
+from splat.model.gaussians import Gaussians
+from splat.projection.formulas import ProjectionJacobian
+
+Stacked = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class ColourSpace:
+    """A space of SH coefficients for each Gaussian, laid out like `Gaussians.sh`: d = bands x 3 channels.
+
+    harmonics: spaces of the coefficients of one channel; row: which of them each channel has.  slopes: directions in all
+    channels, at right angles to the harmonics.
+    """
+
+    harmonics: RowSpace
+    row: Int[Tensor, "n 3"]
+    slopes: RowSpace
+
+    @property
+    def rank(self) -> Int[Tensor, " n"]:
+        return self.harmonics.rank[self.row].sum(dim=1) + self.slopes.rank
+
+    def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
+        """x without its null components."""
+        return self._by_kernel(x) if x.device.type == "cpu" else self._by_products(x)
+
+    def _by_kernel(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
+        (n, d, k), bands = x.shape, self.harmonics.basis.shape[2]
+        x, slopes = x.reshape(n, bands, 3 * k), self.slopes.basis.view(n, -1, bands, 3)
+        out = torch.empty_like(x)
+        spaces = self.harmonics.basis, self.harmonics.rank, self.row, slopes, self.slopes.rank
+        over_range(n, project_colours, *(each.numpy() for each in (*spaces, x, out)))
+        return out.view(n, d, k)
+
+    def _by_products(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
+        kept = [space.project(x[:, c::3]) for c, space in enumerate(self._channels)]
+        slopes = self.slopes.basis
+        return torch.stack(kept, dim=2).view(x.shape) + slopes.mT @ (slopes @ x)
+
+    def without(self, rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n r d"]:
+        """The part of rows at right angles to the space."""
+        return rows - self.project(rows.mT.contiguous()).mT
+
+    def scaled(self, scale: Float[Tensor, "n d"]) -> RowSpace:
+        """The space of all D x, D = diag(scale) > 0 and x in this space."""
+        bases = [self.slopes.basis]
+        for c, space in enumerate(self._channels):
+            wide = scale.new_zeros(*space.basis.shape[:2], scale.shape[1])
+            wide[:, :, c::3] = space.basis
+            bases.append(wide)
+        basis = torch.cat(bases, dim=1)
+        order = (basis == 0).all(dim=2).int().argsort(dim=1, stable=True)  # padding last
+        rows = basis.gather(1, order[:, : int(self.rank.max()), None].expand(-1, -1, basis.shape[2]))
+        return RowSpace(rows, self.rank).scaled(scale)
+
+    @property
+    def _channels(self) -> list[RowSpace]:
+        return [RowSpace(self.harmonics.basis[row], self.harmonics.rank[row]) for row in self.row.T]
+
+    def to(self, dtype: torch.dtype) -> "ColourSpace":
+        return ColourSpace(self.harmonics.to(dtype), self.row, self.slopes.to(dtype))
+
+
+def _alone(rows: Tensor) -> Tensor:
+    return rows
+
+
+def seen_colours(
+    views: Iterable[ProjectionJacobian],
+    count: int,
+    gaussians: Gaussians,
+    stacked: Stacked = _alone,
+    summed: Stacked = _alone,
+    *,
+    apart: bool = False,
+) -> ColourSpace:
+    """The directions of a Gaussian's SH coefficients in which the Hessian can be non-zero; count: of these views.
+
+    stacked, summed: complete the rows of these views, and what is summed over them (up to a factor), to those of all views,
+    where other processes hold some.  apart: of the block of SH by itself, without the slopes.
+    """
+    like, (n, bands) = gaussians.flat, gaussians.sh.shape[:2]
+    rows = like.new_zeros(n, count, bands + 3)  # harmonics, and which channels are not clamped
+    slopes, sizes = like.new_zeros(n, 3, 3 * bands), like.new_zeros(n)
+    for m, held in enumerate(views):
+        index, harmonic, slope = (torch.as_tensor(part) for part in (held.index, held.harmonic, held.slope))
+        bar, visible = (torch.as_tensor(part) for part in (held.colour_bar, held.visible))
+        rows[index, m] = torch.cat([harmonic[:, :bands], visible], dim=1)
+        bent = torch.einsum("ekj,ec->ejkc", slope[:, :bands], bar).flatten(2)
+        slopes.index_add_(0, index, bent)
+        sizes.index_add_(0, index, bent.flatten(1).norm(dim=1))
+    rows, slopes, sizes = stacked(rows), summed(slopes)[:, : 0 if apart else 3], summed(sizes)
+
+    def part(start: int) -> ColourSpace:
+        some = slice(start, start + CHUNK)
+        found = _colours_of(rows[some].double(), slopes[some].double(), sizes[some].double(), TOLERANCE[like.dtype])
+        return found.to(like.dtype)
+
+    return _joined([part(start) for start in range(0, n, CHUNK)])
+
+
+def _colours_of(
+    rows: Float[Tensor, "n m _"], slopes: Float[Tensor, "n s d"], sizes: Float[Tensor, " n"], tolerance: float
+) -> ColourSpace:
+    """Of some Gaussians: the harmonics of each channel, and what the slopes add to them."""
+    (harmonics, visible), n = rows.split([rows.shape[2] - 3, 3], dim=2), len(rows)
+    first = torch.arange(n, device=rows.device)
+    row, lit = first[:, None].repeat(1, 3), [visible[:, :, 0]]
+    gaussian = [first]
+    for c in (1, 2):
+        other = torch.nonzero((visible[:, :, c] != visible[:, :, 0]).any(dim=1))[:, 0]
+        row[other, c] = sum(map(len, gaussian)) + torch.arange(len(other), device=rows.device)
+        gaussian.append(other)
+        lit.append(visible[other, :, c])
+    found = row_space(harmonics[torch.cat(gaussian)] * torch.cat(lit)[:, :, None], tolerance)
+    colours = ColourSpace(found, row, RowSpace(slopes[:, :0], row.new_zeros(n)))
+    added = spanned(colours.without(slopes), sizes, tolerance)
+    for _ in range(2):  # what rounding leaves of the harmonics goes in the second go
+        added = orthonormal(colours.without(added.basis), added.rank)
+    return replace(colours, slopes=added)
+
+
+def _joined(parts: Sequence[ColourSpace]) -> ColourSpace:
+    """Those of all Gaussians, given those of some at a time."""
+    rows, before = [], 0
+    for part in parts:
+        rows.append(part.row + before)
+        before += len(part.harmonics.rank)
+    harmonics, slopes = ([getattr(part, name) for part in parts] for name in ("harmonics", "slopes"))
+    return ColourSpace(joined(harmonics), torch.cat(rows), joined(slopes))

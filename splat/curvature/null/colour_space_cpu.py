@@ -1,0 +1,44 @@
+"""The projection onto what is seen of SH coefficients (`colour_space.py`), on the CPU: one pass over the Gaussians."""
+
+import numpy as np
+
+from splat.backend.cpu.jit import kernel
+
+
+@kernel
+def project_colours(start, stop, basis, rank, row, slopes, slope_rank, x, out):
+    """out = P x of Gaussians start..stop.
+
+    x, out (n, b, 3 k): coefficients, the k vectors of a channel side by side.  basis (m, r, b), rank (m): of the harmonics;
+    row (n, 3): which of them each channel has.  slopes (n, s, b, 3), slope_rank (n).  What is seen whole is copied bit for bit.
+    """
+    bands, width = x.shape[1], x.shape[2]
+    vectors = width // 3
+    along = np.empty(width, x.dtype)
+    for i in range(start, stop):
+        same = row[i, 0] == row[i, 1] == row[i, 2]
+        for c in range(1 if same else 3):
+            j = row[i, c]
+            first, last = (0, width) if same else (c * vectors, (c + 1) * vectors)
+            whole = rank[j] == bands
+            for b in range(bands):
+                for k in range(first, last):
+                    out[i, b, k] = x[i, b, k] if whole else 0
+            for r in range(0 if whole else rank[j]):
+                along[first:last] = 0
+                for b in range(bands):
+                    for k in range(first, last):
+                        along[k] += basis[j, r, b] * x[i, b, k]
+                for b in range(bands):
+                    for k in range(first, last):
+                        out[i, b, k] += basis[j, r, b] * along[k]
+        for s in range(slope_rank[i]):
+            along[:vectors] = 0
+            for b in range(bands):
+                for c in range(3):
+                    for k in range(vectors):
+                        along[k] += slopes[i, s, b, c] * x[i, b, c * vectors + k]
+            for b in range(bands):
+                for c in range(3):
+                    for k in range(vectors):
+                        out[i, b, c * vectors + k] += slopes[i, s, b, c] * along[k]

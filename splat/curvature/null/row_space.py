@@ -1,0 +1,105 @@
+"""Spaces of a few directions for each of many Gaussians, and orthonormal bases of them.
+
+A basis is found per Gaussian by a small singular value decomposition of its rows; directions whose singular value is beneath
+TOLERANCE of the largest are null.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splat.backend.cpu.threads import over_batch
+
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}  # of the largest singular value; what rounding leaves of a zero
+CHUNK = 4096  # Gaussians at a time
+WIDEST = 32  # rows and columns of matrices that CUDA takes apart together; larger ones it takes one by one
+
+
+@dataclass(frozen=True, eq=False)
+class RowSpace:
+    """An orthonormal basis per Gaussian of what is seen, zero-padded; rank: how many of its rows are not padding."""
+
+    basis: Float[Tensor, "n r d"]
+    rank: Int[Tensor, " n"]
+
+    @cached_property
+    def _partial(self) -> Int[Tensor, " m"]:
+        """The Gaussians that have null components: with low SH degrees or many views few have any."""
+        return torch.nonzero(self.rank < self.basis.shape[2])[:, 0]
+
+    @cached_property
+    def _basis(self) -> Float[Tensor, "m r d"]:
+        """Theirs."""
+        return self.basis if len(self._partial) == len(self.basis) else self.basis[self._partial]
+
+    def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
+        """x without its null components."""
+        basis, index = self._basis, self._partial
+        if basis is self.basis:
+            return basis.mT @ (basis @ x)
+        return x.index_copy(0, index, basis.mT @ (basis @ x[index]))
+
+    def scaled(self, scale: Float[Tensor, "n d"]) -> "RowSpace":
+        """The space of all D x, D = diag(scale) > 0 and x in this space."""
+        return orthonormal(self.basis * scale[:, None], self.rank)
+
+    def to(self, dtype: torch.dtype) -> "RowSpace":
+        return RowSpace(self.basis.to(dtype), self.rank)
+
+
+def orthonormal(rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSpace:
+    """The space of rows that are independent of each other, followed by padding."""
+    matrices = rows.mT.double().cpu()  # CUDA forms one Q after the other
+    directions = torch.empty_like(matrices.mT, memory_format=torch.contiguous_format)
+
+    def decompose(first: int, last: int) -> None:
+        directions[first:last] = torch.linalg.qr(matrices[first:last]).Q.mT
+
+    over_batch(len(rows), decompose, matrices.device)
+    held = torch.arange(rows.shape[1], device=rows.device) < rank[:, None]
+    return RowSpace(torch.where(held[:, :, None], directions.to(rows), 0.0), rank)
+
+
+def joined(parts: Sequence[RowSpace]) -> RowSpace:
+    """Those of all Gaussians, given those of some at a time."""
+    width = max(part.basis.shape[1] for part in parts)
+    padded = [torch.nn.functional.pad(part.basis, (0, 0, 0, width - part.basis.shape[1])) for part in parts]
+    return RowSpace(torch.cat(padded), torch.cat([part.rank for part in parts]))
+
+
+def row_space(rows: Float[Tensor, "n r d"], tolerance: float) -> RowSpace:
+    """An orthonormal basis of each Gaussian's rows, whatever their lengths."""
+    return spanned(rows / rows.norm(dim=2, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny), None, tolerance)
+
+
+def spanned(rows: Float[Tensor, "n r d"], sizes: Float[Tensor, " n"] | None, tolerance: float) -> RowSpace:
+    """The leading right singular vectors: of values above tolerance of sizes, by default of the largest."""
+    values, basis = _singular(rows)
+    kept = (values > tolerance * (values[:, :1] if sizes is None else sizes[:, None])) & (values > 0)
+    rank = kept.sum(dim=1)
+    return RowSpace(torch.where(kept[:, :, None], basis, 0.0)[:, : int(rank.max()) if len(rank) else 0], rank)
+
+
+def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m d"]]:
+    """Singular values, descending, and right singular vectors; of wide rows on the CPU."""
+    home, (n, r, d) = rows.device, rows.shape
+    if rows.is_cuda and d > WIDEST:
+        rows = rows.cpu()
+    values, basis = rows.new_empty(n, min(r, d)), rows.new_empty(n, min(r, d), d)
+
+    def decompose(first: int, last: int) -> None:
+        for start in range(first, last, CHUNK):
+            some = slice(start, min(start + CHUNK, last))
+            _, values[some], basis[some] = torch.linalg.svd(_shortened(rows[some]), full_matrices=False)
+
+    over_batch(n, decompose, rows.device)
+    return values.to(home), basis.to(home)
+
+
+def _shortened(rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n _ d"]:
+    """On a GPU no more rows than columns, which have the same singular values and right singular vectors."""
+    return torch.linalg.qr(rows, mode="r").R if rows.is_cuda and rows.shape[1] > rows.shape[2] else rows
