@@ -1,7 +1,7 @@
 """Figures: what `landscape map` found, over the training views.
 
     view        photograph, render, error, and one field of the Gaussians
-    fragility   the way to the next swap, the condition of the splats, the share of one view; the pairs that a way swaps
+    fragility   the distance to the next swap, the condition of the splats, the share of one view; the pairs that change order
     steepest    the Gaussians that carry an end of the spectrum, outlined, and what a step along it does
 
 A field's colour in a pixel is the mean over the splats there, by their weights, of how far each is along the scale beneath.
@@ -13,26 +13,35 @@ import textwrap
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse, Rectangle
-from matplotlib.ticker import PercentFormatter
+from matplotlib.image import BboxImage
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse, Patch, Polygon, Rectangle
+from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.transforms import Affine2D, Bbox, TransformedBbox
 
-from analysis.records.quantities import BYTES, NOTHING, Shade, percent, quantity
-from analysis.records.run_files import MapRecord, Panel, Steepest, Swaps, read_map
-from figures.style import BLACK, MISSING, SKY, VERMILION, folder_script, literal, save, style
+from analysis.records.quantities import BYTES, Shade, percent, quantity
+from analysis.records.run_files import Carrier, MapRecord, Panel, Steepest, Swaps, read_map
+from figures.style import BLACK, BLUE, VERMILION, folder_script, literal, save, style
 
+NEAR = 0.03  # of a scale's length, from its end
 WIDTH, TALLEST = 7.0, 9.0  # inches
-MARGIN, HEAD, LEGEND, BAR = 0.1, 0.22, 0.5, 0.09  # inches: between pictures, above one, beneath one; of a scale
-DOTS = 160  # an inch: a picture of two in a row has about the pixels of a photograph of 500
+MARGIN, HEAD, LEGEND = 0.12, 0.22, 0.5  # inches: between pictures, above one, beneath one
+LINE = 0.15  # inches: of the words above all
+BAR, ARROW, TICK = 0.09, 0.07, 0.03  # inches: of a scale, how high it is, and of its ends and its ticks
+FEWEST, DOTS = 110, 160  # an inch: as many as the photograph has pixels there, where these are between both, or DOTS
 
 
 class Sheet:
-    """Pictures of one shape in rows, each with room for a title above it and a scale beneath it."""
+    """Pictures of one shape in rows, each with room for a title above it and a scale beneath it.
+
+    Places are in inches from the top left.  Only plots have axes, which take longer to draw than pictures.
+    """
 
     def __init__(
         self, rows: int, columns: int, shape: tuple[int, int], legends: tuple[bool, ...], above: float = 0.0
@@ -41,58 +50,77 @@ class Sheet:
         self.across = (WIDTH - MARGIN * (columns + 1)) / columns
         rest = above + rows * HEAD + sum(legends) * LEGEND + MARGIN
         self.across = min(self.across, (TALLEST - rest) / rows / aspect)
-        self.tall, self.columns = self.across * aspect, columns
-        self.size = (rest + rows * self.tall, columns * (self.across + MARGIN) + MARGIN)
+        self.tall = self.across * aspect
+        self.size = (columns * (self.across + MARGIN) + MARGIN, rest + rows * self.tall)
         self.tops = [
             above + HEAD + sum(self.tall + HEAD + LEGEND * each for each in legends[:row]) for row in range(rows)
         ]
-        self.figure = Figure(figsize=(self.size[1], self.size[0]), dpi=DOTS)
+        dots = shape[1] / self.across
+        self.figure = Figure(figsize=self.size, dpi=dots if FEWEST <= dots <= DOTS else DOTS)
+        self.inches = Affine2D().scale(1 / self.size[0], -1 / self.size[1]).translate(0, 1) + self.figure.transFigure
 
-    def axes(self, row: int, column: int, title: str) -> Axes:
-        found = self._at(row, column, 0.0, self.tall)
-        found.set_title(title, loc="left", pad=3)
-        return found
+    def text(self, x: float, y: float, words: str, **how: Any) -> None:
+        """Words from the record, below (x, y) where `how` does not say otherwise."""
+        self.figure.text(x, y, literal(words), transform=self.inches, **{"va": "top", **how})
 
-    def show(self, row: int, column: int, image: np.ndarray, title: str) -> Axes:
-        """A picture with what it is above it."""
-        axes = self.axes(row, column, title)
-        axes.imshow(image)
-        axes.set_axis_off()
-        return axes
+    def show(self, row: int, column: int, image: UInt8[np.ndarray, "h w 3"], title: str) -> Affine2D:
+        """A picture with what it is above it; returns the way from its pixels to inches."""
+        left, top = self.corner(row, column, title)
+        self._image(image, left, top, self.across, self.tall)
+        return Affine2D().scale(self.across / image.shape[1], self.tall / image.shape[0]).translate(left, top)
 
-    def show_scaled(self, row: int, column: int, share: np.ndarray, shade: Shade, title: str) -> Axes:
-        """A map in bytes, with its scale beneath."""
-        axes = self.axes(row, column, title)
-        axes.imshow(np.ma.masked_equal(share, NOTHING), cmap=shade.colours, vmin=0, vmax=BYTES)
-        axes.set(xticks=[], yticks=[], facecolor=MISSING)
-        axes.spines[:].set_visible(False)
-        linear = shade.scale == "linear"
-        ends = Normalize(shade.low, shade.high) if linear else Normalize(0, 1)
-        bar = self.figure.colorbar(
-            ScalarMappable(ends, shade.colours), cax=self._at(row, column, self.tall + 0.05, BAR),
-            orientation="horizontal", extend="max" if shade.name == "error" else "both", extendfrac=0.02,
-        )  # fmt: skip
-        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-        if not linear:
-            ticks = shade.ticks()
-            bar.set_ticks([place for place, _ in ticks], labels=[text for _, text in ticks])
-            bar.minorticks_off()
-        bar.set_label(literal(shade.unit), labelpad=1)
-        return axes
+    def show_scaled(
+        self, row: int, column: int, share: UInt8[np.ndarray, "h w"], shade: Shade, title: str, label: str
+    ) -> None:
+        """A map in bytes, with its scale beneath, and what that is of."""
+        self.show(row, column, shade.palette[share], title)
+        left, top = self.corner(row, column)
+        left, top, across = left + ARROW, top + self.tall + 0.05, self.across - 2 * ARROW
+        self._image(shade.palette[None, : BYTES + 1], left, top, across, BAR)
+        for end, x, out in ((0, left, -1), (BYTES, left + across, 1)):
+            if end or shade.name != "error":  # no error is below 0
+                corners = [(x, top), (x + out * ARROW, top + BAR / 2), (x, top + BAR)]
+                colour = shade.palette[end] / 255
+                self.figure.add_artist(Polygon(corners, color=colour, linewidth=0, transform=self.inches))
+        for place, words in ticks_of(shade):
+            x, y = left + place * across, top + BAR
+            self.line([x, x], [y, y + TICK])
+            side = "left" if place < NEAR else "right" if place > 1 - NEAR else "center"
+            self.text(x, y + TICK + 0.02, words, ha=side, fontsize=6.5)
+        self.text(left + across / 2, top + BAR + 0.17, label, ha="center")
 
-    def inner(self, row: int, column: int, title: str) -> Axes:
-        """Axes of a plot, with room for its labels in a picture's place."""
-        axes, wide = self._at(row, column, 0.0, self.tall), self.size[1]
-        box = axes.get_position()
-        axes.set_position((box.x0 + 0.35 / wide, box.y0, box.width - 0.4 / wide, box.height))
-        axes.set_title(title, loc="left", pad=3)
-        return axes
+    def line(self, x: list[float], y: list[float]) -> None:
+        self.figure.add_artist(Line2D(x, y, color=BLACK, linewidth=0.6, transform=self.inches))
 
-    def _at(self, row: int, column: int, down: float, height: float) -> Axes:
-        """Axes in a picture's column, so many inches beneath its top."""
-        tall, wide = self.size
-        left, top = MARGIN + column * (self.across + MARGIN), self.tops[row] + down
-        return self.figure.add_axes((left / wide, 1 - (top + height) / tall, self.across / wide, height / tall))
+    def plot(self, row: int, column: int, title: str) -> Axes:
+        """Axes in a picture's place, with room for the numbers beside them."""
+        left, top = self.corner(row, column, title)
+        return self.figure.add_axes(self._box(left + 0.35, top, self.across - 0.4, self.tall).bounds)
+
+    def corner(self, row: int, column: int, title: str = "") -> tuple[float, float]:
+        """Left and top of a picture's place, below its title."""
+        left, top = MARGIN + column * (self.across + MARGIN), self.tops[row]
+        if title:
+            self.text(left, top - 0.05, title, va="bottom", fontsize=7.5)
+        return left, top
+
+    def _image(self, image: UInt8[np.ndarray, "h w 3"], left: float, top: float, wide: float, tall: float) -> None:
+        found = BboxImage(TransformedBbox(self._box(left, top, wide, tall), self.figure.transFigure))
+        found.set_data(image)
+        self.figure.add_artist(found)
+
+    def _box(self, left: float, top: float, wide: float, tall: float) -> Bbox:
+        across, down = self.size
+        return Bbox.from_bounds(left / across, 1 - (top + tall) / down, wide / across, tall / down)
+
+
+def ticks_of(shade: Shade) -> list[tuple[float, str]]:
+    """Places within [0, 1], and their numbers."""
+    if shade.scale != "linear":
+        return shade.ticks()
+    values = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(shade.low, shade.high)
+    inside = [float(value) for value in values if shade.low <= value <= shade.high]
+    return [(float(shade.share(np.array(value))), f"{value:.4g}".replace("-", "−")) for value in inside]
 
 
 def draw(maps: dict[str, np.ndarray], panel: Panel, record: MapRecord) -> Figure:
@@ -101,11 +129,11 @@ def draw(maps: dict[str, np.ndarray], panel: Panel, record: MapRecord) -> Figure
     error, field = record.shades["error"], record.shades[record.field]
     with style():
         sheet = Sheet(2, 2, (height, width), (False, True))
-        sheet.show(0, 0, maps["photograph"], f"Photograph, {literal(Path(panel.name).name)}")
+        sheet.show(0, 0, maps["photograph"], f"Photograph, {Path(panel.name).name}")
         sheet.show(0, 1, maps["render"], "Render" if panel.psnr is None else f"Render: {panel.psnr:.1f} dB")
         mean = error.low + (error.high - error.low) * maps["error"].mean() / BYTES
-        sheet.show_scaled(1, 0, maps["error"], error, f"Error: {mean:.3f} on average")
-        sheet.show_scaled(1, 1, maps[record.field], field, f"{field.words[:1].upper()}{field.words[1:]}")
+        sheet.show_scaled(1, 0, maps["error"], error, f"Error: {mean:.3f} on average", error.unit)
+        sheet.show_scaled(1, 1, maps[record.field], field, f"Gaussians: {field.words}", field.unit)
     return sheet.figure
 
 
@@ -113,15 +141,17 @@ def draw_fragility(maps: dict[str, np.ndarray], index: int, record: MapRecord) -
     """The three axes in a view, by its place among those of the record."""
     fragile, shades = record.fragility, record.shades
     titles = {
-        "order_gap": "Position: way along the ray to the next swap",
-        "condition": f"Conditioning: {percent(fragile.needles)} of the Gaussians are needles (above 100)",
-        "one_view": f"Opacity: one view alone sees {percent(fragile.one_view)} of the Gaussians",
+        "order_gap": "Position: how far to the next change of order",
+        "condition": f"Conditioning: {percent(fragile.needles)} are needles, longer than 10 : 1",
+        "one_view": f"Opacity: {percent(fragile.one_view)} have over 90% of their weight in one view",
     }
     with style():
         sheet = Sheet(2, 2, maps["error"].shape, (True, True))
         for place, (name, title) in enumerate(titles.items()):
-            sheet.show_scaled(place // 2, place % 2, maps[name], shades[name], title)
-        _draw_swaps(sheet.inner(1, 1, "Pairs of neighbours that a way along the ray swaps"), fragile.swaps, index)
+            sheet.show_scaled(
+                place // 2, place % 2, maps[name], shades[name], title, f"{shades[name].title}; bright: fragile"
+            )
+        _draw_swaps(sheet.plot(1, 1, "Neighbours that change order when one moves so far"), fragile.swaps, index)
     return sheet.figure
 
 
@@ -134,7 +164,7 @@ def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
     words = [("this view", VERMILION)] + [("other views", "0.5")] * (len(swaps.share) > 1)
     for line, (text, colour) in enumerate(words):
         axes.text(0.97, 0.13 - 0.08 * line, text, color=colour, ha="right", transform=axes.transAxes)
-    axes.set(xlabel="way along the ray, px", ylim=(0, 1))
+    axes.set(xlabel="distance along the ray, px", ylim=(0, 1))
     axes.set_xticks(ticks := [0.01, 0.1, 1, 10], labels=[f"{tick:g}" for tick in ticks])
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.minorticks_off()
@@ -144,27 +174,34 @@ def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
 def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
     """An end of the spectrum: the view with the carriers, and its part at -step, 0 and +step."""
     left, top, right, bottom = end.crop
-    changes = [loss / end.losses[1] - 1 for loss in end.losses]
+    changes, shares = [loss / end.losses[1] - 1 for loss in end.losses], [each.share for each in end.carriers]
     alone = end.curvature * end.step**2 / 2 / end.losses[1]
-    words = f"A step of {quantity(end.step)} along it changes the loss, by its curvature alone, by {_signed(alone)}."
+    words = f"By its curvature alone a step of {quantity(end.step)} changes the loss by {_signed(alone)}; rendered, by "
+    words += f"{_signed(changes[0])} (back) and {_signed(changes[2])} (forth)."
+    if max(change * alone for change in (changes[0], changes[2])) < 0:
+        words += " It holds for shorter steps."
+    lines = [line for text in (end.sentence, words) for line in textwrap.wrap(text, 115)]
     with style():
-        sheet = Sheet(2, 3, maps["view"].shape[:2], (False, True), above=0.5)
-        text = "\n".join(textwrap.fill(literal(line), 115) for line in (end.sentence, words))
-        sheet.figure.text(
-            MARGIN / sheet.size[1], 1 - 0.08 / sheet.size[0], text, va="top", fontsize=7.5, linespacing=1.4
-        )
-        whole = sheet.show(0, 0, maps["view"], f"Photograph, {literal(end.view.rpartition('/')[2])}")
-        whole.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BLACK, linewidth=1.0))
-        part = sheet.show(
-            0, 1, maps["photograph"], f"Share of it: {', '.join(percent(each.share) for each in end.carriers)}"
-        )
-        for axes, shift in ((whole, (0, 0)), (part, (left, top))):
+        sheet = Sheet(2, 3, maps["view"].shape[:2], (False, True), above=0.08 + LINE * len(lines))
+        sheet.text(MARGIN, 0.08, "\n".join(lines), fontsize=7.5, linespacing=1.4)
+        whole = sheet.show(0, 0, maps["view"], f"Photograph, {end.view.rpartition('/')[2]}")
+        part = sheet.show(0, 1, maps["photograph"], f"Which Gaussians are {percent(sum(shares))} of it")
+        frame = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BLACK, linewidth=1.0)
+        _inside(sheet, frame, whole, maps["view"])
+        for way, shift, image in ((whole, (0, 0), "view"), (part, (left, top), "photograph")):
             for carrier in reversed(end.carriers):  # the first above the others
-                _outline(axes, carrier.outline, shift, carrier is end.carriers[0])
+                _inside(sheet, _outline(carrier, shift, _colour(carrier, end)), way, maps[image])
+        x, y = sheet.corner(0, 1)
+        for line, carrier in enumerate(end.carriers):
+            sheet.text(
+                x + 0.08, y + sheet.tall - 0.08 - 0.16 * (len(end.carriers) - 1 - line),
+                f"{carrier.gaussian:,}: {percent(carrier.share)}", color=_colour(carrier, end), va="bottom",
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.2},
+            )  # fmt: skip
         sheet.show(0, 2, maps["zero"], f"Render: loss {quantity(end.losses[1])}")
         sheet.show(1, 0, maps["minus"], f"One step back: loss {_signed(changes[0])}")
         sheet.show(1, 1, maps["plus"], f"One step forth: loss {_signed(changes[2])}")
-        sheet.show_scaled(1, 2, maps["difference"], end.difference, "Forth less back")
+        sheet.show_scaled(1, 2, maps["difference"], end.difference, "Forth less back", end.difference.unit)
     return sheet.figure
 
 
@@ -172,14 +209,21 @@ def _signed(share: float) -> str:
     return f"{share:+.2%}".replace("-", "−")
 
 
-def _outline(axes: Axes, outline: list[float], shift: tuple[int, int], first: bool) -> None:
-    x, y, long, short, angle = outline
-    axes.add_patch(
-        Ellipse(
-            (x - shift[0] - 0.5, y - shift[1] - 0.5), 2 * long, 2 * short, angle=math.degrees(angle), fill=False,
-            edgecolor=VERMILION if first else SKY, linewidth=1.0, clip_on=True,
-        )
-    )  # fmt: skip
+def _colour(carrier: Carrier, end: Steepest) -> str:
+    return VERMILION if carrier is end.carriers[0] else BLUE
+
+
+def _outline(carrier: Carrier, shift: tuple[int, int], colour: str) -> Ellipse:
+    x, y, long, short, angle = carrier.outline
+    centre = (x - shift[0], y - shift[1])
+    return Ellipse(centre, 2 * long, 2 * short, angle=math.degrees(angle), fill=False, edgecolor=colour, linewidth=1.0)
+
+
+def _inside(sheet: Sheet, patch: Patch, way: Affine2D, image: np.ndarray) -> None:
+    """A patch over a picture, in its pixels, without what is outside of it."""
+    patch.set_transform(way + sheet.inches)
+    sheet.figure.add_artist(patch)
+    patch.set_clip_path(Rectangle((0, 0), image.shape[1], image.shape[0], transform=way + sheet.inches))
 
 
 def draw_maps(folder: Path, suffix: str = "png", processes: int = 2) -> list[Path]:

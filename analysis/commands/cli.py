@@ -56,7 +56,7 @@ COMMANDS = {
     "probe": Command(ProbeOptions, "analysis.probe.command:run_probe", recorded=True, draws="make_all", compiles=True),
     "slice": Command(SliceOptions, "analysis.slice.command:run_slice", recorded=True, compiles=True),
     "map": Command(MapOptions, "analysis.commands.map.command:run_map", recorded=True, draws="maps", compiles=True),
-    "view": Command(ViewOptions, "analysis.commands.view:run_view"),
+    "view": Command(ViewOptions, "analysis.commands.view.command:run_view", compiles=True),
     "prune": Command(PruneOptions, "analysis.commands.uses.prune:run_prune", recorded=True, compiles=True),
     "next-view": Command(NextViewOptions, "analysis.commands.uses.study:run_next", recorded=True, compiles=True),
     "uncertainty": Command(

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import PurePosixPath
 
@@ -22,9 +22,24 @@ from splat.model.settings import RenderSettings
 from splat.projection.antialias import baked
 from splat.render.render import render_depth
 from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
+from splat.training.origin.presets import PRESETS, render_of
 
-OURS = "splat-landscape"
+OURS = ("splat-landscape", "splat-landscape-mip")
 FAINT = 0.01  # of alpha: what is less covered is as far as the farthest that is not
+
+
+@dataclass(frozen=True)
+class Seen:
+    """How Gaussians were rendered.  centred: with the principal points in the images' middles; moved: in another world."""
+
+    render: RenderSettings
+    centred: bool
+    moved: bool
+
+    def is_that_of(self, tool: str, *, antialiased: bool) -> bool:
+        preset = PRESETS[tool]
+        other = Seen(render_of(preset, {}, antialiased=antialiased), preset.centred, preset.world != "scene")
+        return self == other
 
 
 def run_convert(options: ConvertOptions) -> int:
@@ -53,18 +68,37 @@ def _to_own(options: ConvertOptions) -> list[str]:
 
 
 def _to_tool(options: ConvertOptions, to: str) -> list[str]:
-    found = read_splats(options.source) if is_foreign(options.source) else _own(options)
+    found, seen = _foreign(options) if is_foreign(options.source) else _own(options)
     extra: Mapping[str, np.ndarray] = found.extra
-    content = (
-        splat_ply(found.gaussians, extra, found.tool)
-        if to == "graphdeco"
-        else gsplat_bytes(baked(found.gaussians), found.step or 0, extra, found.tool)
-    )
+    if to == "graphdeco":
+        gaussians = found.gaussians
+        content = splat_ply(gaussians, extra, found.tool, antialiased=found.antialiased)
+    else:
+        gaussians = baked(found.gaussians)
+        content = gsplat_bytes(gaussians, found.step or 0, extra, found.tool, antialiased=found.antialiased)
     write_atomically(options.out, content)
     kept = [f"with {', '.join(extra)}"] if extra else []
-    if to != "graphdeco" and found.gaussians.filter_widths is not None:
+    if gaussians is not found.gaussians:
         kept.append("their 3-D filter, for which such a file has no place, is now in scales and opacities")
-    return [f"{len(found.gaussians)} Gaussians", *kept, *found.notes]
+    back = read_splats(options.out)
+    return [f"{len(found.gaussians)} Gaussians", *kept, *found.notes, *_unsaid(back, seen)]
+
+
+def _unsaid(back: SplatFile, seen: Seen | None) -> list[str]:
+    """A sentence on how the file has to be read, where it does not say so itself.  back: as it is read; seen: as it was."""
+    if seen is None or (
+        back.tool and back.tool in PRESETS and seen.is_that_of(back.tool, antialiased=back.antialiased)
+    ):
+        return []
+    render = seen.render
+    how = f"antialiasing {render.antialias}, blur {render.blur:g}, alpha cap {render.alpha_max:g}, near {render.near:g}"
+    for name in PRESETS:
+        for antialiased in (back.antialiased, True):
+            if seen.is_that_of(name, antialiased=antialiased):
+                option = "" if antialiased == back.antialiased else " --antialiased"
+                return [f"the file cannot say how it was rendered ({how}): read it with --trained-by {name}{option}"]
+    where = ", through the images' middles" if seen.centred else ""
+    return [f"no --trained-by renders as it was ({how}{where}), and the file cannot say it: pictures will differ"]
 
 
 def _to_depths(options: ConvertOptions) -> list[str]:
@@ -89,9 +123,22 @@ def _to_depths(options: ConvertOptions) -> list[str]:
     ]
 
 
-def _own(options: ConvertOptions) -> SplatFile:
-    """tool: none where the settings are not our defaults, which the file could not say."""
+def _foreign(options: ConvertOptions) -> tuple[SplatFile, Seen | None]:
+    """A file, and how its trainer saw it; None where it is not known."""
+    found = read_splats(options.source)
+    tool = options.foreign.trained_by or found.tool
+    found = replace(found, tool=tool, antialiased=found.antialiased or options.foreign.antialiased)
+    if tool is None or tool not in PRESETS:
+        return found, None
+    preset = PRESETS[tool]
+    render = render_of(preset, found.settings, antialiased=found.antialiased)
+    return found, Seen(render, preset.centred, preset.world != "scene")
+
+
+def _own(options: ConvertOptions) -> tuple[SplatFile, Seen]:
     checkpoint = load_checkpoint(options.source)
     training, scene = checkpoint.training, checkpoint.scene
-    usual = training.config.render == RenderSettings() and scene.similarity is None and not scene.centred
-    return SplatFile(training.gaussians, OURS, OURS if usual else None, training.step)
+    seen = Seen(training.config.render, scene.centred, scene.similarity is not None)
+    antialiased = seen.render.antialias != "none"
+    tool = next((name for name in OURS if seen.is_that_of(name, antialiased=antialiased)), None)
+    return SplatFile(training.gaussians, OURS[0], tool, training.step, antialiased=antialiased), seen

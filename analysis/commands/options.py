@@ -68,7 +68,8 @@ class ViewOptions:
     host: str = "127.0.0.1"
     """Who may open the page; 0.0.0.0: everybody who reaches this machine."""
     html: Unset[Path] = None
-    """Write a page that needs no server to this file instead: splats in the field's colours and cameras, without controls.
+    """Write a page that needs no server to this file instead: cameras, and splats whose colours are switched between
+    some fields.
     RUN/view.html is linked to by the probe's report."""
     scene: SceneFolder = None
     foreign: Foreign = field(default_factory=ForeignOptions)

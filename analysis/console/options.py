@@ -37,8 +37,8 @@ def _unset_choices(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | N
 
 
 @dataclass(frozen=True)
-class ForeignOptions:
-    """What a file that another tool trained does not say; a checkpoint of landscape train holds all but max_views."""
+class TrainerOptions:
+    """What a file that another tool trained does not say of its trainer."""
 
     trained_by: Unset[str] = None
     """Of another tool's file: whose conventions to follow.
@@ -47,6 +47,17 @@ class ForeignOptions:
     Default: what the file says."""
     antialiased: FlagCreatePairsOff[bool] = False
     """Of another tool's file that does not say so: its renderer was antialiased."""
+    opacity_reg: Unset[float | Literal["trained"]] = None
+    """Of another tool's file: a weight of the mean opacity in the loss, as MCMC trainers have it.
+    trained: that of its training, which the settings beside it say (cfg.yml, config.yml).  Default: 0."""
+    scale_reg: Unset[float | Literal["trained"]] = None
+    """Of another tool's file: the same of the mean scale."""
+
+
+@dataclass(frozen=True)
+class ForeignOptions(TrainerOptions):
+    """What a file that another tool trained does not say; a checkpoint of landscape train holds all but max_views."""
+
     views: Unset[int | Literal["all"]] = None
     """Of another tool's file: number of its training views, by the scene's protocol.
     Default: what the tool's files say, else all that are not held out."""

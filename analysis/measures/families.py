@@ -199,7 +199,7 @@ def _stage_of(scene: SceneName, operator: schema.Operator) -> str:
 
 def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:
     """Objective of the split Gaussians: the same loss over the same views."""
-    settings = objective.loss_settings, objective.background, objective.settings
+    settings = objective.loss_of_active, objective.background, objective.settings
     return SceneObjective(control.gaussians, objective.views, *settings)
 
 

@@ -78,8 +78,8 @@ def _in_double(objective: SceneObjective, views: int | None) -> SceneObjective:
     """The same objective of these views, in float64."""
     return SceneObjective(
         objective.active.to(torch.float64),
-        [replace(view, image=view.image.double()) for view in objective.views[:views]],
-        objective.loss_settings,
+        [view.with_image(view.image.double()) for view in objective.views[:views]],
+        objective.loss_of_active,
         objective.background.double(),
         objective.settings,
         keep_unseen=True,
@@ -112,6 +112,7 @@ def _gradient(
     def gradient(theta: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
         nonlocal done
         at, total = double.with_flat(theta.detach()), double.with_flat(torch.zeros_like(theta))
+        regularizers = objective.regularizers(at)
         for view, of_view, order in zip(shown, losses, depths, strict=True):
             size = view.camera.width, view.camera.height
             with torch.no_grad():
@@ -121,6 +122,7 @@ def _gradient(
             moving = [getattr(splats, name).requires_grad_() for name in MOVING]
             image, _ = rasterize_by_kernel(splats, background, *size, settings)
             _pull(torch.autograd.grad(view_loss(image, of_view), moving), at, total, view.camera, settings)
+            regularizers.add_gradient(total.flat)
         done += 1
         if progress:
             progress(done, 2 * len(STEPS), "gradients in double precision")

@@ -66,13 +66,13 @@ def steepest(
     view = objective.views[index]
     carriers = [_carrier(objective, view, end, values, mass, i) for i in chosen]
     crop = crop_around(carriers[0].outline, view.camera.width, view.camera.height)
-    rise = RISE * objective.loss(objective.active.flat)
-    step = curvature_reach(end.curvature, rise)
+    loss = objective.loss(objective.active.flat)
+    step = curvature_reach(end.curvature, RISE * loss)
     steps = {
         name: objective.active.flat + sign * step * end.vector
         for name, sign in (("minus", -1), ("zero", 0), ("plus", 1))
     }
-    losses = [objective.loss(flat) for flat in steps.values()]
+    losses = [objective.loss(steps["minus"]), loss, objective.loss(steps["plus"])]
     pictures, difference = _pictures(objective, view, steps, crop)
     found = Steepest(
         name=end.name, curvature=end.curvature, participation=participation(mass), carriers=carriers, view=view.name,

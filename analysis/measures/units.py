@@ -13,9 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.curvature.objective import SceneObjective
+from splat.model.gaussians import ATTRIBUTES
 from splat.training.state import LearningRates, learning_rates, position_rate
 
-ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 Metric = Literal["parameters", "scene", "optimiser"]
 FACING = 0.7  # views are forward-facing where every axis keeps this share of its length along their mean
 

@@ -35,6 +35,7 @@ from analysis.probe.views import write_views
 from analysis.records.provenance import require_seed, versions
 from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
+from analysis.train.source import of_trainer
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks, torchrun_ranks
 from landscape.probes import spawn
@@ -46,7 +47,6 @@ from splat.scenes.scene import Scene
 from splat.scenes.splits import read_names
 from splat.scenes.view import digests
 from splat.training.checkpoint import Checkpoint, open_checkpoint
-from splat.training.origin.foreign import Foreign
 
 if TYPE_CHECKING:
     from analysis.measures.families import FamilyOptions
@@ -177,9 +177,8 @@ def _write(
 def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
     """A checkpoint, our own or another tool's, and its scene.  out: beside which a picture explains a refusal."""
     listed = None if ask.train_list is None else read_names(ask.train_list)
-    foreign = Foreign(
-        folder, ask.views, listed, ask.trained_by, ask.images, ask.downscale, antialiased=ask.antialiased or None
-    )
+    foreign = replace(of_trainer(ask), scene=folder, views=ask.views, train_list=listed)
+    foreign = replace(foreign, images=ask.images, downscale=ask.downscale)
     checkpoint = open_checkpoint(path, foreign, out.with_name(f"{out.name}-mismatch.png"))
     scene = checkpoint.load_scene(path, folder)
     return checkpoint.thinned(scene, ask.max_views), scene

@@ -119,13 +119,17 @@ def loss_name(loss: LossSettings) -> str:
 
     >>> loss_name(LossSettings()), loss_name(LossSettings("charbonnier", 0.0, eps=0.001))
     ('0.8 L1 + 0.2 (1 − SSIM)', 'Charbonnier (eps 0.001)')
+    >>> loss_name(LossSettings(opacity_reg=0.01, scale_reg=0.02))
+    '0.8 L1 + 0.2 (1 − SSIM) + 0.01 mean opacity + 0.02 mean scale'
     """
     pixel = {"l1": "L1", "l2": "L2", "charbonnier": f"Charbonnier (eps {loss.eps:g})"}[loss.pixel]
-    if loss.ssim_weight == 0:
-        return pixel
-    weighted = pixel if loss.pixel_weight == 1 else f"{loss.pixel_weight:g} {pixel}"
-    windows = " of windows within the image" if loss.border == "valid" else ""
-    return f"{weighted} + {loss.ssim_weight:g} (1 − SSIM{windows})"
+    terms = [pixel if loss.pixel_weight == 1 else f"{loss.pixel_weight:g} {pixel}"]
+    if loss.ssim_weight:
+        windows = " of windows within the image" if loss.border == "valid" else ""
+        terms.append(f"{loss.ssim_weight:g} (1 − SSIM{windows})")
+    regularizers = {"opacity": loss.opacity_reg, "scale": loss.scale_reg}
+    terms += [f"{weight:g} mean {name}" for name, weight in regularizers.items() if weight]
+    return " + ".join(terms)
 
 
 def left_out_note(views: int, population: int | None) -> list[str]:

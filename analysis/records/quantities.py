@@ -7,6 +7,7 @@ significant digits.  None, *not determined* in a record, is an en dash.
 """
 
 import math
+from collections.abc import Sequence
 from decimal import Decimal
 from typing import Literal
 
@@ -169,6 +170,11 @@ class Shade(Struct, frozen=True, kw_only=True):
         )
 
     @property
+    def title(self) -> str:
+        """What it is, and in which unit."""
+        return f"{self.words}, {self.unit}" if self.unit else self.words
+
+    @property
     def diverges(self) -> bool:
         """Whether 0 is in the middle."""
         return self.low == -self.high
@@ -188,6 +194,22 @@ class Shade(Struct, frozen=True, kw_only=True):
         colours = colormaps[self.colours](np.arange(NOTHING + 1) / BYTES)[:, :3]
         colours[NOTHING] = GREY / 255
         return (255 * colours).round().astype(np.uint8)
+
+    @property
+    def legend(self) -> str:
+        """The colours and the values at both ends, as a part of a page."""
+        stops = ", ".join(
+            "rgb({}, {}, {})".format(*colour) for colour in self.palette[np.linspace(0, BYTES, 9, dtype=int)]
+        )
+        ends = [quantity(self.value(t)) for t in (self.low, self.high)]
+        return (
+            f'<span style="display:block;height:.5em;background:linear-gradient(to right, {stops})"></span><span '
+            f'style="display:flex;justify-content:space-between"><span>{ends[0]}</span><span>{ends[1]}</span></span>'
+        )
+
+    def colours_of(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        """The colours of values, within [0, 1], float32."""
+        return (self.palette[self.bytes(values)] / 255).astype(np.float32)
 
     def shown(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """t; nan for what has none."""
@@ -226,7 +248,8 @@ class Shade(Struct, frozen=True, kw_only=True):
         if len(values) < 2 and self.scale == "log":
             values = [x * 10.0**k for k in range(math.floor(math.log10(least)), powers.stop + 1) for x in (1, 2, 5)]
         values = values if self.scale == "log" else [*(-v for v in reversed(values)), 0.0, *values]
-        return [(float(self.share(np.array(v))), _short(v)) for v in values if ends[0] <= v <= ends[1]]
+        values = [v for v in values if ends[0] <= v <= ends[1]]
+        return list(zip(self.share(np.array(values)).tolist(), _labels(values), strict=True))
 
 
 def share_in_bytes(share: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
@@ -238,13 +261,20 @@ def share_in_bytes(share: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     return np.where(np.isnan(share), NOTHING, np.round(BYTES * np.clip(np.nan_to_num(share), 0, 1))).astype(np.uint8)
 
 
-def _short(value: float) -> str:
-    """A round number as a label: without places that say nothing."""
-    exponent = _exponent(value)
-    if -2 <= exponent <= 3:
-        return f"{value:g}".replace("-", "−")
-    digit = round(abs(value) / 10.0**exponent)
-    return "−" * (value < 0) + (f"{digit} × " if digit > 1 else "") + power_of_ten(exponent)
+def _labels(values: Sequence[float]) -> list[str]:
+    """Round numbers as labels, without places that say nothing; all as powers of ten where one needs it.
+
+    >>> _labels([-0.01, 0.0, 0.5]), _labels([-2e-5, 0.0, 1.0])
+    (['−0.01', '0', '0.5'], ['−2 × 10⁻⁵', '0', '1'])
+    """
+    exponents = [_exponent(value) for value in values]
+    plain, texts = all(-2 <= exponent <= 3 for exponent in exponents), []
+    for value, exponent in zip(values, exponents, strict=True):
+        text, digit = f"{abs(value):g}", round(abs(value) / 10.0**exponent)
+        if exponent and not plain:
+            text = (f"{digit} × " if digit > 1 else "") + power_of_ten(exponent)
+        texts.append("−" * (value < 0) + text)
+    return texts
 
 
 def _quantiles(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], percent: float) -> float:

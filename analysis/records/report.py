@@ -21,14 +21,14 @@ from plotly.offline import get_plotlyjs
 
 from analysis.records.findings import Line, attribute_name, findings, headline, is_open
 from analysis.records.json_files import plain
-from analysis.records.quantities import BYTES, Shade, limits, measured, percent, quantity
+from analysis.records.quantities import limits, measured, percent, quantity
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map
 from analysis.records.schema import INDICES
-from analysis.records.tables import family_lines
+from analysis.records.tables import bracketed, family_lines
 
 FILE, SPLATS = "report.html", "view.html"  # in the record's folder, and beside it: the page of `landscape view --html`
-FINE, COARSE = 82, 60  # quality of WebP: of photographs and drawings, and of maps, which are noisy
+FINE, COARSE, QUICK = 82, 60, 2  # quality of WebP: of drawings, and of maps, which are noisy; effort, of 6
 PICTURES = {
     "slice2d": "The loss on the plane of the two steepest directions. Dots: renders, blue where the order of the splats or the "
     "set of visible ones is not the checkpoint's; dashed: the quadratic model.",
@@ -54,10 +54,10 @@ def write_report(folder: str | Path, surface: str | None = None) -> Path:
     return path
 
 
-def template_environment() -> jinja2.Environment:
-    """Of the pages whose templates lie beside this file."""
+def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environment:
+    """Of the pages whose templates lie in a folder, by default beside this file."""
     return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        loader=jinja2.FileSystemLoader(folder),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -77,7 +77,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "capitalise": lambda words: words[:1].upper() + words[1:],
         "open_ended": is_open,
     }
-    surface = embedded_surface(record) if surface is None else surface
+    surface, views = embedded_surface(record) if surface is None else surface, views_in(record)
     return environment.get_template("report.html.jinja").render(
         data=record.data,
         counts=plain(record.data.counts),
@@ -85,14 +85,16 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         numbers=numbers(record.data),
         headline=opening(record),
         findings=findings(record.data),
-        views=views_in(record),
+        views=views,
+        listed_views=[{**view, "pictures": [{**each, "uri": ""} for each in view["pictures"]]} for view in views[:1]]
+        + views[1:],
         pictures=pictures_in(record.folder, PICTURES, shown_numbers(record)),
         where=where(record),
         splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
         families=family_lines(record.data),
         indices=INDICES,
         surface=surface,
-        plotly_js=base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode() if surface else "",
+        plotly_js=base64.b64encode(gzip.compress(get_plotlyjs().encode(), 6, mtime=0)).decode() if surface else "",
     )
 
 
@@ -105,7 +107,7 @@ def opening(record: Record[ProbeRecord]) -> list[Line]:
 def numbers(data: ProbeRecord) -> list[dict[str, str]]:
     """The five numbers at the top: value with its error or bracket, and what it is."""
     ends, found = data.eigenvalues, []
-    for end, words in ((ends.max, "largest curvature"), (ends.min, "smallest curvature")):
+    for end, words in ((ends.max, "largest curvature, λ max"), (ends.min, "smallest curvature, λ min")):
         found.append({"value": measured(end.value, end.residual), "words": words})
     traces = {
         name: trace for name, trace in data.traces.items() if trace.value is not None and math.isfinite(trace.value)
@@ -115,9 +117,9 @@ def numbers(data: ProbeRecord) -> list[dict[str, str]]:
         words = f"trace of {attribute_name(name)}, the largest of five"
         found.append({"value": measured(trace.value, trace.standard_error), "words": words})
     if index := data.anisotropy.literal:
-        bracket = " to ".join(limits(index.low, index.high))
-        known = index.low is not None and index.high is not None
-        found.append({"value": quantity(index.value if known else None), "words": f"largest over smallest ({bracket})"})
+        cell = bracketed(None if is_open(index) else index)
+        words = "largest over smallest curvature" + (f" ({cell.bracket})" if cell.bracket else "")
+        found.append({"value": cell.value, "words": words})
     if lives := ends.max.lives_on:
         words = f"Gaussians carry the steepest direction, of {data.counts.visible_gaussians:,} in sight"
         found.append({"value": quantity(lives.participation), "words": words})
@@ -148,7 +150,7 @@ def views_in(record: Record[ProbeRecord]) -> list[dict[str, Any]]:
     views = []
     for i in sorted(panels) or drawn:
         pictures = [
-            {"words": words, "uri": picture_uri(path), "legend": ""}
+            {"words": words, "uri": data_uri(path.read_bytes(), "jpeg"), "legend": ""}
             for words, path in zip(("photograph", "render"), pairs[i])
         ]
         if found and panels:
@@ -157,7 +159,7 @@ def views_in(record: Record[ProbeRecord]) -> list[dict[str, Any]]:
                     coloured = Image.fromarray(shade.palette[arrays[shade.name]])
                     coloured.thumbnail(Image.open(pairs[i][0]).size)
                     uri = picture_uri(coloured, COARSE)
-                    pictures.append({"words": f"{shade.words}, {shade.unit}", "uri": uri, "legend": legend(shade)})
+                    pictures.append({"words": shade.title, "uri": uri, "legend": shade.legend})
         views.append({"name": names[i], "pictures": pictures})
     return views
 
@@ -185,25 +187,24 @@ def carriers_in_words(end: Steepest) -> str:
         f"{', '.join(map(quantity, each.sigmas))}, splat of {each.aspect:.3g} : 1, opacity {each.opacity:.2f}"
         for each in end.carriers
     )
-    view = end.view.rpartition("/")[2]
-    return f"{end.name} in {view}, its carriers outlined, and renders one step back and forth along it. {carriers}."
-
-
-def legend(shade: Shade) -> str:
-    """The scale of colours with its ends and its unit, as a part of a page."""
-    stops = ", ".join("rgb({}, {}, {})".format(*colour) for colour in shade.palette[:BYTES:30])
-    ends = [quantity(shade.value(t)) for t in (shade.low, shade.high)]
+    view, (back, here, forth) = end.view.rpartition("/")[2], end.losses
+    alone = end.curvature * end.step**2 / 2
+    changes = [f"{100 * change / here:+.2f}%".replace("-", "−") for change in (back - here, forth - here, alone)]
     return (
-        f'<span style="display:block;height:.5em;background:linear-gradient(to right, {stops})"></span><span '
-        f'style="display:flex;justify-content:space-between"><span>{ends[0]}</span><span>{ends[1]}</span></span>'
+        f"{end.name} in {view}, its carriers outlined, and renders one step of {quantity(end.step)} back and forth along it, "
+        f"which change the loss by {changes[0]} and {changes[1]} ({changes[2]} by the curvature alone). {carriers}."
     )
 
 
 def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:
     """A picture as a data URI; WebP takes a quarter of the bytes of PNG."""
     content, image = io.BytesIO(), Image.open(picture) if isinstance(picture, Path) else picture
-    image.convert("RGB").save(content, "WEBP", quality=quality)
-    return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
+    image.convert("RGB").save(content, "WEBP", quality=quality, method=QUICK)
+    return data_uri(content.getvalue(), "webp")
+
+
+def data_uri(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def interactive_surface(record: Record[ProbeRecord]) -> go.Figure | None:

@@ -15,28 +15,27 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from rich.console import Console
 
 from analysis.console.drawing import draw
-from analysis.console.options import DeviceName
 from analysis.console.overrides import leaves
-from analysis.probe.options import ProbeOptions
 from analysis.probe.record import loss_name
 from analysis.records.findings import of_budgets, of_checks, unresolved
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import quantity
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.report import pictures_in, template_environment
-from analysis.records.run_files import CHECKPOINT, COMPARISON, METRICS, Comparison, Scores, read_scores
+from analysis.records.run_files import COMPARISON, Comparison
 from analysis.runs.compare_table import Row, Run, compare_table, comparison, frame
+from analysis.runs.compared import checkpoint_path, compared, probe, probe_command, probe_folder, probed, scores_of
 from analysis.runs.options import CompareOptions
 from analysis.runs.seeds import Group, grouped, groups_of, identical, sayings
 from landscape.errors import InputError
-from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
+from splat.training.checkpoint import Checkpoint, write_atomically
 
-PAGE, TABLE, PROBE = "compare.html", "compare.csv", "probe"
+PAGE, TABLE = "compare.html", "compare.csv"
 PICTURES = {
     "compare_traces": "Traces by attribute, with their intervals. Filled: positive; open: negative; crossed: not decided.",
     "compare_densities": "How many directions are at least so curved, down (left) and up (right). Thin: each start "
@@ -54,24 +53,20 @@ def run_compare(options: CompareOptions) -> int:
     common = Path(os.path.commonpath(folders))
     common = common.parent if common in folders else common
     labels = [str(folder.relative_to(common)) for folder in folders]
-    checkpoints = [load_checkpoint(folder / CHECKPOINT) for folder in folders]
+    checkpoints = [compared(path, options) for path in paths]
     require_same(labels, checkpoints, trained_alike=False)
-    loss = (
-        "3dgs"
-        if any(c.training.config.loss != checkpoints[0].training.config.loss for c in checkpoints)
-        else "training"
-    )
+    of_training = [checkpoint.training.config.loss for checkpoint in checkpoints]
+    loss = "training" if of_training == of_training[:1] * len(of_training) else "3dgs"
     missing = [path for path, checkpoint in zip(paths, checkpoints) if not probed(path, checkpoint)]
     if missing and not options.probe:
-        more = "" if loss == "training" else f" --loss {loss}"
-        again = "; ".join(f"landscape probe {shlex.quote(str(path / CHECKPOINT))}{more}" for path in missing)
+        again = "; ".join(probe_command(path, options, loss) for path in missing)
         raise InputError(
             f"expected probed runs, got no record of the checkpoint in {missing[0]}; run {again}, or add --probe"
         )
     for path in missing:
-        _probe(path, options.device, loss)
+        probe(path, options, loss)
     runs = [
-        Run(path, label, checkpoint, _scores(path), read_record(path / PROBE, ProbeRecord).data)
+        Run(path, label, checkpoint, scores_of(path), read_record(probe_folder(path), ProbeRecord).data)
         for path, label, checkpoint in zip(paths, labels, checkpoints)
     ]
     require_same_loss(runs)
@@ -126,26 +121,6 @@ def require_same_loss(runs: Sequence[Run]) -> None:
             )
 
 
-def probed(run: Path, checkpoint: Checkpoint) -> bool:
-    """Whether the run has a record of this checkpoint's step."""
-    if not (run / PROBE / ProbeRecord.FILE).is_file():
-        return False
-    return read_record(run / PROBE, ProbeRecord).data.provenance.iteration == checkpoint.training.step
-
-
-def _probe(run: Path, device: DeviceName, loss: Literal["training", "3dgs"]) -> None:
-    from analysis.probe.command import run_probe
-
-    path = run / CHECKPOINT
-    command = ["landscape", "probe", str(path), "--device", device, "--loss", loss]
-    run_probe(ProbeOptions(path, device=device, loss=loss), command)
-
-
-def _scores(run: Path) -> Scores | None:
-    """None of a run that was stopped before it was scored."""
-    return read_scores(run) if (run / METRICS).is_file() else None
-
-
 def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
     """What differs between the runs, or is missing from some, that a reader has to keep in mind.  seeds: which differ here."""
     settings: dict[str, Callable[[Run], Any]] = {
@@ -186,7 +161,7 @@ def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
         lines.append(
             "Anisotropy depends on the number of Gaussians; how much, the split control says, which is missing: "
             + "; ".join(
-                f"landscape probe {shlex.quote(str(run.folder / CHECKPOINT))} --split-control" for run in without
+                f"landscape probe {shlex.quote(str(checkpoint_path(run.folder)))} --split-control" for run in without
             )
         )
     return lines
@@ -231,7 +206,7 @@ def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], ou
         notes.append(f"The pictures show the first run of each group: {', '.join(map(str, shown_runs))}.")
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode(errors="backslashreplace"))
-    index = Comparison(runs={label: str((folder / PROBE).resolve()) for folder, label in shown_runs.items()})
+    index = Comparison(runs={label: str(probe_folder(folder).resolve()) for folder, label in shown_runs.items()})
     write_atomically(out / COMPARISON, json_text(plain(index)).encode())
     notes += draw("compare", out)
     names = [group.label for group in groups]

@@ -1,12 +1,12 @@
 """Options of the commands on several runs: `landscape sweep`, `trajectory`, `compare` and `claims`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from analysis.console.options import DeviceName, Unset
+from analysis.console.options import DeviceName, ForeignOptions, Unset
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class CompareOptions:
     """Compare probed runs in one table and on one page: scores, traces, spectra, anisotropy, slices."""
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN...", help_behavior_hint="")]
-    """Two or more folders that landscape train wrote, of the same views and loss, each probed.
+    """Two or more folders that landscape train wrote, or files of other tools, of the same views and loss, each probed.
     A folder whose sub-folders are runs, such as OUT/SCENE/METHOD of a sweep, stands for all its seeds: mean and spread."""
     group: UseAppendAction[tuple[str, ...]] = ()
     """LABEL=RUN,RUN: runs that differ in their seed alone, as one; may be repeated."""
@@ -65,6 +65,9 @@ class CompareOptions:
     """Probe the runs that have no record of their checkpoint yet."""
     device: DeviceName = "auto"
     """Where to probe.  auto: on the GPU where there is one that can be used, else on the CPU."""
+    scene: Unset[Path] = None
+    """Folder of the scene of other tools' files; those that were probed are opened as they were then."""
+    foreign: Annotated[ForeignOptions, arg(name="")] = field(default_factory=ForeignOptions)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,12 @@
 """Options of `landscape train`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from analysis.console.options import DeviceName, Unset
+from analysis.console.options import DeviceName, TrainerOptions, Unset
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,7 @@ class TrainOptions:
     box: random points in the box of the scene's points."""
     from_: Annotated[Unset[Path], arg(name="from")] = None
     """A checkpoint, our own or another tool's, whose Gaussians to start from, with its renderer and in its world."""
-    trained_by: Unset[str] = None
-    """Whose conventions another tool's file of --from follows, see landscape probe.  Default: what the file says."""
-    antialiased: FlagCreatePairsOff[bool] = False
-    """Another tool's file of --from does not say so, but its renderer was antialiased."""
+    foreign: Annotated[TrainerOptions, arg(name="")] = field(default_factory=TrainerOptions)
     masks: Unset[Path] = None
     """Folder of object masks, named after the images; the scores are taken inside them.
     Default: mask or masks in the scene, or what its files name (nerfstudio's mask_path, DTU's idrmasks)."""

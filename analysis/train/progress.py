@@ -24,6 +24,7 @@ from analysis.train.training_time import TrainingTime
 from landscape.errors import InputError
 from splat.losses.autograd import view_loss
 from splat.losses.reference import psnr
+from splat.losses.regularizers import Regularizers
 from splat.render.render import render
 from splat.scenes.view import View
 from splat.training.checkpoint import write_atomically
@@ -118,7 +119,8 @@ def scored(training: Training, view: View) -> tuple[float, float]:
     background = config.background_colour(gaussians.flat.dtype)
     image = render(gaussians, view.camera, background, config.render).image
     loss = view_loss(image, config.loss_against(view.image, gaussians.flat))
-    return float(loss), psnr(image.to(view.image.device), view.image)
+    regularizers = Regularizers(gaussians, config.loss, len(gaussians))
+    return float(loss) + regularizers.value, psnr(image.to(view.image.device), view.image)
 
 
 def scalar_writer() -> Any:

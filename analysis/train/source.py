@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+from analysis.console.options import TrainerOptions
 from analysis.console.overrides import assignments
 from analysis.train.options import TrainOptions
 from landscape.errors import InputError
@@ -11,12 +12,22 @@ from splat.model.gaussians import Gaussians
 from splat.scenes.scene import Scene
 from splat.scenes.splits import Split
 from splat.training.checkpoint import open_checkpoint
-from splat.training.origin.foreign import Foreign
+from splat.training.origin.foreign import REGULARIZERS, Foreign
 from splat.training.origin.frames import posed
 from splat.training.origin.scene_reference import SceneReference
 from splat.training.state import TrainConfig
 
 Planned = tuple[Scene, Split, TrainConfig, SceneReference]
+
+
+def of_trainer(ask: TrainerOptions) -> Foreign:
+    """What was said of the trainer of another tool's file."""
+    return Foreign(
+        trained_by=ask.trained_by,
+        antialiased=ask.antialiased or None,
+        opacity_reg=ask.opacity_reg,
+        scale_reg=ask.scale_reg,
+    )
 
 
 def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Planned, Gaussians | None]:
@@ -25,20 +36,28 @@ def from_checkpoint(options: TrainOptions, plan: Planned, out: Path) -> tuple[Pl
     InputError where the checkpoint is refused, and where --set changes its renderer or --trained-by has no file to speak of.
     """
     scene, split, config, reference = plan
+    asked = of_trainer(options.foreign)
     if options.from_ is None:
-        if options.trained_by is not None or options.antialiased:
-            raise InputError("expected --from beside --trained-by or --antialiased, which speak of its file, got none")
+        if asked != Foreign():
+            raise InputError(
+                "expected --from beside --trained-by, --antialiased, --opacity-reg or --scale-reg, which speak of its file, "
+                "got none"
+            )
         return plan, None
-    if any(key.startswith("render.") for key in assignments(options.set)):
+    changes = assignments(options.set)
+    if any(key.startswith("render.") for key in changes):
         raise InputError("expected --from, which brings its renderer, or --set render..., got both; leave one out")
-    names, foreign = tuple(split.train), is_foreign(options.from_)
-    said = {"trained_by": options.trained_by, "antialiased": options.antialiased or None}
-    asked = Foreign(options.scene, None, names, images=options.images, downscale=options.downscale, **said)
-    picture = out.with_name(f"{out.name}-mismatch.png")
-    found = open_checkpoint(options.from_, asked if foreign else Foreign(**said), picture)
+    regularized = [name for name in REGULARIZERS if getattr(asked, name) is not None]
+    if twice := [name for name in regularized if f"loss.{name}" in changes]:
+        raise InputError(f"expected --{twice[0].replace('_', '-')} or --set loss.{twice[0]}, got both; leave one out")
+    if is_foreign(options.from_):
+        place = {"scene": options.scene, "images": options.images, "downscale": options.downscale}
+        asked = replace(asked, train_list=tuple(split.train), **place)
+    found = open_checkpoint(options.from_, asked, out.with_name(f"{out.name}-mismatch.png"))
     world = found.scene
     scene = posed(scene, world.similarity, centred=world.centred)
     reference = replace(reference, similarity=world.similarity, centred=world.centred)
     theirs = found.training.config
-    loss = replace(config.loss, border=theirs.loss.border)
+    weights = {name: getattr(theirs.loss, name) for name in regularized}
+    loss = replace(config.loss, border=theirs.loss.border, **weights)
     return (scene, split, replace(config, render=theirs.render, loss=loss), reference), found.training.gaussians

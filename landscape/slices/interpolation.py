@@ -19,8 +19,7 @@ The error of the interpolant is judged by its predictions at n points drawn at r
 from math import inf
 
 import numpy as np
-from scipy.interpolate import RBFInterpolator
-from scipy.spatial.distance import cdist
+import scipy
 
 CONFIDENCE = 0.95
 TAIL = 1 / 16  # share of the errors that the tail is fitted to
@@ -54,7 +53,7 @@ class PlaneInterpolant:
 
         From the axes alone: the corners, then the middles of the quarters, ...
         """
-        distances, found = cdist(self._places, self._places[known]).min(axis=1), []
+        distances, found = scipy.spatial.distance.cdist(self._places, self._places[known]).min(axis=1), []
         for _ in range(min(count, int((~known).sum()))):
             found.append(int(distances.round(DIGITS).argmax()))
             step = np.hypot(*(self._places - self._places[found[-1]]).T)
@@ -78,7 +77,7 @@ class PlaneInterpolant:
             r[self._i, self._j], known[self._i, self._j] = 0.0, True
         if known.sum() < FEWEST_NODES:
             return np.zeros_like(r)
-        spline = RBFInterpolator(self._places[known.ravel()], r[known], kernel="cubic")
+        spline = scipy.interpolate.RBFInterpolator(self._places[known.ravel()], r[known], kernel="cubic")
         return spline(self._places).reshape(r.shape)
 
 

@@ -35,15 +35,16 @@ from splat.curvature.objective import SceneObjective
 from splat.render.sight import Sight, sight
 
 Values = dict[str, Float64[Tensor, " n"]]
-PER_UNIT = {"means": "1 / world unit²", "log_scales": "1", "quats": "1", "opacity_logits": "1 / logit²", "sh": "1"}
+PER_UNIT = {"means": "per world unit²", "log_scales": "", "quats": "", "opacity_logits": "per logit²", "sh": ""}
 WORDS = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "colour"}
 PREFIXES = ("", "gn_")
-MIXED = "1 / stored unit²"
+MIXED = "per stored unit²"
 
 
 @dataclass(frozen=True)
 class Field:
-    """What a field is, in words, and its unit.  scale: as a picture shows it; log: of positive numbers, signed: about 0."""
+    """What a field is, in words; its unit, empty where it has none; scale: as a picture shows it; log: of positive numbers,
+    signed: about 0."""
 
     words: str
     unit: str
@@ -53,19 +54,19 @@ class Field:
 OF_BLOCKS = {
     **{f"trace_{name}": Field(f"trace of {WORDS[name]}", unit, "signed") for name, unit in PER_UNIT.items()},
     "largest": Field("largest curvature", MIXED, "log"),
-    "log_det": Field("log-determinant", "ln", "linear"),
-    "rank": Field("rank of the block", "directions", "linear"),
-    "negative": Field("negative curvatures", "directions", "linear"),
+    "log_det": Field("log-determinant", "", "linear"),
+    "rank": Field("rank of the block", "", "linear"),
+    "negative": Field("negative curvatures of the block", "", "linear"),
     "depth": Field("curvature along the ray", PER_UNIT["means"], "signed"),
     "lateral": Field("curvature across the ray", PER_UNIT["means"], "signed"),
 }
 OF_VIEWS = {
-    "views": Field("views that see it", "views", "linear"),
-    "pixels": Field("pixels that see it", "px", "log"),
+    "views": Field("views that see it", "", "linear"),
+    "pixels": Field("pixels that see it", "", "log"),
     "weight": Field("weight in the images", "px", "log"),
-    "one_view": Field("share of its weight in one view", "share", "linear"),
+    "one_view": Field("share of its weight in one view", "", "linear"),
     "condition": Field("condition of its splat", "λ max / λ min", "log"),
-    "order_gap": Field("way along the ray to the next in front", "px", "log"),
+    "order_gap": Field("distance along the ray to the next in front", "px", "log"),
 }
 FIELDS = {
     **OF_BLOCKS,

@@ -31,6 +31,11 @@ class PerGaussianBlocks(Brief):
         self.geometry.add_(other.geometry)
         self.sh.add_(other.sh)
 
+    def add_diagonal(self, parts: Mapping[str, Float[Tensor, "n ..."]]) -> None:
+        """Add numbers of attributes in GEOMETRY_COLUMNS to the blocks' diagonals, in their place."""
+        for name, part in parts.items():
+            self.geometry.diagonal(dim1=1, dim2=2)[:, GEOMETRY_COLUMNS[name]] += part.view(len(part), -1)
+
     def apply(self, V: Float[Tensor, "p k"], gaussians: Gaussians) -> Float[Tensor, "p k"]:
         """B V of vectors over the parameters of these Gaussians."""
         rows, result = gaussians.blocks, torch.empty_like(V)

@@ -27,6 +27,8 @@ from landscape.errors import InputError
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.losses.cpu.loss import CpuLinearLoss
 from splat.losses.protocols import ViewLoss
+from splat.losses.reference import LossSettings
+from splat.losses.regularizers import Regularizers
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
@@ -45,7 +47,7 @@ VECTORS = 8  # at a time in a product: a wider block gains nothing more, because
 class LinearizedView:
     """A view's loss, linearised at its Gaussians: `.value`, `.image`, `.gradient`, `.jvp(U)`, `.vjp(G)`, `.hvp(U)`, `.ggn(U)`.
 
-    loss: of the view's images, from `losses.autograd.loss_against`.
+    loss: of the view's images, from `losses.autograd.loss_against`.  regularizers: of these Gaussians, a part of the loss.
     """
 
     def __init__(
@@ -55,8 +57,10 @@ class LinearizedView:
         loss: ViewLoss,
         background: Float[Tensor, "3"],
         settings: RenderSettings = RenderSettings(),
+        regularizers: Regularizers | None = None,
     ):
         self.gaussians = gaussians
+        self._regularizers = regularizers or Regularizers(gaussians, LossSettings(), len(gaussians))
         self._raster = rasterize_view(gaussians, camera, background, settings)
         self._loss, self._couples = loss.linearize(self._raster.planes), loss.couples_pixels
         self._adjoint = self._raster.backward(self._loss.gradient)
@@ -67,12 +71,12 @@ class LinearizedView:
 
     @property
     def value(self) -> float:
-        return self._loss.value
+        return self._loss.value + self._regularizers.value
 
     @property
     def gradient(self) -> Float[Tensor, " p"]:
         """Of the loss; worked out from its adjoint every time, so that a view that is kept does not hold p numbers more."""
-        return self._pulled([self._adjoint])[:, 0]
+        return self._regularizers.add_gradient(self._pulled([self._adjoint])[:, 0])
 
     @property
     def image(self) -> Float[Tensor, "3 h w"]:
@@ -129,7 +133,7 @@ class LinearizedView:
 
         On a GPU always True: to look would be to wait for the device.
         """
-        return self._projection.affects(U)
+        return self._projection.affects(U) or self._regularizers.affects(U)
 
     def jvp(self, U: Float[Tensor, "p k"]) -> Float[Tensor, "k 4 h w"]:
         """J U: tangents of colour and accumulated alpha."""
@@ -143,7 +147,7 @@ class LinearizedView:
         self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, coupled: bool = True
     ) -> Float[Tensor, "p k"]:
         """H U of the view's loss.  total: what it is added to.  coupled: False for the pixel-diagonal of l''."""
-        return self._projection.vjp(self._adjoint_tangent(U, coupled), U, total)
+        return self._regularizers.add_product(self._projection.vjp(self._adjoint_tangent(U, coupled), U, total), U)
 
     def ggn(
         self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, coupled: bool = True
@@ -181,6 +185,8 @@ class LinearizedView:
         for gauss_newton in parts:
             blocks = self._raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton) + coupled
             found.append(PerGaussianBlocks(*self._projection.blocks(blocks, not gauss_newton)))
+            if not gauss_newton:
+                found[-1].add_diagonal(self._regularizers.second)
         return found
 
     def loss_curvatures(self, U: Float[Tensor, "p k"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:

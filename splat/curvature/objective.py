@@ -1,11 +1,12 @@
 """The loss of a scene over a set of views, as a function of the Gaussians' stored parameters.
 
-    L(theta) = 1/M sum_m l(I_m(theta))
+    L(theta) = 1/M sum_m l(I_m(theta)) + R(theta)
 
 theta: the parameters of the active Gaussians, laid out like `Gaussians.flat`; I_m: the render of view m; l: the loss against
-its picture.  Parameters that L cannot depend on are removed and counted: Gaussians that touch no pixel of any view, and SH
-bands not in use.  Quaternions are brought to unit length: the image does not change, and the trace of their block of the
-Hessian, which scales with 1/|q|^2, gets a meaning.
+its picture; R: regularisers of opacities and scales, where there are any (`losses/regularizers.py`).  Parameters that no l can
+depend on are removed and counted: Gaussians that touch no pixel of any view, and SH bands not in use; their share of R is a
+constant.  Quaternions are brought to unit length: the image does not change, and the trace of their block of the Hessian, which
+scales with 1/|q|^2, gets a meaning.
 
 Processes can share the views (`landscape.Ranks`): every rank holds some views and all Gaussians.
 
@@ -32,6 +33,7 @@ from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import KeptViews, LinearizedView
 from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
+from splat.losses.regularizers import Regularizers
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.render.forward import background_of, rasterize_view, touches
@@ -142,6 +144,7 @@ class SceneObjective:
         if keep_unseen:
             self.mask = torch.ones_like(self.mask)
         self.active = used.select(self.mask)
+        self._unseen = Regularizers(used.select(~self.mask), loss_settings, len(gaussians)).value
         quats = self.active.quats
         quats /= quats.norm(dim=1, keepdim=True)
         self.counts = ActiveCounts(
@@ -208,7 +211,19 @@ class SceneObjective:
     def evaluate_view(self, index: int, gaussians: Gaussians) -> tuple[float, Hashable]:
         """(l, smooth piece) of one view of this rank, at finite Gaussians in place of the active ones."""
         raster = rasterize_view(gaussians, self.views[index].camera, self.background, self.settings, finite=True)
-        return self._losses[index].value(raster.planes), raster.draw_order
+        return self._losses[index].value(raster.planes) + self.regularizers(gaussians).value, raster.draw_order
+
+    def regularizers(self, gaussians: Gaussians) -> Regularizers:
+        """R at Gaussians in place of the active ones, of whose value those out of sight have their share."""
+        found = Regularizers(gaussians, self.loss_settings, self.counts.gaussians)
+        found.value += self._unseen
+        return found
+
+    @property
+    def loss_of_active(self) -> LossSettings:
+        """The loss as that of a scene of the active Gaussians alone: with their share in the means of R."""
+        share, loss = self.counts.active_gaussians / self.counts.gaussians, self.loss_settings
+        return replace(loss, opacity_reg=share * loss.opacity_reg, scale_reg=share * loss.scale_reg)
 
     def loss(self, flat: Float[Tensor, " p"]) -> float:
         """L alone, as of `evaluate`."""
@@ -247,8 +262,10 @@ class SceneObjective:
         It does not refer to this objective, which would otherwise be freed only when Python looks for circles.
         """
         cameras, losses = [view.camera for view in self.views], self._losses
-        background, settings = self.background, self.settings
-        return lambda index: LinearizedView(gaussians, cameras[index], losses[index], background, settings)
+        background, settings, regularizers = self.background, self.settings, self.regularizers(gaussians)
+        return lambda index: LinearizedView(
+            gaussians, cameras[index], losses[index], background, settings, regularizers
+        )
 
     @cached_property
     def losses(self) -> Float64[Tensor, " m"]:

@@ -12,6 +12,7 @@ Images are (3, h, w) in [0, 1].  Every loss is a mean over pixels and channels.
 """
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal
 
 import torch
@@ -34,6 +35,7 @@ class LossSettings:
 
     eps: Charbonnier's, in units of intensity.  literal: the pixel loss has the weight 1 instead of 1 - lambda.
     border: whether SSIM's windows may reach beyond the image.
+    opacity_reg, scale_reg: weights of the mean opacity and the mean scale, in the loss of a scene (`losses/regularizers.py`).
 
     >>> LossSettings("l2", ssim_weight=0.2).pixel_weight
     0.8
@@ -44,6 +46,8 @@ class LossSettings:
     eps: float = 0.01
     literal: bool = False
     border: Border = "padded"
+    opacity_reg: float = 0.0
+    scale_reg: float = 0.0
 
     def __post_init__(self) -> None:
         if self.pixel not in ("l1", "charbonnier", "l2"):
@@ -52,6 +56,10 @@ class LossSettings:
             raise InputError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
         if self.border not in ("padded", "valid"):
             raise InputError(f"expected the border 'padded' or 'valid', got {self.border!r}")
+        if not (0 <= self.opacity_reg < inf and 0 <= self.scale_reg < inf):
+            raise InputError(
+                f"expected opacity_reg and scale_reg of at least 0, got {self.opacity_reg} and {self.scale_reg}"
+            )
 
     @property
     def margin(self) -> int:

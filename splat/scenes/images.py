@@ -26,7 +26,7 @@ import pycolmap
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Float32
-from PIL import ImageOps
+from PIL import Image, ImageOps
 from torch import Tensor
 
 from landscape.errors import InputError
@@ -40,8 +40,15 @@ RADIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 UNDISTORTED_HERE = (
     *RADIAL_MODELS, "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FOV", "THIN_PRISM_FISHEYE"
 )  # fmt: skip
-SIXTEEN_BITS = ("I;16", "I;16B", "I;16L")  # modes of a grey picture; Pillow reads coloured ones with 8
-EXIF_ORIENTATION, QUARTER_TURNS = 0x0112, (5, 6, 7, 8)
+SIXTEEN_BITS = ("I;16", "I;16B", "I;16L")  # modes of a grey picture; Pillow reads coloured ones with 8 bits
+STORED = {"RGB;16B": "rgb", "RGBA;16B": "rgba"}  # of a PNG's colours of 16 bits, in Pillow's words and kornia_rs's
+TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {  # by EXIF orientation
+    5: lambda pixels: pixels.swapaxes(0, 1),
+    6: lambda pixels: np.rot90(pixels, 3),
+    7: lambda pixels: np.rot90(pixels.swapaxes(0, 1), 2),
+    8: np.rot90,
+}
+EXIF_ORIENTATION = 0x0112
 LARGEST_SIDE = 2**31 - 1  # px; COLMAP counts them in 32 bits
 SMALLEST = 4  # px a side of a reduced picture; a smaller one comes from a mistyped factor
 LARGEST_DISPLACEMENT = 2  # of a corner, in half diagonals; the strongest lenses stay below 1
@@ -109,6 +116,9 @@ def image_header(path: Path) -> tuple[tuple[int, int], bool]:
 def image_pixels(path: Path, turned: bool = False) -> Float32[np.ndarray, "h w c"]:
     """Red, green, blue, and alpha where the image has it, from 0 to 1.  turned: as its EXIF orientation says."""
     with opened_image(path) as file:
+        if channels := _colours_of_sixteen_bits(file):
+            pixels = _sixteen_bits(path, channels)
+            return np.ascontiguousarray(TURNS[file.getexif()[EXIF_ORIENTATION]](pixels)) if turned else pixels
         image = ImageOps.exif_transpose(file) if turned else file
         if image.mode in SIXTEEN_BITS:
             grey = np.array(image).astype(np.float32) / np.float32(2**16 - 1)
@@ -116,10 +126,26 @@ def image_pixels(path: Path, turned: bool = False) -> Float32[np.ndarray, "h w c
         return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB")).astype(np.float32) / 255
 
 
+def _colours_of_sixteen_bits(file: Image.Image) -> str | None:
+    """rgb or rgba of a PNG that has 16 bits of each colour, of which Pillow would keep 8."""
+    stored = [STORED.get(str(tile.args)) for tile in getattr(file, "tile", ())] if file.format == "PNG" else []
+    return stored[0] if stored and "transparency" not in file.info else None
+
+
+def _sixteen_bits(path: Path, channels: str) -> Float32[np.ndarray, "h w c"]:
+    from kornia_rs.io import read_image_png_u16  # its own, of few pictures
+
+    try:
+        pixels = np.asarray(read_image_png_u16(str(path), channels))
+    except Exception as error:  # of no other type
+        raise InputError(f"expected an image, cannot read {path}: {error}; replace the file") from error
+    return pixels.astype(np.float32) / np.float32(2**16 - 1)
+
+
 def _quarter_turned(path: Path) -> bool:
     """Whether the EXIF orientation of an image file turns it by a right angle."""
     with opened_image(path) as file:
-        return file.getexif().get(EXIF_ORIENTATION) in QUARTER_TURNS
+        return file.getexif().get(EXIF_ORIENTATION) in TURNS
 
 
 def checked_lens(model: str, size: tuple[float, float], params: Sequence[float], name: str) -> pycolmap.Camera:
@@ -134,7 +160,7 @@ def checked_lens(model: str, size: tuple[float, float], params: Sequence[float],
 
 def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Frame:
     """The final camera of a photograph, and how to read it.  ValueError where file and lens cannot belong together."""
-    size, _ = image_header(photo.path)
+    size, transparent = image_header(photo.path)
     stored, across = (photo.lens.width, photo.lens.height), (size[1], size[0])
     turned = not _same_shape(stored, size) and _same_shape(stored, across) and _quarter_turned(photo.path)
     size = across if turned else size
@@ -154,7 +180,9 @@ def frame(photo: Photo, downscale: float, background: Float[Tensor, "3"]) -> Fra
     camera = full.resized(width, height)
     warp = partial(_warp, lens, pinhole, (width, height))
     view = partial(_view, photo, turned, camera, warp, background)
-    return Frame(photo.name, camera, view, photo.subset, photo.depth_range, photo.path)
+    layers = {"alpha": transparent, "mask": photo.mask, "depth": photo.depth}
+    named = frozenset(name for name, there in layers.items() if there)
+    return Frame(photo.name, camera, view, photo.subset, photo.depth_range, photo.path, named)
 
 
 def _scaled_to(lens: pycolmap.Camera, size: tuple[int, int], photo: Photo) -> pycolmap.Camera:

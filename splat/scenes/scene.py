@@ -23,6 +23,7 @@ from torch import Tensor
 
 from landscape.errors import InputError
 from landscape.results import Brief
+from splat.backend.memory import free_memory
 from splat.model.camera import Camera
 from splat.scenes.formats.colmap import MODEL_FOLDERS, find_model, read_colmap
 from splat.scenes.formats.dtu import is_dtu, mask_folder, read_dtu
@@ -30,8 +31,9 @@ from splat.scenes.formats.llff import POSES, read_llff
 from splat.scenes.formats.transforms import BLENDER_FILES, SINGLE_FILE, read_blender, read_transforms
 from splat.scenes.images import Photo, frame, image_header, require_files
 from splat.scenes.layers import DEPTH_SUFFIXES, MASK_FOLDERS, MASK_SUFFIXES, find_layer
-from splat.scenes.view import Frame, Points, View
+from splat.scenes.view import Frame, Photograph, Points, Shelf, View
 
+PICTURES = 0.25  # of the free memory
 Kind = Literal["colmap", "llff", "blender", "transforms", "dtu", "synthetic"]
 
 
@@ -66,10 +68,19 @@ class Scene(Brief):
         return [by_name[name] for name in names]
 
     def load(self, names: Sequence[str] | None = None) -> list[View]:
-        """Read the pictures of these frames (all by default), several at a time."""
+        """Read the pictures of these frames (all by default), several at a time.
+
+        Where they take more than a share of the free memory, the last ones used stay in it, and others are read when they are.
+        """
         frames = self.frames if names is None else self.select(names)
+        room = int(PICTURES * free_memory(torch.device("cpu")))
+        shelf = Shelf(room) if sum(frame.bytes for frame in frames) > room else None
         with ThreadPoolExecutor(max(1, min(len(frames), torch.get_num_threads()))) as readers:
-            return list(readers.map(lambda frame: frame.view(), frames))
+            if shelf is None:
+                return list(readers.map(lambda frame: frame.view(), frames))
+            first = room // max(frame.bytes for frame in frames)
+            list(readers.map(shelf.view, frames[:first]))
+        return [Photograph(frame, shelf) for frame in frames]
 
     def extent(self, names: Sequence[str] | None = None) -> float:
         """`camera_extent` of these frames (all by default)."""

@@ -2,17 +2,20 @@
 
     View    a camera with its picture, as training and evaluation use it
     Frame   a camera whose picture is read from disk by `view()`; camera and size are already final
+    Shelf   as many views of frames as there is room for, the others as `Photograph`s: views that are read when they are used
     Points  coloured points of the scene, from structure from motion or a scanner, and the images that see each of them
 
 Pictures are (3, h, w) float32 in [0, 1], in the encoding of the file (no linearisation), composited over the scene's
 background where the file has an alpha channel.  World units and axes are those of the scene's files.
 """
 
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
-from typing import Literal
+from threading import Lock
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -53,6 +56,10 @@ class View(Brief):
                 f"{tuple(self.image.shape)}; resize the picture, or the camera with Camera.resized"
             )
 
+    def with_image(self, image: Float[Tensor, "3 h w"]) -> "View":
+        """The same view of another picture."""
+        return View(self.name, self.camera, image, self.alpha, self.mask, self.depth)
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -60,6 +67,7 @@ class Frame:
 
     subset: the part that the scene's own files assign it to.  depth_range: nearest and farthest depth of the scene
     content, world units.  None where the files do not say.  path: of the picture, None where it is not on disk.
+    layers: which of alpha, mask and depth its view has.
     """
 
     name: str
@@ -68,6 +76,45 @@ class Frame:
     subset: Subset | None = None
     depth_range: tuple[float, float] | None = None
     path: Path | None = None
+    layers: frozenset[str] = frozenset()
+
+    @property
+    def bytes(self) -> int:
+        """Of the view's numbers, about."""
+        return (3 + len(self.layers)) * self.camera.width * self.camera.height * torch.float32.itemsize
+
+
+class Shelf:
+    """Views of frames, of which those that were used last stay in memory: as many as fit into so many bytes, at least one."""
+
+    def __init__(self, memory: int):
+        self._memory, self._kept, self._lock = memory, OrderedDict[Frame, View](), Lock()
+
+    def view(self, frame: Frame) -> View:
+        with self._lock:
+            if frame in self._kept:
+                self._kept.move_to_end(frame)
+                return self._kept[frame]
+        found = frame.view()
+        with self._lock:
+            self._kept[frame] = found
+            while len(self._kept) > 1 and sum(each.bytes for each in self._kept) > self._memory:
+                self._kept.popitem(last=False)
+        return found
+
+
+class Photograph(View):
+    """A view of a shelf: its picture and what belongs to it are read when they are used, and may be read again."""
+
+    def __init__(self, frame: Frame, shelf: Shelf):
+        for name, value in {"name": frame.name, "camera": frame.camera, "_frame": frame, "_shelf": shelf}.items():
+            object.__setattr__(self, name, value)
+
+    def __getattribute__(self, name: str) -> Any:
+        if name not in ("image", "alpha", "mask", "depth"):
+            return object.__getattribute__(self, name)
+        frame: Frame = self._frame  # pyright: ignore[reportAttributeAccessIssue]
+        return getattr(self._shelf.view(frame), name) if name == "image" or name in frame.layers else None  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def digests(frames: Sequence[Frame]) -> list[str] | None:

@@ -43,6 +43,8 @@ KIND = "expected a checkpoint written by landscape train"
 LATER = {
     "protocol",
     "loss.border",
+    "loss.opacity_reg",
+    "loss.scale_reg",
     "clamp_image",
     "rates.position_hold",
     "densify.split_distance",

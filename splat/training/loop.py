@@ -28,7 +28,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
-from splat.render.loss_and_gradient import loss_and_gradient
 from splat.scenes.view import View
 from splat.training.state import Step, Training
 
@@ -76,18 +75,20 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
     """
     prepare(training, views)
     config, method, dtype = training.config, training.method, training.gaussians.flat.dtype
-    losses = [config.loss_against(view.image, training.gaussians.flat) for view in views]
+    loss_of = config.losses_against(views, training.gaussians.flat)
     cameras = [view.camera for view in views]
     while training.step < config.iterations:
         # what the step is about: a view, a background, the loss against that view
         number = training.step + 1
         training.raise_sh_degree(min(config.sh_degree, (number - 1) // config.sh_degree_every))
         chosen = training.next_view(len(views))
-        view, background, loss = views[chosen], config.background_colour(dtype), losses[chosen]
+        view, background = views[chosen], config.background_colour(dtype)
         if config.random_background:
             drawn = torch.rand(3, generator=training.generator, dtype=dtype)
             target = with_background(view, background, drawn)
             background, loss = drawn, config.loss_against(target, training.gaussians.flat)
+        else:
+            loss = loss_of(chosen)
         step = Step(number, training, training.gaussians, views, chosen, background, loss)
 
         value = method.own_step(step)
@@ -101,10 +102,10 @@ def train(training: Training, views: Sequence[View]) -> Iterator[StepResult]:
 
 def photometric_step(step: Step) -> float:
     """A step of 3DGS on the sampled view, with what the method adds; the loss before it."""
-    training, config, method = step.training, step.config, step.training.method
-    # the photometric gradient, and what the method makes of it
+    training, method = step.training, step.training.method
+    # the gradient of the loss, and what the method makes of it
     scale = method.opacity_scale(step)
-    base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background, config.render, scale)
+    base = step.loss_and_gradient(step.gaussians, scale)
     _require_finite("loss", base.loss, step)
     found = method.gradient(step, base)
     _require_finite("gradient", float(found.gradient.sum()), step)

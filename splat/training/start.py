@@ -36,7 +36,6 @@ from splat.model.capture import common_target
 from splat.model.gaussians import Gaussians
 from splat.model.harmonics import Y00
 from splat.scenes.scene import Scene
-from splat.scenes.sfm.plane_sweep import dense_points
 from splat.scenes.sfm.triangulation import triangulated_points
 from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
 
@@ -77,6 +76,8 @@ def initial_gaussians(
         return gaussians_from_points(scene.points, views, sh_degree)
     ranges = depth_ranges(views, [frame.depth_range for frame in scene.select([view.name for view in views])])
     if source == "dense":
+        from splat.scenes.sfm.plane_sweep import dense_points  # a fifth of a second of imports
+
         return gaussians_from_points(dense_points(views, [near for near, _ in ranges]), views, sh_degree)
     points = points_in_common_volume(views, random_points, generator, ranges)
     return gaussians_from_points(points, views, sh_degree)

@@ -7,8 +7,9 @@ Step                           one step: its number, its view, its loss
 The loop (`splat/training/loop.py`) makes the steps; a checkpoint (`splat/training/checkpoint.py`) holds all of it.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
@@ -19,21 +20,24 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
 from landscape.results import Brief
+from splat.backend.memory import free_memory
 from splat.curvature.objective import SceneObjective
 from splat.losses.autograd import Clamped, loss_against
 from splat.losses.protocols import ViewLoss
 from splat.losses.reference import LossSettings
+from splat.losses.regularizers import Regularizers
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
 from splat.model.typed import Count, Length, NonNegative, Positive, Settings, Share, typed
 from splat.projection.antialias import sampling_widths
-from splat.render.loss_and_gradient import LossAndGradient
+from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
 from splat.scenes.view import View
 from splat.training.densify import Densified, DensifySettings, ScreenGradients, densify, reset_opacities
 from splat.training.optim.adam import Adam
 
 FILTER_EVERY = 100  # steps
+LOSS_PLANES, LOSSES = 9, 0.25  # of a target and its moments; a share of the free memory
 Protocol = Literal["common", "llff"]
 Row = dict[str, Count | float | bool | str]  # of a history
 
@@ -56,6 +60,14 @@ class Step:
     @property
     def config(self) -> "TrainConfig":
         return self.training.config
+
+    def loss_and_gradient(
+        self, gaussians: Gaussians, opacity_scale: Float[Tensor, " n"] | None = None
+    ) -> LossAndGradient:
+        """Of the sampled view, with the regularisers, at these Gaussians.  opacity_scale: see `render`."""
+        found = loss_and_gradient(gaussians, self.camera, self.loss, self.background, self.config.render, opacity_scale)
+        regularizers = Regularizers(gaussians, self.config.loss, len(gaussians))
+        return replace(found, loss=found.loss + regularizers.value, gradient=regularizers.add_gradient(found.gradient))
 
     @property
     def camera(self) -> Camera:
@@ -219,6 +231,12 @@ class TrainConfig(Settings):
         """The loss that a step descends, against a view's image; like: see `loss_against`."""
         loss = loss_against(image, self.loss, like)
         return Clamped(loss) if self.clamp_image else loss
+
+    def losses_against(self, views: Sequence[View], like: Tensor) -> Callable[[int], ViewLoss | Clamped]:
+        """The same of the view of an index, where those that were used last are kept: as many as have room."""
+        each = LOSS_PLANES * like.element_size() * max(view.camera.width * view.camera.height for view in views)
+        most = max(1, int(LOSSES * free_memory(like.device)) // each)
+        return lru_cache(min(most, len(views)))(lambda index: self.loss_against(views[index].image, like))
 
     def objective(
         self, gaussians: Gaussians, views: Sequence[View], *, keep_unseen: bool = False, ranks: Ranks = ALONE

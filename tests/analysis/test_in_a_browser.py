@@ -1,15 +1,19 @@
 """The pages in a real browser: the report and `landscape view`, driven as a user drives them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from analysis.commands import view
 from analysis.commands.map.command import measured_fields
 from analysis.commands.map.pictures import rendered
+from analysis.commands.view import viewer as view
+from analysis.commands.view.page import offline_page
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from tests.analysis.records.test_report import with_views
@@ -58,7 +62,7 @@ def test_the_wheel_scrolls_the_page_until_the_surface_was_clicked(browser, tmp_p
     assert browser.execute_script("return window.scrollY") == before
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def viewer() -> Iterator[view.Viewer]:
     viser = pytest.importorskip("viser", reason="needs viser; pip install -e '.[view]'")
     made = synthetic_scene(SyntheticSettings(gaussians=150, views=2, width=32, height=24))
@@ -83,16 +87,51 @@ def test_a_click_a_field_and_a_step_reach_the_viewer(browser, viewer):
     until(browser, "/Gaussian \\d+, \\d+% of this pixel/.test(document.body.innerText)")
     assert "largest curvature" in viewer.numbers.content
     field = next(
-        each for each in browser.find_elements("tag name", "input") if each.get_attribute("value") == "largest"
+        each for each in browser.find_elements("tag name", "input") if "largest" in each.get_attribute("value")
     )
     field.click()
     field.send_keys("\ue009a")  # all of it
     field.send_keys("condition", "\ue015", "\ue007")  # the first of what is left, by the arrow down and Enter
     until(browser, "document.body.innerText.includes('condition of its splat')")
-    assert viewer.field.value == "condition"
+    assert viewer.names[viewer.field.value] == "condition"
     browser.find_elements("css selector", "[role=slider]")[-1].send_keys("\ue010")  # to the end
     (direction, reach), active = viewer.steps["e₁"], viewer.objective.active
     there = active.with_flat(active.flat + reach * direction)
     until(browser, f"document.body.innerText.includes('loss {view.quantity(viewer.objective.loss(there.flat))}')")
     image = view.in_bytes(rendered(viewer.objective, 0, there))
     assert (viewer.render.image == image.transpose(1, 2, 0)).all()
+
+
+def test_the_page_of_the_splats_needs_no_network_and_switches_colours(browser, viewer, tmp_path):
+    path = tmp_path / "view.html"
+    path.write_text(offline_page(viewer, "condition"), encoding="utf-8")
+    requests_of(browser)
+    errors_in(browser)
+    browser.set_network_conditions(offline=True, latency=0, throughput=0)
+    browser.get(path.as_uri())
+    shown = splats_of(browser, lambda _: True)
+    assert "λ max / λ min" in browser.find_element("id", "legend").text
+    keys_to(browser, "#fields select", "appearance")
+    splats_of(browser, lambda pixels: apart(pixels, shown) > 3)
+    assert browser.find_element("id", "legend").text == ""
+    keys_to(browser, "#fields select", "condition")
+    splats_of(browser, lambda pixels: apart(pixels, shown) < 0.5)
+    assert requests_of(browser) == [path.as_uri()]
+    assert [error for error in errors_in(browser) if "Computed radius is NaN" not in error] == []  # viser's own
+    browser.delete_network_conditions()
+
+
+def splats_of(browser: Any, condition: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """The picture of the splats once they are drawn, and a condition holds."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    def drawn(_: Any) -> list[np.ndarray]:
+        image = Image.open(BytesIO(browser.find_element("tag name", "canvas").screenshot_as_png)).convert("RGB")
+        pixels = np.asarray(image, float)[:, image.width // 2 :]  # beside the panel
+        return [pixels] if len(image.getcolors(2**24) or []) > 2000 and condition(pixels) else []
+
+    return WebDriverWait(browser, 60, 0.5).until(drawn)[0]
+
+
+def apart(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.abs(one - other).mean())

@@ -31,14 +31,15 @@ def two_views(width: int = 30, height: int = 22) -> list[View]:
 def mean_loss(
     gaussians: Gaussians, views: Sequence[View], loss: LossSettings, settings: RenderSettings = RenderSettings()
 ) -> Tensor:
-    """The specification's loss of the views."""
+    """The specification's loss of the views, with its regularisers of all the Gaussians."""
     losses = [
         photometric_loss(
             render(gaussians, view.camera, BACKGROUND, settings, backend="reference").image, view.image.double(), loss
         )
         for view in views
     ]
-    return torch.stack(losses).mean()
+    opacity, scale = gaussians.opacity_logits.sigmoid().mean(), gaussians.log_scales.exp().mean()
+    return torch.stack(losses).mean() + loss.opacity_reg * opacity + loss.scale_reg * scale
 
 
 def gradient_and_products(

@@ -1,8 +1,8 @@
 """Cases of the accuracy study: operators with known traces, spectrum and diagonal, and the cost of their products.
 
-    splats      the Hessian of a small synthetic scene, made dense in float64: the truth is its eigendecomposition.  Methods see
-                the same matrix in float32, and every product costs what the scene's own product with as many vectors took.
-                Only `exact_traces`, which needs more than products, and the comparison of precisions run on the scene itself.
+    splats      the Hessian of a small synthetic scene, made dense in float64: the truth is its eigendecomposition.  Methods are
+                given the same matrix in float32, and charged for a product what the scene's kernels take for it.  Only
+                `exact_traces`, which needs more than products, and the comparison of precisions run on the scene itself.
     matrices    random eigenvectors, prescribed eigenvalues
     checkpoint  a trained scene, with a converged long run as truth (`accuracy_checkpoint`)
 
@@ -110,10 +110,10 @@ class Case:
 
 
 class MeteredOperator:
-    """H itself; counts what is applied and what that costs.
+    """The operator of a case, with counts of its use.
 
-    matvecs: vectors applied, and whatever was charged; seconds: in products, at the case's price where there is one;
-    spent: in products, by the clock.
+    matvecs: vectors applied, and whatever was charged.  seconds: that the products cost, at the case's price where it has one;
+    spent: that they took here, by the clock.
     """
 
     def __init__(self, case: Case) -> None:

@@ -4,9 +4,9 @@
     ends      Lanczos to a residual of FINE
     sums      quadrature with STARTS x STEPS products
 
-OUT/truth.json belongs to one checkpoint at one size of its pictures; for another it is computed anew.  The truth of the sums
-has an error of a few percent (half its brackets); estimates that are better than that cannot be told apart.  The diagonal
-is left out: nothing but as many products as rows gives it.
+OUT/truth.json belongs to one checkpoint at one size of its pictures; for another it is computed anew.  The truth of the sums is
+known to half its brackets, a few percent; estimates that are better than that cannot be told apart.  There is no truth of the
+diagonal, which would take a product for every row.
 """
 
 import hashlib

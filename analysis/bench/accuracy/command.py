@@ -11,13 +11,17 @@ Errors are shares of a scale: of the sum of |H_ii| over the block (traces), of |
 over the spectrum; of the larger end where an end is zero).  Errors below the round-off of the products count as that.
 Matvecs and seconds are those of all parts of a quantity together.
 
-**At equal true error.**  The default's error e over all seeds, and its mean matvecs; a rival's matvecs at the error e are
-read from the polygon through its settings (logarithmic axes), each with the largest error of its own and of the costlier ones:
-a setting that is better than others of four times its work is so by chance, or on this matrix, and nobody would have stopped
-there who did not know the truth.  An estimator that several packages have alike is one rival: the luckiest of them would need
-less than it does.  The interval of the ratio is a bootstrap over seeds.  An end of the polygon gives a bound.  What is asked
-holds ("yes") where the whole interval is below it, "no" where all of it is above, and is "open" otherwise.  Peers without a
-stopping rule are given the right budget, as an oracle would.
+**At equal true error.**  A ratio is the default's mean matvecs over those that a rival needs for the same error e, that of the
+default over all seeds.
+
+- A rival's settings make a polygon of error over matvecs, on logarithmic axes, in which its matvecs at e are read.  A setting
+  counts with the largest error of its own and of the costlier ones: where it is better than one of more work, it is so by
+  chance, and nobody who does not know the truth would have stopped there.
+- Beyond either end of the polygon the ratio is a bound, "≤" or "≥".
+- An estimator that several packages have alike is one rival: the luckiest of equals would seem better than any is.
+- Peers without a stopping rule are given the budget that suits e, which their users cannot know.
+- The interval of the ratio is a bootstrap over seeds.  What is asked holds ("yes") where the whole interval is below it, does
+  not ("no") where all of it is above, and is "open" otherwise.
 """
 
 from collections.abc import Iterator, Sequence

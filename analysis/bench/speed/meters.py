@@ -17,8 +17,8 @@ import torch
 from analysis.bench.speed.timing import interleaved, wall_clock
 
 COPIED = 1 << 28  # bytes of each of the two arrays of a copy: five times an H200's second-level cache
-ROWS = {"cpu": 2048, "cuda": 8192}  # of the matrices that are multiplied
-REPETITIONS = 7  # of the calls that measure a ceiling
+ROWS = {"cpu": 768, "cuda": 8192}  # of matrices: a product takes milliseconds, as long calls are disturbed
+REPETITIONS = 20  # of the calls that measure a ceiling
 
 
 class Meter(Protocol):

@@ -14,6 +14,7 @@ in the images.
 """
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -23,7 +24,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from analysis.commands.map.files import coloured_ply, fields_ply, top_table
+from analysis.commands.map.files import coloured_ply, csv_text, fields_ply, top_table
 from analysis.commands.map.pictures import error_shade, view_maps, write_maps
 from analysis.commands.options import MapOptions
 from analysis.console.drawing import Draw
@@ -36,10 +37,11 @@ from analysis.probe.record import provenance_of
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import Shade, quantity
 from analysis.records.records import record_folder, require_replaceable
-from analysis.records.run_files import MAP, MapRecord, Panel, Steepest
+from analysis.records.run_files import MAP, Fragility, MapRecord, Panel, Steepest
 from analysis.slice.directions import recorded_probe
 from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
+from splat.backend.cpu.threads import single_threaded
 from splat.curvature.fields import FIELDS, Field, Values, scene_fields
 from splat.curvature.objective import SceneObjective
 from splat.render.sight import Sight
@@ -85,7 +87,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         objective = scene_objective(checkpoint, scene)
         chosen = _chosen(options.draw, objective.views)
-    with record_folder(out, MapRecord) as folder, stages:
+    with record_folder(out, MapRecord) as folder, stages, ThreadPoolExecutor(1) as beside:
         with stages.stage("fields") as report:
             found = measured_fields(objective, options.checkpoint.parent / PROBE, notes, report)
         if options.shown not in found.values:
@@ -93,12 +95,10 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
                 f"expected a probe with eigenvectors of this checkpoint in {options.checkpoint.parent / 'probe'} for "
                 f"--field {options.shown}, got none; run landscape probe first"
             )
+        swapping = beside.submit(_fragility, objective, found, options.seed)  # no stage fills two processors by itself
         with stages.stage("maps") as report:
             shades = {name: found.shade(name) for name in dict.fromkeys((options.shown, *AXES))}
             panels = _write_panels(folder, objective, found, shades, chosen, report)
-        with stages.stage("fragility") as report:
-            generator = torch.Generator().manual_seed(options.seed)
-            fragile = fragility(objective, found.values, found.sights, generator, report)
         with stages.stage("steepest") as report:
             shown = _write_ends(folder, objective, found, report)
         shade, gaussians = shades[options.shown], checkpoint.training.gaussians
@@ -107,7 +107,9 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
             coloured = coloured_ply(gaussians, objective.mask, shade, found.values[options.shown])
             (folder / f"{options.shown}.ply").write_bytes(coloured)
             top = top_table(objective, found.values, options.shown)
-            (folder / "top.csv").write_text(top.to_csv(index=False, float_format="%.6g"), encoding="utf-8")
+            (folder / "top.csv").write_text(csv_text(top), encoding="utf-8")
+        with stages.stage("fragility"):
+            fragile = swapping.result()
         made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
         data = MapRecord(
             gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
@@ -123,7 +125,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         from analysis.records.report import write_report  # a quarter of a second of imports
 
         write_report(options.checkpoint.parent / PROBE)  # its page has the map's pictures too
-    _conclude(data, top.iloc[0].to_dict(), found.kinds[options.shown], out)
+    _conclude(data, {name: column[0] for name, column in top.items()}, found.kinds[options.shown], out)
     return 0
 
 
@@ -155,8 +157,14 @@ def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], re
                     ENDS[name][len("share of ") :], title, torch.from_numpy(vectors[group][:, 0]), end.value
                 )
                 values[name] = masses(ends[name].vector, objective.active)
-                kinds[name] = Field(ENDS[name], "share", "log")
+                kinds[name] = Field(ENDS[name], "", "log")
     return Fields(values, kinds, ends, sights)
+
+
+def _fragility(objective: SceneObjective, found: Fields, seed: int) -> Fragility:
+    with single_threaded():
+        generator = torch.Generator().manual_seed(seed)
+        return fragility(objective, found.values, found.sights, generator, lambda *_: None)
 
 
 def _write_panels(
@@ -207,14 +215,13 @@ def _write(folder: Path, data: MapRecord) -> None:
 
 def _conclude(data: MapRecord, first: Mapping[str, Any], kind: Field, out: Path) -> None:
     say = Console().print
-    unit = f" {kind.unit}" if kind.unit not in ("share", "1") else ""
     say(f"{data.seen:,} of {data.gaussians:,} Gaussians are in sight", **SAID)
     for text in data.sentences:
         say(text, **SAID)
     if not data.steepest:
         say("for the Gaussians that carry the steepest directions: landscape probe, then map again", **SAID)
     say(
-        f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {quantity(float(first[data.field]))}{unit}",
+        f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {quantity(float(first[data.field]))} {kind.unit}",
         **SAID,
     )
     for note in data.notes:

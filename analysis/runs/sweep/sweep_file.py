@@ -25,11 +25,12 @@ all of the first seed come before those of the second, so that a sweep that is s
 
 import re
 import tomllib
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from analysis.console.options import TrainerOptions
 from analysis.console.overrides import leaves, read_value
 from analysis.probe.options import ProbeOptions
 from analysis.train.options import TrainOptions
@@ -40,7 +41,12 @@ from splat.training.methods.protocols import presets
 FOLDER_NAME = re.compile(r"[\w+-][\w.+ -]*")
 OF_THE_SWEEP = {"scene", "out", "seed", "resume", "method", "set"}  # options of train that have a place of their own
 OF_THE_CELL = {"checkpoint", "out", "scene", "foreign"}  # options of probe that the cell decides
-TRAINING = {name.strip("_"): hint for name, hint in get_type_hints(TrainOptions).items() if name not in OF_THE_SWEEP}
+TRAINER = get_type_hints(TrainerOptions)
+TRAINING = {
+    name.strip("_"): hint
+    for name, hint in (get_type_hints(TrainOptions) | TRAINER).items()
+    if name not in OF_THE_SWEEP | {"foreign"}
+}
 PROBING = {name: hint for name, hint in get_type_hints(ProbeOptions).items() if name not in OF_THE_CELL}
 TOP = {"out": Path, "seeds": tuple[int, ...]}
 SCENE, METHOD = {"path": Path}, {"method": str}
@@ -132,8 +138,10 @@ def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -
 def _options(options: Mapping[str, Any], seed: int, out: Path) -> TrainOptions:
     """Of a cell; {seed} in the checkpoint that it starts from is its seed."""
     start = options.get("from")
-    rest = {name: value for name, value in options.items() if name != "from"}
-    return TrainOptions(**rest, seed=seed, out=out, from_=start and Path(str(start).replace("{seed}", str(seed))))
+    foreign = TrainerOptions(**{name: value for name, value in options.items() if name in TRAINER})
+    rest = {name: value for name, value in options.items() if name not in {"from", *TRAINER}}
+    source = start and Path(str(start).replace("{seed}", str(seed)))
+    return TrainOptions(**rest, foreign=foreign, seed=seed, out=out, from_=source)
 
 
 def _probe(table: Any, file: Path) -> ProbeOptions:
@@ -206,10 +214,17 @@ def arguments(command: str, options: TrainOptions | ProbeOptions) -> list[str]:
     ['train', 'fern', '--out', 'runs/fern', '--set', 'gamma=0.5', '--no-densify']
     """
     positional, *named = fields(options)
-    words = [command, str(getattr(options, positional.name))]
+    return [command, str(getattr(options, positional.name)), *_words(options, named)]
+
+
+def _words(options: Any, named: Sequence[Field]) -> list[str]:
+    words = []
     for field in named:
         value = getattr(options, field.name)
         option = field.name.strip("_").replace("_", "-")
+        if is_dataclass(value):
+            words += _words(value, fields(value))
+            continue
         if value == (field.default if field.default_factory is MISSING else field.default_factory()):
             continue
         if isinstance(value, bool):

@@ -6,6 +6,7 @@ import re
 import zipfile
 import zlib
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,19 @@ from splat.model.untrusted import require_modest
 
 ZIP_MAGIC, LICHTFELD = b"PK\x03\x04", (b"LFKP", b"PKFL")
 LONGEST_SETTINGS = 1 << 16
-ANTIALIASED = (  # of gsplat's and nerfstudio's settings, in the folder above that of the checkpoint
-    ("cfg.yml", re.compile(rb"^antialiased: true\s*$", re.M)),
-    ("config.yml", re.compile(rb"^\s+rasterize_mode: antialiased\s*$", re.M)),
-)
+SETTINGS = {  # of gsplat and nerfstudio: names in the file in the folder above that of the checkpoint, and here
+    "cfg.yml": {name: name for name in ("antialiased", "ssim_lambda", "opacity_reg", "scale_reg")},
+    "config.yml": {
+        "rasterize_mode": "antialiased",
+        "ssim_lambda": "ssim_lambda",
+        "mcmc_opacity_reg": "opacity_reg",
+        "mcmc_scale_reg": "scale_reg",
+        "strategy": "strategy",
+        "use_scale_regularization": "use_scale_regularization",
+    },
+}
+LINE = re.compile(r"^( *)(\w+): ([\w.+-]+) *$", re.M)
+WORDS: dict[str, Any] = {"true": True, "false": False, "antialiased": True, "classic": False}
 KINDS = "PLY, a checkpoint of graphdeco, gsplat or nerfstudio, .splat, compressed PLY, .spz or .sog"
 
 
@@ -86,8 +96,8 @@ def _with_settings(found: SplatFile, path: Path) -> SplatFile:
     model = path.resolve().parents[2] if parts[-3:-2] == ("point_cloud",) else path.resolve().parent
     settings = read_cfg_args(model / "cfg_args") if found.format in ("PLY", "graphdeco checkpoint") else {}
     if not settings:
-        said = any(_says(path.resolve().parents[1] / name, line) for name, line in ANTIALIASED)
-        return replace(found, antialiased=found.antialiased or said)
+        settings = read_yaml_lines(path.resolve().parents[1])
+        return replace(found, antialiased=found.antialiased or settings.get("antialiased") is True, settings=settings)
     step = found.step
     if step is None and parts[-2].removeprefix("iteration_").isdigit():
         step = int(parts[-2].removeprefix("iteration_")[:9])
@@ -100,9 +110,32 @@ def _with_settings(found: SplatFile, path: Path) -> SplatFile:
     )
 
 
-def _says(path: Path, line: re.Pattern[bytes]) -> bool:
-    """Whether a file of settings has this line.  It is YAML with tags that would make Python objects, so it is not parsed."""
-    return path.is_file() and path.stat().st_size <= LONGEST_SETTINGS and bool(line.search(path.read_bytes()))
+def read_yaml_lines(folder: Path) -> dict[str, Any]:
+    """What SETTINGS names of the files in a folder: numbers, true or false, and words.
+
+    They are YAML with tags that would make Python objects, so that single lines are read and nothing is parsed; those of gsplat
+    are not indented.
+    """
+    found: dict[str, Any] = {}
+    for name, known in SETTINGS.items():
+        path = folder / name
+        if not path.is_file() or path.stat().st_size > LONGEST_SETTINGS:
+            continue
+        for indent, key, value in LINE.findall(path.read_text(encoding="utf-8", errors="replace")):
+            if key in known and bool(indent) == (name == "config.yml"):
+                found[known[key]] = WORDS.get(value, number(value))
+    if found.get("strategy", "mcmc") != "mcmc":  # splatfacto has them in its file all the same
+        found |= {"opacity_reg": 0.0, "scale_reg": 0.0}
+    return found
+
+
+def number(text: str) -> float | str:
+    """A number that is finite, else the text."""
+    try:
+        value = float(text)
+    except ValueError:
+        return text
+    return value if isfinite(value) else text
 
 
 def read_cfg_args(path: Path) -> dict[str, Any]:

@@ -87,21 +87,26 @@ def _harmonics(rows: Rows) -> np.ndarray:
 
 
 def _tool(header: Header, rows: Rows) -> str | None:
-    if "filter_3D" in rows.names:
-        return "mip-splatting"
     for line in map(str.strip, header.comments):
         if line.startswith(TRAINED_BY):
             return line.removeprefix(TRAINED_BY)[:80]
         for tool, pattern in COMMENTS.items():
             if pattern.search(line):
                 return tool
-    return None
+    return "mip-splatting" if "filter_3D" in rows.names else None
 
 
-def splat_ply(gaussians: Gaussians, extra: Mapping[str, np.ndarray] | None = None, tool: str | None = None) -> bytes:
+def splat_ply(
+    gaussians: Gaussians,
+    extra: Mapping[str, np.ndarray] | None = None,
+    tool: str | None = None,
+    *,
+    antialiased: bool = False,
+) -> bytes:
     """A file with graphdeco's properties in graphdeco's order, float32, and then those of `extra`, (n,) each by name.
 
-    Gaussians with a 3-D filter get Mip-Splatting's property for it too.
+    Gaussians with a 3-D filter get Mip-Splatting's property for it too.  tool, antialiased: for the comments, of which the
+    second is Postshot's.
 
     InputError where a further property has the name of one of the Gaussians', or another length.
     """
@@ -127,4 +132,4 @@ def splat_ply(gaussians: Gaussians, extra: Mapping[str, np.ndarray] | None = Non
     rows = np.empty(n, [(name, "f4") for name in columns])
     for name, column in columns.items():
         rows[name] = column
-    return ply_bytes(rows, [f"{TRAINED_BY}{tool}"] if tool else ())
+    return ply_bytes(rows, [*([f"{TRAINED_BY}{tool}"] if tool else []), *(["antialiased 1"] if antialiased else [])])

@@ -179,15 +179,21 @@ def _gsplat(ranks: list[Any]) -> SplatFile:
         "gsplat checkpoint",
         tool if isinstance(tool, str) else "gsplat",
         _step(first.get("step")),
+        antialiased=first.get("antialiased") is True,
         extra=extra,
         notes=notes,
     )
 
 
 def gsplat_bytes(
-    gaussians: Gaussians, step: int, extra: Mapping[str, np.ndarray] | None = None, tool: str | None = None
+    gaussians: Gaussians,
+    step: int,
+    extra: Mapping[str, np.ndarray] | None = None,
+    tool: str | None = None,
+    *,
+    antialiased: bool = False,
 ) -> bytes:
-    """A checkpoint as gsplat's `simple_trainer` writes it; extra, (n,) each by name, and tool lie beside what it reads."""
+    """A checkpoint as gsplat's `simple_trainer` writes it; extra, (n,) each by name, tool and antialiased lie beside that."""
     values = {name: value.detach().cpu().float().clone() for name, value in gaussians.attributes.items()}
     splats = {
         "means": values["means"],
@@ -202,6 +208,8 @@ def gsplat_bytes(
         content["extra"] = {name: torch.from_numpy(np.array(column, np.float32)) for name, column in extra.items()}
     if tool:
         content["trained_by"] = tool
+    if antialiased:
+        content["antialiased"] = True
     buffer = io.BytesIO()
     torch.save(content, buffer)
     return buffer.getvalue()

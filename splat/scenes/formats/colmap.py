@@ -1,6 +1,8 @@
 """Scenes from COLMAP models, binary or text, read with pycolmap.
 
-A model is three files, cameras, images and points3D (.bin or .txt), in `sparse/0`, `sparse` or the scene folder itself.
+A model is three files, cameras, images and points3D (.bin or .txt), in `sparse/0`, `sparse` or the scene folder itself, where
+nerfstudio puts it (`colmap/sparse/0`), or in the `sparse/N` of most images: COLMAP's mapper makes a model for each part of a
+scene that it cannot join.
 COLMAP's conventions are those of this package: world to camera, +x right, +y down, +z forward, pixel centres at + 0.5.
 """
 
@@ -17,7 +19,7 @@ from splat.model.untrusted import inside
 from splat.scenes.images import IMAGE_SUFFIXES, Photo, image_files, image_folder
 from splat.scenes.view import Points
 
-MODEL_FOLDERS = ("sparse/0", "sparse", ".")
+MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse")
 MODEL_FILES = ("cameras", "images", "points3D")
 SMALLEST_RECORD = {"cameras": 40, "images": 73, "points3D": 51}  # bytes in a binary model, after a count of 8 bytes
 LISTS = {"images": (64, 24), "points3D": (43, 8)}  # bytes of a record before its list (and the name), and of an entry
@@ -25,11 +27,15 @@ LISTS = {"images": (64, 24), "points3D": (43, 8)}  # bytes of a record before it
 
 def find_model(root: Path) -> Path | None:
     """The folder with the model's three files, if there is one."""
-    for folder in (root / name for name in MODEL_FOLDERS):
-        for suffix in (".bin", ".txt"):
-            if all((folder / (name + suffix)).is_file() for name in MODEL_FILES):
-                return folder
-    return None
+    found = next((folder for folder in (root / name for name in MODEL_FOLDERS) if _is_model(folder)), None)
+    numbered = [folder for folder in sorted(root.glob("sparse/[1-9]*")) if _is_model(folder)]
+    if found is None and numbered:
+        return max(numbered, key=lambda folder: max(path.stat().st_size for path in folder.glob("images.*")))
+    return found
+
+
+def _is_model(folder: Path) -> bool:
+    return any(all((folder / (name + suffix)).is_file() for name in MODEL_FILES) for suffix in (".bin", ".txt"))
 
 
 def read_colmap(

@@ -38,7 +38,7 @@ from landscape.errors import InputError
 from splat.model.camera import Camera, slerp
 from splat.model.gaussians import Gaussians
 from splat.model.typed import Count, NonNegative, Positive
-from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
+from splat.render.loss_and_gradient import LossAndGradient
 from splat.scenes.view import View
 from splat.training.densify import Densified
 from splat.training.methods.agreement import agreement_gradients
@@ -86,7 +86,7 @@ class CoRGSMethod(Method[CoRGS]):
         settings, partner = self.settings, self.partner
         assert partner is not None
         partner.raise_sh_degree(step.gaussians.sh_degree)
-        other = loss_and_gradient(partner.gaussians, step.camera, step.loss, step.background, step.config.render)
+        other = step.loss_and_gradient(partner.gaussians)
         if settings.weight and step.number > settings.pseudo_start:
             pose = pseudo_view([view.camera for view in step.views], settings.noise, self.generator)
             if found := agreement_gradients(step, (step.gaussians, partner.gaussians), pose):

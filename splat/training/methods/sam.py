@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splat.model.typed import Positive
-from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
+from splat.render.loss_and_gradient import LossAndGradient
 from splat.training.state import Method, MethodSettings, Step
 
 
@@ -46,8 +46,7 @@ class SAMMethod(Method[SAM]):
             rates = step.training.rates(step.number)
             eps = ascent(base.gradient, rates, self.settings.rho * sqrt(rates.numel()))
         worst = step.gaussians.with_flat(step.gaussians.flat + eps)
-        there = loss_and_gradient(worst, step.camera, step.loss, step.background, step.config.render)
-        return replace(base, gradient=there.gradient)
+        return replace(base, gradient=step.loss_and_gradient(worst).gradient)
 
 
 def ascent(gradient: Float[Tensor, " p"], units: Float[Tensor, " p"], length: float) -> Float[Tensor, " p"]:

@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 from landscape.errors import InputError
-from splat.losses.reference import psnr
+from splat.losses.reference import LossSettings, psnr
 from splat.model.files.read import read_splats
 from splat.model.files.splat_file import SplatFile
 from splat.model.gaussians import Gaussians
@@ -39,6 +39,8 @@ GUARDED = 2  # views
 NERFSTUDIO_SHARE = 0.9
 LOSSY = "curvature of the quantised scene: the file has rounded the trained numbers"
 WHITE = (1.0, 1.0, 1.0)
+REGULARIZERS = ("opacity_reg", "scale_reg")
+MCMC_DEFAULT = 0.01  # of both in 3DGS-MCMC, whose cfg_args does not have them
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Foreign:
 
     scene: folder.  views: how many, by the scene's protocol; train_list: names of the training views.  trained_by: a name of
     `PRESETS`.  images, downscale: as for `load_scene`.  antialiased: whether its renderer was, where the file does not know.
+    opacity_reg, scale_reg: the loss's weights of these names (`LossSettings`); trained: those of the tool's settings.
     """
 
     scene: Path | None = None
@@ -56,6 +59,8 @@ class Foreign:
     images: str | None = None
     downscale: float | None = None
     antialiased: bool | None = None
+    opacity_reg: float | Literal["trained"] | None = None
+    scale_reg: float | Literal["trained"] | None = None
 
 
 def foreign_training(path: Path, ask: Foreign, picture: Path) -> tuple[Training, SceneReference, dict[str, Any]]:
@@ -74,16 +79,17 @@ def foreign_training(path: Path, ask: Foreign, picture: Path) -> tuple[Training,
     scene, images, downscale = _scene(found, ask, preset)
     split, how = _split(scene, found, ask, path)
     reference = SceneReference.to(scene, path, split, images, downscale)
-    config = _config(scene, found, preset, render)
+    config = _config(scene, found, preset.loss, render, ask)
     world, level = _world(found.gaussians, scene, reference, config, _worlds(preset, scene, path), picture, name)
     similarity = None if world is None else world.tolist()
     reference = replace(reference, similarity=similarity, centred=preset.centred)
     moved = posed(scene, similarity, centred=preset.centred)
     training = Training.start(found.gaussians, moved.extent(split.train), config)
     training.step = found.step or 0
-    notes = [*found.notes, *preset.different, *([LOSSY] if found.lossy else [])]
+    notes = [*found.notes, *preset.different, *_left_out(found, config.loss), *([LOSSY] if found.lossy else [])]
     said = {"format": found.format, "trained_by": name, "trained_by_source": source, "views": how, "notes": notes}
-    conventions = asdict(replace(preset, render=render))
+    said |= {"images": images, "downscale": downscale}
+    conventions = asdict(replace(preset, render=render, loss=config.loss))
     return training, reference, {**said, "psnr": level, "similarity": similarity, "preset": conventions}
 
 
@@ -151,12 +157,50 @@ def _used(path: Path, scene: Scene) -> set[str]:
     return {name for name in scene.names if Path(name).stem in listed}
 
 
-def _config(scene: Scene, found: SplatFile, preset: Preset, render: RenderSettings) -> TrainConfig:
+def _config(scene: Scene, found: SplatFile, loss: LossSettings, render: RenderSettings, ask: Foreign) -> TrainConfig:
     """3DGS, with the trainer's renderer and loss, on the scene's background."""
     red, green, blue = scene.background.tolist()
-    return TrainConfig(
-        iterations=max(1, found.step or 1), background=(red, green, blue), render=render, loss=preset.loss
+    if isinstance(weight := found.settings.get("ssim_lambda"), float):
+        loss = replace(loss, ssim_weight=weight)
+    loss = replace(loss, **{name: _weight(name, getattr(ask, name), found) for name in REGULARIZERS})
+    return TrainConfig(iterations=max(1, found.step or 1), background=(red, green, blue), render=render, loss=loss)
+
+
+def _weight(name: str, asked: float | Literal["trained"] | None, found: SplatFile) -> float:
+    """Of a regulariser.  InputError where it should be that of the training, of which nothing is known."""
+    if asked != "trained":
+        return asked or 0.0
+    if isinstance(known := found.settings.get(name), float):
+        return known
+    option = f"--{name.replace('_', '-')}"
+    usual = f", such as 3DGS-MCMC's default, {option} {MCMC_DEFAULT:g}" if "cap_max" in found.settings else ""
+    raise InputError(
+        f"expected {option} with a number, as the settings beside the file do not say with what it was trained{usual}, got "
+        "trained"
     )
+
+
+def _left_out(found: SplatFile, loss: LossSettings) -> list[str]:
+    """Sentences on what belonged to the loss of the training, as its settings say, and does not belong to this one."""
+    missing = [
+        f"{name} {weight:g}"
+        for name in REGULARIZERS
+        if isinstance(weight := found.settings.get(name), float) and weight and not getattr(loss, name)
+    ]
+    lines = []
+    if missing:
+        options = " ".join(f"--{each.split()[0].replace('_', '-')} trained" for each in missing)
+        lines.append(f"its training's {' and '.join(missing)} are not in this loss; {options} adds them")
+    if "cap_max" in found.settings and not (loss.opacity_reg or loss.scale_reg):
+        lines.append(
+            "3DGS-MCMC has regularisers of opacities and scales, whose weights it does not write; they are not in this loss: "
+            f"--opacity-reg {MCMC_DEFAULT:g} --scale-reg {MCMC_DEFAULT:g} adds those of its defaults"
+        )
+    if found.settings.get("train_test_exp") is True:
+        lines.append("the exposures of its images, which it fitted too (train_test_exp), are not applied")
+    if found.settings.get("use_scale_regularization") is True:
+        lines.append("splatfacto's regulariser of elongated Gaussians is not in this loss")
+    return lines
 
 
 def _worlds(preset: Preset, scene: Scene, path: Path) -> Sequence[Similarity | None]:

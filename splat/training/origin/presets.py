@@ -12,10 +12,11 @@
 
 *: not known, or not here: 3DGS's.  **: mip-plain with a blur of 0.1.  antialiased: by what equation, where the Gaussians are
 (`splat/projection/antialias.py`).  mip-splatting is a graphdeco with that, a blur of its cfg_args' kernel_size (0.1), and a 3-D
-filter.  Sources: graphdeco-inria/gaussian-splatting 1152adc; gsplat v1.5.3 and 1.6 (`_constants.py`,
-`examples/simple_trainer.py`, `losses.py`); nerfstudio `models/splatfacto.py`; Brush `kernels/helpers.rs`, `rasterize.rs`;
-LichtFeld `src/training/trainer.cpp`.  SSIM: whether windows may reach beyond the image (`LossSettings.border`).  Not followed:
-the limits of the projection's Jacobian are 3DGS's; splats end at alpha 1/255 and not at 3 or 3.33 sigma.
+filter; splat-landscape-mip is the same through the cameras' own principal points.  Sources: graphdeco-inria/gaussian-splatting
+1152adc; gsplat v1.5.3 and 1.6 (`_constants.py`, `examples/simple_trainer.py`, `losses.py`); nerfstudio `models/splatfacto.py`;
+Brush `kernels/helpers.rs`, `rasterize.rs`; LichtFeld `src/training/trainer.cpp`.  SSIM: whether windows may reach beyond the
+image (`LossSettings.border`).  Not followed: the limits of the projection's Jacobian are 3DGS's; splats end at alpha 1/255 and
+not at 3 or 3.33 sigma.
 """
 
 from collections.abc import Mapping
@@ -73,6 +74,7 @@ PRESETS: Mapping[str, Preset] = {
     ),
     "lichtfeld": Preset(loss=_VALID, different=(UNKNOWN, "its antialiasing is not known here, 3DGS's is used")),
     "splat-landscape": Preset(),
+    "splat-landscape-mip": Preset(RenderSettings(blur=0.1, antialias="mip-splatting"), antialias="mip-splatting"),
 }
 
 

@@ -9,11 +9,17 @@ import torch
 from analysis.commands.cli import main
 from analysis.records.records import read_record
 from splat.model.files.read import read_splats
+from splat.model.files.splat_ply import splat_ply
+from splat.model.settings import RenderSettings
+from splat.render.render import render as rendered
 from splat.render.render import render_depth
 from splat.scenes.scene import load_scene
+from splat.scenes.splits import split_scene
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
-from splat.training.checkpoint import load_checkpoint
+from splat.training.checkpoint import load_checkpoint, save_checkpoint
+from splat.training.origin.scene_reference import SceneReference
+from splat.training.state import TrainConfig, Training
 from tests.splat.model.files import written
 
 MADE = synthetic_scene(SyntheticSettings(gaussians=60, views=5, width=24, height=16))
@@ -89,6 +95,60 @@ def test_a_training_starts_from_another_tools_gaussians_with_its_renderer(folder
     moved = (training.gaussians.means - MADE.truth.means).abs().max()
     assert 0 < moved < 0.01 * training.extent
     assert main([*common, "--set", "render.near=0.1", "--out", str(folder / "other")]) == 2
+
+
+SAID = "the file cannot say how it was rendered"
+RENDERS = {
+    "none": (RenderSettings(), []),
+    "mip": (RenderSettings(antialias="mip"), []),
+    "mip-splatting": (RenderSettings(antialias="mip-splatting", blur=0.1), []),
+    "brush": (RenderSettings(antialias="mip-plain", blur=0.1, alpha_max=0.999), ["--trained-by", "brush"]),
+    "none's": (RenderSettings(antialias="mip-plain", blur=0.2), None),
+}
+
+
+@pytest.mark.parametrize("to", ["graphdeco", "gsplat"])
+@pytest.mark.parametrize("name", RENDERS)
+def test_a_checkpoint_that_was_written_and_read_back_is_the_same_scene(folder, capsys, name, to):
+    render, words = RENDERS[name]
+    loaded = load_scene(folder / "scene")
+    split = split_scene(loaded)
+    training = Training.start(MADE.truth, loaded.extent(split.train), TrainConfig(render=render))
+    if name == "mip-splatting":
+        training.gaussians = training.gaussians.with_filter(torch.linspace(0.01, 0.1, len(MADE.truth)))
+    save_checkpoint(folder / "own.pt", training, SceneReference.to(loaded, folder / "own.pt", split, None, 1.0))
+    assert convert(folder / "own.pt", folder / "out", "--to", to) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    if words is None:
+        assert "no --trained-by renders as it was (antialiasing mip-plain, blur 0.2" in said
+        return
+    assert " ".join(words) in said and (SAID in said) == bool(words)
+    assert convert(folder / "out", folder / "back.pt", "--scene", folder / "scene", *words) == 0
+    before, after = (load_checkpoint(folder / file) for file in ("own.pt", "back.pt"))
+    assert after.training.config.render == render and not after.scene.centred
+    images = [
+        rendered(each.training.gaussians, loaded.frames[0].camera, settings=each.training.config.render).image
+        for each in (before, after)
+    ]
+    torch.testing.assert_close(*images, rtol=0, atol=0 if to == "graphdeco" else 1e-6)
+    if name == "mip-splatting" and to == "graphdeco":
+        assert b"property float rot_3\nproperty float filter_3D\nend_header" in (folder / "out").read_bytes()
+
+
+def test_what_a_file_says_of_its_renderer_goes_with_it(folder, capsys):
+    brush = written.ply(written.columns(MADE.truth), ("Exported from Brush", "SplatRenderMode: mip"))
+    (folder / "brush.ply").write_bytes(brush)
+    assert convert(folder / "brush.ply", folder / "other.ply") == 0 and SAID not in capsys.readouterr().err
+    found = read_splats(folder / "other.ply")
+    assert (found.tool, found.antialiased) == ("brush", True)
+    model = folder / "model/point_cloud/iteration_9"
+    model.mkdir(parents=True)
+    (model / "point_cloud.ply").write_bytes(splat_ply(MADE.truth.with_filter(torch.full((60,), 0.05))))
+    (folder / "model/cfg_args").write_text("Namespace(kernel_size=0.3)")
+    assert convert(model / "point_cloud.ply", folder / "m.ply") == 0
+    assert "no --trained-by renders as it was (antialiasing mip-splatting, blur 0.3" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 def test_depths_of_every_view_are_those_of_its_pixels_and_train_reads_them(folder):

@@ -9,7 +9,6 @@ import torch
 from PIL import Image
 
 from analysis.commands.cli import main
-from analysis.commands.map.files import colours
 from analysis.commands.map.pictures import composited
 from analysis.records.quantities import Shade
 from analysis.records.run_files import read_map
@@ -72,7 +71,7 @@ def test_a_splat_has_the_colour_of_its_value_and_none_is_grey(folder):
     written = read_splats(folder / "map" / "largest.ply").gaussians
     values = read_splats(folder / "map" / "fields.ply").extra["largest"]
     assert written.sh_degree == 0 and written.sh[-1].abs().max() < 0.01
-    assert np.allclose(0.5 + Y00 * written.sh[:, 0].numpy(), colours(shade, values), atol=1e-6)
+    assert np.allclose(0.5 + Y00 * written.sh[:, 0].numpy(), shade.colours_of(values), atol=1e-6)
 
 
 def test_pictures_are_drawn_of_the_views_that_were_asked_for(folder):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from analysis.commands import view
 from analysis.commands.cli import main
 from analysis.commands.map.command import measured_fields
-from analysis.commands.map.files import colours
 from analysis.commands.map.pictures import rendered
+from analysis.commands.view import command, page
+from analysis.commands.view import viewer as view
 from splat.curvature.objective import SceneObjective
 from splat.projection.reference import rotation_matrices
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -36,7 +36,7 @@ def test_without_viser_it_says_what_to_install(monkeypatch, capsys):
     def missing(_: str):
         raise ImportError("No module named 'viser'")
 
-    monkeypatch.setattr(view, "import_module", missing)
+    monkeypatch.setattr(command, "import_module", missing)
     assert main(["view", "nowhere.pt"]) == 2
     assert "pip install -e '.[view]'" in capsys.readouterr().err
 
@@ -72,7 +72,7 @@ def test_the_controls_colour_hide_and_step(viewer, objective):
     fields = measured_fields(objective, Path("nowhere"), [], lambda *_: None)
     viewer.add_fields(fields, "largest")
     values = fields.values["largest"].numpy()
-    expected = colours(fields.shade("largest"), values)
+    expected = fields.shade("largest").colours_of(values)
     assert np.abs(viewer.splats.rgbs / 255 - expected).max() < 0.01
     assert "largest curvature" in viewer.legend.content
     viewer.shown.value = (90.0, 100.0)
@@ -98,6 +98,7 @@ def _ray(viewer: view.Viewer, objective: SceneObjective) -> tuple[list[float], l
 
 
 def test_a_page_needs_no_network(viewer):
-    page = viewer.server.scene.as_html()
-    assert "__VISER_EMBED_DATA__" in page and len(page) < 20e6
-    assert 'src="http' not in page and 'href="http' not in page
+    viewer.add_fields(measured_fields(viewer.objective, Path("nowhere"), [], lambda *_: None), "condition")
+    written = page.offline_page(viewer, "condition")
+    assert "__VISER_EMBED_DATA__" in written and len(written) < 2e6
+    assert 'src="http' not in written and 'href="http' not in written

@@ -61,7 +61,7 @@ def test_a_blocker_of_one_view_is_alone_in_it():
     curvature = values["trace_opacity_logits"].abs()
     assert found.one_view == pytest.approx(1 / 3)
     assert found.one_view_trace == pytest.approx(float(curvature[1] / curvature.sum()))
-    assert "one view alone sees 33% of the Gaussians" in fragility_sentences(found)[2]
+    assert "33% of the Gaussians have over 90% of their weight in one view" in fragility_sentences(found)[2]
 
 
 def test_the_correlation_is_that_of_ranks():

@@ -9,10 +9,15 @@ import pandas as pd
 import pytest
 
 from analysis.commands.cli import main
+from analysis.probe.command import opened
+from analysis.probe.record import provenance_of
+from analysis.records.json_files import plain
 from analysis.records.quantities import measured, quantity
 from analysis.records.schema import Index
 from analysis.records.tables import bracketed
+from analysis.runs import compared
 from splat.losses.reference import LossSettings
+from splat.model.files.splat_ply import splat_ply
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
@@ -21,6 +26,7 @@ from tests.figures.test_trajectory_figure import rows
 from tests.recorded import depth_section, synthetic, written
 
 ITERATIONS = 4
+SETTINGS = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
 FACTOR = {"value": 2.5, "low": 2.0, "high": 3.1, "note": ""}
 
 
@@ -50,8 +56,7 @@ def record(folder: Path, scale: float, **changes) -> None:
 def trained(tmp_path_factory) -> Path:
     """Two trainings of the same scene, with records in place of probes."""
     folder = tmp_path_factory.mktemp("compare")
-    settings = SyntheticSettings(gaussians=60, views=5, width=16, height=12)
-    write_transforms_scene(synthetic_scene(settings).scene, folder / "still")
+    write_transforms_scene(synthetic_scene(SETTINGS).scene, folder / "still")
     run = ["train", str(folder / "still"), "--iterations", str(ITERATIONS), "--out"]
     assert main([*run, str(folder / "runs/plain/0")]) == 0
     assert main([*run, str(folder / "runs/sam/0"), "--method", "sam"]) == 0
@@ -224,7 +229,7 @@ def test_runs_trained_with_other_losses_are_probed_with_that_of_3dgs(runs, capsy
         record(options.checkpoint.parent / "probe", 1.0)
         return 0
 
-    monkeypatch.setattr("analysis.probe.command.run_probe", probe)
+    monkeypatch.setattr("analysis.runs.compared.run_probe", probe)
     assert main(["compare", *runs, "--probe"]) == 0 and asked == [("3dgs", "3dgs")] * 2
 
 
@@ -251,10 +256,8 @@ def test_a_run_without_a_record_is_refused_with_the_command_or_probed(runs, caps
         record(options.checkpoint.parent / "probe", 1.0)
         return 0
 
-    monkeypatch.setattr("analysis.probe.command.run_probe", probe)
-    assert main(["compare", *runs, "--probe"]) == 0 and asked == [
-        f"{command} --device auto --loss training" for command in commands
-    ]
+    monkeypatch.setattr("analysis.runs.compared.run_probe", probe)
+    assert main(["compare", *runs, "--probe"]) == 0 and asked == commands
     assert (Path(runs[0]).parents[1] / "compare/compare.csv").exists()
 
 
@@ -323,6 +326,42 @@ def test_damaged_scores_are_named(runs, capsys):
     path = Path(runs[1]) / "metrics.json"
     path.write_text('{"test":')
     refused(capsys, runs, f"expected the scores of landscape train in {path}, got a damaged file")
+
+
+def test_files_of_other_tools_are_compared_as_they_were_probed(trained, tmp_path, capsys, monkeypatch, no_pictures):
+    scene, files = str(trained.parent / "still"), [tmp_path / "a.ply", tmp_path / "b.ply"]
+    for file in files:
+        file.write_bytes(splat_ply(synthetic_scene(SETTINGS).truth, tool="splat-landscape"))
+    words = [*map(str, files), "--scene", scene, "--views", "3", "--opacity-reg", "0.01"]
+    commands = [
+        f"landscape probe {file} --scene {scene} --out {tmp_path}/probe-{file.stem} --opacity-reg 0.01 --views 3"
+        for file in files
+    ]
+    refused(capsys, words, "expected probed runs", "; ".join(commands), "--probe")
+    asked = []
+
+    def probe(options, command) -> int:
+        asked.append(" ".join(command))
+        checkpoint, loaded = opened(options.checkpoint, options.scene, options.foreign, options.out)
+        data, arrays = synthetic()
+        made = provenance_of(0, options.checkpoint, command, options, checkpoint, loaded)
+        data["provenance"] = plain(made)
+        written(options.out, data, arrays)
+        return 0
+
+    monkeypatch.setattr("analysis.runs.compared.run_probe", probe)
+    assert main(["compare", *words, "--probe"]) == 0 and asked == commands
+    assert main(["compare", *words]) == 0  # both are there
+    files[0].with_name("probe-a").rename(tmp_path / "probe")  # as of landscape probe without --out
+    found = []
+    kept = compared.compared
+    monkeypatch.setattr("analysis.runs.compare.compared", lambda *a: found.append(kept(*a)) or found[-1])
+    assert main(["compare", *map(str, files), str(trained / "plain/0")]) == 0
+    assert all(each.scene.train == found[2].scene.train for each in found)
+    assert [each.training.config.loss.opacity_reg for each in found] == [0.01, 0.01, 0.0]
+    capsys.readouterr()
+    refused(capsys, [*words, "--trained-by", "gsplat-raw"], "no record of the checkpoint in", "--trained-by gsplat-raw")
+    assert "was not scored" in (tmp_path / "compare/compare.html").read_text()
 
 
 def test_at_least_two_different_runs_are_asked_for(runs, capsys):

@@ -115,6 +115,38 @@ def test_grey_pictures_of_16_bits_keep_all_of_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(image.numpy(), np.broadcast_to(grey / 65535, (3, *grey.shape)), atol=1e-7)
 
 
+@pytest.mark.parametrize("channels", [3, 4])
+def test_coloured_pictures_of_16_bits_keep_all_of_them(tmp_path: Path, channels: int) -> None:
+    folders.write_transforms(tmp_path)
+    pixels = np.random.default_rng(0).integers(0, 65536, (SIZE[1], SIZE[0], channels), dtype=np.uint16)
+    exif = Image.Exif()
+
+    def stored(pixels: np.ndarray, *more: bytes) -> None:
+        rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
+        height, width = pixels.shape[:2]
+        content = (*more, b"IDAT" + zlib.compress(rows), b"IEND")
+        (tmp_path / "images/a.png").write_bytes(png(width, height, *content, bits=16, kind={3: 2, 4: 6}[channels]))
+
+    stored(pixels)
+    view = load_scene(tmp_path).load()[0]
+    values = pixels / 65535
+    alpha = values[..., 3:] if channels == 4 else 1.0  # on white, as of any scene with an alpha channel
+    wanted = values[..., :3] * alpha + (1 - alpha)
+    np.testing.assert_allclose(view.image.permute(1, 2, 0).numpy(), wanted, atol=1e-6)
+    for orientation, turn in {
+        5: lambda a: a.swapaxes(0, 1),
+        6: lambda a: np.rot90(a),
+        7: lambda a: np.rot90(a, 2).swapaxes(0, 1),
+        8: lambda a: np.rot90(a, -1),
+    }.items():
+        exif[0x0112] = orientation
+        stored(turn(pixels), b"eXIf" + exif.tobytes().removeprefix(b"Exif\0\0"))
+        assert torch.equal(load_scene(tmp_path).load()[0].image, view.image), orientation
+    (tmp_path / "images/a.png").write_bytes((tmp_path / "images/a.png").read_bytes()[:-40])
+    with pytest.raises(ValueError, match=r"cannot read .*a\.png"):
+        load_scene(tmp_path).load()
+
+
 @pytest.mark.parametrize("absurd", [{"k1": 1e30}, {"k1": -1e30}, {"k1": -20.0}, {"p2": 1e6}, {"k3": 1e300}])
 def test_distortion_that_is_no_lens_is_refused(tmp_path: Path, absurd: dict[str, float]) -> None:
     folders.write_transforms(tmp_path / "transforms", **absurd)
@@ -245,9 +277,9 @@ def test_files_that_are_no_pictures_or_have_real_numbers_are_refused(tmp_path: P
         load_scene(tmp_path)
 
 
-def png(width: int, height: int, *chunks: bytes) -> bytes:
-    """The bytes of a PNG file of 8-bit colours with these chunks after its header."""
-    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+def png(width: int, height: int, *chunks: bytes, bits: int = 8, kind: int = 2) -> bytes:
+    """The bytes of a PNG file of colours with these chunks after its header.  kind: 2 of RGB, 6 with alpha."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in (header, *chunks)
     )

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from splat.model.camera import Camera
-from splat.scenes.view import Frame, Points, View, inside_image, pixel_coordinates
+from splat.scenes.view import Frame, Photograph, Points, Shelf, View, inside_image, pixel_coordinates
 
 
 def camera(x: float = 0.0) -> Camera:
@@ -63,3 +63,28 @@ def test_without_tracks_a_point_is_seen_where_it_falls_into_the_image() -> None:
 def test_points_that_cannot_be_are_refused(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Points(*arguments)
+
+
+def test_a_shelf_keeps_the_pictures_used_last_and_reads_the_others_again() -> None:
+    read = []
+
+    def made(name: str, layers: frozenset[str] = frozenset()) -> Frame:
+        def view() -> View:
+            read.append(name)
+            return View(
+                name, camera(), torch.full((3, 6, 8), float(ord(name))), mask=torch.ones(6, 8, dtype=torch.bool)
+            )
+
+        return Frame(name, camera(), view, layers=layers)
+
+    frames = [made("a"), made("b"), made("c", frozenset({"mask"}))]
+    shelf = Shelf(2 * frames[0].bytes)
+    views = [Photograph(each, shelf) for each in frames]
+    assert [view.name for view in views] == ["a", "b", "c"] and views[0].alpha is views[0].mask is None and not read
+    for i in (0, 1, 0):
+        assert views[i].image[0, 0, 0] == ord(views[i].name)
+    assert read == ["a", "b"]
+    assert views[2].mask is not None and views[2].image[0, 0, 0] == ord("c") and read == ["a", "b", "c"]
+    assert views[0].image[0, 0, 0] == ord("a") and read == ["a", "b", "c", "a"]  # c is larger by its mask
+    changed = views[1].with_image(views[1].image + 1)
+    assert type(changed) is View and changed.name == "b" and changed.image[0, 0, 0] == ord("b") + 1

@@ -15,7 +15,10 @@ from splat.model.settings import RenderSettings
 from splat.projection.antialias import sampling_widths
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
-from splat.scenes.view import View
+from splat.scenes.scene import load_scene
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.view import Photograph, View
+from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings, densify
 from splat.training.loop import prepare, train, with_background
@@ -57,8 +60,9 @@ def test_mip_splattings_filter_is_renewed_when_its_training_does_and_resumes(mon
     assert torch.equal(resumed.gaussians.filter_widths, widths)
 
 
-def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands():
-    config = TrainConfig(10, seed=3, sh_degree=1, sh_degree_every=4, densify=ONLY_ADAM)
+@pytest.mark.parametrize("loss", [LossSettings(), LossSettings(opacity_reg=0.3, scale_reg=0.5)], ids=["3DGS", "MCMC"])
+def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands(loss):
+    config = TrainConfig(10, seed=3, sh_degree=1, sh_degree_every=4, densify=ONLY_ADAM, loss=loss)
     training, progress = run(config, torch.float64)
 
     views = {view.name: view for view in tiny_views(torch.float64)}
@@ -75,14 +79,31 @@ def test_training_equals_a_plain_loop_with_torch_adam_over_all_bands():
         mask = 0.0 if done.step <= 4 else 1.0
         model = gaussians.pack({**leaves, "sh": torch.cat([constant, mask * higher], dim=1)})
         view = views[done.view]
-        loss = photometric_loss(render(model, view.camera).image, view.image)
+        value = photometric_loss(render(model, view.camera).image, view.image, loss)
+        value = value + loss.opacity_reg * leaves["opacity_logits"].sigmoid().mean()
+        value = value + loss.scale_reg * leaves["log_scales"].exp().mean()
         adam.zero_grad()
-        loss.backward()
+        value.backward()
         adam.step()
-        assert abs(done.loss - loss.item()) < 1e-12
+        assert abs(done.loss - value.item()) < 1e-12
     expected = gaussians.pack({**leaves, "sh": torch.cat([constant, higher], dim=1)}).flat
     assert training.gaussians.sh_degree == 1
     assert (training.gaussians.flat - expected).abs().max() < 1e-12
+
+
+def test_pictures_and_losses_that_do_not_fit_are_made_anew_and_change_nothing(monkeypatch, tmp_path):
+    made = synthetic_scene(SyntheticSettings(gaussians=50, views=4, width=16, height=12))
+    write_transforms_scene(made.scene, tmp_path / "scene")
+    loaded, found = load_scene(tmp_path / "scene"), []
+    for memory in (1 << 40, 4 * 6 * 16 * 12 * 4, 0):
+        for module in ("splat.scenes.scene", "splat.training.state"):
+            monkeypatch.setattr(f"{module}.free_memory", lambda device, memory=memory: memory)
+        views = loaded.load()
+        assert isinstance(views[0], Photograph) == (memory < 1 << 40)
+        training = Training.start(made.truth, EXTENT, TrainConfig(6))
+        assert len(list(train(training, views))) == 6
+        found.append(training.gaussians.flat)
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
 def test_position_rate_decays_exponentially_to_its_final_value():

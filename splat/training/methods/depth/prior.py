@@ -1,6 +1,6 @@
 """Depth maps that the user provides, as the depth-supervised methods read them.
 
-    prior       a map that grows with distance: the view's own for "depth", its negative for "disparity" (MiDaS, DPT)
+    prior       a map that grows with distance: the user's map for "depth", its negative for "disparity" (MiDaS, DPT)
     rendered    the sum of weight times z over the Gaussians of a pixel, world units, not divided by alpha: as published
 
 Monocular depth is known up to a scale and a shift in every view, so both methods compare shapes, not values.

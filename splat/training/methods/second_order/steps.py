@@ -137,7 +137,7 @@ class SecondOrderMethod(Method[S], Generic[S]):
     def own_step(self, step: Step) -> float:
         config, training = step.config, step.training
         old = config.background_colour(step.background.dtype)
-        views = [replace(view, image=with_background(view, old, step.background)) for view in step.views]
+        views = [view.with_image(with_background(view, old, step.background)) for view in step.views]
         loss = replace(config.loss, pixel="charbonnier") if config.loss.pixel == "l1" else config.loss
         local = Local(SceneObjective(step.gaussians, views, loss, step.background, config.render), self.settings)
         moved = self._descend(local, step.number)

@@ -47,7 +47,7 @@ from splat.curvature.traces import LEAST_SAMPLES, exact_traces
 from splat.model.camera import Camera
 from splat.model.capture import capture_geometry
 from splat.model.typed import Count, Length, NonNegative, typed
-from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
+from splat.render.loss_and_gradient import LossAndGradient
 from splat.render.render import render_depth
 from splat.scenes.view import View
 from splat.training.densify import DensifySettings
@@ -158,7 +158,7 @@ class StableGSMethod(Method[StableGS]):
             return replace(base, gradient=(1 + settings.asp_weight) * base.gradient)
         total = base.gradient.clone()
         if settings.asp_weight:
-            again = loss_and_gradient(probed.gaussians, step.camera, step.loss, step.background, step.config.render)
+            again = step.loss_and_gradient(probed.gaussians)
             total.add_(probed.pull(again.gradient), alpha=settings.asp_weight)
         for pose in poses:
             if found := agreement_gradients(step, (step.gaussians, probed.gaussians), pose):

@@ -35,7 +35,10 @@ def along_removal(objective: SceneObjective, gaussian: int) -> float:
     return float((slope + curvature / 2).detach())
 
 
-@pytest.mark.parametrize("loss", [LossSettings(), LossSettings("charbonnier", ssim_weight=0.4)], ids=["3DGS", "smooth"])
+LOSSES = [LossSettings(), LossSettings("charbonnier", ssim_weight=0.4), LossSettings(opacity_reg=3.0, scale_reg=0.1)]
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=["3DGS", "smooth", "MCMC"])
 def test_the_predicted_rise_is_the_second_order_of_removal(loss):
     objective = toy(loss)
     rise = removal_scores(objective, toy(L2))["rise"]

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from landscape.errors import InputError
-from splat.scenes.formats.colmap import SMALLEST_RECORD
+from splat.scenes.formats.colmap import SMALLEST_RECORD, find_model
 from splat.scenes.scene import load_scene
 from splat.scenes.view import pixel_coordinates
 from tests.splat.scenes import folders
@@ -19,7 +19,7 @@ from tests.splat.scenes.folders import CENTRE, FOCAL, NAMES, RGB, SEEN, SIZE, XY
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["bin", "txt"])
-@pytest.mark.parametrize("at", ["sparse/0", "sparse", "."])
+@pytest.mark.parametrize("at", ["sparse/0", "sparse", ".", "colmap/sparse/0", "sparse/3"])
 def test_colmap_cameras_points_and_tracks_come_back(tmp_path: Path, text: bool, at: str) -> None:
     folders.write_colmap(tmp_path / "s", text, at)
     scene = load_scene(tmp_path / "s")
@@ -32,6 +32,17 @@ def test_colmap_cameras_points_and_tracks_come_back(tmp_path: Path, text: bool, 
     np.testing.assert_array_equal((scene.points.rgb.numpy()[order] * 255).round(), RGB[wanted])
     seen = [sorted(scene.points.observations[scene.points.observations[:, 0] == p, 1].tolist()) for p in order]  # type: ignore[index]
     assert seen == [list(SEEN[p]) for p in wanted]
+
+
+def test_of_several_models_the_first_is_taken_else_that_of_most_images(tmp_path: Path) -> None:
+    for at, keep in (("sparse/1", 1), ("sparse/2", 3), ("sparse/10", 2)):
+        folders.write_colmap(tmp_path, True, at)
+        lines = (tmp_path / at / "images.txt").read_text().splitlines()
+        body = [line for line in lines if not line.startswith("#")]
+        (tmp_path / at / "images.txt").write_text("\n".join(body[: 2 * keep]) + "\n")
+    assert find_model(tmp_path) == tmp_path / "sparse/2"
+    folders.write_colmap(tmp_path, True, "sparse/0")
+    assert find_model(tmp_path) == tmp_path / "sparse/0"
 
 
 @pytest.mark.parametrize("there", [True, False])

@@ -9,7 +9,7 @@ from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
-from splat.training.methods import sam
+from splat.training import state
 from splat.training.methods.sam import SAM, ascent
 from splat.training.state import LearningRates, Step, TrainConfig, Training, learning_rates, position_rate
 from tests.splat.tiny import EXTENT, tiny_gaussians, tiny_views
@@ -70,7 +70,7 @@ def test_no_step_of_the_same_length_rises_faster():
 
 def test_one_more_render_a_step_and_nothing_moves_where_the_gradient_is_0(monkeypatch):
     calls = []
-    monkeypatch.setattr(sam, "loss_and_gradient", lambda *a: calls.append(a[0]) or loss_and_gradient(*a))
+    monkeypatch.setattr(state, "loss_and_gradient", lambda *a: calls.append(a[0]) or loss_and_gradient(*a))
     step = a_step(SAM())
     step.gaussians.means[:, 2] = -3.0
     base = loss_and_gradient(step.gaussians, step.camera, step.loss, step.background)

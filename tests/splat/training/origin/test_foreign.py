@@ -218,6 +218,53 @@ def test_the_presets_conventions_reach_the_renderer_and_the_record(folder):
     assert "trained by gsplat-raw (asked for)" in found.assumptions[0]
 
 
+WEIGHTS = "opacity_reg: 0.02\nscale_reg: 0.03\nssim_lambda: 0.4\n"
+SPLATFACTO = "  mcmc_opacity_reg: 0.02\n  mcmc_scale_reg: 0.03\n  strategy: {}\n"
+TRAINED = {"opacity_reg": "trained", "scale_reg": "trained"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "text", "ask", "expected", "said"),
+    [
+        (
+            "cfg.yml",
+            WEIGHTS,
+            {},
+            (0.4, 0.0, 0.0),
+            "opacity_reg 0.02 and scale_reg 0.03 are not in this loss; --opacity-reg",
+        ),
+        ("cfg.yml", WEIGHTS, TRAINED, (0.4, 0.02, 0.03), None),
+        ("cfg.yml", WEIGHTS, {"opacity_reg": 0.5}, (0.4, 0.5, 0.0), "training's scale_reg 0.03 are not in this loss"),
+        ("cfg.yml", "  opacity_reg: 0.02\n", {}, (0.2, 0.0, 0.0), None),
+        ("cfg.yml", "opacity_reg: 0.02 # of\nscale_reg: .inf\n", {}, (0.2, 0.0, 0.0), None),
+        ("config.yml", SPLATFACTO.format("mcmc"), TRAINED, (0.2, 0.02, 0.03), None),
+        ("config.yml", SPLATFACTO.format("default"), TRAINED, (0.2, 0.0, 0.0), None),
+        ("config.yml", "  use_scale_regularization: true\n", {}, (0.2, 0.0, 0.0), "elongated Gaussians is not in this"),
+        ("ckpts/cfg_args", "Namespace(cap_max=9)", {}, (0.2, 0.0, 0.0), "--opacity-reg 0.01 --scale-reg 0.01 adds"),
+    ],
+)
+def test_regularisers_are_in_the_loss_when_asked_for_and_else_said_to_be_missing(
+    folder, settings, text, ask, expected, said
+):
+    path = stored(folder / "run/ckpts/a.ply", written.ply(written.columns(gaussians())))
+    stored(folder / "run" / settings, text.encode())
+    found = opened(path, scene=folder / "scene", trained_by="gsplat-raw", **ask)
+    loss = found.training.config.loss
+    assert (loss.ssim_weight, loss.opacity_reg, loss.scale_reg) == expected and loss.border == "valid"
+    assert found.origin and found.origin["preset"]["loss"]["opacity_reg"] == expected[1]
+    assert [note for note in found.assumptions if "this loss" in note] == [] if said is None else True
+    assert said is None or any(said in note for note in found.assumptions)
+
+
+def test_weights_of_a_training_that_are_not_known_are_asked_for(folder):
+    path = stored(folder / "a.ply", written.ply(written.columns(gaussians())))
+    with pytest.raises(InputError, match=r"expected --scale-reg with a number.*got trained"):
+        opened(path, trained_by=OURS, scale_reg="trained")
+    stored(folder / "cfg_args", b"Namespace(cap_max=9)")
+    with pytest.raises(InputError, match=r"3DGS-MCMC's default, --opacity-reg 0\.01"):
+        opened(path, trained_by=OURS, opacity_reg="trained")
+
+
 def test_3dgs_looks_through_the_middle_of_images_of_1600_px_at_most(folder, monkeypatch):
     file = folder / "scene" / "transforms.json"
     content = json.loads(file.read_text())

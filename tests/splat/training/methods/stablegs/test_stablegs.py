@@ -13,6 +13,7 @@ from splat.losses.cpu.loss import CpuViewLoss
 from splat.losses.reference import photometric_loss
 from splat.render.loss_and_gradient import loss_and_gradient
 from splat.render.render import render
+from splat.training import state
 from splat.training.checkpoint import load_checkpoint, save_checkpoint
 from splat.training.densify import DensifySettings
 from splat.training.loop import train
@@ -88,7 +89,7 @@ def test_a_probe_of_no_attribute_weighs_the_photometric_gradient_alone(monkeypat
     def never(*_, **__):
         raise AssertionError("was worked out for nothing")
 
-    for module, name in ((stablegs, "loss_and_gradient"), (stablegs, "exact_traces"), (agreement, "render")):
+    for module, name in ((state, "loss_and_gradient"), (stablegs, "exact_traces"), (agreement, "render")):
         monkeypatch.setattr(module, name, never)
     settings = StableGS(warm_up=0, probe=ProbeSettings(attributes=()), viewpoint=ViewpointSettings(edge_rotation=False))
     step = first_step(settings)
@@ -109,7 +110,7 @@ def test_a_loss_of_weight_0_is_not_rendered(monkeypatch, weights, renders):
 
         return call
 
-    for module, name in ((stablegs, "loss_and_gradient"), (agreement, "render")):
+    for module, name in ((state, "loss_and_gradient"), (agreement, "render")):
         monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
     asp, vsp = weights
     viewpoint = ViewpointSettings(edge_rotation=False)

@@ -1,4 +1,4 @@
-"""`landscape view`: the splat in the browser, by viser, in the colours of any field of its Gaussians.
+"""The viewer: the splat in the browser, by viser, in the colours of any field of its Gaussians.
 
     field       what colours the splats; the ends of its scale, and which splats are shown, are percentiles
     cameras     the training views, with their photographs; the chosen one is rendered by our own renderer
@@ -10,29 +10,19 @@ of the constant band.
 """
 
 from collections.abc import Mapping
-from importlib import import_module
-from pathlib import Path
-from threading import Event, Lock
+from threading import Lock
 from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from analysis.commands.map.command import PROBE, Fields, measured_fields
-from analysis.commands.map.files import colours
+from analysis.commands.map.command import Fields
 from analysis.commands.map.pictures import rendered
-from analysis.commands.options import ViewOptions
-from analysis.console.stages import Stages
 from analysis.measures.steepest import in_bytes
-from analysis.probe.command import opened, scene_objective
 from analysis.records.quantities import Shade, percent, quantity
-from analysis.records.report import FILE as REPORT
-from analysis.records.report import SPLATS, legend, write_report
-from analysis.slice.directions import RISE, UNITS, recorded_probe
-from landscape import curvature_reach
+from analysis.slice.directions import UNITS
 from landscape.errors import InputError
 from splat.curvature.objective import SceneObjective
 from splat.model.camera import Camera, look_at
@@ -41,73 +31,11 @@ from splat.model.harmonics import Y00
 from splat.projection.antialias import baked
 from splat.projection.reference import rotation_matrices
 from splat.render.sight import sight
-from splat.training.checkpoint import write_atomically
 
 APPEARANCE = "appearance"
 RADIUS, WITHIN = 20.0, 0.95  # viser's units, and the share of the Gaussians that lies within
 LARGEST = 6e4  # of a covariance, just below the end of float16
 NARROW = 2000.0  # focal length of a click's pixel, px
-
-
-def run_view(options: ViewOptions) -> int:
-    """Show the checkpoint until Ctrl-C, or write a page; returns the exit code."""
-    viser = _viser()
-    console = Console(stderr=True)
-    stages = Stages(console)
-    with stages.stage("load"):
-        folder = options.checkpoint.parent
-        checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, folder / "view")
-        objective = scene_objective(checkpoint, scene)
-    try:
-        server = viser.ViserServer(host=options.host, port=options.port, label="splat-landscape", verbose=False)
-    except OSError as error:
-        raise InputError(f"expected a free --port, got {options.port} ({error}); choose another") from error
-    try:
-        viewer = Viewer(server, objective)
-        if options.html is None:
-            console.print(f"open http://{options.host}:{server.get_port()}; Ctrl-C ends it", highlight=False)
-        notes: list[str] = []
-        with stages, stages.stage("fields") as report:
-            viewer.add_fields(measured_fields(objective, folder / PROBE, notes, report), options.shown)
-        for note in notes:
-            console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
-        if options.html is not None:
-            write_atomically(options.html, server.scene.as_html().encode())
-            console.print(f"written: {options.html}", highlight=False, markup=False, soft_wrap=True)
-            if options.html.resolve() == (folder / SPLATS).resolve() and (folder / PROBE / REPORT).is_file():
-                write_report(folder / PROBE)  # its page has a link to this one
-            return 0
-        viewer.add_steps(steepest_directions(objective, folder / PROBE))
-        Event().wait()
-    except KeyboardInterrupt:
-        console.print("ended", highlight=False)
-    finally:
-        server.stop()
-    return 0
-
-
-def _viser() -> Any:
-    try:
-        return import_module("viser")
-    except ImportError as error:
-        raise InputError(
-            f"expected the package viser, which shows a scene in the browser, got none ({error}); pip install -e '.[view]'"
-        ) from None
-
-
-def steepest_directions(objective: SceneObjective, probe: Path) -> dict[str, tuple[Tensor, float]]:
-    """Unit vectors of the two largest eigenvalues in a probe, if any, and how far they may be followed."""
-    recorded = recorded_probe(probe, objective, [])
-    if recorded is None:
-        return {}
-    ends, vectors = recorded.data.eigenvalues, recorded.arrays["eigenvectors"]["largest"]
-    values = {"e₁": ends.max.value, "e₂": ends.second.value if ends.second else None}
-    rise = RISE * objective.loss(objective.active.flat)
-    return {
-        name: (torch.from_numpy(vectors[:, i]), curvature_reach(value, rise, UNITS))
-        for i, (name, value) in enumerate(values.items())
-        if value and i < vectors.shape[1]
-    }
 
 
 class Frame:
@@ -140,6 +68,7 @@ class Viewer:
     def __init__(self, server: Any, objective: SceneObjective) -> None:
         self.server, self.objective, self.frame = server, objective, Frame(objective.active)
         self.fields: Fields | None = None
+        self.names = {APPEARANCE: APPEARANCE}  # of the fields, by what they are in words
         self.steps: Mapping[str, tuple[Tensor, float]] = {}
         self.sliders: dict[str, Any] = {}
         self._drawing = Lock()  # callbacks come from several threads
@@ -186,11 +115,15 @@ class Viewer:
 
     def add_fields(self, fields: Fields, shown: str) -> None:
         """The drop-down's further entries, once they are measured."""
-        self.fields = fields
-        self.field.options = (APPEARANCE, *fields.kinds)
-        if shown not in self.field.options:
-            raise InputError(f"expected --field {', '.join(self.field.options)}, got {shown!r}")
-        self.field.value = shown
+        words = {APPEARANCE: APPEARANCE} | {name: kind.words for name, kind in fields.kinds.items()}
+        if shown not in words:
+            raise InputError(
+                f"expected a probe with eigenvectors of this checkpoint for --field {shown}, got none; run landscape probe "
+                "first"
+            )
+        self.fields, self.names = fields, {text: name for name, text in words.items()}
+        self.field.options = (*self.names,)
+        self.field.value = words[shown]
         self.recolour()
 
     def add_steps(self, steps: Mapping[str, tuple[Tensor, float]]) -> None:
@@ -202,7 +135,7 @@ class Viewer:
 
     def recolour(self) -> None:
         """The splats' colours, which of them are shown, and the legend."""
-        name = self.field.value
+        name = self.names[self.field.value]
         if self.fields is None or name == APPEARANCE:
             self.splats.rgbs, self.splats.opacities, self.legend.content = self.plain, self.opacities, ""
             return
@@ -213,11 +146,9 @@ class Viewer:
         low, high = np.percentile(known, self.shown.value) if len(known) else (0.0, 0.0)
         everything = tuple(self.shown.value) == (0, 100)
         inside = np.ones(len(values), bool) if everything else (values >= low) & (values <= high)
-        self.splats.rgbs = colours(shade, values)
+        self.splats.rgbs = shade.colours_of(values)
         self.splats.opacities = self.opacities * inside[:, None]
-        self.legend.content = (
-            f'<div style="padding:0 1em;font-size:.85em">{shade.words}, {shade.unit}{legend(shade)}</div>'
-        )
+        self.legend.content = f'<div style="padding:0 1em;font-size:.85em">{shade.title}{shade.legend}</div>'
 
     def step(self) -> None:
         """The splats, the render of the chosen view and the loss where the sliders are."""
@@ -245,12 +176,19 @@ class Viewer:
 
     def told(self, gaussian: int, share: float) -> str:
         """A Gaussian in sight, and its share of the pixel."""
-        number = int(self.objective.mask.nonzero()[gaussian, 0])
-        lines = [f"**Gaussian {number:,}**, {percent(share)} of this pixel", ""]
-        for name, kind in self.fields.kinds.items() if self.fields else ():
-            assert self.fields is not None
-            unit = "" if kind.unit == "1" else f" {kind.unit}"
-            lines.append(f"- {kind.words}: {quantity(float(self.fields.values[name][gaussian]))}{unit}")
+        lines = [
+            f"**Gaussian {int(self.objective.mask.nonzero()[gaussian, 0]):,}**, {percent(share)} of this pixel",
+            "",
+        ]
+        if self.fields is None:
+            return lines[0]
+        kinds = self.fields.kinds
+        numbers = {name: quantity(float(self.fields.values[name][gaussian])) for name in kinds}
+        pairs = {name: f"gn_{name}" for name in kinds if f"gn_{name}" in kinds}
+        single = [name for name in kinds if name not in pairs and name not in pairs.values()]
+        lines += [f"- {kinds[name].words}: {numbers[name]} {kinds[name].unit}" for name in single]
+        lines += ["", "| | Hessian | Gauss-Newton |", "| --- | --- | --- |"]
+        lines += [f"| {kinds[a].words} {kinds[a].unit} | {numbers[a]} | {numbers[b]} |" for a, b in pairs.items()]
         return "\n".join(lines)
 
 
