@@ -8,7 +8,7 @@ from rich.console import Console
 
 from splat.backend.memory import RESERVE, require_room
 
-SAID = "compiling kernels for this processor, which may take two minutes; later runs find them"
+SAID = "compiling kernels for this processor: seconds for one, up to two minutes for all; later runs find them"
 
 
 class _Once(event.Listener):
