@@ -24,6 +24,7 @@ from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, S
 from analysis.commands.uses.options import NextViewOptions, PruneOptions, UncertaintyOptions
 from analysis.console.failures import report
 from analysis.console.interruption import ignored, raising
+from analysis.console.options import REGISTRY
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, TrajectoryOptions
 from analysis.slice.options import SliceOptions
@@ -135,7 +136,9 @@ def _parsed(arguments: Sequence[str]) -> tuple[Command, Any]:
     """
     name, config = (*arguments, "")[0], (tyro.conf.DisallowNone,)
     if found := COMMANDS.get(name):
-        return found, tyro.cli(found.options, prog=f"landscape {name}", args=arguments[1:], config=config)
+        return found, tyro.cli(
+            found.options, prog=f"landscape {name}", args=arguments[1:], config=config, registry=REGISTRY
+        )
     if name and not name.startswith("-"):
         raise InputError(f"expected a command among {', '.join(COMMANDS)}, got {name!r}{did_you_mean(name, COMMANDS)}")
     options = tyro.extras.subcommand_cli_from_dict(

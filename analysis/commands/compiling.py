@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from numba.core import event
 from rich.console import Console
 
-SAID = "compiling kernels for this processor, which may take two minutes; later runs find them"
+SAID = "compiling kernels for this processor: seconds for one, up to two minutes for all; later runs find them"
 
 
 class _Once(event.Listener):

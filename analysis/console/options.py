@@ -6,13 +6,34 @@ The help keeps the line breaks of their docstrings: a line is a sentence.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from types import NoneType
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 T = TypeVar("T")
 Unset = Annotated[T | None, arg(help_behavior_hint="")]  # its docstring says what stands for None
+REGISTRY = ConstructorRegistry()
+
+
+@REGISTRY.primitive_rule
+def _unset_choices(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Of Unset[Literal[...]]: tyro's own rule names None among the choices where it refuses another."""
+    kinds = get_args(info.type)
+    choices = [kind for kind in kinds if get_origin(kind) is Literal]
+    if NoneType not in kinds or len(choices) != len(kinds) - 1:
+        return None
+    known = {str(value): value for kind in choices for value in get_args(kind)}
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(known)}}}",
+        instance_from_str=lambda words: known[words[0]],
+        is_instance=lambda value: value is None or value in known.values(),
+        str_from_instance=lambda value: [str(value)],
+        choices=tuple(known),
+    )
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,7 @@ OPERATORS: dict[schema.Operator, bool] = {"hessian": False, "gauss-newton": True
 PARTS = 6  # the whole and five attributes
 FEWEST_STEPS = 2  # that make a density
 TRACE_SAMPLES = 8  # of SSIM's coupling: to a few percent, within which start vectors do not know it
+PRODUCTS, SPLIT = 33.0, 1.5  # with a batch's vectors that a family takes; as much more where every Gaussian is split
 DENSITY_SHARE = 0.45  # of a family's time: 48 of 108 products by default
 
 
@@ -170,7 +171,7 @@ def measure_families(
     }
     rows: list[FamilyRow] = []
     for (scene, operator), stream in streams.items():
-        with stage(f"families: {operator}{', split' if scene == 'split' else ''}") as report:
+        with stage(_stage_of(scene, operator)) as report:
             hessian = SceneHessian(scenes[scene], gauss_newton=OPERATORS[operator])
             D = scale(scenes[scene])
             known = ends if scene == "trained" and operator == "hessian" and D is None else None
@@ -178,6 +179,22 @@ def measure_families(
             count = len(scenes[scene].active)
             rows += [FamilyRow(scene, operator, block, count, dim, found) for block, dim, found in measured]
     return FamilyFindings(tuple(rows), control, _effects(rows), tuple(dict.fromkeys(notes)), options.metric, unit)
+
+
+def expected_families(options: FamilyOptions) -> dict[str, tuple[int, float, float]]:
+    """What every stage takes: units, as its progress counts them, products of as many vectors as a batch has, and renders."""
+    scenes: dict[SceneName, float] = {"trained": 1.0}
+    if options.split_control:
+        scenes["split"] = SPLIT
+    return {
+        _stage_of(scene, operator): (PARTS, PARTS * PRODUCTS * more, 0)
+        for scene, more in scenes.items()
+        for operator in OPERATORS
+    }
+
+
+def _stage_of(scene: SceneName, operator: schema.Operator) -> str:
+    return f"families: {operator}{', split' if scene == 'split' else ''}"
 
 
 def _with(objective: SceneObjective, control: SplitControl) -> SceneObjective:

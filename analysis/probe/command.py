@@ -26,7 +26,7 @@ from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.measures.memory import expected_peak, require_pictures, size_of, telling_needs
 from analysis.measures.units import step_lengths
-from analysis.probe.measurement import expected_seconds, measure
+from analysis.probe.measurement import Expected, expected_seconds, measure, seconds_of_render
 from analysis.probe.options import ProbeOptions
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.settings import ProbeSettings
@@ -88,7 +88,8 @@ def _run(
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
     console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True, markup=False)
-    console.print(_expected(objective, settings), highlight=False, soft_wrap=True, markup=False)
+    after = _expected_after(family_options)
+    console.print(_expected(objective, settings, after), highlight=False, soft_wrap=True, markup=False)
     told = (
         f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} "
         f"{digests(scene.select(checkpoint.scene.train))} {settings} "
@@ -104,7 +105,15 @@ def _run(
     ):
         generator = torch.Generator(device).manual_seed(options.seed)
         found = measure(
-            objective, settings, generator, stages, None if ranks else unfinished, told, deadline, checkpoint.all_views
+            objective,
+            settings,
+            generator,
+            stages,
+            None if ranks else unfinished,
+            told,
+            deadline,
+            checkpoint.all_views,
+            after,
         )
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
@@ -231,13 +240,19 @@ def _introduction(scene: Scene, checkpoint: Checkpoint, objective: SceneObjectiv
     )
 
 
-def _expected(objective: SceneObjective, settings: ProbeSettings) -> str:
+def _expected_after(families: "FamilyOptions | None") -> Expected:
+    if families is None:
+        return {}
+    from analysis.measures.families import expected_families
+
+    return expected_families(families)
+
+
+def _expected(objective: SceneObjective, settings: ProbeSettings, after: Expected) -> str:
     """Time and memory, from a render and from the views' sizes.  MemoryError where it cannot fit."""
-    peak, flat = expected_peak(objective), objective.active.flat
-    objective.loss(flat)  # for the first render the kernels may compile
-    start = perf_counter()
-    objective.loss(flat)
-    seconds = expected_seconds(settings, perf_counter() - start)
+    peak = expected_peak(objective)
+    objective.loss(objective.active.flat)  # for the first render the kernels may compile
+    seconds = expected_seconds(settings, seconds_of_render(objective), after)
     return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
 
 

@@ -18,11 +18,13 @@ stop at their accuracy or after so many products as settings allow at most; each
 deadline, which ends what is under way.  The numbers depend on the seed alone, also where stages were kept from a run before.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
+from statistics import median
 from time import monotonic
+from types import MappingProxyType
 
 import torch
 from jaxtyping import Float64
@@ -76,18 +78,22 @@ LEFT_OUT = {
     "depth": "positions along and across the rays were left out",
 }
 MOST_AT_ONCE = 4  # start vectors
-PRODUCT, BEFORE = 6, 25  # renders that a product with them takes, and what comes before the first stage
+PRODUCT, BEFORE = 5, 50  # renders that a product with them takes, and what comes before the first stage
+TIMED = 3  # calls, of which the middle one tells how long one takes
 MOST_SAMPLES = 64  # of a trace, beyond which its exact value takes less
-# what a stage took on three real scenes: units, as its progress counts them (0: of different kinds), products of MOST_AT_ONCE
-# vectors, and renders of all views
-TYPICAL: dict[str, tuple[int, float, float]] = {
+Expected = Mapping[str, tuple[int, float, float]]
+"""What a stage takes: units, as its progress counts them (0: of different kinds), products of MOST_AT_ONCE vectors, and renders
+of all views."""
+NOTHING: Expected = MappingProxyType({})
+# on real scenes of different kinds
+TYPICAL: Expected = {
     "traces": (25, 11, 0),
     "eigenvalues": (60, 28, 0),
-    "slice": (230, 0, 184),
+    "slice": (320, 0, 240),
     "depth": (0, 3, 60),
     "block shares": (0, 4, 0),
-    "pictures": (0, 8, 45),
 }
+PICTURES, QUICK_PICTURES = 3.0, 0.5  # seconds that pictures take, which hardly depend on the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,21 +163,25 @@ def measure(
     told: str = "",
     deadline: float = inf,
     population: int | None = None,
+    after: Expected = NOTHING,
 ) -> Measured:
-    """Run every stage.  folder, told, deadline: see `Kept`; population: training views, where the objective has fewer."""
+    """Run every stage.  folder, told, deadline: see `Kept`; population: training views, where the objective has fewer; after:
+    what the caller does then."""
     with stages.stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
-        gradient, value, render = _linearised(objective, report)
+        gradient, value = _linearised(objective, report)
         objective.approximate_blocks  # noqa: B018 (made here, where kernels compile)
+        if settings.block_coupling or not settings.trace_samples:
+            _compile_blocks(objective)
     with stages.stage("checks") as report:
         operator_check = check_operator(operator, spawn(generator), settings.checked_vectors)
         gradient_check = check_against_gradient(hessian, spawn(generator), report, settings.checked_views)
     checks = operator.matvecs, hessian.views.spared
-    product = _seconds_of_product(hessian)
+    product, render = _seconds_of_product(hessian), seconds_of_render(objective)
     words = f"{MOST_AT_ONCE} products at once take {product:.2g} s, a render of all views {render:.2g} s"
     kept = Kept(stages, generator, STAGES, lambda: [operator.matvecs, hessian.views.spared], folder, told, deadline)
-    plan = _plan(settings, product, render)
+    plan = _plan(settings, product, render, after)
     stages.expect({name: work for name, work in plan.items() if not kept.has(name)}, words)
     point = _Point(objective, hessian, operator, settings, gradient, value)
     return _all_stages(point, kept, operator_check, gradient_check, checks, population)
@@ -244,25 +254,42 @@ def _left_out(at: _Point, ends: EigenEnds, population: int) -> LeftOut:
     return LeftOut(population, at.objective.losses, at.hessian.by_view(vectors))
 
 
-def _linearised(objective: SceneObjective, report: Progress) -> tuple[Tensor, float, float]:
-    """The gradient, the loss, and the seconds that rendering it takes; for the first render the kernels may compile."""
+def _linearised(objective: SceneObjective, report: Progress) -> tuple[Tensor, float]:
+    """The gradient and the loss."""
     report(0, 1, f"{len(objective.views)} views")
-    gradient, center = objective.gradient, objective.active.flat
+    gradient = objective.gradient
     report(1, 1, f"{len(objective.views)} views")
-    objective.loss(center)
-    start = monotonic()
-    return gradient, objective.loss(center), monotonic() - start
+    return gradient, objective.loss(objective.active.flat)
+
+
+def _compile_blocks(objective: SceneObjective) -> None:
+    """The kernel of exact blocks, by those of one Gaussian: only late stages need it, whose time is told before."""
+    if objective.couples_pixels and not by_triton(objective.active.flat):
+        one = objective.active.select(torch.zeros(1, dtype=torch.int64))
+        objective.linearizer(one)(0).block_diagonals(approximate=False, parts=(False, True))
 
 
 def _seconds_of_product(hessian: SceneHessian) -> float:
     """With MOST_AT_ONCE vectors."""
     V = torch.ones_like(hessian.objective.active.flat)[:, None].expand(-1, MOST_AT_ONCE).contiguous()
-    start = monotonic()
-    finished(hessian.apply(V))
-    return monotonic() - start
+    return _seconds_of(lambda: finished(hessian.apply(V)))
 
 
-def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str, Work]:
+def seconds_of_render(objective: SceneObjective) -> float:
+    """Of all views, with all threads; compiles nothing only where one has been made before."""
+    return _seconds_of(lambda: objective.loss(objective.active.flat))
+
+
+def _seconds_of(call: Callable[[], object]) -> float:
+    taken = []
+    for _ in range(TIMED):
+        start = monotonic()
+        call()
+        taken.append(monotonic() - start)
+    return median(taken)
+
+
+def _plan(settings: ProbeSettings, product: float, render: float, after: Expected = NOTHING) -> Mapping[str, Work]:
     """What every stage is expected to take, from the seconds of a product and of a render."""
     work = dict(TYPICAL)
     if settings.trace_samples:
@@ -271,7 +298,7 @@ def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str
     points = min(units, settings.slice_points**2) if settings.slice_plane else 2 * settings.slice_points
     work["slice"] = (points, 0, renders * points / units)
     if count := settings.density_matvecs:
-        work["density"] = (count, 0.32 * count, 0)
+        work["density"] = (count, 0.3 * count, 0)
     if settings.power_apart:
         work["power iteration"] = (0, settings.power.max_matvecs, 0)
     if settings.probe_steps:
@@ -279,17 +306,18 @@ def _plan(settings: ProbeSettings, product: float, render: float) -> Mapping[str
         work["finite probe"] = (count, 0, count)
     if settings.depth is None:
         del work["depth"]
-        work["pictures"] = (0, 0, 12)
     if settings.block_coupling:
-        work["block shares"] = (0, 16, 0)  # exact blocks take longest
-    return {
-        name: Work(products * product + renders * render, units) for name, (units, products, renders) in work.items()
+        work["block shares"] = (0, 24, 0)  # exact blocks take longest
+    found = {
+        name: Work(products * product + renders * render, units)
+        for name, (units, products, renders) in (work | dict(after)).items()
     }
+    return found | {"pictures": Work(PICTURES if settings.slice_plane else QUICK_PICTURES)}
 
 
-def expected_seconds(settings: ProbeSettings, render: float) -> float:
+def expected_seconds(settings: ProbeSettings, render: float, after: Expected = NOTHING) -> float:
     """About how long all stages take, from the seconds of a render of all views alone."""
-    stages = _plan(settings, PRODUCT * render, render).values()
+    stages = _plan(settings, PRODUCT * render, render, after).values()
     return sum(work.seconds for work in stages) + BEFORE * render
 
 

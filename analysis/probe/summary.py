@@ -6,7 +6,7 @@ from pathlib import Path
 
 from analysis.records.findings import Line, findings, is_open
 from analysis.records.quantities import UNDETERMINED, apart, limits, measured, quantity
-from analysis.records.records import Counts, ProbeRecord
+from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import Index, Trace
 
 SHORT = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "SH"}
@@ -80,4 +80,10 @@ def _checks(data: ProbeRecord) -> str:
     passed = sum(check.passed is True for check in data.checks.values())
     if passed == len(data.checks):
         return f"all {passed} passed"
-    return f"{passed} of {len(data.checks)} passed"
+    rest = [_not_passed(name, check) for name, check in data.checks.items() if check.passed is not True]
+    return f"{passed} of {len(data.checks)} passed, not {' and '.join(rest)}"
+
+
+def _not_passed(name: str, check: Check) -> str:
+    words = name.replace("_", " ")
+    return f"{words} ({quantity(check.value)} of {quantity(check.bound)})" if check.passed is False else words

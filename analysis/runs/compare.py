@@ -121,8 +121,8 @@ def require_same_loss(runs: Sequence[Run]) -> None:
             )
 
 
-def cautions(runs: Sequence[Run]) -> list[str]:
-    """What differs between the runs, or is missing from some, that a reader has to keep in mind."""
+def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
+    """What differs between the runs, or is missing from some, that a reader has to keep in mind.  seeds: which differ here."""
     settings: dict[str, Callable[[Run], Any]] = {
         "scene": lambda run: run.data.provenance.scene,
         "steps": lambda run: run.checkpoint.training.step,
@@ -135,7 +135,8 @@ def cautions(runs: Sequence[Run]) -> list[str]:
         "precision": lambda run: run.data.provenance.dtype,
     }
     lines = [f"The {what} are not the same." if what.endswith("s") else f"The {what} is not the same."
-             for what, of in settings.items() if any(of(run) != of(runs[0]) for run in runs)]  # fmt: skip
+             for what, of in settings.items()
+             if any(of(run) != of(runs[0]) for run in runs) and not (seeds and what == "seed")]  # fmt: skip
     if len({row.unit for run in runs for row in run.data.families or ()}) > 1:
         lines.append("The units of the families are not the same.")
     found = [leaves(run.data.provenance.settings or {}) for run in runs]
@@ -147,13 +148,15 @@ def cautions(runs: Sequence[Run]) -> list[str]:
     if different:
         order = ", ".join(run.label for run in runs)
         lines.append(f"The probes were run with different settings (those of {order}): {'; '.join(different)}.")
+    said: list[tuple[Run, str]] = []
     for run in runs:
         if run.data.slice and not run.data.slice.is_resolved:
-            lines.append(f"{run.label}: {unresolved(run.data.slice, run.data.provenance)}")
-        lines += [f"{run.label}: {line.text}" for line in of_checks(run.data.checks) if line.level != "fact"]
+            said.append((run, unresolved(run.data.slice, run.data.provenance)))
+        said += [(run, line.text) for line in of_checks(run.data.checks) if line.level != "fact"]
         ends = {"max": run.data.eigenvalues.max.reason, "min": run.data.eigenvalues.min.reason}
-        lines += [f"{run.label}: {line.text}" for line in of_budgets(ends)]
-        lines += [f"{run.label} was not scored."] * (run.scores is None)
+        said += [(run, line.text) for line in of_budgets(ends)]
+        said += [(run, "It was not scored.")] * (run.scores is None)
+    lines += _once(said)
     if without := [run for run in runs if not run.data.split_control]:
         lines.append(
             "Anisotropy depends on the number of Gaussians; how much, the split control says, which is missing: "
@@ -180,10 +183,22 @@ def split_controls(runs: Sequence[Run]) -> list[str]:
     return lines
 
 
+def _once(lines: Sequence[tuple[Run, str]]) -> list[str]:
+    """What is said of runs, once of all of whom the same is said but for the command that mends it."""
+    alike: dict[str, list[tuple[Run, str]]] = {}
+    for run, text in lines:
+        alike.setdefault(text.partition("; landscape ")[0], []).append((run, text))
+    return [
+        f"{group[0][0].label}: {group[0][1]}"
+        + (f"  So it is of {', '.join(run.label for run, _ in group[1:])}." if group[1:] else "")
+        for group in alike.values()
+    ]
+
+
 def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], out: Path) -> None:
     """Table, pictures, page; and what it says, the table and the cautions once more for the terminal."""
     console, labels = Console(), [run.label for run in runs]
-    rows, notes = comparison(runs), cautions(runs)
+    rows, notes = comparison(runs), cautions(runs, any(len(group.folders) > 1 for group in groups))
     shown = grouped(rows, groups)
     says = [*same, *sayings(shown, groups)]
     shown_runs = {folder: group.label for group in groups for folder in group.folders[:1]}

@@ -94,9 +94,9 @@ def gathered(runs: Sequence[Path]) -> pd.DataFrame:
 def first_and_last(table: pd.DataFrame) -> Table:
     """The first and the last record of every run that were measured."""
     result = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    result.add_column("", no_wrap=True)
+    result.add_column("")
     for name in ("first", "last"):
-        result.add_column(name, justify="right")
+        result.add_column(name, justify="right", no_wrap=True)
     for run, rows in table.groupby("run", sort=False):
         known = rows[rows["state"] != "skipped"]
         skipped = len(rows) - len(known)
@@ -121,7 +121,7 @@ def _bracketed(row: Mapping[str, Any], key: str) -> str:
     value, low, high = (_known(row[name]) for name in (key, f"{key}_low", f"{key}_high"))
     if low is None or high is None:
         return bracketed(Index(value=value, low=low, high=high, note="")).value
-    return f"{quantity(value)} ({quantity(low)} to {quantity(high)})"
+    return f"{quantity(value)}\n{quantity(low)} to {quantity(high)}"
 
 
 def _known(number: float) -> float | None:

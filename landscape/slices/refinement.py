@@ -2,7 +2,8 @@
 
     axes        every point: nothing is interpolated along a line, nor along the two sections of a plane
     fill        the points farthest from all that are known: COARSE at first, then 3/4 as many as are known beside the axes
-    hold out    predict random points that are not known, then evaluate them; from then on the interpolant has them too.  If the
+    hold out    predict as many random points that are not known, then evaluate them: the bound is the closer to the largest
+                error the more they are, and from then on the interpolant has them too.  If the
                 bound of the error that follows is within tolerance * range, the slice is done; else fill again
 
 The errors of the last hold-out are those of an interpolant without its points, so that the final one is better.  A plane whose
@@ -30,8 +31,8 @@ class SliceSettings:
     """Which points of a plane are evaluated; the others are interpolated.
 
     tolerance: of the interpolation, as a share of the range of the values; None: every point is evaluated.
-    holdout: random points of a hold-out.  From 64 of which the largest error is within the tolerance follows, with 97.5%
-        confidence, that at most 5.6% of the others are not; the bound extrapolates to all.
+    holdout: random points of a hold-out, at least.  From 64 of which the largest error is within the tolerance follows, with
+        97.5% confidence, that at most 5.6% of the others are not; the bound extrapolates to all.
     workers: threads that evaluate.
     max_evaluations, max_seconds: budgets for what comes after the axes, which are always evaluated.  max_evaluations counts
         these and the one at the centre, and those of a store; time counts from the call.  Allowed only with a tolerance.
@@ -77,7 +78,7 @@ def evaluate_adaptively(
     evaluations.require(grid.axes)
     while not (known := evaluations.known).all():
         filling = grid.farthest(known, fill)
-        drawn = _draw(known, filling, settings.holdout, generator)
+        drawn = _draw(known, filling, max(settings.holdout, fill), generator)
         if reason := _spent(evaluations, settings, len(filling) + len(drawn), monotonic() - begun):
             return Refined(evaluations.value, errors, looks, reason)
         evaluations.require(filling)

@@ -21,7 +21,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from landscape.errors import InputError, lacks_memory
+from landscape.errors import InputError, did_you_mean, lacks_memory
 from landscape.results import Brief
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
@@ -254,8 +254,10 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 def _instead(path: Path) -> str:
     """What there is in place of a checkpoint, and what to name."""
-    if not path.is_dir():
-        return "no such file"
+    if not path.exists():
+        near = path.parent if path.name == "checkpoint.pt" else path
+        beside = [each.name for each in near.parent.iterdir()] if near.parent.is_dir() else []
+        return f"no such file{did_you_mean(near.name, beside)}"
     if (inside := path / "checkpoint.pt").is_file():
         return f"a folder; name the {inside} in it"
     if runs := sorted(path.glob("*/checkpoint.pt")):

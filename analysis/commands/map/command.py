@@ -14,6 +14,7 @@ in the images.
 """
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -36,10 +37,11 @@ from analysis.probe.record import provenance_of
 from analysis.records.json_files import json_text, plain
 from analysis.records.quantities import Shade, quantity
 from analysis.records.records import record_folder, require_replaceable
-from analysis.records.run_files import MAP, MapRecord, Panel, Steepest
+from analysis.records.run_files import MAP, Fragility, MapRecord, Panel, Steepest
 from analysis.slice.directions import recorded_probe
 from landscape.errors import InputError, did_you_mean
 from landscape.results import Progress
+from splat.backend.cpu.threads import single_threaded
 from splat.curvature.fields import FIELDS, Field, Values, scene_fields
 from splat.curvature.objective import SceneObjective
 from splat.render.sight import Sight
@@ -85,7 +87,7 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         objective = scene_objective(checkpoint, scene)
         chosen = _chosen(options.draw, objective.views)
-    with record_folder(out, MapRecord) as folder, stages:
+    with record_folder(out, MapRecord) as folder, stages, ThreadPoolExecutor(1) as beside:
         with stages.stage("fields") as report:
             found = measured_fields(objective, options.checkpoint.parent / PROBE, notes, report)
         if options.shown not in found.values:
@@ -93,12 +95,10 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
                 f"expected a probe with eigenvectors of this checkpoint in {options.checkpoint.parent / 'probe'} for "
                 f"--field {options.shown}, got none; run landscape probe first"
             )
+        swapping = beside.submit(_fragility, objective, found, options.seed)  # no stage fills two processors by itself
         with stages.stage("maps") as report:
             shades = {name: found.shade(name) for name in dict.fromkeys((options.shown, *AXES))}
             panels = _write_panels(folder, objective, found, shades, chosen, report)
-        with stages.stage("fragility") as report:
-            generator = torch.Generator().manual_seed(options.seed)
-            fragile = fragility(objective, found.values, found.sights, generator, report)
         with stages.stage("steepest") as report:
             shown = _write_ends(folder, objective, found, report)
         shade, gaussians = shades[options.shown], checkpoint.training.gaussians
@@ -108,6 +108,8 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
             (folder / f"{options.shown}.ply").write_bytes(coloured)
             top = top_table(objective, found.values, options.shown)
             (folder / "top.csv").write_text(csv_text(top), encoding="utf-8")
+        with stages.stage("fragility"):
+            fragile = swapping.result()
         made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
         data = MapRecord(
             gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
@@ -157,6 +159,12 @@ def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], re
                 values[name] = masses(ends[name].vector, objective.active)
                 kinds[name] = Field(ENDS[name], "", "log")
     return Fields(values, kinds, ends, sights)
+
+
+def _fragility(objective: SceneObjective, found: Fields, seed: int) -> Fragility:
+    with single_threaded():
+        generator = torch.Generator().manual_seed(seed)
+        return fragility(objective, found.values, found.sights, generator, lambda *_: None)
 
 
 def _write_panels(

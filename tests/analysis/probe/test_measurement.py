@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from analysis.bench.accuracy.cases import splat_cases
-from analysis.console.stages import Stages
+from analysis.console.stages import Stages, Work
 from analysis.probe import measurement
 from analysis.probe.measurement import _plan, measure
 from analysis.probe.settings import ProbeSettings
@@ -14,6 +14,7 @@ from landscape import EigenSettings, TraceSettings, extreme_eigenpairs
 from landscape.eigen.power import power_iteration
 from splat.curvature.block_eigenvectors import BlockEigenvectors
 from splat.curvature.hessian import SceneHessian
+from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
 from splat.curvature.traces import block_traces
 from splat.losses.reference import LossSettings
@@ -29,20 +30,22 @@ def test_kernels_are_compiled_before_the_time_is_told_and_blocks_made_once(monke
         whole = getattr(owner, name)
 
         def call(*args, **options):
-            calls.append("gauss_newton" if options.get("gauss_newton") else name)
+            exact = name == "block_diagonals" and not options["approximate"]
+            calls.append("exact" if exact else "gauss_newton" if options.get("gauss_newton") else name)
             return whole(*args, **options)
 
         monkeypatch.setattr(owner, name, call)
 
     for name in ("block_diagonal", "evaluate"):
         counted(SceneObjective, name)
+    counted(LinearizedView, "block_diagonals")
     counted(measurement, "check_against_gradient")
     counted(measurement, "_plan")
     objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
-    settings = replace(ProbeSettings.quick(), slice_points=5)
+    settings = replace(ProbeSettings.quick(), slice_points=5, block_coupling=True)
     found = measure(objective, settings, torch.Generator().manual_seed(0), Stages())
     first = calls[: calls.index("_plan")]
-    assert {"block_diagonal", "evaluate", "check_against_gradient"} <= {*first}
+    assert {"block_diagonal", "evaluate", "exact", "check_against_gradient"} <= {*first}
     assert calls.count("block_diagonal") == 1 and calls.count("gauss_newton") == 1
     assert found.value == pytest.approx(objective.loss(objective.active.flat))
     assert found.plane is not None  # the two axes alone
@@ -116,8 +119,9 @@ def test_a_quick_probe_is_expected_to_take_what_it_makes_alone():
     assert set(whole) - set(quick) == {"density", "finite probe", "depth"}
     assert quick["slice"].units == 2 * 21 < whole["slice"].units
     assert (
-        quick["slice"].seconds == pytest.approx(1.6 * 21 * 10.0) and quick["traces"].seconds < whole["traces"].seconds
+        quick["slice"].seconds == pytest.approx(1.5 * 21 * 10.0) and quick["traces"].seconds < whole["traces"].seconds
     )
+    assert _plan(ProbeSettings(), 2.0, 10.0, {"families": (6, 100, 1)})["families"] == Work(210.0, 6)
 
 
 def test_traces_that_samples_do_not_resolve_are_exact():

@@ -281,13 +281,35 @@ def test_what_has_to_be_kept_in_mind_is_said(runs, capsys, no_pictures):
         "The precision is not the same",
         "The probes were run with different settings (those of plain/0, sam/0): eigen.rtol None, 0.5; quick None, True.",
         "sam/0: The check of symmetry failed",
-        "sam/0 was not scored",
-        "sam/0: The search for the smallest eigenvalue ended at its time budget: the end may lie farther out.",
+        "sam/0: It was not scored.",
+        "plain/0: The search for the smallest eigenvalue ended at its time budget: the end may lie farther out. "
+        "So it is of sam/0.",
         f"landscape probe {runs[1]}/checkpoint.pt --split-control",
     ):
         assert part in said and part in " ".join(
             (Path(runs[0]).parents[1] / "compare/compare.html").read_text().split()
         )
+
+
+def test_what_holds_of_many_runs_is_said_once_and_seeds_may_differ(runs, capsys, no_pictures):
+    data, arrays = synthetic()
+    data["provenance"] |= {"iteration": ITERATIONS}
+    data["checks"]["symmetry"]["passed"] = False
+    data["anisotropy"]["share"] |= {"value": None, "low": None, "high": None}
+    for run, seed in zip(runs, (0, 3), strict=True):
+        changed(run, seed=seed)
+        written(Path(run) / "probe", data, arrays)
+    assert main(["compare", *runs]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("The check of symmetry failed") == 1 and "So it is of sam/0." in said
+    assert "The seed is not the same" in said and " share " not in said
+    assert main(["compare", "--group", f"both={runs[0]},{runs[1]}", "--group", f"again={trained_again(runs)}"]) == 0
+    assert "The seed is not the same" not in capsys.readouterr().out
+
+
+def trained_again(runs: list[str]) -> Path:
+    """A copy of the first run."""
+    return Path(shutil.copytree(runs[0], Path(runs[0]).with_name("copy")))
 
 
 def test_families_that_only_one_run_has_are_in_no_other_units(runs, capsys, no_pictures):

@@ -64,13 +64,13 @@ def test_a_slice_that_continues_has_its_evaluations_in_total(tmp_path):
 
 
 def test_a_slice_that_continues_has_its_whole_time_again(tmp_path, monkeypatch):
-    store, rest, limit = tmp_path / "slice.npz", Objective(), 120.0
+    store, rest, limit = tmp_path / "slice.npz", Objective(), 150.0
     settings = {"tolerance": 1e-4, "holdout": 8}
     with pytest.raises(KeyboardInterrupt):
         sliced(Objective(dies_after=100), store, **settings)
     monkeypatch.setattr("landscape.slices.refinement.monotonic", lambda: float(rest.calls))  # a second each
     found = sliced(rest, store, **settings, max_seconds=limit)
-    expected = 1 + 37 + (16 + 8) + (18 + 8) + (37 + 8) + (71 + 8)
+    expected = 1 + 37 + (16 + 16) + (24 + 24) + (60 + 60)
     assert found.reason == "time budget" and found.evaluations == expected > 100 + limit / 2
     assert rest.calls <= limit
 

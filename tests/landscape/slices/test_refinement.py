@@ -33,6 +33,11 @@ def crease(theta):
     return float(np.hypot(x + 0.7 * y - 0.2, 0.1)) + 0.2 * x * x
 
 
+def jumps(theta):
+    """As where splats change their order: small jumps everywhere over a valley."""
+    return valley(theta) + 0.02 * noise(theta)
+
+
 def sliced(loss, seed=0, axes=(SIDE, SIDE), **settings):
     return evaluate_slice(
         loss,
@@ -70,6 +75,13 @@ def test_the_slice_takes_few_evaluations_and_is_as_good_as_asked_for(loss, toler
     assert found.evaluations == 1 + int(found.evaluated.sum()) <= share * 41**2
     assert off.max() <= tolerance and found.error_seen <= found.interpolation_error
     assert found.holdout.numel() == 64
+
+
+def test_a_plane_with_small_jumps_is_not_rendered_whole():
+    """Of a thousandth of the range: a larger hold-out has more errors in its tail, from which the bound is told."""
+    for seed in range(3):
+        found = sliced(jumps, seed)
+        assert found.reason == "tolerance" and found.evaluations < 0.4 * 41**2 and errors(jumps, found).max() <= 0.01
 
 
 @pytest.mark.parametrize("loss", [valley, crease, noise])
@@ -138,7 +150,7 @@ def test_beyond_the_axes_no_more_evaluations_are_made_than_allowed(most):
     found = sliced(rough, max_evaluations=most)
     assert len(calls) == found.evaluations <= max(most, 82) and found.reason == "evaluation budget"
     assert found.interpolation_error > 0.1 and not found.resolved and found.loss[~found.evaluated].isnan().all()
-    assert found.looks == (most > 161) + (most > 285) + (most > 502) + (most > 881)
+    assert found.looks == (most > 161) + (most > 285) + (most > 591) + (most > 1355)
 
 
 def test_of_noise_every_point_is_evaluated():
