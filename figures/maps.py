@@ -9,7 +9,6 @@ Grey: no splat with a value.  The arrow ends of a scale say that there are value
 """
 
 import math
-import textwrap
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -32,7 +31,6 @@ from figures.style import BLACK, BLUE, VERMILION, folder_script, literal, save, 
 NEAR = 0.03  # of a scale's length, from its end
 WIDTH, TALLEST = 7.0, 9.0  # inches
 MARGIN, HEAD, LEGEND = 0.12, 0.22, 0.5  # inches: between pictures, above one, beneath one
-LINE = 0.15  # inches: of the words above all
 BAR, ARROW, TICK = 0.09, 0.07, 0.03  # inches: of a scale, how high it is, and of its ends and its ticks
 FEWEST, DOTS = 110, 160  # an inch: as many as the photograph has pixels there, where these are between both, or DOTS
 
@@ -43,18 +41,14 @@ class Sheet:
     Places are in inches from the top left.  Only plots have axes, which take longer to draw than pictures.
     """
 
-    def __init__(
-        self, rows: int, columns: int, shape: tuple[int, int], legends: tuple[bool, ...], above: float = 0.0
-    ) -> None:
+    def __init__(self, rows: int, columns: int, shape: tuple[int, int], legends: tuple[bool, ...]) -> None:
         aspect = shape[0] / shape[1]
         self.across = (WIDTH - MARGIN * (columns + 1)) / columns
-        rest = above + rows * HEAD + sum(legends) * LEGEND + MARGIN
+        rest = rows * HEAD + sum(legends) * LEGEND + MARGIN
         self.across = min(self.across, (TALLEST - rest) / rows / aspect)
         self.tall = self.across * aspect
         self.size = (columns * (self.across + MARGIN) + MARGIN, rest + rows * self.tall)
-        self.tops = [
-            above + HEAD + sum(self.tall + HEAD + LEGEND * each for each in legends[:row]) for row in range(rows)
-        ]
+        self.tops = [HEAD + sum(self.tall + HEAD + LEGEND * each for each in legends[:row]) for row in range(rows)]
         dots = shape[1] / self.across
         self.figure = Figure(figsize=self.size, dpi=dots if FEWEST <= dots <= DOTS else DOTS)
         self.inches = Affine2D().scale(1 / self.size[0], -1 / self.size[1]).translate(0, 1) + self.figure.transFigure
@@ -67,6 +61,11 @@ class Sheet:
         """A picture with what it is above it; returns the way from its pixels to inches."""
         left, top = self.corner(row, column, title)
         self._image(image, left, top, self.across, self.tall)
+        return self.way(row, column, image)
+
+    def way(self, row: int, column: int, image: UInt8[np.ndarray, "h w ..."]) -> Affine2D:
+        """From the pixels of a picture that is shown there to inches."""
+        left, top = self.corner(row, column)
         return Affine2D().scale(self.across / image.shape[1], self.tall / image.shape[0]).translate(left, top)
 
     def show_scaled(
@@ -174,23 +173,37 @@ def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
 def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
     """An end of the spectrum: the view with the carriers, and its part at -step, 0 and +step."""
     left, top, right, bottom = end.crop
-    changes, shares = [loss / end.losses[1] - 1 for loss in end.losses], [each.share for each in end.carriers]
-    alone = end.curvature * end.step**2 / 2 / end.losses[1]
-    words = f"By its curvature alone a step of {quantity(end.step)} changes the loss by {_signed(alone)}; rendered, by "
-    words += f"{_signed(changes[0])} (back) and {_signed(changes[2])} (forth)."
-    if max(change * alone for change in (changes[0], changes[2])) < 0:
-        words += " It holds for shorter steps."
-    lines = [line for text in (end.sentence, words) for line in textwrap.wrap(text, 115)]
+    changes, share = (
+        [loss / end.losses[1] - 1 for loss in end.losses],
+        percent(sum(each.share for each in end.carriers)),
+    )
+    step, (back, _, forth) = quantity(end.step), map(_signed, changes)
     with style():
-        sheet = Sheet(2, 3, maps["view"].shape[:2], (False, True), above=0.08 + LINE * len(lines))
-        sheet.text(MARGIN, 0.08, "\n".join(lines), fontsize=7.5, linespacing=1.4)
+        sheet = Sheet(2, 3, maps["view"].shape[:2], (False, True))
         whole = sheet.show(0, 0, maps["view"], f"Photograph, {end.view.rpartition('/')[2]}")
-        part = sheet.show(0, 1, maps["photograph"], f"Which Gaussians are {percent(sum(shares))} of it")
         frame = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BLACK, linewidth=1.0)
         _inside(sheet, frame, whole, maps["view"])
-        for way, shift, image in ((whole, (0, 0), "view"), (part, (left, top), "photograph")):
+        parts = {
+            "photograph": (0, 1, f"Gaussians with {share} of {end.name}"),
+            "zero": (0, 2, f"Render: loss {quantity(end.losses[1])}"),
+            "minus": (1, 0, f"{step} back: loss {back}"),
+            "plus": (1, 1, f"{step} forth: loss {forth}"),
+        }
+        ways = [("view", whole, (0, 0))]
+        ways += [
+            (name, sheet.show(row, column, maps[name], title), (left, top))
+            for name, (row, column, title) in parts.items()
+        ]
+        sheet.show_scaled(1, 2, maps["difference"], end.difference, "Forth less back", end.difference.unit)
+        ways.append(("difference", sheet.way(1, 2, maps["difference"]), (left, top)))
+        for name, way, shift in ways:
             for carrier in reversed(end.carriers):  # the first above the others
-                _inside(sheet, _outline(carrier, shift, _colour(carrier, end)), way, maps[image])
+                _inside(
+                    sheet,
+                    _outline(carrier, shift, _colour(carrier, end), 0.4 if name == "difference" else 0.8),
+                    way,
+                    maps[name],
+                )
         x, y = sheet.corner(0, 1)
         for line, carrier in enumerate(end.carriers):
             sheet.text(
@@ -198,10 +211,6 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
                 f"{carrier.gaussian:,}: {percent(carrier.share)}", color=_colour(carrier, end), va="bottom",
                 bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.2},
             )  # fmt: skip
-        sheet.show(0, 2, maps["zero"], f"Render: loss {quantity(end.losses[1])}")
-        sheet.show(1, 0, maps["minus"], f"One step back: loss {_signed(changes[0])}")
-        sheet.show(1, 1, maps["plus"], f"One step forth: loss {_signed(changes[2])}")
-        sheet.show_scaled(1, 2, maps["difference"], end.difference, "Forth less back", end.difference.unit)
     return sheet.figure
 
 
@@ -213,10 +222,12 @@ def _colour(carrier: Carrier, end: Steepest) -> str:
     return VERMILION if carrier is end.carriers[0] else BLUE
 
 
-def _outline(carrier: Carrier, shift: tuple[int, int], colour: str) -> Ellipse:
+def _outline(carrier: Carrier, shift: tuple[int, int], colour: str, width: float) -> Ellipse:
     x, y, long, short, angle = carrier.outline
     centre = (x - shift[0], y - shift[1])
-    return Ellipse(centre, 2 * long, 2 * short, angle=math.degrees(angle), fill=False, edgecolor=colour, linewidth=1.0)
+    return Ellipse(
+        centre, 2 * long, 2 * short, angle=math.degrees(angle), fill=False, edgecolor=colour, linewidth=width
+    )
 
 
 def _inside(sheet: Sheet, patch: Patch, way: Affine2D, image: np.ndarray) -> None:

@@ -1,11 +1,11 @@
 """Figure: the loss on a plane through the checkpoint, as contours, and its two cross-sections through the centre.
 
 Dots: true renders, among them all of the cross-sections; between them the loss is interpolated.  Blue dots: crossed points,
-where the order of the splats or the set of visible ones is not the centre's.  White dashed lines: the quadratic model at the
-contours' levels.  Grey: no finite loss.  Crosses: other checkpoints that the plane leads to.  The cross-sections share their
-vertical axis, so that a steep direction looks steep beside a flat one; their upper axes count steps in curvature units, within
-one of which the curvature alone changes the loss by the amount named.  Where too few points are renders to know the others, the
-cross-sections are drawn alone, and a sentence says what resolves the plane.
+where the order of the splats or the set of visible ones is not the centre's.  Dashed: the quadratic model, in the plane at the
+contours' levels.  Grey: no finite loss.  Upright cross: the checkpoint; others: where the plane leads.  The cross-sections
+share their vertical axis, so that a steep direction looks steep beside a flat one; their upper axes count steps in curvature
+units, within one of which the curvature alone changes the loss by the amount named.  Where too few points are renders to know
+the others, the cross-sections are drawn alone, and a sentence says what resolves the plane.
 """
 
 import textwrap
@@ -24,7 +24,6 @@ from figures.plane import Direction, Plane, curvature_text, plane, same_scale
 from figures.style import BLACK, FIELD_MAP, MISSING, SKY, VERMILION, new_figure, script, style
 
 LEVELS = 12
-LOWER = 0.01  # of the range of the loss
 WRAP = 76  # characters in a line of the sentence
 ACROSS, INTERVALS = 5, 3  # between ticks of the plane and of a cross-section: labels such as -0.008 stay apart
 RENDERED: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 2.6, "color": BLACK, "markeredgewidth": 0}
@@ -62,7 +61,7 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
         filled = axes.contourf(x, y, field.change.T, levels=levels, cmap=FIELD_MAP)
         axes.contour(x, y, field.change.T, levels=levels, colors=BLACK, linewidths=0.4)
         if field.model is not None:
-            axes.contour(x, y, field.model.T, levels=levels, colors="white", linewidths=0.7, linestyles="dashed")
+            axes.contour(x, y, field.model.T, levels=levels, colors=VERMILION, linewidths=0.8, linestyles="dashed")
     else:
         axes.text(0.5, 0.65, "the loss is the same\nat every point", transform=axes.transAxes, ha="center")
         axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
@@ -86,16 +85,16 @@ def _draw_plane(axes: Axes, field: Plane) -> QuadContourSet | None:
 
 
 def _finding(field: Plane) -> str:
-    """Sentence: whether the loss rises from the centre to all sides, and by how much.
-
-    Points count as lower than the centre where they are so by more than a hundredth of the range.
-    """
+    """Sentence: how far the loss rises and falls in this plane, and where it is lowest, on the axes' numbers."""
     low, high, power = float(field.change.min()), float(field.change.max()), 10.0**field.exponent
     if not high > low:
         return "The loss is the same everywhere"
-    if low < -LOWER * (high - low):
-        return f"Lower ground near by: {quantity(power * low)}; highest {quantity(power * high)}"
-    return f"The loss rises to all sides, by up to {quantity(power * high)}"
+    text = f"In this plane the loss is up by at most {quantity(power * high)},\n"
+    row, column = np.unravel_index(int(field.change.argmin()), field.change.shape)
+    if (row, column) == (field.x.centre, field.y.centre):
+        return f"{text}lowest at the checkpoint, the cross"
+    place = ", ".join(f"{each:.2g}".replace("-", "−") for each in (field.x.scaled[row], field.y.scaled[column]))
+    return f"{text}lowest, by {quantity(power * low)}, at ({place})"
 
 
 def _levels(field: Plane) -> np.ndarray:
@@ -133,7 +132,8 @@ def _legend(field: Plane) -> list[Line2D]:
     handles = [Line2D([], [], color=BLACK, label="loss, true renders")]
     if not field.evaluated.all():
         size = "unbounded" if field.error is None else f"<{100 * field.error:.2g}%"
-        label = "loss, renders" if field.unresolved else f"loss, {field.evaluated.mean():.0%} renders (error {size})"
+        label = f"dots: rendered ({field.evaluated.mean():.0%})\nline: interpolated (error {size})"
+        label = "loss, renders" if field.unresolved else label
         handles = [Line2D([], [], color=BLACK, marker=".", markersize=4, label=label)]
     if field.model is not None:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))

@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 from msgspec import structs
 
-from analysis.records.findings import attribute_name
+from analysis.records.findings import attribute_name, largest_steps, shares_per_trace
 from analysis.records.quantities import measured, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from analysis.records.schema import Trace
@@ -48,17 +48,9 @@ def draw(record: Record[ProbeRecord]) -> Figure:
         else:
             _draw_traces(axes, entries, samples)
             axes.set_xlabel("|trace|; rows have units of their own\nand do not compare")
-        figure.suptitle(_title(entries, shares), x=0.02, ha="left", fontsize=7.5)
+        figure.suptitle(_title(record.data), x=0.02, ha="left", fontsize=7.5)
         figure.legend(handles=_legend(entries), loc="outside lower center", ncols=3, handletextpad=0.2, columnspacing=1)
     return figure
-
-
-def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
-    """By attribute, what a trace of 1 changes of the loss in a random step, as a share of it; empty where that is not known."""
-    loss = data.objective.value
-    if not data.steps or not loss or not loss > 0 or set(data.traces) - set(data.steps):
-        return {}
-    return {name: data.steps[name] ** 2 / (2 * loss) for name in data.traces}
 
 
 def scaled(trace: Trace, factor: float) -> Trace:
@@ -68,17 +60,13 @@ def scaled(trace: Trace, factor: float) -> Trace:
     return structs.replace(trace, **{name: x if x is None else factor * x for name, x in found.items()})
 
 
-def _title(entries: dict[str, Trace], shares: dict[str, float]) -> str:
+def _title(data: ProbeRecord) -> str:
     """Name of the steepest attribute, and its ratio to the next where their intervals do not overlap."""
-    ends = {
-        name: [abs(shares[name] * x) for x in _interval(entry)] for name, entry in entries.items() if name in shares
-    }
-    if len(ends) < 2:
+    if len(shares_per_trace(data)) < 2:
         return "Curvature of each attribute"
-    first, second, *_ = sorted(ends, key=lambda name: -min(ends[name]))
-    if not min(ends[first]) > max(max(found) for name, found in ends.items() if name != first) > 0:
+    if (found := largest_steps(data)) is None:
         return "No attribute is the steepest for certain"
-    ratio = sum(ends[first]) / sum(ends[second])
+    first, second, ratio = found
     return f"Per step, {attribute_name(first)} is steepest: {ratio:.2g} × {attribute_name(second)}"
 
 
@@ -94,8 +82,8 @@ def _draw_traces(axes: Axes, entries: dict[str, Trace], samples: dict[str, np.nd
                 _arrow(axes, left, row, look)
             continue
         value = abs(entry.value)
-        low, high = sorted(abs(end) for end in _interval(entry))
-        low = left if _interval(entry)[0] * _interval(entry)[1] <= 0 else max(low, left)
+        low, high = sorted(abs(end) for end in entry.interval)
+        low = left if entry.interval[0] * entry.interval[1] <= 0 else max(low, left)
         axes.plot([low, max(high, value)], [row, row], "-", color=look["color"], linewidth=1.4)
         if low == left:
             _arrow(axes, left, row, {**look, "markerfacecolor": look["color"]})
@@ -135,14 +123,6 @@ def _sign(trace: Trace) -> str:
 
 def _signed(trace: Trace) -> str:
     return measured(trace.value, trace.standard_error)
-
-
-def _interval(trace: Trace) -> tuple[float, float]:
-    """The recorded interval; where there is none, one standard error to either side."""
-    if trace.low is not None and trace.high is not None and math.isfinite(trace.high - trace.low):
-        return trace.low, trace.high
-    value, error = trace.value or 0.0, trace.standard_error if _drawable(trace.standard_error) else 0.0
-    return value - error, value + error
 
 
 def _drawable(number: float | None) -> TypeGuard[float]:

@@ -1,8 +1,11 @@
 """An eigenvector of the loss shown where it acts: the Gaussians that carry it, in the view where they weigh most.
 
     mass       of Gaussian i in a unit vector v: the sum of v^2 over its parameters; carriers have at least LEAST of it
-    step       sqrt(2 RISE L / |lambda|): by its curvature alone the loss L changes by RISE L
-    renders    at -step, 0 and +step along v, all Gaussians moved at once, in the part of the view around the first carrier
+    steps      sqrt(2 RISE L / |lambda|), by which the curvature alone changes the loss L by RISE L, and its halves
+    factor     of a step s: the mean change of the loss by +s and -s, rendered, over lambda s^2 / 2.  The slope drops out; 1
+               where the second-order model holds
+    renders    at -step, 0 and +step along v, all Gaussians moved at once, in the part of the view around the first carrier, at
+               the longest step whose factor is within AGREES of 1, else whose sign is the curvature's, else of all
 
 The sentence names the attribute in which the first carrier has most of its mass.
 """
@@ -16,7 +19,7 @@ from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
 from analysis.measures.localization import mass_shares, masses, participation
-from analysis.records.quantities import Shade
+from analysis.records.quantities import Shade, percent, quantity
 from analysis.records.run_files import Carrier, Steepest
 from landscape import curvature_reach
 from splat.curvature.fields import Values
@@ -29,9 +32,13 @@ from splat.render.sight import Sight
 from splat.scenes.view import View
 
 LEAST, MOST = 0.05, 5  # share of a carrier; how many at most
-RISE = 0.01  # of the loss, at the step
+RISE, HALVINGS = (
+    0.01,
+    6,
+)  # of the loss, at the longest step; at the shortest 2e-6 of it, fifty times the rounding of float32
+AGREES = 0.2  # of the change by curvature
 SIGMAS = 2.0  # of an outline
-ROOM, SMALLEST, LARGEST = 1.3, 8, 2  # around an outline; a crop is between 1 / SMALLEST and 1 / LARGEST of its view
+ROOM, SMALLEST = 1.3, 8  # around an outline; a crop is at least 1 / SMALLEST of its view
 WORDS = {"means": "moves", "log_scales": "stretches", "quats": "turns", "opacity_logits": "fades", "sh": "recolours"}
 PLACES = (
     ("in the upper left", "at the top", "in the upper right"),
@@ -67,19 +74,56 @@ def steepest(
     carriers = [_carrier(objective, view, end, values, mass, i) for i in chosen]
     crop = crop_around(carriers[0].outline, view.camera.width, view.camera.height)
     loss = objective.loss(objective.active.flat)
-    step = curvature_reach(end.curvature, RISE * loss)
-    steps = {
-        name: objective.active.flat + sign * step * end.vector
+    steps = [curvature_reach(end.curvature, RISE * loss) / 2**k for k in range(HALVINGS + 1)]
+    pairs = [[objective.loss(objective.active.flat + sign * step * end.vector) for sign in (-1, 1)] for step in steps]
+    factors = [
+        (back + forth - 2 * loss) / (end.curvature * step**2) for step, (back, forth) in zip(steps, pairs, strict=True)
+    ]
+    best = shown_step(factors)
+    places = {
+        name: objective.active.flat + sign * steps[best] * end.vector
         for name, sign in (("minus", -1), ("zero", 0), ("plus", 1))
     }
-    losses = [objective.loss(steps["minus"]), loss, objective.loss(steps["plus"])]
-    pictures, difference = _pictures(objective, view, steps, crop)
+    pictures, difference = _pictures(objective, view, places, crop)
     found = Steepest(
         name=end.name, curvature=end.curvature, participation=participation(mass), carriers=carriers, view=view.name,
-        crop=list(crop), step=step, losses=losses, difference=difference, file=file,
+        crop=list(crop), step=steps[best], losses=[pairs[best][0], loss, pairs[best][1]], difference=difference, file=file,
+        steps=steps, factors=factors, rendered=rendered_sentence(end, loss, steps, factors),
         sentence=sentence(end, carriers, participation(mass), view, len(objective.views)),
     )  # fmt: skip
     return found, pictures
+
+
+def shown_step(factors: Sequence[float]) -> int:
+    """The longest of the steps at which renders agree with the curvature, else have its sign, else of all.
+
+    >>> shown_step([0.5, 1.1, 0.9]), shown_step([-0.2, 0.5]), shown_step([-0.2, -1.0])
+    (1, 1, 0)
+    """
+    agree = [k for k, factor in enumerate(factors) if abs(factor - 1) <= AGREES]
+    return next(iter(agree + [k for k, factor in enumerate(factors) if factor > 0]), 0)
+
+
+def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Sequence[float]) -> str:
+    """What renders say of the curvature, at the step that is shown and over all steps, which begin with the longest."""
+    best = shown_step(factors)
+    step, factor, alone = steps[best], factors[best], end.curvature * steps[best] ** 2 / 2 / loss
+    extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])}"
+    ways = ("lower", "raise") if end.curvature < 0 else ("raise", "lower")
+    if not factor > 0:
+        kind = "negative curvature" if end.curvature < 0 else "curvature"
+        return (
+            f"The {kind} along {end.name} is not confirmed by renders: {extent} {ways[1]} the loss, back and forth together, where by the "
+            f"curvature they would {ways[0]} it."
+        )
+    text = f"A step of {quantity(step)} along {end.name} {ways[0]}s the loss by {abs(factor * alone):.2%}"
+    text += f", the mean of back and forth (by its curvature alone: {abs(alone):.2%})"
+    if abs(factor - 1) > AGREES:
+        text += f", {quantity(factor)} times as much as the curvature has it"
+    if max(abs(each - 1) for each in factors) <= AGREES:
+        return f"{text}."
+    low, high = quantity(min(factors)), quantity(max(factors))
+    return f"{text}; over {extent} by {low} to {high} times what the curvature has."
 
 
 def _carrier(
@@ -117,17 +161,23 @@ def outline_of(splat: Float64[Tensor, "9"]) -> list[float]:
 
 
 def crop_around(outline: Sequence[float], width: int, height: int) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of a part of a picture, of the picture's shape, that has an outline in its middle.
+    """Left, top, right, bottom of a part of a picture, of the picture's shape, around what it has of an outline.
 
     >>> crop_around([10.0, 90.0, 3.0, 1.0, 0.0], 160, 120)
     (0, 82, 20, 97)
     """
     x, y, long, short, angle = outline
-    reach = [
-        np.hypot(long * np.cos(angle), short * np.sin(angle)),
-        np.hypot(long * np.sin(angle), short * np.cos(angle)),
-    ]
-    share = min(max(2 * ROOM * max(reach[0] / width, reach[1] / height), 1 / SMALLEST), 1 / LARGEST)
+    turn, radius = np.meshgrid(np.linspace(0, 2 * np.pi, 181), np.linspace(0, 1, 51))
+    along, across = long * radius * np.cos(turn), short * radius * np.sin(turn)
+    points = np.stack(
+        [x + along * np.cos(angle) - across * np.sin(angle), y + along * np.sin(angle) + across * np.cos(angle)]
+    )
+    size = np.array([width, height])[:, None, None]
+    inside = points[:, ((points >= 0) & (points <= size)).all(axis=0)]
+    ends = inside if inside.size else np.array([[x], [y]])
+    (left, top), (right, bottom) = ends.min(axis=1), ends.max(axis=1)
+    share = min(max(ROOM * max((right - left) / width, (bottom - top) / height), 1 / SMALLEST), 1.0)
+    x, y = (left + right) / 2, (top + bottom) / 2
     wide, tall = max(round(share * width), 1), max(round(share * height), 1)
     left = min(max(round(x - wide / 2), 0), width - wide)
     top = min(max(round(y - tall / 2), 0), height - tall)
@@ -162,8 +212,12 @@ def in_bytes(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "3 h w"]:
 def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, count: int) -> str:
     """What the first carrier is, and how much of the vector it has.  spread: the participation; count: of views."""
     first = carriers[0]
-    name, share = max(first.attributes.items(), key=lambda item: item[1])
-    kind = f"a needle of {first.aspect:.0f} : 1" if first.aspect**2 > NEEDLE else f"a splat of {first.aspect:.1f} : 1"
+    name = max(first.attributes, key=first.attributes.__getitem__)
+    kind = f"a splat of {first.aspect:.1f} : 1"
+    if first.aspect**2 > NEEDLE:
+        large, middle, small = first.sigmas
+        flat = large * small < middle**2  # nearer to a disc than to a rod
+        kind = f"{'a plate seen edge-on' if flat else 'a needle'}, {first.aspect:.0f} : 1 in the picture,"
     x, y = first.outline[0] / view.camera.width, first.outline[1] / view.camera.height
     row, column = (min(max(int(3 * each), 0), 2) for each in (y, x))
     outside = "" if 0 <= x < 1 and 0 <= y < 1 else ", its centre outside of the picture"
@@ -171,8 +225,8 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
     seen = "one view" if first.views == 1 else f"{some if first.views == count else f'{first.views} of {count}'} views"
     if first.views > 1 and first.one_view >= 0.9:
         seen += f", one of which has {first.one_view:.0%} of its weight"
-    alone = "" if share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
+    alone = "" if first.share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
     return (
-        f"{share:.0%} of {end.name}, {end.title}, {WORDS[name]} Gaussian {first.gaussian:,}, {kind} "
-        f"{PLACES[row][column]} of {view.name.rpartition('/')[2]}{outside}, seen by {seen}{alone}."
+        f"{percent(first.share)} of {end.name}, {end.title}, lies on Gaussian {first.gaussian:,}, which it {WORDS[name]}: "
+        f"{kind} {PLACES[row][column]} of {view.name.rpartition('/')[2]}{outside}, seen by {seen}{alone}."
     )

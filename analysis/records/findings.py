@@ -45,8 +45,8 @@ def findings(data: ProbeRecord) -> list[Line]:
     ends = data.eigenvalues
     lines = [
         *of_checks(data.checks),
-        *_of_traces(data.traces),
-        *_of_ends(ends),
+        *_of_traces(data),
+        *_of_ends(data),
         *of_budgets({"max": ends.max.reason, "min": ends.min.reason}),
         *_of_anisotropy(data.anisotropy),
         *_of_open(data),
@@ -64,11 +64,7 @@ def findings(data: ProbeRecord) -> list[Line]:
 
 def headline(data: ProbeRecord) -> list[Line]:
     """Three sentences at most: basin or saddle, the attribute that carries the curvature, the steepest direction."""
-    found = [
-        *_of_ends(data.eigenvalues),
-        *_of_traces(data.traces)[:1],
-        *_of_needles(data.eigenvalues.max.lives_on, data.counts),
-    ]
+    found = [*_of_ends(data), *_of_traces(data)[:1], *_of_needles(data.eigenvalues.max.lives_on, data.counts)]
     return found[:3]
 
 
@@ -91,7 +87,8 @@ def of_checks(checks: Mapping[str, Check]) -> list[Line]:
     return lines
 
 
-def _of_traces(traces: Mapping[str, schema.Trace]) -> list[Line]:
+def _of_traces(data: ProbeRecord) -> list[Line]:
+    traces = data.traces
     values = {
         name: trace.value for name, trace in traces.items() if trace.value is not None and math.isfinite(trace.value)
     }
@@ -101,7 +98,7 @@ def _of_traces(traces: Mapping[str, schema.Trace]) -> list[Line]:
         if name not in values
     ]
     if any(values.values()):
-        lines.append(_of_largest_trace(traces, values))
+        lines.append(_of_largest_step(data) or _of_largest_trace(traces, values))
     elif values:
         lines.append(Line("Every trace is exactly 0."))
     signs = {"negative": "negative: on average the loss curves down there", "undetermined": "not decided by its error"}
@@ -109,6 +106,38 @@ def _of_traces(traces: Mapping[str, schema.Trace]) -> list[Line]:
         if named := [attribute_name(name) for name in values if traces[name].sign == sign]:
             lines.append(Line(f"The sign of the trace of {' and '.join(named)} is {words}.", "caution"))
     return lines
+
+
+def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
+    """By attribute, what a trace of 1 changes of the loss in a random step, as a share of it; empty where that is not known."""
+    loss = data.objective.value
+    if not data.steps or not loss or not loss > 0 or set(data.traces) - set(data.steps):
+        return {}
+    return {name: data.steps[name] ** 2 / (2 * loss) for name in data.traces}
+
+
+def largest_steps(data: ProbeRecord) -> tuple[str, str, float] | None:
+    """The attribute whose curvature changes the loss most in a random step as long as the optimiser's first, the next, and
+    the ratio of the changes; None where that is not known or the intervals overlap."""
+    ends = {
+        name: [abs(share * x) for x in data.traces[name].interval] for name, share in shares_per_trace(data).items()
+    }
+    if len(ends) < 2:
+        return None
+    first, second, *_ = sorted(ends, key=lambda name: -min(ends[name]))
+    if not min(ends[first]) > max(max(found) for name, found in ends.items() if name != first) > 0:
+        return None
+    return first, second, sum(ends[first]) / sum(ends[second])
+
+
+def _of_largest_step(data: ProbeRecord) -> Line | None:
+    if (found := largest_steps(data)) is None:
+        return None
+    first, second, ratio = found
+    return Line(
+        f"By its curvature a random step in {attribute_name(first)}, as long as the optimiser's first, changes the loss "
+        f"{ratio:.2g} times as much as one in {attribute_name(second)}, the next."
+    )
 
 
 def _known(error: schema.Maybe[float | None]) -> float:
@@ -140,12 +169,15 @@ def _of_largest_trace(traces: Mapping[str, schema.Trace], values: Mapping[str, f
     return Line(text)
 
 
-def _of_ends(ends: schema.Eigenvalues) -> list[Line]:
+def _of_ends(data: ProbeRecord) -> list[Line]:
+    ends, norm = data.eigenvalues, data.objective.gradient_norm
     numbers = [number for end in (ends.max, ends.min) for number in (end.value, end.residual) if _is_finite(number)]
     if len(numbers) < 4:
         return [Line("The ends of the spectrum were not determined.", "failure")]
     top, top_error, bottom, bottom_error = (number for number in numbers if number is not None)
-    text = f"the curvature runs from {measured(bottom, bottom_error)} to {measured(top, top_error)}"
+    where = f"over {data.counts.active_parameters:,} parameters"
+    where += f", with a gradient of norm {quantity(norm)}," if _is_finite(norm) else ""
+    text = f"{where} the curvature runs from {measured(bottom, bottom_error)} to {measured(top, top_error)}"
     if bottom + bottom_error < 0 < top - top_error:
         return [Line(f"The Hessian is indefinite, so the checkpoint is no basin in every direction: {text}.")]
     if bottom - bottom_error > 0:

@@ -19,7 +19,7 @@ import plotly.io
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from analysis.records.findings import Line, attribute_name, findings, headline, is_open
+from analysis.records.findings import Line, attribute_name, findings, headline, is_open, largest_steps
 from analysis.records.json_files import plain
 from analysis.records.quantities import limits, measured, percent, quantity
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
@@ -78,18 +78,19 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "open_ended": is_open,
     }
     surface, views = embedded_surface(record) if surface is None else surface, views_in(record)
+    first = opening(record)
     return environment.get_template("report.html.jinja").render(
         data=record.data,
         counts=plain(record.data.counts),
         provenance=plain(record.data.provenance),
         numbers=numbers(record.data),
-        headline=opening(record),
+        headline=first,
         findings=findings(record.data),
         views=views,
         listed_views=[{**view, "pictures": [{**each, "uri": ""} for each in view["pictures"]]} for view in views[:1]]
         + views[1:],
         pictures=pictures_in(record.folder, PICTURES, shown_numbers(record)),
-        where=where(record),
+        where=where(record, first[-1].text),
         splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
         families=family_lines(record.data),
         indices=INDICES,
@@ -101,29 +102,48 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
 def opening(record: Record[ProbeRecord]) -> list[Line]:
     """The three sentences at the top: where a map knows which Gaussian carries the steepest direction, it has the last one."""
     lines, found = headline(record.data), map_beside(record)[1]
-    return [*lines[:2], Line(found.steepest[0].sentence)] if found and found.steepest else lines
+    if found is None or not found.steepest:
+        return lines
+    if any(end.curvature < 0 and end.is_refuted for end in found.steepest):
+        lines[0] = Line(f"{lines[0].text} Renders do not confirm its negative end, see below.", lines[0].level)
+    return [*lines[:2], Line(found.steepest[0].sentence)]
 
 
 def numbers(data: ProbeRecord) -> list[dict[str, str]]:
     """The five numbers at the top: value with its error or bracket, and what it is."""
     ends, found = data.eigenvalues, []
-    for end, words in ((ends.max, "largest curvature, λ max"), (ends.min, "smallest curvature, λ min")):
+    lowest = "most negative" if (ends.min.value or 0.0) < 0 else "smallest"
+    for end, words in ((ends.max, "largest curvature, λ max"), (ends.min, f"{lowest} curvature, λ min")):
         found.append({"value": measured(end.value, end.residual), "words": words})
-    traces = {
-        name: trace for name, trace in data.traces.items() if trace.value is not None and math.isfinite(trace.value)
-    }
-    if traces:
-        name, trace = max(traces.items(), key=lambda item: abs(item[1].value or 0.0))
-        words = f"trace of {attribute_name(name)}, the largest of five"
-        found.append({"value": measured(trace.value, trace.standard_error), "words": words})
+    found += _steepest_attribute(data)
     if index := data.anisotropy.literal:
         cell = bracketed(None if is_open(index) else index)
-        words = "largest over smallest curvature" + (f" ({cell.bracket})" if cell.bracket else "")
-        found.append({"value": cell.value, "words": words})
+        value, words = cell.value, "λ max / λ min"
+        if index.value and index.value < 0:
+            value, words = value.removeprefix("−"), "λ max / |λ min|, of opposite signs"
+        found.append({"value": value, "words": words + (f" ({cell.bracket})" if cell.bracket else "")})
     if lives := ends.max.lives_on:
         words = f"Gaussians carry the steepest direction, of {data.counts.visible_gaussians:,} in sight"
         found.append({"value": quantity(lives.participation), "words": words})
     return found
+
+
+def _steepest_attribute(data: ProbeRecord) -> list[dict[str, str]]:
+    """Its step's effect over the next one's, where that is known; else the trace that is the largest number."""
+    if steps := largest_steps(data):
+        first, second, ratio = steps
+        words = (
+            f"the change of the loss by a step of the optimiser: {attribute_name(first)} over {attribute_name(second)}"
+        )
+        return [{"value": f"{ratio:.2g} : 1", "words": words}]
+    traces = {
+        name: trace for name, trace in data.traces.items() if trace.value is not None and math.isfinite(trace.value)
+    }
+    if not traces:
+        return []
+    name, trace = max(traces.items(), key=lambda item: abs(item[1].value or 0.0))
+    words = f"trace of {attribute_name(name)}, the largest of five in their own units"
+    return [{"value": measured(trace.value, trace.standard_error), "words": words}]
 
 
 def map_beside(record: Record[ProbeRecord]) -> tuple[Path, MapRecord | None]:
@@ -164,19 +184,22 @@ def views_in(record: Record[ProbeRecord]) -> list[dict[str, Any]]:
     return views
 
 
-def where(record: Record[ProbeRecord]) -> list[dict[str, str]]:
-    """Of the map beside the record: its sentences, each as the caption of the picture that shows it, if that was drawn."""
+def where(record: Record[ProbeRecord], said: str) -> list[dict[str, str]]:
+    """Of the map beside the record, by picture: the sentence above it, and the caption beneath; said: what is told already."""
     folder, found = map_beside(record)
     if found is None:
         return []
-    shown = [(end.file, end.sentence, carriers_in_words(end)) for end in found.steepest]
+    shown = []
+    for end in found.steepest:
+        text = end.rendered if end.sentence == said else f"{end.sentence} {end.rendered}"
+        shown.append((end.file, text, end.sentence, carriers_in_words(end)))
     fragile = " ".join(found.sentences[len(found.steepest) :])
     panel = found.panels[0] if found.panels else None
     words = f"{panel.name}: maps of its fragility in position, conditioning and opacity." if panel else ""
-    shown.append((panel.file.replace("view", "fragility") if panel else "", words, fragile))
+    shown.append((panel.file.replace("view", "fragility") if panel else "", fragile, words, words))
     return [
-        {"caption": caption, "words": words, "uri": picture_uri(path) if path.is_file() else ""}
-        for path, words, caption in ((folder / f"{name}.png", *rest) for name, *rest in shown)
+        {"text": text, "caption": caption, "words": words, "uri": picture_uri(path) if path.is_file() else ""}
+        for path, text, words, caption in ((folder / f"{name}.png", *rest) for name, *rest in shown)
     ]
 
 
@@ -184,16 +207,11 @@ def carriers_in_words(end: Steepest) -> str:
     """The caption of the picture of an end of the spectrum."""
     carriers = "; ".join(
         f"Gaussian {each.gaussian:,} has {percent(each.share)} of it: standard deviations "
-        f"{', '.join(map(quantity, each.sigmas))}, splat of {each.aspect:.3g} : 1, opacity {each.opacity:.2f}"
+        f"{', '.join(map(quantity, each.sigmas))} world units, opacity {each.opacity:.2f}, {each.aspect:.3g} : 1 in the picture"
         for each in end.carriers
     )
-    view, (back, here, forth) = end.view.rpartition("/")[2], end.losses
-    alone = end.curvature * end.step**2 / 2
-    changes = [f"{100 * change / here:+.2f}%".replace("-", "−") for change in (back - here, forth - here, alone)]
-    return (
-        f"{end.name} in {view}, its carriers outlined, and renders one step of {quantity(end.step)} back and forth along it, "
-        f"which change the loss by {changes[0]} and {changes[1]} ({changes[2]} by the curvature alone). {carriers}."
-    )
+    place = f"{end.name} in {end.view.rpartition('/')[2]}"
+    return f"{place}: its carriers, outlined at two standard deviations, and renders a step back and forth. {carriers}."
 
 
 def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:

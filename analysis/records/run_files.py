@@ -134,7 +134,9 @@ class Steepest(Struct, kw_only=True):
 
     curvature: its eigenvalue.  participation: over how many Gaussians it is spread.  view: in which the first of the carriers
     weighs most; crop: left, top, right, bottom of the part that is shown, px.  step: along the unit vector; losses: at -step,
-    0, +step.  difference: scale of render(+step) - render(-step).  file: of the pictures, NAME.npz.
+    0, +step.  steps, factors: of other lengths, the longest first, the mean change of the loss by both, rendered, over that by
+    the curvature; none in older maps.  rendered: these in words.  difference: scale of render(+step) - render(-step).  file: of
+    the pictures, NAME.npz.
     """
 
     name: str
@@ -145,9 +147,17 @@ class Steepest(Struct, kw_only=True):
     crop: list[Count]
     step: float
     losses: list[float]
+    steps: list[float] = []
+    factors: list[float] = []
     difference: Shade
     file: str
     sentence: str
+    rendered: str = ""
+
+    @property
+    def is_refuted(self) -> bool:
+        """Whether it was rendered and no step changed the loss to the side that the curvature says."""
+        return bool(self.factors) and max(self.factors) <= 0
 
 
 class Swaps(Struct, kw_only=True):

@@ -11,6 +11,7 @@ Within a version of a format keys are added, never renamed or removed.  Fields w
 lack; keys of a file that are no fields are ignored.
 """
 
+import math
 from collections.abc import Iterator
 from typing import Annotated, Generic, Literal, TypeVar
 
@@ -81,6 +82,15 @@ class TraceOf(Struct, kw_only=True):
 
     def __post_init__(self) -> None:
         _require_error("standard_error", self.standard_error)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """low, high; where they are not known, one standard error to either side."""
+        if self.low is not None and self.high is not None and math.isfinite(self.high - self.low):
+            return self.low, self.high
+        value, error = self.value or 0.0, self.standard_error
+        error = error if error is not None and math.isfinite(error) else 0.0
+        return value - error, value + error
 
 
 class Trace(TraceOf, kw_only=True):

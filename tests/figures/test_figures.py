@@ -190,12 +190,28 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     }
     assert dots == {BLACK: 3 * 5, SKY: 2 * 5}
     said = " ".join(text for text, _ in words(figure, laid_out(figure)))
-    assert "loss, 7% renders (error <0.4%)" in said and "order changed: 40%" in said
+    assert "dots: rendered (7%)\nline: interpolated (error <0.4%)" in said and "order changed: 40%" in said
     sections = [axes for axes in figure.axes if "step along" in axes.get_xlabel()]
     along = [
         [len(np.asarray(line.get_xdata())) for line in axes.lines if line.get_marker() == "."] for axes in sections
     ]
     assert [3, 2] in along  # the crossed ones apart
+
+
+@pytest.mark.parametrize(
+    ("lowest", "said"),
+    [((10, 8), "lowest at the checkpoint, the cross"), ((4, 2), "lowest, by −0.500, at (−0.41, −0.82)")],
+)
+def test_the_title_of_a_plane_says_where_it_is_lowest(tmp_path, lowest, said):
+    data, arrays = synthetic()
+    loss = np.full((21, 17), data["slice"]["center_loss"])
+    loss[0, 0], loss[lowest] = loss[0, 0] + 2.0, loss[lowest] - 0.5
+    loss[10, 8] = data["slice"]["center_loss"] - 0.01 * (lowest == (10, 8))
+    arrays["slice"]["loss"] = loss
+    figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
+    title = figure.axes[0].get_title(loc="left").replace("\n", " ")
+    assert title.startswith("In this plane the loss is up by at most 2.00, ") and said in title
+    require_layout(figure)
 
 
 def test_a_plane_of_too_few_renders_is_drawn_as_its_sections_with_the_command_that_resolves_it(tmp_path):

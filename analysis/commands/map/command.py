@@ -113,7 +113,8 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
         made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
         data = MapRecord(
             gaussians=len(gaussians), seen=len(objective.active), field=options.shown, shades=shades, panels=panels,
-            sentences=[each.sentence for each in shown] + fragility_sentences(fragile), steepest=shown, fragility=fragile,
+            sentences=[f"{each.sentence} {each.rendered}" for each in shown] + fragility_sentences(fragile),
+            steepest=shown, fragility=fragile,
             notes=notes + checkpoint.assumptions + _views_left_out(checkpoint), provenance=made,
         )  # fmt: skip
         _write(folder, data)

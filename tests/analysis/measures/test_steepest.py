@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from analysis.measures.steepest import End, crop_around, outline_of, sentence, steepest
+from analysis.measures.steepest import End, crop_around, outline_of, rendered_sentence, sentence, steepest
+from analysis.records.quantities import percent
 from splat.curvature.fields import scene_fields
 from splat.curvature.hessian import SceneHessian
 from splat.projection.reference import project
@@ -30,9 +31,9 @@ def test_the_carrier_is_the_needle_and_the_sentence_says_so(shown):
     assert first.gaussian == 1 and first.share > 0.9 and found.participation < 1.2
     assert sum(first.attributes.values()) == pytest.approx(first.share)
     assert first.sigmas[0] == pytest.approx(np.exp(-0.9)) and first.views == 2
-    share = first.attributes["means"]
-    assert share == pytest.approx(float(end.vector[3:6].square().sum()))
-    assert found.sentence.startswith(f"{share:.0%} of e₁, the steepest direction, moves Gaussian 1, a needle of ")
+    assert first.attributes["means"] == pytest.approx(float(end.vector[3:6].square().sum()))
+    start = f"{percent(first.share)} of e₁, the steepest direction, lies on Gaussian 1, which it moves: a needle, "
+    assert found.sentence.startswith(start)
     assert "in the lower right of" in found.sentence and "seen by both views" in found.sentence
 
 
@@ -45,13 +46,63 @@ def test_a_carrier_beyond_the_edge_is_said_to_be_there(shown):
         assert f"{said} {view.name}, its centre outside of the picture, " in sentence(end, [moved], 1.0, view, 2)
 
 
+def test_a_disc_from_its_edge_is_a_plate_and_a_rod_is_a_needle(shown):
+    objective, end, found, _ = shown
+    view = objective.views[0]
+    for sigmas, kind in (([2.5, 1.0, 0.004], "a plate seen edge-on"), ([7.3, 0.008, 0.0003], "a needle")):
+        moved = msgspec.structs.replace(found.carriers[0], sigmas=sigmas, aspect=20.8)
+        assert f": {kind}, 21 : 1 in the picture, in the " in sentence(end, [moved], 1.0, view, 2)
+
+
+STEPS = [0.2, 0.1, 0.05]
+
+
+MEAN = "the mean of back and forth (by its curvature alone:"
+REFUTED = "along e is not confirmed by renders: steps of 0.0500 to 0.200"
+
+
+@pytest.mark.parametrize(
+    ("curvature", "factors", "said"),
+    [
+        (4.0, [1.1, 1.0, 0.9], f"A step of 0.200 along e raises the loss by 4.40%, {MEAN} 4.00%)."),
+        (
+            4.0,
+            [3.0, 0.9, 1.0],
+            f"A step of 0.100 along e raises the loss by 0.90%, {MEAN} 1.00%); over steps of 0.0500 to 0.200 by 0.900 to 3.00 "
+            "times what the curvature has.",
+        ),
+        (-4.0, [-1.0, 1.1, 1.0], "A step of 0.100 along e lowers the loss by 1.10%, "),
+        (
+            -4.0,
+            [-1.0, 0.5, 0.6],
+            f"A step of 0.100 along e lowers the loss by 0.50%, {MEAN} 1.00%), 0.500 times as much as the curvature has it; ",
+        ),
+        (
+            -4.0,
+            [-0.2, -1.4, -1.9],
+            f"The negative curvature {REFUTED} raise the loss, back and forth together, where by the curvature they would "
+            "lower it.",
+        ),
+        (4.0, [-0.2, -1.4, -1.9], f"The curvature {REFUTED} lower the loss, "),
+    ],
+)
+def test_only_what_renders_bear_out_is_said_of_a_curvature(curvature, factors, said):
+    end = End("e", "an end", torch.zeros(1), curvature)
+    assert rendered_sentence(end, 2.0, STEPS, factors).startswith(said)
+
+
 def test_steps_change_the_loss_as_the_curvature_has_it(shown):
     objective, end, found, pictures = shown
     low, middle, high = found.losses
     assert middle == objective.loss(objective.active.flat)
     second = (high - 2 * middle + low) / found.step**2
     assert second == pytest.approx(end.curvature, rel=0.3)  # the step is finite
-    assert end.curvature * found.step**2 / 2 == pytest.approx(0.01 * middle)
+    assert end.curvature * found.steps[0] ** 2 / 2 == pytest.approx(0.01 * middle)
+    place = found.steps.index(found.step)
+    assert found.factors[place] == pytest.approx(second / end.curvature) and found.factors[0] == pytest.approx(
+        1, abs=0.1
+    )
+    assert found.rendered == rendered_sentence(end, middle, found.steps, found.factors)
     left, top, right, bottom = found.crop
     assert pictures["zero"].shape == pictures["photograph"].shape == (bottom - top, right - left, 3)
     assert np.array_equal(pictures["photograph"], pictures["view"][top:bottom, left:right])
@@ -69,6 +120,17 @@ def test_the_outline_is_the_splats(shown):
         dx, dy = reach * np.cos(turn), reach * np.sin(turn)
         assert a * dx**2 + 2 * b * dx * dy + c * dy**2 == pytest.approx(4)  # two standard deviations
     assert long / short == pytest.approx(found.carriers[0].aspect)
+
+
+@pytest.mark.parametrize(("x", "angle"), [(80.0, 0.4), (-90.0, 0.1), (150.0, 1.9)])
+def test_a_crop_has_all_of_an_outline_that_its_picture_has(x, angle):
+    left, top, right, bottom = crop_around([x, 60.0, 120.0, 2.0, angle], 160, 120)
+    along = np.linspace(-1, 1, 400) * 120
+    points = np.stack([x + along * np.cos(angle), 60 + along * np.sin(angle)])
+    points = points[:, ((points > 1) & (points < np.array([[159], [119]]))).all(axis=0)]
+    assert points.size and (points > np.array([[left - 1], [top - 1]])).all()
+    assert (points < np.array([[right + 1], [bottom + 1]])).all()
+    assert (right - left) / 160 <= 1.35 * max(np.ptp(points[0]) / 160, np.ptp(points[1]) / 120) + 0.05  # tight
 
 
 @pytest.mark.parametrize("x", [-50.0, 3.0, 80.0, 400.0])

@@ -127,8 +127,10 @@ def test_the_map_beside_the_record_says_where(tmp_path, step):
     carrier |= {"opacity": 0.7, "views": 1, "one_view": 1.0, "outline": [4.0, 3.0, 2.0, 1.0, 0.0]}
     end = {"name": "e₁", "curvature": 3.0, "participation": 1.5, "carriers": [carrier], "view": "a.png", "step": 0.1}
     end |= {"crop": [0, 0, 4, 3], "losses": [1.1, 1.0, 1.2], "difference": shade, "file": "steepest-e1"}
-    found["steepest"] = [end | {"sentence": "80% of e₁ turns Gaussian 3,778."}]
-    found["sentences"] = ["80% of e₁ turns Gaussian 3,778.", "Position: half of all pairs."]
+    found["steepest"] = [end | {"sentence": "80% of e₁ turns Gaussian 3,778.", "rendered": "Not confirmed by renders."}]
+    found["steepest"].append(found["steepest"][0] | {"name": "e_min", "curvature": -1.0, "factors": [-0.2, -1.9]})
+    found["steepest"][1] |= {"sentence": "97% of e_min.", "rendered": "", "file": "steepest-e_min"}
+    found["sentences"] = ["80% of e₁ turns Gaussian 3,778.", "97% of e_min.", "Position: half of all pairs."]
     (tmp_path / "map").mkdir()
     (tmp_path / "map" / "map.json").write_text(json.dumps(found))
     largest, error = np.full((6, 8), 254, np.uint8), np.zeros((6, 8), np.uint8)
@@ -140,7 +142,11 @@ def test_the_map_beside_the_record_says_where(tmp_path, step):
     assert text.count("data:image/") == (4 + 2 if here else 2)
     assert ("Largest &lt;curvature&gt;, 1" in text) == here and "<curvature>" not in text
     said = Page(text).text
-    assert ("standard deviations 0.400, 0.0200, 0.0100, splat of 41 : 1, opacity 0.70" in said) == here
+    assert (
+        "standard deviations 0.400, 0.0200, 0.0100 world units, opacity 0.70, 41 : 1 in the picture" in said
+    ) == here
+    assert ("Renders do not confirm its negative end" in said) == here
+    assert (said.count("Not confirmed by renders.") == 1) == here
     assert (said.count("80% of e₁ turns Gaussian 3,778.") == 1) == here == ("Position: half" in said)
     (headline,) = re.findall(r'<ul class="headline">(.*?)</ul>', text, re.DOTALL)
     assert ("80% of e₁" in headline.split("<li")[-1]) == here  # the third sentence is the map's
@@ -165,14 +171,39 @@ def test_every_picture_has_words_with_its_numbers(tmp_path):
 def test_the_five_numbers_carry_their_errors_and_one_without_bracket_is_none():
     data, _ = synthetic()
     found = {each["words"]: each["value"] for each in numbers(probe_of(data))}
-    assert (
-        found["largest curvature, λ max"] == "(3.1000 ± 0.0012) × 10⁴"
-        and found["smallest curvature, λ min"] == "−220.0 ± 3.0"
-    )
-    assert found["trace of position, the largest of five"] == "(3.991 ± 0.093) × 10⁵"
+    assert found["largest curvature, λ max"] == "(3.1000 ± 0.0012) × 10⁴"
+    assert found["most negative curvature, λ min"] == "−220.0 ± 3.0"
+    assert found["trace of position, the largest of five in their own units"] == "(3.991 ± 0.093) × 10⁵"
+    assert found["λ max / |λ min|, of opposite signs"] == "140.9 ± 2.1"
     data["anisotropy"]["literal"] |= {"value": -361.0, "low": 0.0, "high": None}
     found = {each["words"]: each["value"] for each in numbers(probe_of(data))}
-    assert [value for words, value in found.items() if words.startswith("largest over smallest")] == ["–"]
+    assert [value for words, value in found.items() if words.startswith("λ max / |λ min|")] == ["–"]
+    data["eigenvalues"]["min"] |= {"value": 5.0}
+    data["anisotropy"]["literal"] |= {"value": 6200.0, "low": 3900.0, "high": 15500.0}
+    found = {each["words"]: each["value"] for each in numbers(probe_of(data))}
+    assert found["smallest curvature, λ min"] == "5.0 ± 3.0"
+    assert found["λ max / λ min (3900 … 1.55 × 10⁴)"] == "6200"
+
+
+def test_attributes_are_compared_by_the_optimisers_steps_where_their_intervals_are_apart():
+    data, _ = synthetic()
+    assert "optimiser" not in sentences(data)  # the record has no steps
+    data["steps"] = dict.fromkeys(data["traces"], 0.001)
+    data["steps"]["log_scales"] = 0.02
+    said, factor = sentences(data), 400 * data["traces"]["log_scales"]["value"] / data["traces"]["means"]["value"]
+    expected = f"a random step in log scale, as long as the optimiser's first, changes the loss {factor:.2g} times"
+    assert f"{expected} as much as one in position, the next." in said and "all absolute traces" not in said
+    tiles = {each["words"]: each["value"] for each in numbers(probe_of(data))}
+    assert tiles["the change of the loss by a step of the optimiser: log scale over position"] == f"{factor:.2g} : 1"
+    data["steps"]["log_scales"] = 7e-3  # the same change as of positions, within the errors
+    assert "optimiser" not in sentences(data) and "all absolute traces" in sentences(data)
+
+
+def test_an_indefinite_checkpoint_is_said_over_how_many_parameters_and_with_which_gradient():
+    data, _ = synthetic()
+    assert "over 136,682 parameters, with a gradient of norm 0.410, the curvature runs from" in sentences(data)
+    data["objective"]["gradient_norm"] = None
+    assert "over 136,682 parameters the curvature runs from" in sentences(data)
 
 
 def test_every_number_of_the_tables_is_on_the_page_with_its_error(tmp_path):
