@@ -18,6 +18,10 @@ class InputError(ValueError):
     """Input, settings, a file, a scene, a checkpoint or an operator that cannot be used as given."""
 
 
+class TooLittleMemory(MemoryError):
+    """There is less memory than is known to be needed: says how much, and what would fit."""
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """The end of a message about a name that is none of the known ones.
 

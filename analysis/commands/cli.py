@@ -168,6 +168,9 @@ def at_files(options: Any) -> Any:
 
 def run(command: Command, options: Any, arguments: Sequence[str]) -> int:
     """Hand over to the subcommand; returns the exit code."""
+    from splat.backend.memory import RESERVE, require_room  # not for --help
+
+    require_room(RESERVE, libraries=True)
     module, function = command.runs.split(":")
     with ExitStack() as around:
         given = [options, ["landscape", *arguments]] if command.recorded else [options]

@@ -4,7 +4,7 @@
     1    a self-check failed under --strict, a bound of `bench stress` was exceeded, or a cell of a sweep failed
     2    bad input: one sentence that says what was expected, what came and what to do
     70   a fault of the program: its traceback, and how to report it
-    71   memory ran out
+    71   memory ran out, or would
     74   the disk is full, or a limit on the size of files is reached
     130  interrupted by Ctrl-C; 143 by SIGTERM, 129 by a terminal that closed
     141  nobody reads the help any more, as after `| head -1`
@@ -20,7 +20,7 @@ import traceback
 from collections.abc import Sequence
 
 from analysis.console.interruption import Interrupted
-from landscape.errors import InputError, lacks_memory, lacks_space
+from landscape.errors import InputError, TooLittleMemory, lacks_memory, lacks_space
 
 LONGEST = 4000  # characters of a sentence; the list of all settings, the longest of our own, takes a third
 BAD_INPUT, BUG, NO_MEMORY, FULL_DISK, INTERRUPTED, NO_READER = 2, 70, 71, 74, 130, 141
@@ -47,6 +47,8 @@ def describe(error: BaseException) -> tuple[int, str]:
         return INTERRUPTED, "interrupted"
     if isinstance(error, BrokenPipeError):
         return NO_READER, ""
+    if isinstance(error, TooLittleMemory):
+        return NO_MEMORY, text
     if lacks_memory(error):
         return NO_MEMORY, f"memory ran out; take fewer Gaussians or smaller images, or end other programs ({text})"
     if isinstance(error, OSError):

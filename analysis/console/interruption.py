@@ -1,12 +1,17 @@
 """Ctrl-C, a scheduler's SIGTERM, a terminal that closes: what is under way is left in order, the exit code names the signal."""
 
+import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from threading import Event, current_thread, main_thread
+from threading import Event, Timer, current_thread, main_thread
 from types import FrameType
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+DEAF = "_raw_object_cache"  # how the functions of llvmlite begin that LLVM calls, and which must not fail
+AGAIN = 0.05  # seconds until a signal that came where nothing can be raised is sent again
 
 
 class Interrupted(KeyboardInterrupt):
@@ -30,13 +35,36 @@ class Interruption(Event):
 
 @contextmanager
 def raising() -> Iterator[None]:
-    """Signals raise `Interrupted` wherever the main thread is, so that what it has begun is cleaned up."""
+    """Signals raise `Interrupted` wherever the main thread is, so that what it has begun is cleaned up.
 
-    def interrupt(number: int, _: FrameType | None) -> None:
+    Where Python drops what is raised, in finalizers and what C calls, the signal is sent again until it is heard.
+    """
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        while frame is not None:
+            if frame.f_code.co_name.startswith(DEAF):
+                return _send_again(number)
+            frame = frame.f_back
         raise Interrupted(number)
 
-    with _handled(interrupt):
-        yield
+    def dropped(found: Any) -> None:
+        if isinstance(found.exc_value, Interrupted):
+            _send_again(found.exc_value.number)
+        else:
+            before(found)
+
+    before, sys.unraisablehook = sys.unraisablehook, dropped
+    try:
+        with _handled(interrupt):
+            yield
+    finally:
+        sys.unraisablehook = before
+
+
+def _send_again(number: int) -> None:
+    again = Timer(AGAIN, os.kill, (os.getpid(), number))
+    again.daemon = True
+    again.start()
 
 
 @contextmanager

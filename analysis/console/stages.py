@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Column
 
 from landscape.results import Progress as Report
+from splat.backend.memory import require_room
 
 Stage = Callable[[str], AbstractContextManager[Report]]
 NOW_AND_THEN = 15.0  # seconds between lines off a terminal
@@ -79,7 +80,11 @@ class Stages:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Report]:
-        """Time the block; call what it gives with the units done, the most there can be, and a few words."""
+        """Time the block; call what it gives with the units done, the most there can be, and a few words.
+
+        TooLittleMemory where limits of the process leave no room to begin.
+        """
+        require_room()
         task = self._progress.add_task(name, total=None, state="")
         start = perf_counter()
 

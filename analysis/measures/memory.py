@@ -8,8 +8,8 @@ from math import ceil, sqrt
 import torch
 
 from landscape import EigenSettings
-from landscape.errors import InputError, lacks_memory
-from splat.backend.memory import SLACK, free_memory, resident_memory
+from landscape.errors import InputError, TooLittleMemory, lacks_memory
+from splat.backend.memory import RESERVE, SLACK, free_memory, is_told, require_room, resident_memory
 from splat.curvature.linearize import VECTORS, KeptViews
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
@@ -47,13 +47,14 @@ def size_of(text: str | None) -> int | None:
 
 
 def require_pictures(frames: Sequence[Frame], gaussians: Gaussians) -> None:
-    """InputError that says what would fit, where pictures and Gaussians alone take more than is free."""
+    """TooLittleMemory that says what would fit, where pictures and Gaussians alone take more than is free."""
+    require_room(RESERVE)
     each = [PICTURES * 4 * frame.camera.width * frame.camera.height for frame in frames]
     fixed, free = COPIES * gaussians.flat.nbytes, max(free_memory(torch.device("cpu")), 0)
     if fixed + sum(each) <= free:
         return
     some = (free - fixed) // max(each)
-    raise InputError(
+    raise TooLittleMemory(
         f"expected {_gb(fixed + sum(each))} of memory beside what is taken, for {len(frames)} pictures and "
         f"{len(gaussians):,} Gaussians, got {_gb(free)}; "
         + (f"--max-views {some} would fit" if some > 0 else "allow or free more, or take fewer Gaussians")
@@ -61,16 +62,23 @@ def require_pictures(frames: Sequence[Frame], gaussians: Gaussians) -> None:
 
 
 def expected_peak(objective: SceneObjective) -> int:
-    """About the most that a probe takes at a time, in bytes.  InputError that says what would fit, where less is free."""
+    """About the most that a probe takes at a time, in bytes.  TooLittleMemory that says what would fit, where less is
+    free."""
+    require_room(RESERVE)
     needs, device = objective.needs, objective.active.flat.device
     free, used = max(free_memory(device), 0), resident_memory() if device.type == "cpu" else 0
     least, camera = needs.view + needs.beside, objective.views[0].camera
     if least > free:
-        fit, ask = int(len(objective.active) * free / least), ceil((used + least) / (1 - SLACK) / 1e7) / 100
-        raise InputError(
+        fit = int(len(objective.active) * free / least)
+        enough = (
+            f"--memory {ceil((used + least) / (1 - SLACK) / 1e7) / 100:g}GB"
+            if is_told()
+            else f"{_gb(least - free + 5e6)} more"
+        )
+        raise TooLittleMemory(
             f"expected at least {_gb(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
-            f"{camera.width} x {camera.height} px, got {_gb(used + free)}, of which {_gb(used)} are taken; --memory {ask:g}GB "
-            f"would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
+            f"{camera.width} x {camera.height} px, got {_gb(used + free)}, of which {_gb(used)} are taken; "
+            f"{enough} would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
         )
     return used + min(free, len(objective.views) * needs.view + needs.beside)
 
@@ -86,7 +94,7 @@ def telling_needs(objective: SceneObjective) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if not lacks_memory(error):
+        if not lacks_memory(error) or isinstance(error, TooLittleMemory):
             raise
         raise MemoryError(_needs(objective, vars(objective).get("linearized"), free)) from error
 

@@ -22,6 +22,7 @@ from rich.text import Text
 
 from analysis.train.training_time import TrainingTime
 from landscape.errors import InputError
+from splat.backend.memory import require_room
 from splat.losses.autograd import view_loss
 from splat.losses.reference import psnr
 from splat.losses.regularizers import Regularizers
@@ -85,7 +86,8 @@ class TrainingProgress:
             self._row(spent)
 
     def after_step(self, done: StepResult, spent: TrainingTime) -> None:
-        """spent: in all steps so far."""
+        """spent: in all steps so far.  TooLittleMemory where limits of the process leave no room to go on."""
+        require_room()
         self.loss = done.loss if isnan(self.loss) else self.loss + SMOOTHING * (done.loss - self.loss)
         state = f"loss {self.loss:.4f} {done.gaussians} Gaussians"
         self.bars.update(self.bar, completed=done.step, state=state)

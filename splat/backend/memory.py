@@ -1,19 +1,33 @@
-"""How much memory is free: on a GPU, or for this process within the machine's, its group's and its own limits."""
+"""How much memory is free: on a GPU, or for this process within the machine's, its group's and its own limits.
+
+Limits of addresses and of data (`ulimit -v`, `ulimit -d`) are kept well away from.  Beyond them a tensor raises, but compiled
+code and libraries end the process, and the start of a thread waits for ever: these are asked for only where a reserve is left.
+"""
 
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 import psutil
-import torch
+
+from landscape.errors import TooLittleMemory
+
+if TYPE_CHECKING:
+    import torch
 
 GROUPS, GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 VERSIONS = {  # of control groups: folder, limit, usage
     2: ("", "memory.max", "memory.current"),
     1: ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
 }
-
+LIMITED = {  # what the process may be told to stay within, and the option of ulimit; bytes of it that libraries take
+    resource.RLIMIT_AS: ("addresses (ulimit -v)", 3 * 2**29),
+    resource.RLIMIT_DATA: ("data (ulimit -d)", 2**29),
+}
+RESERVE = 2**29  # bytes of these that no plan counts on: for threads, compiled code and libraries that are loaded late
+LEAST = RESERVE // 4  # of which is left where something goes on
 
 SLACK = 0.05  # of a limit that is asked for: what allocators and libraries hold beside what is counted
 
@@ -31,28 +45,52 @@ def staying_within(size: int | None) -> Iterator[None]:
         _most = before
 
 
+def is_told() -> bool:
+    """Whether `staying_within` says how much this process may have."""
+    return _most is not None
+
+
 def resident_memory() -> int:
     """Bytes of this process that are in memory."""
     return psutil.Process().memory_info().rss
 
 
-def free_memory(device: torch.device) -> int:
+def free_memory(device: "torch.device") -> int:
     """Free bytes on a device; on a GPU with those that torch keeps for future tensors."""
     if device.type == "cuda":
+        import torch
+
         cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + cached
     return max(0, min([psutil.virtual_memory().available, *_of_process(), *_of_groups()]))
 
 
 def _of_process() -> Iterator[int]:
-    """What the limits of this process leave, of memory, of addresses and of data."""
+    """What the limits of this process leave, of memory, and of addresses and data beside the reserve."""
     if _most is not None:
         yield int(_most) - resident_memory()
+    yield from (left - RESERVE for left in _left().values())
+
+
+def _left() -> dict[int, int]:
+    """Bytes that the limits of this process leave, for each that there is."""
+    limits = {kind: limit for kind in LIMITED if (limit := resource.getrlimit(kind)[0]) != resource.RLIM_INFINITY}
+    if not limits:
+        return {}
     used = psutil.Process().memory_info()
-    for kind, bytes_used in ((resource.RLIMIT_AS, used.vms), (resource.RLIMIT_DATA, getattr(used, "data", used.rss))):
-        limit = resource.getrlimit(kind)[0]
-        if limit != resource.RLIM_INFINITY:
-            yield limit - bytes_used
+    taken = {resource.RLIMIT_AS: used.vms, resource.RLIMIT_DATA: getattr(used, "data", used.rss)}
+    return {kind: limit - taken[kind] for kind, limit in limits.items()}
+
+
+def require_room(least: int = LEAST, *, libraries: bool = False) -> None:
+    """TooLittleMemory where limits of this process leave fewer bytes; libraries: beside what these take, not loaded yet."""
+    for kind, left in _left().items():
+        name, taken = LIMITED[kind]
+        if left < (expected := least + libraries * taken):
+            raise TooLittleMemory(
+                f"expected at least {expected / 1e6:,.0f} MB of {name} {'to begin with' if libraries else 'to go on'}, got "
+                f"{max(left, 0) / 1e6:,.0f} MB; allow more{'' if libraries else ', or take fewer Gaussians or smaller images'}"
+            )
 
 
 def _of_groups() -> Iterator[int]:

@@ -10,12 +10,10 @@ than at its start, and that is ended where a case takes too long.  Outcomes:
 """
 
 import argparse
-import json
+import multiprocessing
 import os
 import random
 import resource
-import select
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,7 +21,12 @@ import traceback
 import warnings
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import cache
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext
+from multiprocessing.forkserver import ensure_running
 from pathlib import Path
+from unittest.mock import patch
 
 import psutil
 
@@ -56,79 +59,75 @@ def fuzzed(name: str, cases: int, seed: int = 0) -> Found:
 
 def _watched(name: str, first: int, cases: int, seed: int, found: Found) -> int:
     """Run cases from `first` on in a process, until it ends; returns the next case."""
-    words = [
-        sys.executable,
-        "-m",
-        "tests.hostile.fuzz",
-        "--work",
-        str(first),
-        "--cases",
-        str(cases),
-        "--seed",
-        str(seed),
-        name,
-    ]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    with (
-        tempfile.TemporaryFile() as errors,
-        subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, env=environment) as process,
-    ):
-        assert process.stdout is not None
-        case, waiting, spent, silent, begun = first - 1, b"", 0.0, 0, False
+    receiver, sender = _processes().Pipe(duplex=False)
+    with tempfile.NamedTemporaryFile() as errors:
+        process = _processes().Process(target=work, args=(name, first, cases, seed, sender, errors.name))
+        process.start()
+        sender.close()
+        case, spent, silent, begun = first - 1, 0.0, 0, False
+        assert process.pid is not None
         while True:
-            ready, _, _ = select.select([process.stdout], [], [], PATIENCE)
-            if not ready:
+            if not receiver.poll(PATIENCE):
                 silent += 1
                 if _seconds(process.pid) - spent < 4 * SECONDS and silent < 20:
                     continue
                 process.kill()
                 found.add(case + 1, "hang", f"silent for {_seconds(process.pid) - spent:.0f} s of a processor")
                 return case + 2
-            spent, silent = _seconds(process.pid), 0
-            content = os.read(process.stdout.fileno(), 1 << 16)
-            if not content:
+            try:
+                case, outcome, said = receiver.recv()
+            except EOFError:
                 break
-            *lines, waiting = (waiting + content).split(b"\n")
-            for line in lines:
-                case, outcome, said = json.loads(line)
-                begun = True
-                if outcome != "begun":
-                    found.add(case, outcome, said)
-        process.wait()
+            spent, silent, begun = _seconds(process.pid), 0, True
+            if outcome != "begun":
+                found.add(case, outcome, said)
+        process.join()
+        said = errors.read().decode(errors="replace")
         if not begun:
-            errors.seek(0)
-            raise RuntimeError(f"no example of {name}: {errors.read().decode(errors='replace')[-2000:]}")
+            raise RuntimeError(f"no example of {name}: {said[-2000:]}")
         if case + 1 < cases:
-            errors.seek(0)
-            found.add(
-                case + 1, "crash", f"exit code {process.returncode}: {errors.read().decode(errors='replace')[-300:]}"
-            )
+            found.add(case + 1, "crash", f"exit code {process.exitcode}: {said[-300:]}")
             return case + 2
     return cases
 
 
+@cache
+def _processes() -> ForkServerContext:
+    """Makes processes that have everything imported, and one thread each."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tests.hostile.formats"])
+    with patch.dict(os.environ, {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}):
+        ensure_running()
+    return context
+
+
 def _seconds(process: int) -> float:
-    """That it has had of a processor."""
-    times = psutil.Process(process).cpu_times()
+    """That it has had of a processor; 0 where it has ended."""
+    try:
+        times = psutil.Process(process).cpu_times()
+    except psutil.NoSuchProcess:
+        return 0.0
     return times.user + times.system
 
 
-def work(name: str, first: int, cases: int, seed: int) -> None:
-    """Run cases, a line of JSON each on standard output."""
+def work(name: str, first: int, cases: int, seed: int, told: Connection, errors: str) -> None:
+    """Run cases, and tell of each; errors: the file for what libraries print."""
     from tests.hostile.formats import FORMATS
 
     warnings.simplefilter("ignore")
-    with tempfile.TemporaryDirectory() as folder, os.fdopen(os.dup(1), "w") as out:
-        os.dup2(2, 1)  # what libraries print
+    printed = os.open(errors, os.O_WRONLY | os.O_APPEND)
+    os.dup2(printed, 1)
+    os.dup2(printed, 2)
+    with tempfile.TemporaryDirectory() as folder:
         example = FORMATS[name](Path(folder))
         _limit_memory()
-        print(json.dumps([first - 1, "begun", ""]), file=out, flush=True)
+        told.send((first - 1, "begun", ""))
         for case in range(first, cases):
             start = time.process_time()
             outcome, said = _outcome(example, random.Random(f"{name} {seed} {case}"))
             if (spent := time.process_time() - start) > SECONDS:
                 outcome, said = "hang", f"{spent:.1f} s, {outcome} {said}"
-            print(json.dumps([case, outcome, said]), file=out, flush=True)
+            told.send((case, outcome, said))
 
 
 def _limit_memory() -> None:
@@ -168,11 +167,7 @@ def main() -> int:
     parser.add_argument("formats", nargs="*")
     parser.add_argument("--cases", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--work", type=int)
     options = parser.parse_args()
-    if options.work is not None:
-        work(options.formats[0], options.work, options.cases, options.seed)
-        return 0
     from tests.hostile.formats import FORMATS
 
     bad = 0

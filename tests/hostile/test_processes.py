@@ -182,6 +182,13 @@ def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]  # from where it goes on
 
 
+def test_a_command_with_too_few_addresses_says_so_before_it_begins(tmp_path):
+    few = 2**30
+    done = started(["probe", str(tmp_path)], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (few, few)))
+    said = done.communicate()[1]
+    assert done.returncode == 71 and said.startswith("landscape: expected at least 2,147 MB of addresses"), said
+
+
 def test_without_a_home_or_a_folder_beside_the_code_kernels_are_kept_with_temporary_files(tmp_path, monkeypatch):
     from splat.backend.cpu import kernel_cache
 

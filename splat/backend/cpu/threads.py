@@ -41,11 +41,14 @@ def thread_count() -> int:
 
 
 def _run(calls: list[tuple]) -> None:
-    """Run (function, arguments...) of every call at once, the first in this thread."""
-    waiting = [_pool(len(calls)).submit(*call) for call in calls[1:]]
+    """Run (function, arguments...) of every call at once: the first in this thread, and what no other has begun by then."""
+    waiting = [(_pool(len(calls)).submit(*call), call) for call in calls[1:]]
     calls[0][0](*calls[0][1:])
-    for future in waiting:
-        future.result()
+    for future, (function, *arguments) in waiting:
+        if future.cancel():
+            function(*arguments)
+        else:
+            future.result()
 
 
 def over_range(size: int, kernel: Callable, *arguments) -> None:

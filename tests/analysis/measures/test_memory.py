@@ -8,7 +8,7 @@ import torch
 from analysis.commands.cli import main
 from analysis.measures import memory
 from analysis.measures.memory import GIB, MIB, expected_peak, require_pictures, size_of, telling_needs, vectors_within
-from landscape.errors import InputError
+from landscape.errors import InputError, TooLittleMemory
 from splat.backend.memory import SLACK, free_memory, resident_memory, staying_within
 from splat.curvature.objective import SceneObjective
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -69,10 +69,12 @@ def test_less_memory_keeps_fewer_views_and_too_little_is_refused(objective, monk
     few = SceneObjective(objective.active, objective.views, memory=needs.view)
     assert few.linearized.kept == 1 and objective.linearized.kept == 2
     free(monkeypatch, needs.view)
-    with pytest.raises(InputError, match=r"expected at least \d+\.\d\d GB .* got .*; --memory [\d.]+GB would fit"):
+    with pytest.raises(TooLittleMemory, match=r"expected at least \d+\.\d\d GB .* got .*; \d\.\d\d GB more would fit"):
+        expected_peak(objective)
+    with staying_within(1), pytest.raises(TooLittleMemory, match=r"; --memory [\d.]+GB would fit"):
         expected_peak(objective)
     free(monkeypatch, 1e6)
-    with pytest.raises(InputError, match=r"--max-views 6 would fit"):
+    with pytest.raises(TooLittleMemory, match=r"--max-views 6 would fit"):
         require_pictures([*MADE.scene.frames] * 5, objective.active)
 
 

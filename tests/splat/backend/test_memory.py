@@ -1,12 +1,16 @@
 """Free memory within the limits of the process and of its control groups."""
 
+import resource
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from numba.core import event
+from rich.console import Console
 
+from landscape.errors import TooLittleMemory
 from splat.backend import memory
 from splat.backend.memory import free_memory
 
@@ -18,15 +22,32 @@ MIB = 2**20
 @pytest.mark.parametrize("kind", ["RLIMIT_AS", "RLIMIT_DATA"])
 def test_a_limit_of_the_process_is_honoured(kind):
     program = (
-        f"import resource, torch\nfrom splat.backend.memory import free_memory\n"
+        f"import resource, torch\nfrom splat.backend.memory import RESERVE, free_memory\n"
         f"used = {{'RLIMIT_AS': 'VmSize', 'RLIMIT_DATA': 'VmData'}}['{kind}']\n"
         f"of = lambda: 1024 * int(open('/proc/self/status').read().partition(used + ':')[2].split()[0])\n"
-        f"limit = of() + {300 * MIB}\nresource.setrlimit(resource.{kind}, (limit, limit))\n"
-        f"kept = bytearray({100 * MIB})\nprint(free_memory(torch.device('cpu')), limit - of())"
+        f"limit = of() + RESERVE + {300 * MIB}\nresource.setrlimit(resource.{kind}, (limit, limit))\n"
+        f"kept = bytearray({100 * MIB})\nprint(free_memory(torch.device('cpu')), limit - of() - RESERVE)"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     free, expected = map(int, done.stdout.split())
     assert abs(free - expected) < 16 * MIB and 150 * MIB < free < 220 * MIB
+
+
+def test_little_room_in_limits_is_refused_before_what_cannot_say_that_it_lacks_it(monkeypatch):
+    from analysis.commands.compiling import _Once
+    from analysis.console.stages import Stages
+
+    def leave(size: int) -> None:
+        monkeypatch.setattr(memory, "_left", lambda: {resource.RLIMIT_AS: size})
+
+    leave(memory.LEAST)
+    with Stages().stage("one"):
+        leave(memory.LEAST - 1)
+        with pytest.raises(TooLittleMemory, match=r"at least 134 MB of addresses \(ulimit -v\) to go on, got 134 MB"):
+            Stages().stage("another").__enter__()
+    leave(memory.RESERVE - 1)
+    with pytest.raises(TooLittleMemory, match="at least 537 MB"):
+        _Once(Console(quiet=True)).on_start(event.Event("numba:compile", event.EventStatus.START))
 
 
 def group(folder: Path, limit: str, usage: int, version: int, cached: int = 0) -> None:

@@ -1,12 +1,13 @@
 """No number depends on how many threads made it."""
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 
+from splat.backend.cpu import threads as threads_module
 from splat.backend.cpu.threads import ALIGNED, over_batch, over_range, single_threaded, thread_count
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.objective import SceneObjective
@@ -109,3 +110,20 @@ def test_a_batch_is_taken_apart_to_the_same_bits_on_one_two_and_five_threads():
 
         over_batch(len(matrices), decompose, matrices.device)
         assert torch.equal(found, whole)
+
+
+@pytest.mark.usefixtures("threads")
+def test_parts_that_no_thread_begins_are_done_where_they_are_waited_for(monkeypatch):
+    class Dead:  # as a pool whose threads could not be made, or died
+        def submit(self, *_: object) -> Future:
+            return Future()
+
+    monkeypatch.setattr(threads_module, "_pool", lambda _: Dead())
+    torch.set_num_threads(3)
+    found = np.zeros(10)
+
+    def fill(start: int, stop: int) -> None:
+        found[start:stop] = range(start, stop)
+
+    over_range(10, fill)
+    assert found.tolist() == list(range(10))

@@ -1,0 +1,302 @@
+"""Commands on a tiny scene that somebody ends at a random moment, and what they come to when nobody does."""
+
+import io
+import json
+import random
+import shutil
+import signal
+import time
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+
+from analysis.commands.cli import main
+from analysis.commands.uses.prune import PruneRecord
+from analysis.records.records import ProbeRecord, SliceRecord, read_record
+from analysis.records.run_files import COMPARISON, MapRecord
+from analysis.runs.compare import PAGE, TABLE
+from splat.model.files.read import read_splats
+from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
+from splat.scenes.write import write_transforms_scene
+from splat.training.checkpoint import load_checkpoint, training_state
+from tests.hostile.programs import forked, program
+
+CHANGING = ("second", "provenance", "timing", "created", "skipped")  # in the names of what no two runs have alike
+TRAINED = 6  # steps of the run that others read
+COMPARED = (TABLE, COMPARISON, PAGE)
+Numbers = dict[str, str]  # what was found, in words, by its name
+
+
+class Ended:
+    """A command on a tiny scene in `root`, and what it comes to when nobody ends it."""
+
+    name: ClassVar[str]
+    apart = 0.2  # share of the rounds that run a program of its own
+    goes_on = False  # from files in `out`, which are replaced one by one
+
+    def __init__(self, root: Path) -> None:
+        self.out, self.scene, self.checkpoint = root / "work" / "out", root / "scene", root / "run" / "checkpoint.pt"
+        self.out.parent.mkdir(parents=True)
+        self.made_before()
+        self.run_to_its_end()  # compiles
+        self.clean()
+        start = time.monotonic()
+        self.run_to_its_end()
+        self.seconds, self.expected = time.monotonic() - start, self.numbers()
+
+    def made_before(self) -> None:
+        """The scene and the run that the command reads."""
+        settings = SyntheticSettings(gaussians=60, views=5, width=24, height=18)
+        assert forked(lambda: write_transforms_scene(synthetic_scene(settings).scene, self.scene) or 0).wait() == 0
+        train = ["train", str(self.scene), "--out", str(self.checkpoint.parent), "--iterations", str(TRAINED)]
+        assert forked(lambda: main(train)).wait() == 0
+
+    def words(self) -> list[str]:
+        raise NotImplementedError
+
+    def numbers(self) -> Numbers:
+        """All that does not depend on the time.  InputError where the result is not whole."""
+        raise NotImplementedError
+
+    def run_to_its_end(self) -> None:
+        if (code := self.begun().wait()) != 0:
+            raise AssertionError(f"the same command again ends with {code}")
+
+    def begun(self) -> "forked":
+        return forked(lambda: main(self.words()))
+
+    def clean(self) -> None:
+        shutil.rmtree(self.out.parent)
+        self.out.parent.mkdir()
+
+    def prepare(self, chance: random.Random) -> None:
+        """What is there before: nothing, or what the command wrote before."""
+        if chance.random() < 0.5:
+            self.clean()
+
+    def round(self, chance: random.Random, number: int) -> str:
+        """End the command once and go on; what became of it."""
+        self.prepare(chance)
+        before, apart = self.out.exists(), chance.random() < self.apart
+        process = program(self.words()) if apart else self.begun()
+        time.sleep(chance.random() * (self.seconds + 3 * apart))
+        process.send(number)
+        code = process.wait()
+        allowed = {-9, 0} if number == signal.SIGKILL else {128 + number, 0} | ({-number} if apart else set())
+        assert code in allowed, f"exit code {code}"
+        aside = self.out.with_name(f".{self.out.name}.previous")
+        assert not before or self.out.exists() or (number == signal.SIGKILL and aside.exists()), (
+            "what was there is gone"
+        )
+        if self.out.exists():
+            self.check()
+        self.run_to_its_end()
+        self.require_expected("after the same command again")
+        assert (left := sorted(path.name for path in self.out.parent.iterdir())) == ["out"], f"left: {left}"
+        return "had ended" if code == 0 else "ended and went on to the same bits"
+
+    def check(self) -> None:
+        """What lies there although the command did not come to its end must be whole."""
+        self.require_expected("as it was left")
+
+    def require_expected(self, when: str) -> None:
+        found = self.numbers()
+        changed = [name for name in {**found, **self.expected} if found.get(name) != self.expected.get(name)]
+        shown = [f"{name} {found.get(name, '')[:30]} for {self.expected.get(name, '')[:30]}" for name in changed[:4]]
+        assert not changed, f"{len(changed)} other numbers {when}: {', '.join(shown)}"
+
+
+class Train(Ended):
+    name, goes_on = "train", True
+
+    def words(self) -> list[str]:
+        more = ["--resume"] if self.out.exists() else []
+        return [
+            "train",
+            str(self.scene),
+            "--iterations",
+            "20",
+            "--checkpoint-every",
+            "2",
+            "--out",
+            str(self.out),
+            *more,
+        ]
+
+    def numbers(self) -> Numbers:
+        return trained(self.out)
+
+    def prepare(self, chance: random.Random) -> None:
+        self.clean()
+
+    def check(self) -> None:
+        load_checkpoint(self.out / "checkpoint.pt")
+
+
+class Probe(Ended):
+    name = "probe"
+
+    def words(self) -> list[str]:
+        return ["probe", str(self.checkpoint), "--quick", "--slice-points", "5", "--out", str(self.out)]
+
+    def numbers(self) -> Numbers:
+        return recorded(self.out, ProbeRecord)
+
+
+class Slice(Ended):
+    name = "slice"
+
+    def words(self) -> list[str]:
+        return ["slice", str(self.checkpoint), "--points", "9", "--all-points", "--out", str(self.out)]
+
+    def numbers(self) -> Numbers:
+        found = recorded(self.out, SliceRecord)
+        return {name: value for name, value in found.items() if name != ".counts.products"}  # of the last run alone
+
+
+class Map(Ended):
+    name = "map"
+
+    def words(self) -> list[str]:
+        return ["map", str(self.checkpoint), "--out", str(self.out)]
+
+    def numbers(self) -> Numbers:
+        found = {name: digest((self.out / name).read_bytes()) for name in ("fields.ply", "largest.ply", "top.csv")}
+        return found | leaves(json.loads((self.out / MapRecord.FILE).read_text()))
+
+
+class Convert(Ended):
+    name = "convert"
+
+    def words(self) -> list[str]:
+        return ["convert", str(self.checkpoint), str(self.out), "--to", "graphdeco"]
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.seconds = max(self.seconds, 0.05)
+
+    def numbers(self) -> Numbers:
+        return {"file": digest(self.out.read_bytes()), "n": str(len(read_splats(self.out).gaussians))}
+
+    def prepare(self, chance: random.Random) -> None:
+        self.clean()
+
+    def run_to_its_end(self) -> None:
+        if not self.out.exists():  # which it refuses
+            super().run_to_its_end()
+
+
+class Sweep(Ended):
+    """Its commands are programs of their own, which a kill leaves at work."""
+
+    name = "sweep"
+
+    def words(self) -> list[str]:
+        file = self.scene.with_name("sweep.toml")
+        file.write_text(
+            f'out = "work/out"\nseeds = [0]\niterations = {TRAINED}\n[probe]\nquick = true\nslice_points = 5\n'
+            f'[scenes.tiny]\npath = "{self.scene}"\n[methods.3dgs]\n'
+        )
+        return ["sweep", str(file)]
+
+    def numbers(self) -> Numbers:
+        run = self.out / "tiny/3dgs/0"
+        return trained(run) | recorded(run / "probe", ProbeRecord)
+
+    def prepare(self, chance: random.Random) -> None:
+        self.clean()
+
+    def run_to_its_end(self) -> None:
+        end = time.monotonic() + 600
+        while (code := self.begun().wait()) == 2 and time.monotonic() < end:  # another is at work
+            time.sleep(1)
+        assert code == 0, f"the same command again ends with {code}"
+
+    def check(self) -> None:
+        for checkpoint in self.out.rglob("checkpoint.pt"):
+            load_checkpoint(checkpoint)
+        for record in self.out.rglob(ProbeRecord.FILE):
+            if not record.parent.name.startswith("."):
+                read_record(record.parent, ProbeRecord)
+
+
+class Prune(Ended):
+    name = "prune"
+
+    def words(self) -> list[str]:
+        return ["prune", str(self.checkpoint), "--sample", "10", "--out", str(self.out)]
+
+    def numbers(self) -> Numbers:
+        json.loads((self.out / PruneRecord.FILE).read_text())
+        tables = {
+            name: digest((self.out / name).read_bytes()) for name in ("scores.csv", "correlations.csv", "pruned.ply")
+        }
+        return tables | trained(self.out)
+
+
+class Compare(Ended):
+    """Replaces each file whole, not the folder."""
+
+    name = "compare"
+
+    def __init__(self, root: Path) -> None:
+        self.runs = [root / "run", root / "other"]
+        super().__init__(root)
+
+    def made_before(self) -> None:
+        super().made_before()
+        train = ["train", str(self.scene), "--out", str(self.runs[1]), "--iterations", str(TRAINED), "--seed", "1"]
+        assert forked(lambda: main(train)).wait() == 0
+        for run in self.runs:
+            probe = ["probe", str(run), "--quick", "--slice-points", "5", "--out", str(run / "probe")]
+            assert forked(lambda words=probe: main(words)).wait() == 0
+
+    def words(self) -> list[str]:
+        return ["compare", *map(str, self.runs), "--out", str(self.out)]
+
+    def numbers(self) -> Numbers:
+        whole = {name: (self.out / name).read_bytes() for name in COMPARED if (self.out / name).exists()}
+        if PAGE in whole:
+            assert whole.pop(PAGE).rstrip().endswith(b"</html>"), "a page that was cut"
+        return {name: digest(content) for name, content in whole.items()}
+
+    def check(self) -> None:
+        found = self.numbers()
+        changed = [name for name in found if found[name] != self.expected[name]]
+        assert not changed, f"other content of {changed} as it was left"
+
+
+COMMANDS: dict[str, type[Ended]] = {
+    each.name: each for each in (Train, Probe, Slice, Map, Convert, Sweep, Prune, Compare)
+}
+
+
+def digest(content: bytes) -> str:
+    return sha256(content).hexdigest()
+
+
+def trained(run: Path) -> Numbers:
+    buffer = io.BytesIO()
+    torch.save(training_state(load_checkpoint(run / "checkpoint.pt").training), buffer)
+    return {"training": digest(buffer.getvalue())}
+
+
+def recorded(folder: Path, kind: Any) -> Numbers:
+    record = read_record(folder, kind)
+    arrays = {
+        f"{group}.{name}": f"{array.shape} {digest(array.tobytes())}"
+        for group, arrays in record.arrays.items()
+        for name, array in arrays.items()
+    }
+    return arrays | leaves(json.loads((folder / kind.FILE).read_text()))
+
+
+def leaves(tree: Any, name: str = "") -> Numbers:
+    if isinstance(tree, dict):
+        kept = {key: value for key, value in tree.items() if not any(each in key for each in CHANGING)}
+        return {k: v for key, value in kept.items() for k, v in leaves(value, f"{name}.{key}").items()}
+    if isinstance(tree, list):
+        return {k: v for i, value in enumerate(tree) for k, v in leaves(value, f"{name}[{i}]").items()}
+    return {name: repr(tree)}

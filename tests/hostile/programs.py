@@ -1,0 +1,75 @@
+"""A command in a process of its own: a fork of this one, which has everything imported, or a program."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import splat.raster.cpu.raster  # noqa: F401
+from analysis.commands.map import command as _map  # noqa: F401
+from analysis.commands.uses import prune as _prune  # noqa: F401
+from analysis.console import drawing, recording
+from analysis.console.interruption import ignored, raising
+from analysis.runs import compare
+
+ROOT = Path(__file__).parents[2]
+
+
+@contextmanager
+def nothing_drawn(*_: Any) -> Iterator[Callable[[Path], list[str]]]:
+    yield lambda _: []
+
+
+class forked:
+    """A fork that runs a function, quietly and without pictures, and ends with what it returns.  Its signals raise by then."""
+
+    def __init__(self, run: Callable[[], int], said: Path = Path(os.devnull)) -> None:
+        """said: the file for what it prints."""
+        ready, begun = os.pipe()
+        self.process = os.fork()
+        if self.process == 0:
+            drawing.drawing = nothing_drawn
+            recording.draw = compare.draw = lambda *_: []
+            quiet = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(quiet, 1)
+            os.dup2(quiet, 2)
+            code = 70
+            try:
+                with raising():
+                    os.write(begun, b".")
+                    code = run()
+                    with ignored():
+                        os._exit(code)
+            finally:
+                os._exit(code)
+        os.close(begun)
+        os.read(ready, 1)
+        os.close(ready)
+
+    def send(self, number: int) -> None:
+        os.kill(self.process, number)
+
+    def wait(self) -> int:
+        return os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
+
+    def ended(self) -> int | None:
+        """The exit code of one that has come to its end."""
+        process, status = os.waitpid(self.process, os.WNOHANG)
+        return os.waitstatus_to_exitcode(status) if process else None
+
+
+class program:
+    """The command as a program of its own."""
+
+    def __init__(self, words: list[str]) -> None:
+        command = [sys.executable, "-m", "analysis.commands.cli", *words]
+        self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def send(self, number: int) -> None:
+        self.process.send_signal(number)
+
+    def wait(self) -> int:
+        return self.process.wait()

@@ -1,0 +1,78 @@
+"""Two processes at one folder: `python -m tests.hostile.races [--rounds 1000] [COMMAND ...]`.
+
+Each round begins a command twice, at nearly the same moment; half of those of a training go on from one that was interrupted,
+and its checkpoint is read while they are at work.  At least one must come to its end; who does not, with exit code 2, must
+say why in one sentence.  The numbers in the end must be the bits of one that was alone.
+"""
+
+import argparse
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from analysis.commands.cli import main
+from tests.hostile.ended import COMMANDS, Ended
+from tests.hostile.programs import forked
+
+BAD_INPUT = 2
+
+
+def race(command: Ended, chance: random.Random, files: Path) -> str:
+    """What became of the two."""
+    command.prepare(chance)
+    if command.goes_on and chance.random() < 0.5:
+        before = command.begun()
+        time.sleep(chance.random() * command.seconds)
+        before.send(signal.SIGTERM)
+        before.wait()
+    said = [files / "first", files / "second"]
+    words = command.words()
+    first = forked(lambda: main(words), said[0])
+    time.sleep(chance.choice((0, 0, 0.01, 0.1, chance.random() * command.seconds)))
+    second = forked(lambda: main(words), said[1])
+    both, codes = [first, second], dict[int, int]()
+    while len(codes) < 2:
+        for i, process in enumerate(both):
+            if i not in codes and (code := process.ended()) is not None:
+                codes[i] = code
+        if command.goes_on and command.out.exists():  # else a folder is replaced, whose files a reader may lose
+            command.check()
+        time.sleep(0.02)
+    lost = [i for i, code in codes.items() if code]
+    for i in lost:
+        text = said[i].read_text()
+        assert codes[i] == BAD_INPUT, f"exit code {codes[i]}: {text[-300:]}"
+        assert text.count("landscape:") == 1 and "expected" in text.rsplit("landscape:")[-1], text[-300:]
+    assert len(lost) < 2, f"both lost: {[path.read_text()[-300:] for path in said]}"
+    command.require_expected("after a race")
+    assert (left := sorted(path.name for path in command.out.parent.iterdir())) == ["out"], f"left: {left}"
+    return "one was refused" if lost else "both did it, one after the other"
+
+
+def attack(name: str, rounds: int, seed: int) -> list[str]:
+    """So many races; what went wrong."""
+    outcomes, failures = Counter[str](), list[str]()
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as files:
+        command = COMMANDS[name](Path(folder))
+        for round in range(rounds):
+            try:
+                outcomes[race(command, random.Random(f"race {name} {seed} {round}"), Path(files))] += 1
+            except Exception as error:  # whatever it is, it is what is looked for
+                failures.append(f"{name}, round {round}: {type(error).__name__} {error}")
+                print(failures[-1], flush=True)
+    print(f"{name}: {dict(outcomes)}, {len(failures)} failures", flush=True)
+    return failures
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("commands", nargs="*", default=["train"])
+    parser.add_argument("--rounds", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    failures = [attack(name, options.rounds, options.seed) for name in options.commands]
+    sys.exit(any(map(bool, failures)))
