@@ -183,7 +183,8 @@ class Viewer:
         if self.fields is None:
             return lines[0]
         kinds = self.fields.kinds
-        numbers = {name: quantity(float(self.fields.values[name][gaussian])) for name in kinds}
+        values = {name: float(self.fields.values[name][gaussian]) for name in kinds}
+        numbers = {name: f"{value:,.0f}" if value.is_integer() else quantity(value) for name, value in values.items()}
         pairs = {name: f"gn_{name}" for name in kinds if f"gn_{name}" in kinds}
         single = [name for name in kinds if name not in pairs and name not in pairs.values()]
         lines += [f"- {kinds[name].words}: {numbers[name]} {kinds[name].unit}" for name in single]
