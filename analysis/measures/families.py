@@ -51,7 +51,7 @@ OPERATORS: dict[schema.Operator, bool] = {"hessian": False, "gauss-newton": True
 PARTS = 6  # the whole and five attributes
 FEWEST_STEPS = 2  # that make a density
 TRACE_SAMPLES = 8  # of SSIM's coupling: to a few percent, within which start vectors do not know it
-PRODUCTS, SPLIT = 33.0, 1.5  # with a batch's vectors that a family takes; as much more where every Gaussian is split
+PRODUCTS, SPLIT = 26.0, 1.5  # with a batch's vectors that a family takes; as much more where every Gaussian is split
 DENSITY_SHARE = 0.45  # of a family's time: 48 of 108 products by default
 
 

@@ -78,7 +78,7 @@ LEFT_OUT = {
     "depth": "positions along and across the rays were left out",
 }
 MOST_AT_ONCE = 4  # start vectors
-PRODUCT, BEFORE = 5, 50  # renders that a product with them takes, and what comes before the first stage
+PRODUCT, BEFORE = 4.5, 50  # renders that a product with them takes, and what comes before the first stage
 TIMED = 3  # calls, of which the middle one tells how long one takes
 MOST_SAMPLES = 64  # of a trace, beyond which its exact value takes less
 Expected = Mapping[str, tuple[int, float, float]]

@@ -35,7 +35,7 @@ KINDS = (torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.bool, 
 def odd_tensor(chance: Random, value: Any) -> Any:
     """Something else in place of a tensor, or a tensor in place of something else."""
     plain = isinstance(value, torch.Tensor) and not value.is_nested and value.layout is torch.strided
-    plain = plain and value.device.type == "cpu" and value.numel() < 10**6
+    plain = plain and value.device.type == "cpu" and not value.is_quantized and value.numel() < 10**6
     n = value.numel() if plain else 3
     base = value if plain else torch.ones(3)  # a second change may meet what the first one made
     made: list[Callable[[], Any]] = [
