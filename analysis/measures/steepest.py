@@ -113,8 +113,8 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
     if not factor > 0:
         kind = "negative curvature" if end.curvature < 0 else "curvature"
         return (
-            f"The {kind} along {end.name} is not confirmed by renders: {extent} {ways[1]} the loss, back and forth together, where by the "
-            f"curvature they would {ways[0]} it."
+            f"The {kind} along {end.name} is not confirmed by renders: {extent} {ways[1]} the loss, back and forth together, "
+            f"where by the curvature they would {ways[0]} it."
         )
     text = f"A step of {quantity(step)} along {end.name} {ways[0]}s the loss by {abs(factor * alone):.2%}"
     text += f", the mean of back and forth (by its curvature alone: {abs(alone):.2%})"
