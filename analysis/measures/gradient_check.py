@@ -38,6 +38,9 @@ from splat.projection.reference import Splats, project
 from splat.render.autograd import project_by_kernel, rasterize_by_kernel
 
 STEPS = (1e-10, 3e-11, 1e-11, 3e-12)  # per parameter; means in units of their spread
+MOST_MOVED = (
+    5e-4  # sum of a step over all parameters, beyond which something lies within it that jumps: the last two need not
+)
 CHUNK = 1 << 16  # Gaussians that autograd projects at a time
 MOVING = ("means", "conics", "opacities", "colours")  # of the splats; their depths give their order alone
 ENOUGH = ROUND_OFFS * torch.finfo(torch.float32).eps  # what a probe asks for
@@ -94,14 +97,16 @@ def _differences(
     progress: Progress | None,
     views: int | None,
 ) -> DerivativeCheck:
-    gradient = _gradient(objective, progress, views)
-    return check_gradient(operator, gradient, objective.active.flat.double(), direction, STEPS, enough=ENOUGH)
+    center = objective.active.flat.double()
+    steps = [step for step in STEPS if step * len(center) <= MOST_MOVED or step in STEPS[-2:]]
+    gradient = _gradient(objective, progress, views, 2 * len(steps))
+    return check_gradient(operator, gradient, center, direction, steps, enough=ENOUGH)
 
 
 def _gradient(
-    objective: SceneObjective, progress: Progress | None, views: int | None
+    objective: SceneObjective, progress: Progress | None, views: int | None, most: int
 ) -> Callable[[Float[Tensor, " p"]], Float[Tensor, " p"]]:
-    """The gradient at any theta, in float64, each view composited in its order at the objective's own."""
+    """The gradient at any theta, in float64, each view composited in its order at the objective's own; most: calls of it."""
     active, settings = objective.active, objective.settings
     double, background = active.to(torch.float64), objective.background.double()
     shown = objective.views[:views]
@@ -125,7 +130,7 @@ def _gradient(
             regularizers.add_gradient(total.flat)
         done += 1
         if progress:
-            progress(done, 2 * len(STEPS), "gradients in double precision")
+            progress(done, most, "gradients in double precision")
         return _without_lengths(double, objective.mean_over_views(total.flat)[:, None])[:, 0]
 
     return gradient
