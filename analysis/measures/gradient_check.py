@@ -38,9 +38,7 @@ from splat.projection.reference import Splats, project
 from splat.render.autograd import project_by_kernel, rasterize_by_kernel
 
 STEPS = (1e-10, 3e-11, 1e-11, 3e-12)  # per parameter; means in units of their spread
-MOST_MOVED = (
-    5e-4  # a step's sum over all parameters: longer ones cross a jump, and only the last two steps may be longer
-)
+MOST_MOVED = 5e-4  # sum of a step over all parameters: longer ones cross jumps, which the last two STEPS may
 CHUNK = 1 << 16  # Gaussians that autograd projects at a time
 MOVING = ("means", "conics", "opacities", "colours")  # of the splats; their depths give their order alone
 ENOUGH = ROUND_OFFS * torch.finfo(torch.float32).eps  # what a probe asks for
