@@ -63,6 +63,22 @@ def _effects(axes: Axes, part: pd.DataFrame) -> None:
     axes.grid(True, axis="x")
 
 
+WORDS = {  # of quantities whose names do not say it
+    "train_psnr": "PSNR on training views",
+    "gaussians": "number of Gaussians",
+    "lambda_max": "λ max",
+    "lambda_second": "second largest λ",
+    "lambda_min": "λ min",
+    "literal": "λ max / λ min",
+    "saddle": "λ max / |λ min|",
+    "finite_curvature": "curvature by steps of Adam",
+    "depth_gradient": "gradient, depth : lateral",
+    "needles": "share of e₁ on needles",
+    "one_gaussian": "share of e₁ on one Gaussian",
+    "opacity_one_view": "opacity's curvature ~ one view",
+}
+
+
 def draw_predictors(table: pd.DataFrame) -> Figure:
     """A panel for each kind of correlation, a row a quantity."""
     names = list(dict.fromkeys(table["quantity"]))[::-1]
@@ -79,22 +95,24 @@ def draw_predictors(table: pd.DataFrame) -> Figure:
             axes.axvline(0, color="0.5", linewidth=0.6)
             axes.set_title(f"{title} (n = {max(part['n'], default=0)})", loc="left")
             axes.grid(True, axis="x")
-        panels[0].set_yticks(range(len(names)), [_words(name) for name in names])
+        panels[0].set_yticks(range(len(names)), [words_of(name) for name in names])
         panels[0].set_xlim(-1.05, 1.05)
-        panels[1].set_xlabel("rank correlation with PSNR on held-out views; red: the interval excludes 0")
+        panels[1].set_xlabel("rank correlation with PSNR on held-out views; orange: the interval excludes 0")
     return figure
 
 
-def _words(name: str) -> str:
+def words_of(quantity: str) -> str:
+    """What a quantity of a run is called in a figure.
+
+    >>> words_of("trace_means"), words_of("one_gaussian"), words_of("share_scene")
+    ('trace of position', 'share of e₁ on one Gaussian', 'share, scene units')
     """
-    >>> _words("trace_means"), _words("effective_rank")
-    ('trace of position', 'effective rank')
-    """
-    if name.startswith("trace_"):
-        return f"trace of {attribute_name(name.removeprefix('trace_'))}"
-    return (
-        name.replace("lambda_max", "λ1").replace("lambda_second", "λ2").replace("lambda_min", "λ min").replace("_", " ")
-    )
+    for metric in ("scene", "optimiser"):
+        if quantity.endswith(f"_{metric}"):
+            return f"{words_of(quantity.removesuffix(f'_{metric}'))}, {metric} units"
+    if quantity.startswith("trace_"):
+        return f"trace of {attribute_name(quantity.removeprefix('trace_'))}"
+    return WORDS.get(quantity, quantity.replace("_", " "))
 
 
 def draw(folder: Path, suffix: str) -> list[Path]:

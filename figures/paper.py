@@ -27,7 +27,7 @@ from analysis.records.run_files import read_trajectory
 from analysis.runs.claims.effects import BASE, LEAST, SCORE, STABLE, Interval, gains, log_ratios, numbers
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
-from figures.claims import draw_claims, draw_predictors
+from figures.claims import draw_claims, draw_predictors, words_of
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
 
 RESULTS = Path(__file__).parents[1] / "notebooks" / "results"
@@ -233,7 +233,9 @@ def _of_predictors(related: pd.DataFrame) -> str:
     best = sorted(decided.to_dict("records"), key=lambda row: -abs(row["rho"]))[:3]
     if not best:
         return "No quantity has a rank correlation with PSNR on held-out views whose interval excludes 0."
-    words = [f"{row['quantity']} ({row['rho']:+.2f}, {row['low']:+.2f} to {row['high']:+.2f})" for row in best]
+    words = [
+        f"{words_of(row['quantity'])} ({row['rho']:+.2f}, {row['low']:+.2f} to {row['high']:+.2f})" for row in best
+    ]
     return f"Over all runs PSNR on held-out views goes most with {', '.join(words)}; correlation is not cause."
 
 
