@@ -5,6 +5,7 @@
 sigma = BROADENING of the range; a peak narrower than sigma is not resolved.
 """
 
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,7 +16,7 @@ from matplotlib.ticker import NullLocator
 
 from analysis.records.quantities import power_of_ten, quantity
 from analysis.records.records import ProbeRecord, Record
-from figures.style import BLUE, exponent_of, new_figure, script, style, unit_suffix
+from figures.style import BLUE, VERMILION, exponent_of, new_figure, script, style, unit_suffix
 from landscape.errors import InputError
 
 BROADENING = 0.01
@@ -43,13 +44,15 @@ def draw_density(density: Quadrature) -> Figure:
     return figure
 
 
-def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> float:
-    """The density on axes; returns sigma."""
+def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray, ends: Iterable[float] = ()) -> float:
+    """The density on axes, with a line at each of the ends of the spectrum; returns sigma."""
     curvature, height, sigma = smooth_density(nodes, weights)
     exponent = exponent_of(curvature)
     curvature, height = curvature / 10.0**exponent, height / height.max()
     axes.fill_between(curvature, height, height.max() / 10**DECADES, color=BLUE, alpha=0.25, linewidth=0)
     axes.plot(curvature, height, color=BLUE, linewidth=0.9)
+    for end in ends:
+        axes.axvline(end / 10.0**exponent, color=VERMILION, linewidth=0.6)
     axes.set_yscale("log")
     axes.set_yticks([10.0**-k for k in range(0, DECADES, 2)], [power_of_ten(-k) for k in range(0, DECADES, 2)])
     axes.yaxis.set_minor_locator(NullLocator())

@@ -139,8 +139,9 @@ def draw(maps: dict[str, np.ndarray], panel: Panel, record: MapRecord) -> Figure
 def draw_fragility(maps: dict[str, np.ndarray], index: int, record: MapRecord) -> Figure:
     """The three axes in a view, by its place among those of the record."""
     fragile, shades = record.fragility, record.shades
+    view = next((Path(panel.name).name for panel in record.panels if panel.place == index), "")
     titles = {
-        "order_gap": "Position: how far to the next change of order",
+        "order_gap": f"Position: to the next change of order, {view}",
         "condition": f"Conditioning: {percent(fragile.needles)} are needles, longer than 10 : 1",
         "one_view": f"Opacity: {percent(fragile.one_view)} have over 90% of their weight in one view",
     }

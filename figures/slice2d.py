@@ -89,7 +89,7 @@ def _finding(field: Plane) -> str:
     low, high, power = float(field.change.min()), float(field.change.max()), 10.0**field.exponent
     if not high > low:
         return "The loss is the same everywhere"
-    text = f"In this plane the loss is up by at most {quantity(power * high)},\n"
+    text = f"In this plane: up by at most {quantity(power * high)},\n"
     row, column = np.unravel_index(int(field.change.argmin()), field.change.shape)
     if (row, column) == (field.x.centre, field.y.centre):
         return f"{text}lowest at the checkpoint, the cross"

@@ -46,9 +46,13 @@ def draw(record: Record[ProbeRecord]) -> Figure:
         _draw_values(last, values, residuals)
         _label_ends(last, record)
         if known:
-            sigma = draw_on(above[0], arrays["nodes"], arrays["weights"])
+            found = (record.data.eigenvalues.min.value, record.data.eigenvalues.max.value)
+            ends = [end for end in found if end is not None and math.isfinite(end)]
+            sigma = draw_on(above[0], arrays["nodes"], arrays["weights"], ends)
             above[0].set_title(
-                f"{_finding(arrays['nodes'], arrays['weights'])}\nbroadened by σ = {quantity(sigma)}", loc="left"
+                f"{_finding(arrays['nodes'], arrays['weights'])}\n"
+                f"broadened by σ = {quantity(sigma)}\norange: λ min and λ max",
+                loc="left",
             )
             _draw_distribution(above[1], arrays["nodes"], arrays["weights"])
         figure.legend(handles=_legend(known), loc="outside lower center", ncols=2, handlelength=1.2)

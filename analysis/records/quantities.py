@@ -202,9 +202,10 @@ class Shade(Struct, frozen=True, kw_only=True):
             "rgb({}, {}, {})".format(*colour) for colour in self.palette[np.linspace(0, BYTES, 9, dtype=int)]
         )
         ends = [quantity(self.value(t)) for t in (self.low, self.high)]
+        middle = "<span>logarithmic</span>" if self.scale == "log" else ""
         return (
             f'<span style="display:block;height:.5em;background:linear-gradient(to right, {stops})"></span><span '
-            f'style="display:flex;justify-content:space-between"><span>{ends[0]}</span><span>{ends[1]}</span></span>'
+            f'style="display:flex;gap:.5em;justify-content:space-between"><span>{ends[0]}</span>{middle}<span>{ends[1]}</span></span>'
         )
 
     def colours_of(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

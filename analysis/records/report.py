@@ -78,7 +78,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "open_ended": is_open,
     }
     surface, views = embedded_surface(record) if surface is None else surface, views_in(record)
-    first = opening(record)
+    first, start = opening(record), first_view(record, views)
     return environment.get_template("report.html.jinja").render(
         data=record.data,
         counts=plain(record.data.counts),
@@ -87,8 +87,13 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         headline=first,
         findings=findings(record.data),
         views=views,
-        listed_views=[{**view, "pictures": [{**each, "uri": ""} for each in view["pictures"]]} for view in views[:1]]
-        + views[1:],
+        listed_views=[
+            {**view, "pictures": [{**each, "uri": ""} for each in view["pictures"]]} if i == start else view
+            for i, view in enumerate(views)
+        ],
+        start=start,
+        title=title(record.data),
+        checks=passed(record.data),
         pictures=pictures_in(record.folder, PICTURES, shown_numbers(record)),
         where=where(record, first[-1].text),
         splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
@@ -97,6 +102,28 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         surface=surface,
         plotly_js=base64.b64encode(gzip.compress(get_plotlyjs().encode(), 6, mtime=0)).decode() if surface else "",
     )
+
+
+def title(data: ProbeRecord) -> str:
+    """What the page is about: scene, views and steps, as far as they are known."""
+    made, count = data.provenance, data.counts.views
+    steps = plain(made).get("iteration")
+    parts = [f"Loss landscape of {made.scene or 'a checkpoint'}", f"{count:,} view{'' if count == 1 else 's'}"]
+    return ", ".join(parts + ([] if steps is None else [f"{steps:,} steps"]))
+
+
+def passed(data: ProbeRecord) -> str:
+    """How many of the self-checks passed, and how many could not run; empty without any."""
+    results = [check.passed for check in data.checks.values()]
+    text = f"{sum(map(bool, results))} of {len(results)} passed" if results else ""
+    return text + (f", {missing} could not run" if (missing := results.count(None)) else "")
+
+
+def first_view(record: Record[ProbeRecord], views: list[dict[str, Any]]) -> int:
+    """The place of the view that the opening names, else of the first."""
+    found = map_beside(record)[1]
+    named = found.steepest[0].view if found and found.steepest else None
+    return next((i for i, view in enumerate(views) if view["name"] == named), 0)
 
 
 def opening(record: Record[ProbeRecord]) -> list[Line]:

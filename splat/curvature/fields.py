@@ -65,7 +65,7 @@ OF_VIEWS = {
     "pixels": Field("pixels that see it", "", "log"),
     "weight": Field("weight in the images", "px", "log"),
     "one_view": Field("share of its weight in one view", "", "linear"),
-    "condition": Field("condition of its splat", "λ max / λ min", "log"),
+    "condition": Field("condition of its splat", "long : short axis, squared", "log"),
     "order_gap": Field("distance along the ray to the next in front", "px", "log"),
 }
 FIELDS = {

@@ -210,7 +210,7 @@ def test_the_title_of_a_plane_says_where_it_is_lowest(tmp_path, lowest, said):
     arrays["slice"]["loss"] = loss
     figure = slice2d.draw(written(tmp_path / "probe", data, arrays))
     title = figure.axes[0].get_title(loc="left").replace("\n", " ")
-    assert title.startswith("In this plane the loss is up by at most 2.00, ") and said in title
+    assert title.startswith("In this plane: up by at most 2.00, ") and said in title
     require_layout(figure)
 
 

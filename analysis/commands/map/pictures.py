@@ -35,7 +35,7 @@ def error_shade(objective: SceneObjective) -> Shade:
     index = len(objective.views) // 2
     error = (rendered(objective, index) - objective.views[index].image).abs().mean(dim=0)
     high = float(np.quantile(error.numpy(), WORST)) or 1.0
-    return Shade(name="error", words="error", unit="of the range of a colour", scale="linear", low=0.0, high=high)
+    return Shade(name="error", words="error", unit="|render − photograph|, 0 to 1", scale="linear", low=0.0, high=high)
 
 
 def view_maps(

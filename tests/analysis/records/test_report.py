@@ -3,6 +3,7 @@ import math
 import re
 from html.parser import HTMLParser
 from io import StringIO
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from analysis.records import report
 from analysis.records.findings import findings
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
 from analysis.records.report import interactive_surface, numbers, write_report
@@ -435,3 +437,25 @@ def test_the_page_of_the_splats_is_linked_where_it_is(tmp_path):
     assert "view.html" not in path.read_text(encoding="utf-8")
     (tmp_path / "view.html").write_text("")
     assert '<a href="../view.html">' in write_report(path.parent).read_text(encoding="utf-8")
+
+
+def test_the_title_and_the_checks_say_what_is_known(tmp_path):
+    data, arrays = synthetic()
+    text = Page(page(tmp_path / "whole", data, arrays)).text
+    assert "Loss landscape of fern, 3 views, 2,000 steps" in text and "Checks: 2 of 3 passed, 1 could not run." in text
+    del data["provenance"]["scene"], data["provenance"]["iteration"]
+    data["counts"] |= {"views": 1}
+    data["checks"] = {"symmetry": data["checks"]["symmetry"]}
+    text = Page(page(tmp_path / "less", data, arrays)).text
+    assert "Loss landscape of a checkpoint, 1 view " in text and "Checks: 1 of 1 passed." in text
+
+
+def test_the_first_view_is_that_of_the_steepest_direction(tmp_path, monkeypatch):
+    path = with_views(tmp_path / "probe", ["a.png", "b.png", "c.png"])
+    assert 'id="name">1 of 3: a.png<' in path.read_text(encoding="utf-8")
+    steepest = SimpleNamespace(view="b.png", sentence="most of e₁ in b.png", rendered="", curvature=1.0)
+    found = SimpleNamespace(steepest=[steepest], panels=[])
+    monkeypatch.setattr(report, "map_beside", lambda record: (tmp_path, found))
+    monkeypatch.setattr(report, "where", lambda *_: [])
+    text = write_report(path.parent).read_text(encoding="utf-8")
+    assert 'id="name">2 of 3: b.png<' in text and 'value="1" aria-label' in text
