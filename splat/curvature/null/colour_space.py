@@ -6,12 +6,14 @@ serves all three; only the slopes, at most three, go across the channels.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from splat.backend.cpu.threads import over_range
+from splat.backend.device import by_triton
 from splat.curvature.null.colour_space_cpu import project_colours
 from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, joined, orthonormal, row_space, spanned
 from splat.model.gaussians import Gaussians
@@ -38,7 +40,7 @@ class ColourSpace:
 
     def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         """x without its null components."""
-        return self._by_kernel(x) if x.device.type == "cpu" else self._by_products(x)
+        return self._by_products(x) if by_triton(x) else self._by_kernel(x)
 
     def _by_kernel(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
         (n, d, k), bands = x.shape, self.harmonics.basis.shape[2]
@@ -69,7 +71,7 @@ class ColourSpace:
         rows = basis.gather(1, order[:, : int(self.rank.max()), None].expand(-1, -1, basis.shape[2]))
         return RowSpace(rows, self.rank).scaled(scale)
 
-    @property
+    @cached_property
     def _channels(self) -> list[RowSpace]:
         return [RowSpace(self.harmonics.basis[row], self.harmonics.rank[row]) for row in self.row.T]
 

@@ -137,7 +137,9 @@ def test_traces_of_exact_blocks_are_within_the_error_of_sampled_ones() -> None:
 
 def test_memory_decides_which_views_are_kept_and_changes_no_bit(monkeypatch) -> None:
     gaussians, loss, widths, hvp = awkward_gaussians(), LossSettings(), [], LinearizedView.hvp
-    monkeypatch.setattr(LinearizedView, "hvp", lambda view, U, **how: widths.append(U.shape[1]) or hvp(view, U, **how))
+    monkeypatch.setattr(
+        LinearizedView, "hvp", lambda view, U, *total, **how: widths.append(U.shape[1]) or hvp(view, U, *total, **how)
+    )
     roomy = objective_of(gaussians, loss, noise=0.3)
     tight = SceneObjective(gaussians, roomy.views, loss, BACKGROUND, memory=0)
     assert (tight.linearized.kept, roomy.linearized.kept) == (1, 2)
