@@ -122,13 +122,17 @@ def test_the_page_of_the_splats_needs_no_network_and_switches_colours(browser, v
 
 
 def splats_of(browser: Any, condition: Callable[[np.ndarray], bool]) -> np.ndarray:
-    """The picture of the splats once they are drawn, and a condition holds."""
+    """The picture of the splats once they are drawn, two in a row are the same, and a condition holds."""
     from selenium.webdriver.support.ui import WebDriverWait
+
+    before = np.zeros(())
 
     def drawn(_: Any) -> list[np.ndarray]:
         image = Image.open(BytesIO(browser.find_element("tag name", "canvas").screenshot_as_png)).convert("RGB")
-        pixels = np.asarray(image, float)[:, image.width // 2 :]  # beside the panel
-        return [pixels] if len(image.getcolors(2**24) or []) > 2000 and condition(pixels) else []
+        nonlocal before
+        last, before = before, np.asarray(image, float)[:, image.width // 2 :]  # beside the panel
+        done = len(image.getcolors(2**24) or []) > 2000 and np.array_equal(last, before) and condition(before)
+        return [before] if done else []
 
     return WebDriverWait(browser, 60, 0.5).until(drawn)[0]
 
