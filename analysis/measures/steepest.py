@@ -1,7 +1,7 @@
 """An eigenvector of the loss shown where it acts: the Gaussians that carry it, in the view where they weigh most.
 
     mass       of Gaussian i in a unit vector v: the sum of v^2 over its parameters; carriers have at least LEAST of it
-    steps      sqrt(2 RISE L / |lambda|), by which the curvature alone changes the loss L by RISE L, and its quarters
+    steps      sqrt(2 RISE L / |lambda|), by which the curvature alone changes the loss L by RISE L, and its halves
     factor     of a step s: the mean change of the loss by +s and -s, rendered, over lambda s^2 / 2.  The slope drops out; 1
                where the second-order model holds
     renders    at -step, 0 and +step along v, all Gaussians moved at once, in the part of the view around the first carrier, at
@@ -11,6 +11,7 @@ The sentence names the attribute in which the first carrier has most of its mass
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from analysis.measures.localization import mass_shares, masses, participation
 from analysis.records.quantities import Shade, percent, quantity
 from analysis.records.run_files import Carrier, Steepest
 from landscape import curvature_reach
+from splat.backend.cpu.threads import single_threaded, thread_count
 from splat.curvature.fields import Values
 from splat.curvature.objective import SceneObjective
 from splat.projection.dispatch import projected
@@ -32,7 +34,7 @@ from splat.render.sight import Sight
 from splat.scenes.view import View
 
 LEAST, MOST = 0.05, 5  # share of a carrier; how many at most
-RISE, STEPS = 0.01, 4  # of the loss, at the longest; at the shortest 2e-6 of it, fifty times the rounding of float32
+RISE, STEPS = 0.01, 7  # of the loss, at the longest; at the shortest 2e-6 of it, fifty times the rounding of float32
 AGREES = 0.2  # of the change by curvature
 SIGMAS = 2.0  # of an outline
 ROOM, SMALLEST = 1.3, 8  # around an outline; a crop is at least 1 / SMALLEST of its view
@@ -71,8 +73,8 @@ def steepest(
     carriers = [_carrier(objective, view, end, values, mass, i) for i in chosen]
     crop = crop_around(carriers[0].outline, view.camera.width, view.camera.height)
     loss = objective.loss(objective.active.flat)
-    steps = [curvature_reach(end.curvature, RISE * loss) / 4**k for k in range(STEPS)]
-    pairs = [[objective.loss(objective.active.flat + sign * step * end.vector) for sign in (-1, 1)] for step in steps]
+    steps = [curvature_reach(end.curvature, RISE * loss) / 2**k for k in range(STEPS)]
+    pairs = _losses_at(objective, end.vector, steps)
     factors = [
         (back + forth - 2 * loss) / (end.curvature * step**2) for step, (back, forth) in zip(steps, pairs, strict=True)
     ]
@@ -89,6 +91,20 @@ def steepest(
         sentence=sentence(end, carriers, participation(mass), view, len(objective.views)),
     )  # fmt: skip
     return found, pictures
+
+
+def _losses_at(
+    objective: SceneObjective, vector: Float[Tensor, " p"], steps: Sequence[float]
+) -> list[tuple[float, float]]:
+    """The loss at -step and at +step, for every step; as many at once as there are threads."""
+
+    def loss(step: float) -> float:
+        with single_threaded():
+            return objective.loss(objective.active.flat + step * vector)
+
+    with ThreadPoolExecutor(thread_count()) as pool:
+        found = list(pool.map(loss, [sign * step for step in steps for sign in (-1, 1)]))
+    return list(zip(found[::2], found[1::2], strict=True))
 
 
 def shown_step(factors: Sequence[float]) -> int:
