@@ -189,7 +189,7 @@ def _focal(values: Mapping[str, Any], width: int, name: str, path: Path) -> floa
         return float(values["fl_x"])
     if "camera_angle_x" in values:
         angle = float(values["camera_angle_x"])
-        if not 0 < angle < pi:
+        if not (0 < angle < pi and tan(angle / 2) > 0):  # half the least number there is, is 0
             raise InputError(f"expected camera_angle_x above 0 and below pi, got {angle} for {name!r} in {path}")
         return width / (2 * tan(angle / 2))
     raise InputError(f"expected fl_x or camera_angle_x for {name!r} in {path}, got neither; add the focal length in px")

@@ -97,6 +97,10 @@ def test_lenses_that_a_pinhole_cannot_stand_for_are_refused(
             lambda c: (c.pop("fl_x"), c.update(camera_angle_x=0)),
             "expected camera_angle_x above 0 and below pi, got 0.0",
         ),
+        (
+            lambda c: (c.pop("fl_x"), c.update(camera_angle_x=5e-324)),
+            "expected camera_angle_x above 0 and below pi, got 5e-324",
+        ),
         (lambda c: c.update(background="white"), "three numbers in"),
         (lambda c: c.update(background=1), "three numbers in"),
         (lambda c: c.update(ply_file_path=5), "expected the name of a file, got ply_file_path = 5"),
