@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
+from analysis.console.plain import say
 from landscape.results import Progress as Report
 from splat.backend.memory import require_room
 
@@ -139,4 +140,4 @@ class Stages:
     def _say(self, words: str) -> None:
         self._said = perf_counter()
         if self._console is not None:
-            self._console.print(words, highlight=False, markup=False, soft_wrap=True)
+            say(words, console=self._console)

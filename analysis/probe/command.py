@@ -22,6 +22,7 @@ from rich.console import Console
 from analysis.console.drawing import Draw
 from analysis.console.kept import kept_stages
 from analysis.console.options import ForeignOptions
+from analysis.console.plain import say
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.measures.memory import expected_peak, require_pictures, size_of, telling_needs
@@ -87,9 +88,9 @@ def _run(
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         checkpoint.training.move(device)
         objective = scene_objective(checkpoint, scene, ranks, loss=LossSettings() if options.loss == "3dgs" else None)
-    console.print(_introduction(scene, checkpoint, objective), highlight=False, soft_wrap=True, markup=False)
+    say(_introduction(scene, checkpoint, objective), console=console)
     after = _expected_after(family_options)
-    console.print(_expected(objective, settings, after), highlight=False, soft_wrap=True, markup=False)
+    say(_expected(objective, settings, after), console=console)
     told = (
         f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} "
         f"{digests(scene.select(checkpoint.scene.train))} {settings} "
@@ -146,7 +147,7 @@ def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[No
     except KeyboardInterrupt:
         if stages := ", ".join(kept_stages(folder)):
             words = f"kept: {stages}; the same command continues from there: {shlex.join(command)}"
-            console.print(words, highlight=False, markup=False, soft_wrap=True)
+            say(words, console=console)
         raise
 
 
@@ -270,12 +271,9 @@ def _conclude(data: ProbeRecord, out: Path, verbose: bool) -> None:
     if verbose:
         console.print(probe_table(data, console.width))
         pictures = ", ".join(path.name for path in sorted(out.glob("*.png")))
-        console.print(
-            f"pictures: {pictures}; numbers: {data.FILE}, in {out}", soft_wrap=True, highlight=False, markup=False
-        )
+        say(f"pictures: {pictures}; numbers: {data.FILE}, in {out}", console=console)
     if data.families:
         console.print(family_table(data))
     for line in remarks(data, verbose):
         console.print(line.text, style="red" if line.level == "failure" else "yellow", highlight=False, markup=False)
-    for text in summary(data, out / REPORT):
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
+    say(*summary(data, out / REPORT), console=console)

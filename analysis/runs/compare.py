@@ -21,6 +21,7 @@ from rich.console import Console
 
 from analysis.console.drawing import draw
 from analysis.console.overrides import leaves
+from analysis.console.plain import say
 from analysis.probe.record import loss_name
 from analysis.records.findings import of_budgets, of_checks, unresolved
 from analysis.records.json_files import json_text, plain
@@ -211,12 +212,10 @@ def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], ou
     notes += draw("compare", out)
     names = [group.label for group in groups]
     write_atomically(out / PAGE, render_page(runs, names, shown, says, notes, out).encode(errors="backslashreplace"))
-    for line in says:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    say(*says, console=console)
     console.print(compare_table(shown, names))
-    for note in notes:
-        console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
-    console.print(f"open {out / PAGE}; numbers: {out / TABLE}", highlight=False, soft_wrap=True, markup=False)
+    say(*notes, style="yellow", console=console)
+    say(f"open {out / PAGE}; numbers: {out / TABLE}", console=console)
 
 
 def render_page(

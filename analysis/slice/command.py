@@ -15,11 +15,9 @@ import io
 import shlex
 import shutil
 from collections.abc import Sequence
-from functools import partial
 from math import inf
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +25,7 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
+from analysis.console.plain import say
 from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.measures.memory import expected_peak, size_of, telling_needs
@@ -62,7 +61,6 @@ from splat.model.files.read import is_foreign, read_splats
 from splat.model.untrusted import read_array
 from splat.training.checkpoint import Checkpoint, load_checkpoint, write_atomically
 
-SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 DECADES = [10.0 ** (k / 2) for k in range(-8, 1)]  # finite steps, in radii
 
 
@@ -97,7 +95,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
             )
         except BaseException:
             if unfinished.is_dir():
-                console.print(f"what was rendered is kept; to continue: {shlex.join(command)}", **SAID)
+                say(f"what was rendered is kept; to continue: {shlex.join(command)}", console=console)
             raise
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         made.other = ", ".join(map(str, options.others)) or None
@@ -239,17 +237,14 @@ def _evaluation(objective: SceneObjective, workers: int) -> Loss:
 
 def _conclude(data: SliceRecord, out: Path) -> None:
     """The curvatures, how well the slice is known, and the files to open."""
-    say = partial(Console().print, **SAID)
     for direction in data.slice.directions:
         curvature = measured(direction.curvature, direction.residual or 0.0) + apart(direction.views_error)
         text = f"{direction.name}: curvature {curvature}, slope {quantity(direction.slope or 0.0)}"
         say(f"{text}; one curvature unit is a step of {quantity(direction.unit)}")
     if data.finite_probe:
         say(_finite_curvature(data.finite_probe))
-    for line in of_slice(data.slice, data.provenance):
-        say(line.text)
-    for note in data.notes:
-        say(note, style="yellow")
+    say(*(line.text for line in of_slice(data.slice, data.provenance)))
+    say(*data.notes, style="yellow")
     say(f"{data.timing['total']:.1f} s, {data.counts.renders:,} renders of a view")
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))) or "none"
     say(f"pictures: {pictures}; numbers: {data.FILE}, in {out}")

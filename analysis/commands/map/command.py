@@ -28,6 +28,7 @@ from analysis.commands.map.files import coloured_ply, csv_text, fields_ply, top_
 from analysis.commands.map.pictures import error_shade, view_maps, write_maps
 from analysis.commands.options import MapOptions
 from analysis.console.drawing import Draw
+from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.measures.fragility import fragility, fragility_sentences
 from analysis.measures.localization import masses
@@ -51,7 +52,6 @@ from splat.training.checkpoint import Checkpoint
 ENDS = {"e1": "share of e₁", "e_min": "share of e_min"}
 AXES = ("order_gap", "condition", "one_view")  # of fragility
 PROBE = "probe"
-SAID: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +162,10 @@ def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], re
     return Fields(values, kinds, ends, sights)
 
 
+@single_threaded()
 def _fragility(objective: SceneObjective, found: Fields, seed: int) -> Fragility:
-    with single_threaded():
-        generator = torch.Generator().manual_seed(seed)
-        return fragility(objective, found.values, found.sights, generator, lambda *_: None)
+    generator = torch.Generator().manual_seed(seed)
+    return fragility(objective, found.values, found.sights, generator, lambda *_: None)
 
 
 def _write_panels(
@@ -215,18 +215,13 @@ def _write(folder: Path, data: MapRecord) -> None:
 
 
 def _conclude(data: MapRecord, first: Mapping[str, Any], kind: Field, out: Path) -> None:
-    say = Console().print
-    say(f"{data.seen:,} of {data.gaussians:,} Gaussians are in sight", **SAID)
-    for text in data.sentences:
-        say(text, **SAID)
+    say(f"{data.seen:,} of {data.gaussians:,} Gaussians are in sight", *data.sentences)
     if not data.steepest:
-        say("for the Gaussians that carry the steepest directions: landscape probe, then map again", **SAID)
+        say("for the Gaussians that carry the steepest directions: landscape probe, then map again")
     say(
-        f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {quantity(float(first[data.field]))} {kind.unit}",
-        **SAID,
+        f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {quantity(float(first[data.field]))} {kind.unit}"
     )
-    for note in data.notes:
-        say(note, style="yellow", **SAID)
+    say(*data.notes, style="yellow")
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))[:4]) or "none"
     more = "" if len(data.panels) <= 4 else ", ..."
-    say(f"pictures: {pictures}{more}; splats: fields.ply, {data.field}.ply; table: top.csv; in {out}", **SAID)
+    say(f"pictures: {pictures}{more}; splats: fields.ply, {data.field}.ply; table: top.csv; in {out}")

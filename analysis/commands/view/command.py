@@ -13,6 +13,7 @@ from analysis.commands.map.command import ENDS, PROBE, measured_fields
 from analysis.commands.options import ViewOptions
 from analysis.commands.view.page import offline_page
 from analysis.commands.view.viewer import APPEARANCE, Viewer
+from analysis.console.plain import say
 from analysis.console.stages import Stages
 from analysis.probe.command import opened, scene_objective
 from analysis.slice.directions import RISE, UNITS, recorded_probe
@@ -47,11 +48,10 @@ def run_view(options: ViewOptions) -> int:
         notes: list[str] = []
         with stages, stages.stage("fields") as progress:
             viewer.add_fields(measured_fields(objective, folder / PROBE, notes, progress), options.shown)
-        for note in notes:
-            console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        say(*notes, style="yellow", console=console)
         if options.html is not None:
             write_atomically(options.html, offline_page(viewer, options.shown).encode())
-            console.print(f"written: {options.html}", highlight=False, markup=False, soft_wrap=True)
+            say(f"written: {options.html}", console=console)
             from analysis.records import report  # half a second of imports
 
             if (
