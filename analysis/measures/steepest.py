@@ -98,9 +98,9 @@ def _losses_at(
 ) -> list[tuple[float, float]]:
     """The loss at -step and at +step, for every step; as many at once as there are threads."""
 
+    @single_threaded()
     def loss(step: float) -> float:
-        with single_threaded():
-            return objective.loss(objective.active.flat + step * vector)
+        return objective.loss(objective.active.flat + step * vector)
 
     with ThreadPoolExecutor(thread_count()) as pool:
         found = list(pool.map(loss, [sign * step for step in steps for sign in (-1, 1)]))

@@ -18,7 +18,7 @@ stop at their accuracy or after so many products as settings allow at most; each
 deadline, which ends what is under way.  The numbers depend on the seed alone, also where stages were kept from a run before.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
@@ -411,11 +411,4 @@ def _plane(
 
 def evaluation(objective: SceneObjective, workers: int) -> Loss:
     """The objective for so many threads at once: each alone, or one with all processors to itself."""
-    if workers == 1:
-        return objective.evaluate
-
-    def alone(theta: Tensor) -> tuple[float, Hashable]:
-        with single_threaded():
-            return objective.evaluate(theta)
-
-    return alone
+    return objective.evaluate if workers == 1 else single_threaded()(objective.evaluate)

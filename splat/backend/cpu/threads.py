@@ -27,7 +27,7 @@ _here = threading.local()
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Kernels called from this thread use it alone: for work that is spread over threads already."""
+    """Kernels called from this thread use it alone: for work that is spread over threads already; a decorator, too."""
     before, _here.alone = getattr(_here, "alone", False), True
     try:
         yield
