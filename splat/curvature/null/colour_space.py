@@ -4,7 +4,7 @@ The channels of a Gaussian see the same harmonics but where a view clamps one of
 serves all three; only the slopes, at most three, go across the channels.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,11 +15,19 @@ from torch import Tensor
 from splat.backend.cpu.threads import over_range
 from splat.backend.device import by_triton
 from splat.curvature.null.colour_space_cpu import project_colours
-from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, joined, orthonormal, row_space, spanned
+from splat.curvature.null.row_space import (
+    CHUNK,
+    TOLERANCE,
+    RowSpace,
+    Stacked,
+    alone,
+    joined,
+    orthonormal,
+    row_space,
+    spanned,
+)
 from splat.model.gaussians import Gaussians
 from splat.projection.formulas import ProjectionJacobian
-
-Stacked = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,16 +87,12 @@ class ColourSpace:
         return ColourSpace(self.harmonics.to(dtype), self.row, self.slopes.to(dtype))
 
 
-def _alone(rows: Tensor) -> Tensor:
-    return rows
-
-
 def seen_colours(
     views: Iterable[ProjectionJacobian],
     count: int,
     gaussians: Gaussians,
-    stacked: Stacked = _alone,
-    summed: Stacked = _alone,
+    stacked: Stacked = alone,
+    summed: Stacked = alone,
     *,
     apart: bool = False,
 ) -> ColourSpace:

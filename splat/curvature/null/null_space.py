@@ -19,23 +19,17 @@ Rows are scaled to unit length before a basis of them is found (`row_space.py`).
 of.  The Hessian's space of SH coefficients is in `colour_space.py`, Gauss-Newton's of all parameters here.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, joined, row_space
+from splat.curvature.null.row_space import CHUNK, TOLERANCE, RowSpace, Stacked, alone, joined, row_space
 from splat.projection.formulas import GEOMETRY, ProjectionJacobian
 
 
-def _alone(rows: Tensor) -> Tensor:
-    return rows
-
-
-def seen_parameters(
-    views: Sequence[ProjectionJacobian], n: int, bands: int, stacked: Callable[[Tensor], Tensor] = _alone
-) -> RowSpace:
+def seen_parameters(views: Sequence[ProjectionJacobian], n: int, bands: int, stacked: Stacked = alone) -> RowSpace:
     """The directions of a Gaussian's parameters (mean, log-scales, quaternion, logit, SH) that Gauss-Newton sees."""
     dtype = _like(views).dtype
     parts = [

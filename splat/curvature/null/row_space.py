@@ -4,7 +4,7 @@ A basis is found per Gaussian by a small singular value decomposition of its row
 TOLERANCE of the largest are null.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -62,6 +62,14 @@ def orthonormal(rows: Float[Tensor, "n r d"], rank: Int[Tensor, " n"]) -> RowSpa
     over_batch(len(rows), decompose, matrices.device)
     held = torch.arange(rows.shape[1], device=rows.device) < rank[:, None]
     return RowSpace(torch.where(held[:, :, None], directions.to(rows), 0.0), rank)
+
+
+Stacked = Callable[[Tensor], Tensor]
+
+
+def alone(rows: Tensor) -> Tensor:
+    """Rows of all views, of a process that has all of them."""
+    return rows
 
 
 def joined(parts: Sequence[RowSpace]) -> RowSpace:
