@@ -3,8 +3,8 @@
     axes        every point: nothing is interpolated along a line, nor along the two sections of a plane
     fill        the points farthest from all that are known: COARSE at first, then 3/4 as many as are known beside the axes
     hold out    predict as many random points that are not known, then evaluate them: the bound is the closer to the largest
-                error the more they are, and from then on the interpolant has them too.  If the
-                bound of the error that follows is within tolerance * range, the slice is done; else fill again
+                error the more they are, and from then on the interpolant has them too.  If the bound of the error that follows
+                is within tolerance * range, the slice is done; else fill again
 
 The errors of the last hold-out are those of an interpolant without its points, so that the final one is better.  A plane whose
 bound is not within the tolerance when a budget ends is not resolved: its points are those that were evaluated.  Decisions are

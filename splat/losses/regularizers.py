@@ -5,7 +5,6 @@
 as 3DGS-MCMC (Kheradmand et al., NeurIPS 2024), gsplat's `simple_trainer` and splatfacto have them; the means are over all N
 Gaussians and, of scales, over their three axes.  R is linear in opacities and scales, and so has no Gauss-Newton part; the
 Hessian is diagonal.
-
 """
 
 from collections.abc import Mapping

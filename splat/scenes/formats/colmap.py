@@ -27,11 +27,12 @@ LISTS = {"images": (64, 24), "points3D": (43, 8)}  # bytes of a record before it
 
 def find_model(root: Path) -> Path | None:
     """The folder with the model's three files, if there is one."""
-    found = next((folder for folder in (root / name for name in MODEL_FOLDERS) if _is_model(folder)), None)
+    for folder in (root / name for name in MODEL_FOLDERS):
+        if _is_model(folder):
+            return folder
     numbered = [folder for folder in sorted(root.glob("sparse/[1-9]*")) if _is_model(folder)]
-    if found is None and numbered:
-        return max(numbered, key=lambda folder: max(path.stat().st_size for path in folder.glob("images.*")))
-    return found
+    sizes = [max(path.stat().st_size for path in folder.glob("images.*")) for folder in numbered]
+    return numbered[sizes.index(max(sizes))] if numbered else None
 
 
 def _is_model(folder: Path) -> bool:
