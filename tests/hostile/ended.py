@@ -6,6 +6,8 @@ import random
 import shutil
 import signal
 import time
+from collections import Counter
+from collections.abc import Callable, Iterable
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, ClassVar
@@ -27,6 +29,19 @@ CHANGING = ("second", "provenance", "timing", "created", "skipped")  # in the na
 TRAINED = 6  # steps of the run that others read
 COMPARED = (TABLE, COMPARISON, PAGE)
 Numbers = dict[str, str]  # what was found, in words, by its name
+
+
+def attempts(name: str, trials: Iterable[tuple[str, Callable[[], str]]]) -> list[str]:
+    """Try each, which says what became of it, and print how many went which way; what went wrong, by the words of the trial."""
+    outcomes, failures = Counter[str](), list[str]()
+    for words, trial in trials:
+        try:
+            outcomes[trial()] += 1
+        except Exception as error:  # whatever it is, it is what is looked for
+            failures.append(f"{name}, {words}: {type(error).__name__} {error}")
+            print(failures[-1], flush=True)
+    print(f"{name}: {dict(outcomes)}, {len(failures)} failures", flush=True)
+    return failures
 
 
 class Ended:

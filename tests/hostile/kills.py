@@ -14,31 +14,36 @@ import signal
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
-from tests.hostile.ended import COMMANDS
+from tests.hostile.ended import COMMANDS, Ended, attempts
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 def attack(name: str, rounds: int, seed: int, minutes: float) -> list[str]:
     """So many kills and as many signals, or as many as there is time for; what went wrong."""
-    outcomes, failures, end = Counter[str](), list[str](), time.monotonic() + 60 * minutes
-    with tempfile.TemporaryDirectory() as folder:
-        command = COMMANDS[name](Path(folder))
+    end = time.monotonic() + 60 * minutes
+
+    def trials(command: Ended) -> Iterator[tuple[str, Callable[[], str]]]:
         for round in range(2 * rounds):
             if time.monotonic() > end:
-                break
+                return
             chance = random.Random(f"{name} {seed} {round}")
             number = signal.SIGKILL if round % 2 else chance.choice(SIGNALS)
-            try:
-                outcomes[f"{'kill' if round % 2 else 'signal'}: {command.round(chance, number)}"] += 1
-            except Exception as error:  # whatever it is, it is what is looked for
-                failures.append(f"{name}, round {round}, {signal.Signals(number).name}: {type(error).__name__} {error}")
-                print(failures[-1], flush=True)
-    print(f"{name}: {dict(outcomes)}, {len(failures)} failures; {command.seconds:.1f} s unended", flush=True)
-    return failures
+            words = f"round {round}, {signal.Signals(number).name}"
+            yield words, partial(_ended, command, chance, number)
+
+    with tempfile.TemporaryDirectory() as folder:
+        command = COMMANDS[name](Path(folder))
+        print(f"{name}: {command.seconds:.1f} s unended", flush=True)
+        return attempts(name, trials(command))
+
+
+def _ended(command: Ended, chance: random.Random, number: int) -> str:
+    return f"{'kill' if number == signal.SIGKILL else 'signal'}: {command.round(chance, number)}"
 
 
 if __name__ == "__main__":

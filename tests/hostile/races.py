@@ -11,11 +11,11 @@ import signal
 import sys
 import tempfile
 import time
-from collections import Counter
+from functools import partial
 from pathlib import Path
 
 from analysis.commands.cli import main
-from tests.hostile.ended import COMMANDS, Ended
+from tests.hostile.ended import COMMANDS, Ended, attempts
 from tests.hostile.programs import forked
 
 BAD_INPUT = 2
@@ -55,17 +55,12 @@ def race(command: Ended, chance: random.Random, files: Path) -> str:
 
 def attack(name: str, rounds: int, seed: int) -> list[str]:
     """So many races; what went wrong."""
-    outcomes, failures = Counter[str](), list[str]()
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as files:
         command = COMMANDS[name](Path(folder))
-        for round in range(rounds):
-            try:
-                outcomes[race(command, random.Random(f"race {name} {seed} {round}"), Path(files))] += 1
-            except Exception as error:  # whatever it is, it is what is looked for
-                failures.append(f"{name}, round {round}: {type(error).__name__} {error}")
-                print(failures[-1], flush=True)
-    print(f"{name}: {dict(outcomes)}, {len(failures)} failures", flush=True)
-    return failures
+        chances = (random.Random(f"race {name} {seed} {round}") for round in range(rounds))
+        return attempts(
+            name, ((f"round {i}", partial(race, command, chance, Path(files))) for i, chance in enumerate(chances))
+        )
 
 
 if __name__ == "__main__":
