@@ -27,8 +27,9 @@ from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.measures.memory import expected_peak, require_pictures, size_of, telling_needs
 from analysis.measures.units import step_lengths
-from analysis.probe.measurement import Expected, expected_seconds, measure, seconds_of_render
+from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
+from analysis.probe.plan import Expected, expected_seconds, seconds_of_render
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import remarks, summary

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from analysis.measures.gradient_check import ENOUGH
 from analysis.measures.localization import conditions, localize, mass_shares
-from analysis.probe.measurement import LeftOut, Measured, PlaneSlice
+from analysis.probe.measured import LeftOut, Measured, PlaneSlice
 from analysis.records import schema
 from analysis.records.provenance import Provenance, provenance
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
