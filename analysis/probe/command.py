@@ -142,7 +142,7 @@ def _run(
 
 @contextmanager
 def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[None]:
-    """Says of an interrupted probe how to go on."""
+    """Tell how to go on after an interrupted probe."""
     try:
         yield
     except KeyboardInterrupt:
@@ -224,7 +224,7 @@ def _settings(options: ProbeOptions) -> ProbeSettings:
 
 
 def _family_options(options: ProbeOptions) -> "FamilyOptions | None":
-    """None where no families are asked for; the split control and a metric ask for them too."""
+    """Options of the families, None where they are not asked for; the split control and a metric ask for them too."""
     if not (options.families or options.split_control or options.metric != "parameters"):
         return None
     from analysis.measures.families import FamilyOptions  # a fifth of a second of imports

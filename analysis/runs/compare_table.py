@@ -111,7 +111,7 @@ def _depth(runs: Sequence[Run]) -> Iterable[Row]:
 
 
 def _families(runs: Sequence[Run]) -> Iterable[Row]:
-    """Of every operator and block that a run has families of."""
+    """Rows of every operator and block that a run has families of."""
     of_runs: list[dict[tuple[Operator, str], Anisotropy]] = [
         {(row.operator, row.block): row.indices for row in run.data.families or () if not row.split} for run in runs
     ]
@@ -124,7 +124,7 @@ def _families(runs: Sequence[Run]) -> Iterable[Row]:
 
 
 def _split(section: str, runs: Sequence[Run], operator: Operator, block: str, name: str) -> Iterable[Row]:
-    """What splitting every Gaussian in two multiplies an index by, where a run has that."""
+    """Factor of splitting every Gaussian in two on an index, where a run has that."""
     effects = [_effect(run.data, operator, block, name) for run in runs]
     if any(effects):
         yield Row(section, "  split control", tuple(_index(effect, factor(effect)) for effect in effects))

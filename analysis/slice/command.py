@@ -107,7 +107,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
 
 
 def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
-    """As asked for; a GPU is full with one render."""
+    """Settings as asked for; a GPU is full with one render."""
     most = torch.get_num_threads() if device.type == "cpu" else 1
     workers = most if options.workers is None else options.workers
     if options.all_points:
@@ -212,7 +212,7 @@ def _measure(
 
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:
-    """For the run that continues this one, should it be killed."""
+    """Keep eigenvectors for the run that continues this one, should it be killed."""
     vectors = [direction.vector.cpu().numpy() for direction in directions if direction.kind == "eigenvectors"]
     if not vectors:
         return

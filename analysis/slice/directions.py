@@ -158,7 +158,7 @@ def at_right_angles(found: Sequence[Direction]) -> list[Direction]:
 
 
 def cosine(directions: Sequence[Direction]) -> float | None:
-    """Of the angle between two directions as they are found."""
+    """Cosine of the angle between two directions as they are found."""
     if len(directions) < 2:
         return None
     unit = [direction.vector.double() / direction.vector.double().norm() for direction in directions]

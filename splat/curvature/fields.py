@@ -43,8 +43,8 @@ MIXED = "per stored unit²"
 
 @dataclass(frozen=True)
 class Field:
-    """What a field is, in words; its unit, empty where it has none; scale: as a picture shows it; log: of positive numbers,
-    signed: about 0."""
+    """A field in words; its unit, empty where it has none; scale: as a picture shows it; log: of positive numbers, signed:
+    about 0."""
 
     words: str
     unit: str

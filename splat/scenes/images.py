@@ -274,7 +274,7 @@ def _at_size(layers: Float[Tensor, "c h w"], size: tuple[int, int], path: Path) 
 def _warp(
     lens: pycolmap.Camera, pinhole: pycolmap.Camera, size: tuple[int, int], layers: Float[Tensor, "c h w"]
 ) -> Tensor:
-    """From the pixels of the file to those of the final camera: undistort, downscale."""
+    """Undistort and downscale: from the pixels of the file to those of the final camera."""
     if pinhole is not lens:
         layers = _undistort(layers, lens, pinhole)
     return resize_by_area(layers, *size)

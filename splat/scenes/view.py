@@ -81,7 +81,7 @@ class Frame:
 
     @property
     def bytes(self) -> int:
-        """Of the view's numbers, about."""
+        """Estimated memory of the view."""
         return (3 + len(self.layers)) * self.camera.width * self.camera.height * torch.float32.itemsize
 
 
@@ -120,7 +120,7 @@ class Photograph(View):
 
 
 def digests(frames: Sequence[Frame]) -> list[str] | None:
-    """What tells each picture's file from any other, by its bytes; None where one is not on disk."""
+    """Digest of each picture's file; None where one is not on disk."""
     paths = [frame.path for frame in frames if frame.path is not None]
     if len(paths) < len(frames):
         return None
@@ -177,7 +177,7 @@ def pixel_coordinates(camera: Camera, xyz: Float[Tensor, "n 3"]) -> tuple[Float[
 def inside_image(
     camera: Camera, xyz: Float[Tensor, "n 3"], depth_range: tuple[float, float] | None = None
 ) -> Bool[Tensor, " n"]:
-    """Which points lie in front of the camera, within the depth range (z), and inside its image."""
+    """Mask of the points in front of the camera, within the depth range (z), and inside its image."""
     pixel, z = pixel_coordinates(camera, xyz)
     near, far = depth_range or (0.0, float("inf"))
     u, v = pixel.unbind(-1)

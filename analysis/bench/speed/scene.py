@@ -174,7 +174,7 @@ class ViewBench:
         }
 
     def peers(self) -> Calls:
-        """On a GPU, gradients to compare with: by the faster sums, and by gsplat where there is one."""
+        """Gradients to compare with on a GPU: by the faster sums, and by gsplat where it is installed."""
         if not by_triton(self.like):
             return {}
         calls: Calls = {"gradient, atomic": lambda: self.gradient_by_autograd("atomic")}

@@ -142,7 +142,7 @@ def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
 
 
 def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
-    """What the blocks and the views say, and the masses in the eigenvectors of the probe, where it is of this loss here."""
+    """Fields of the blocks and the views, and the masses in the eigenvectors of the probe, where it is of this loss here."""
     values, sights = scene_fields(objective, report)
     ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, objective, notes)
     if recorded is not None:

@@ -74,7 +74,7 @@ def only(sweep: Sweep, names: Sequence[str]) -> Sweep:
 
 
 def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
-    """What is still to be done for a cell.  ValueError or FileNotFoundError where it cannot be, or has other settings."""
+    """Stages that a cell still needs.  ValueError or FileNotFoundError where it cannot be, or has other settings."""
     try:
         _, _, config, reference = planned(cell.training, cell.out)
         wanted: list[Stage] = ["train", "probe"] if sweep.probe else ["train"]
@@ -212,7 +212,7 @@ def log_of(cell: Cell) -> Path:
 
 
 def _environment(jobs: int) -> dict[str, str]:
-    """Of a command: its share of the processors, or of the threads that this process was given."""
+    """Environment of a command: its share of the processors, or of the threads that this process was given."""
     environment = module_environment()
     if jobs > 1:
         given = os.environ.get("OMP_NUM_THREADS", "")

@@ -73,7 +73,7 @@ def alone(rows: Tensor) -> Tensor:
 
 
 def joined(parts: Sequence[RowSpace]) -> RowSpace:
-    """Those of all Gaussians, given those of some at a time."""
+    """The row spaces of all Gaussians, from those of consecutive ones."""
     width = max(part.basis.shape[1] for part in parts)
     padded = [torch.nn.functional.pad(part.basis, (0, 0, 0, width - part.basis.shape[1])) for part in parts]
     return RowSpace(torch.cat(padded), torch.cat([part.rank for part in parts]))
@@ -109,5 +109,5 @@ def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float
 
 
 def _shortened(rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n _ d"]:
-    """On a GPU no more rows than columns, which have the same singular values and right singular vectors."""
+    """Rows with the same singular values and right singular vectors; on a GPU, no more of them than columns."""
     return torch.linalg.qr(rows, mode="r").R if rows.is_cuda and rows.shape[1] > rows.shape[2] else rows

@@ -68,5 +68,5 @@ def logit(opacity: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def clamped_note(count: int) -> tuple[str, ...]:
-    """Of byte opacities 0 and 255, whose logits would be infinite."""
+    """Note on byte opacities 0 and 255, whose logits would be infinite."""
     return (f"{count} opacities of 0 or 255 were moved to 0.5 or 254.5",) if count else ()

@@ -188,7 +188,7 @@ class StableGSMethod(Method[StableGS]):
             self.normals = [_edge_normal(step, view.camera) for view in step.views]
 
     def traces(self, objective: SceneObjective) -> dict[str, TraceEstimate]:
-        """Of the blocks of the attributes that are probed."""
+        """Traces of the blocks of the attributes that are probed."""
         settings, names = self.settings, self.settings.probe.on
         if not names:
             return {}
