@@ -57,7 +57,7 @@ def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray, ends: Iterable[f
     axes.set_yticks([10.0**-k for k in range(0, DECADES, 2)], [power_of_ten(-k) for k in range(0, DECADES, 2)])
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_ylim(height.max() / 10**DECADES, 3 * height.max())
-    axes.set_xlabel(f"curvature{unit_suffix(exponent)},\nloss per squared parameter unit")
+    axes.set_xlabel(f"curvature{unit_suffix(exponent)},\nloss per squared stored unit")
     axes.set_ylabel("density over\nits highest")
     axes.grid(True)
     return sigma

@@ -84,7 +84,7 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
     axes.set_xlim(0, len(values) + 1)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.set_xlabel(f"rank among the {len(values)} Ritz values")
-    axes.set_ylabel("eigenvalue (loss per\nsquared parameter unit)")
+    axes.set_ylabel("eigenvalue (loss per\nsquared stored unit)")
     axes.set_title("Eigenvalues as the search for the ends met them", loc="left")
     axes.grid(True)
 
@@ -106,7 +106,7 @@ def _draw_distribution(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> No
             axes.step(x, np.append(sums, sums[-1]) / (sums[-1] or 1.0), where="post", **look)
     axes.axvline(0, color=BLACK, linewidth=0.6)
     axes.set_ylim(-0.03, 1.03)
-    axes.set_xlabel("curvature x (loss per squared parameter unit)")
+    axes.set_xlabel("curvature x (loss per squared stored unit)")
     axes.set_ylabel("share ≤ x")
     axes.grid(True)
 
