@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from msgspec import structs
 from rich.console import Console
 
 from analysis.commands.map.files import coloured_ply, csv_text, fields_ply, top_table
@@ -68,8 +69,10 @@ class Fields:
         return self.values["weight"].numpy()
 
     def shade(self, name: str) -> Shade:
-        kind = self.kinds[name]
-        return Shade.of(name, kind.words, kind.unit, kind.scale, self.values[name].numpy(), self.weight)
+        """The scale of a field; that of the share in one view runs from equal parts to all."""
+        kind, views = self.kinds[name], len(self.sights)
+        shade = Shade.of(name, kind.words, kind.unit, kind.scale, self.values[name].numpy(), self.weight)
+        return structs.replace(shade, low=1 / views, high=1.0) if name == "one_view" and views > 1 else shade
 
 
 def in_words(kind: Field, value: float) -> str:
