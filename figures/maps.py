@@ -87,8 +87,8 @@ class Sheet:
                 corners = [(x, top), (x + out * ARROW, top + BAR / 2), (x, top + BAR)]
                 colour = shade.palette[end] / 255
                 self.figure.add_artist(Polygon(corners, color=colour, linewidth=0, transform=self.inches))
-        for share, words in ticks_of(shade):
-            place = 1 - share if shade.falls else share
+        for along, words in ticks_of(shade):
+            place = 1 - along if shade.falls else along
             x, y = left + place * across, top + BAR
             self.line([x, x], [y, y + TICK])
             side = "left" if place < NEAR else "right" if place > 1 - NEAR else "center"

@@ -140,7 +140,7 @@ def _handle(label: str, **look: Any) -> Line2D:
 
 def _legend_below(axes: Axes, handles: list[Line2D]) -> None:
     """What is in this plot, beneath the name of its axis."""
-    below = axes.transAxes + ScaledTranslation(0, -BELOW, axes.get_figure(root=True).dpi_scale_trans)
+    below = axes.transAxes + ScaledTranslation(0, -BELOW, axes.figure.dpi_scale_trans)
     axes.legend(
         handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=2, handlelength=1.2,
         borderpad=0, columnspacing=1,
