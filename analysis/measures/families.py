@@ -77,7 +77,7 @@ class FamilyOptions:
 
 @dataclass(frozen=True, eq=False)
 class FamilyRow:
-    """One family and what it is of.  dim: rows of the operator, those of the null space (see `Family.rank`) counted."""
+    """One family: its scene, operator and block.  dim: rows of the operator, with its null space (see `Family.rank`)."""
 
     scene: SceneName
     operator: schema.Operator

@@ -32,7 +32,7 @@ def _require_error(name: str, value: Number) -> None:
 
 
 class Named(Struct, Generic[T]):
-    """Entries of one kind under names, of which some may be absent."""
+    """Entries of one kind under names; some may be absent."""
 
     def items(self) -> Iterator[tuple[str, T]]:
         """Entries that are there, by name."""

@@ -185,7 +185,7 @@ def split_controls(runs: Sequence[Run]) -> list[str]:
 
 
 def _once(lines: Sequence[tuple[Run, str]]) -> list[str]:
-    """What is said of runs, once of all of whom the same is said but for the command that mends it."""
+    """Remarks on runs; one for all runs whose remarks differ only in the command that mends them."""
     alike: dict[str, list[tuple[Run, str]]] = {}
     for run, text in lines:
         alike.setdefault(text.partition("; landscape ")[0], []).append((run, text))

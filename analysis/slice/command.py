@@ -1,7 +1,7 @@
 """`landscape slice`: one checkpoint in, its loss along a line or over a plane out, as a record with pictures.
 
     load            the checkpoint, its scene, the other checkpoints of a line or a plane
-    linearise       every view held still
+    linearise       derivatives of every view
     directions      eigenvectors from the probe beside the checkpoint or by Lanczos, and their curvatures
     slice           renders in parallel; of a plane where needed, interpolated elsewhere (`landscape.slices.refinement`)
     finite steps    along a line: second differences at steps over four decades, beside the infinitesimal curvature

@@ -117,7 +117,7 @@ def block_fields(
     rays: Float64[Tensor, "n 3"],
     precision: torch.dtype,
 ) -> Values:
-    """The fields of the blocks.  quats: of unit length; precision: in which the blocks were worked out."""
+    """The fields of the blocks.  quats: of unit length; precision: in which the blocks were computed."""
     found: Values = {}
     across = [on_complement(blocks.geometry.double(), quats.double()) for blocks in (hessian, gauss_newton)]
     for prefix, blocks, B in zip(PREFIXES, (hessian, gauss_newton), across, strict=True):

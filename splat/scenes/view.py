@@ -86,7 +86,7 @@ class Frame:
 
 
 class Shelf:
-    """Views of frames, of which those that were used last stay in memory: as many as fit into so many bytes, at least one."""
+    """Views of frames; the last used stay in memory, as many as fit into so many bytes, at least one."""
 
     def __init__(self, memory: int):
         self._memory, self._kept, self._lock = memory, OrderedDict[Frame, View](), Lock()

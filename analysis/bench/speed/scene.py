@@ -23,7 +23,7 @@ Wholes:
     rasterizer          bin to forward, slots, backward + reduce
     gradient            every stage
     gradient, autograd  the same as a training makes it, through torch
-    gradient, atomic    ... with sums as they come (on a GPU)
+    gradient, atomic    ... with sums by atomic additions (on a GPU)
     gsplat              ... by that package's kernels (on a GPU)
     linearize           what `LinearizedView` does once
     H v K               a product with K vectors, per vector

@@ -100,7 +100,7 @@ def _probed(cell: Cell, options: ProbeOptions, loss: LossSettings) -> bool:
 
 
 class _Cells:
-    """The cells under way.  to_do: by a cell's name; whole: also those not asked for; failed: what to say of whom."""
+    """The cells under way.  to_do: by a cell's name; whole: also those not asked for; failed: words by cell."""
 
     def __init__(
         self,

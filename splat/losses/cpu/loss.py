@@ -164,7 +164,7 @@ class CpuLinearLoss:
         return min(vectors, self._together) * self.gradient[:3].nbytes
 
     def coupling(self) -> Coupling:
-        """l'' of a loss with SSIM, taken apart."""
+        """l'' of a loss with SSIM: the part that couples pixels, and the pixelwise rest."""
         loss = self.loss
         image, target, _ = loss._against(self._image)
         found = loss.planes(SECONDS + 1)

@@ -36,7 +36,7 @@ class SplatFile:
 
 
 def packed(attributes: Mapping[str, np.ndarray], filter_widths: np.ndarray | None = None) -> Gaussians:
-    """Gaussians from the five attributes, of which `sh` has all bands, and the widths of their 3-D filter.
+    """Gaussians from the five attributes, `sh` with all bands, and the widths of their 3-D filter.
 
     InputError where their shapes or the SH degree cannot be.  Numbers that are not finite are found by `require_finite`.
     """
