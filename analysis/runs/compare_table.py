@@ -202,10 +202,6 @@ def frame(rows: Sequence[Row], labels: Sequence[str]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def _is_missing(entry: Entry) -> bool:
-    return (entry.cell.value, entry.cell.bracket) == (MISSING.cell.value, "")
-
-
 def compare_table(rows: Sequence[Row], labels: Sequence[str]) -> Table:
     """A column a run; the families are left to the page, and what no run has."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
@@ -214,7 +210,8 @@ def compare_table(rows: Sequence[Row], labels: Sequence[str]) -> Table:
         table.add_column(escape(label), justify="right")
     section = ""
     for row in rows:
-        if row.section == FAMILIES or all(_is_missing(entry) for entry in row.entries):
+        known = [entry for entry in row.entries if (entry.cell.value, entry.cell.bracket) != (MISSING.cell.value, "")]
+        if row.section == FAMILIES or not known:
             continue
         if row.section != section:
             table.add_section()

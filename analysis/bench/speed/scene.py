@@ -104,9 +104,6 @@ class ViewBench:
         w = self.workload
         return LinearizedView(w.gaussians, self.view.camera, self.loss, self.background, w.settings)
 
-    def _rasterizer(self) -> Any:
-        return self._rasterize().backward(self.cotangent)
-
     def gradient(self) -> torch.Tensor:
         """Gradient of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
         splats, depths, drawn = projected(self.workload.gaussians, self.lens)
@@ -164,7 +161,7 @@ class ViewBench:
         """Calls whose times the ratios compare."""
         products = {f"H v {K}": lambda U=U: self.linearized.hvp(U) for K, U in self.vectors.items()}
         return {
-            "rasterizer": self._rasterizer,
+            "rasterizer": lambda: self._rasterize().backward(self.cotangent),
             "gradient": self.gradient,
             "gradient, autograd": self.gradient_by_autograd,
             "linearize": self._linearize,
