@@ -52,7 +52,9 @@ def draw_scene(table: pd.DataFrame) -> Figure:
                     axes.set_yscale("log")
         for j, words in enumerate(ACROSS.values()):
             panels[1, j].set_xlabel(words)
-        panels[0, 0].legend()
+        handles, names = panels[0, 0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=4)
+        figure.suptitle("lines: means over the seeds; bands: from the lowest to the highest", fontsize=7)
     return figure
 
 
