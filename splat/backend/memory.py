@@ -4,6 +4,7 @@ Limits of addresses and of data (`ulimit -v`, `ulimit -d`) are kept well away fr
 code and libraries end the process, and the start of a thread waits for ever: these are asked for only where a reserve is left.
 """
 
+import ctypes
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -53,6 +54,16 @@ def is_told() -> bool:
 def resident_memory() -> int:
     """Bytes of this process that are in memory."""
     return psutil.Process().memory_info().rss
+
+
+def give_back_freed() -> None:
+    """Give the pages that the C library's allocator holds free back to the system, where it is glibc.
+
+    It holds those below a block that is in use: many large blocks that come and go one by one would double what they take.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim:
+        trim(0)
 
 
 def free_memory(device: "torch.device") -> int:

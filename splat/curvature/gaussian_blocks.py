@@ -19,7 +19,7 @@ GEOMETRY_COLUMNS = {
 class PerGaussianBlocks(Brief):
     """A block for every Gaussian: geometry, over the attributes in GEOMETRY_COLUMNS, and the diagonal of its SH.
 
-    views: where the blocks are the mean over views, `traces` of each view's, in order.
+    views: where the blocks are the mean over views, `traces` of each view's, in order, if they were asked for.
     """
 
     geometry: Float[Tensor, "n 11 11"]
@@ -68,7 +68,7 @@ class PerGaussianBlocks(Brief):
     @property
     def diagonals(self) -> dict[str, Float64[Tensor, "n ..."]]:
         """The diagonal, attribute by attribute."""
-        diagonal = self.geometry.double().diagonal(dim1=1, dim2=2)
+        diagonal = self.geometry.diagonal(dim1=1, dim2=2).double()
         return {**{name: diagonal[:, columns] for name, columns in GEOMETRY_COLUMNS.items()}, "sh": self.sh.double()}
 
     def diagonals_across(self, quats: Float[Tensor, "n 4"]) -> dict[str, Float64[Tensor, "n ..."]]:

@@ -283,22 +283,30 @@ class SceneObjective:
             total += view.gradient
         return self.mean_over_views(total)
 
-    def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
+    def block_diagonal(
+        self, *, gauss_newton: bool = False, approximate: bool = False, traced: bool = True
+    ) -> PerGaussianBlocks:
         """The block of every Gaussian in the Hessian of L, or in its Gauss-Newton part: exact, on the CPU.
 
         approximate: with the diagonal of the loss's l'' in place of l'', without the coupling of pixels by SSIM.
+        traced: with the traces of every view.
         """
-        return self.block_diagonals(approximate=approximate, parts=(gauss_newton,))[0]
+        return self.block_diagonals(approximate=approximate, parts=(gauss_newton,), traced=traced)[0]
 
     def block_diagonals(
-        self, *, approximate: bool = False, parts: Sequence[bool] = (False, True), progress: Progress | None = None
+        self,
+        *,
+        approximate: bool = False,
+        parts: Sequence[bool] = (False, True),
+        traced: bool = True,
+        progress: Progress | None = None,
     ) -> list[PerGaussianBlocks]:
         """`block_diagonal` of several parts at once; parts: which are Gauss-Newton."""
         totals: list[PerGaussianBlocks] = []
         traces: list[list[dict[str, float]]] = []
         for done, view in enumerate(self.linearized, start=1):
             found = view.block_diagonals(approximate=approximate, parts=parts)
-            traces.append([each.traces(self.active.quats) for each in found])
+            traces.append([each.traces(self.active.quats) if traced else {} for each in found])
             for total, each in zip(totals, found, strict=False):  # none before the first view
                 total.add(each)
             totals = totals or found

@@ -200,8 +200,9 @@ def ellipse_of(splat, alpha_min, contour):
     level = min(contour * contour, 2 * log(select(drawn, opacity, 1.0) / alpha_min))
     level = level * (1 + WIDEN) + WIDEN
     det = a * c - b * b
-    level = select((level == inf) | (det <= 0), inf, level)
-    level = select(drawn, level, 0.0)
+    flat = det <= 0  # by rounding
+    level = select((level == inf) | flat, inf, level)
+    level, det = select(drawn, level, 0.0), select(flat, 1.0, det)
     bounded = level < inf
     return select(bounded, sqrt(level * c / det), inf), select(bounded, sqrt(level * a / det), inf), level, det
 

@@ -1,8 +1,8 @@
 """How far a sweep is, and about how long it will take: a line for every cell that ends, and a bar.
 
-The time left is estimated from the pace of the steps up to each run's last checkpoint: that of the same scene and method where
-it is known, else the mean of those that are known.  The time of a probe is estimated from the probes before it, else from the
-time that it may take.
+The time of a whole training is estimated from the pace of the steps up to each run's last checkpoint: that of the same scene
+and method where it is known, else of the same method, else the mean time of those that are known, since a step of one method
+may be hundreds of another's.  The time of a probe is estimated from the probes before it, else from the time that it may take.
 """
 
 from collections.abc import Mapping
@@ -89,17 +89,17 @@ class SweepProgress:
 
     def seconds(self, spent: list[TrainingTime]) -> float | None:
         """About how many seconds are left; None before the first checkpoint."""
-        paces: dict[tuple[str, str], list[float]] = {}
+        known: dict[tuple[str, ...], list[float]] = {}  # seconds of a whole training, of what is alike
         for cell, each in zip(self.sweep.cells, spent, strict=True):
             if each.step:
-                paces.setdefault((cell.scene, cell.method), []).append(each.wall / each.step)
-        if not paces:
+                for alike in ((cell.scene, cell.method), (cell.method,), ()):
+                    known.setdefault(alike, []).append(each.wall / each.step * cell.steps)
+        if not known:
             return None
-        other = mean(mean(each) for each in paces.values())
         total = 0.0
         for cell, each in zip(self.sweep.cells, spent, strict=True):
-            pace = mean(paces.get((cell.scene, cell.method), [other]))
-            total += pace * (cell.steps - each.step)
+            alike = next(alike for alike in ((cell.scene, cell.method), (cell.method,), ()) if alike in known)
+            total += mean(known[alike]) * (1 - each.step / cell.steps)
             total += self._probe_seconds() * ("probe" in self.to_do[cell.name])
         return total / self.jobs
 

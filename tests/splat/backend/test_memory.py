@@ -1,5 +1,6 @@
 """Free memory within the limits of the process and of its control groups."""
 
+import platform
 import resource
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from rich.console import Console
 
 from landscape.errors import TooLittleMemory
 from splat.backend import memory
-from splat.backend.memory import free_memory
+from splat.backend.memory import free_memory, give_back_freed, resident_memory
 
 CPU = torch.device("cpu")
 ROOT = Path(__file__).parents[3]
@@ -87,3 +88,12 @@ def test_what_cannot_be_read_of_a_group_limits_nothing(version, tmp_path):
     group(top, str(40 * MIB), 5 * MIB, version)
     (top / "memory.stat").unlink()
     assert free_memory(CPU) == 35 * MIB
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the allocator is not glibc's")
+def test_pages_freed_between_blocks_in_use_are_given_back():
+    blocks = [bytearray(100_000) for _ in range(2000)]
+    del blocks[::2]
+    before = resident_memory()
+    give_back_freed()
+    assert before - resident_memory() > 50e6

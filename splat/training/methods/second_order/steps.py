@@ -74,7 +74,7 @@ class Local:
         self.objective, self.mask, gauss_newton = objective, objective.mask, settings.curvature == "gauss-newton"
         self.each = len(objective.active.flat) // len(objective.active)
         self.loss = sum(view.value for view in objective.linearized) / len(objective.views)
-        blocks = objective.block_diagonal(gauss_newton=gauss_newton, approximate=not settings.coupling)
+        blocks = objective.block_diagonal(gauss_newton=gauss_newton, approximate=not settings.coupling, traced=False)
         self.metric = DampedBlocks(objective.active, blocks, settings.floor)
         H = SceneHessian(objective, gauss_newton=gauss_newton, keep_null=True, coupled=settings.coupling)
         self.A = CountingOperator(ScaledOperator(ProjectedOperator(H, self.metric.project), self.metric.scale))

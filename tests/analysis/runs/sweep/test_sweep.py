@@ -20,7 +20,7 @@ from analysis.commands.cli import main
 from analysis.probe.record import loss_name
 from analysis.records.provenance import usable_cores
 from analysis.runs.sweep.sweep import LOCK, _Cells, missing, only, probe_arguments
-from analysis.runs.sweep.sweep_file import Sweep, arguments, read_sweep
+from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import results
 from analysis.train.options import TrainOptions
@@ -328,6 +328,18 @@ def test_the_time_left_follows_the_pace_of_each_method(folder, tmp_path):
     known = [TrainingTime(step=12, wall=6.0), TrainingTime(step=4, wall=8.0), TrainingTime(), TrainingTime()]
     assert progress.seconds(known) == pytest.approx((8 * 2 + 12 * 0.5 + 12 * 2) / 2)
     assert progress.seconds([TrainingTime(step=12, wall=6.0)] + [TrainingTime()] * 3) == pytest.approx(3 * 12 * 0.5 / 2)
+
+
+def test_the_time_left_of_an_unknown_method_is_that_of_a_whole_run(folder, tmp_path):
+    sweep = read_sweep(folder / "sweep.toml", tmp_path)
+    slow, fast = (
+        Cell("a", name, replace(sweep.cells[0].training, iterations=steps))
+        for name, steps in (("slow", 3), ("fast", 3000))
+    )
+    cells = (slow, fast, replace(slow, scene="b"), replace(fast, method="new"))
+    progress = SweepProgress(replace(sweep, cells=cells), {cell.name: ["train"] for cell in cells}, jobs=1)
+    spent = [TrainingTime(step=3, wall=6.0), TrainingTime(step=3000, wall=2.0), TrainingTime(), TrainingTime()]
+    assert progress.seconds(spent) == pytest.approx(6 + 4)
 
 
 def test_the_time_left_goes_with_the_last_probe(folder, tmp_path, monkeypatch):

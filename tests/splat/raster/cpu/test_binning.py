@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
 
 from splat.backend.cpu.planes import TILE_ROWS
 from splat.backend.cpu.simd import lanes_of
-from splat.raster.cpu.binning import depth_order, heaviest_first, radix_argsort
+from splat.model.settings import RenderSettings
+from splat.raster.cpu.binning import bin_splats, depth_order, heaviest_first, radix_argsort
 from splat.raster.cpu.tile import CAPPED
+from splat.raster.formulas import thresholds_of
 from tests.splat.random_scenes import DTYPES, NUMPY
 from tests.splat.raster.compositing_cases import CASES, truth
 
@@ -30,6 +33,13 @@ def test_the_radix_sort_orders_every_bit():
 
 def test_the_heaviest_tile_comes_first():
     assert heaviest_first(np.array([3, 9, 1, 9])).tolist() == [1, 3, 0, 2]
+
+
+def test_a_faint_splat_whose_determinant_rounds_to_zero_is_in_no_tile():
+    splats = np.array([[5.0, 6.0, 1.0, 1.0, 1.0, opacity, 0.5, 0.5, 0.5] for opacity in (1e-12, 0.0, 0.5)])
+    thresholds = thresholds_of(RenderSettings(), torch.float64)
+    found = bin_splats(splats, np.arange(1.0, 4.0), np.ones(3, bool), 40, 30, thresholds)
+    assert set(found.splat) == {2} and found.start[-1] == found.start.size - 1  # what is drawn is in every tile
 
 
 def active_pixels(name: str) -> np.ndarray:
