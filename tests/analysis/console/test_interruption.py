@@ -45,12 +45,15 @@ def test_a_signal_in_what_llvm_calls_lets_it_do_its_work_first():
 
 
 def test_what_a_library_makes_of_a_signal_is_that_signal():
-    with pytest.raises(Interrupted) as raised, raising():
+    def loaded() -> None:
         try:
             os.kill(os.getpid(), signal.SIGHUP)
             time.sleep(1)
         except BaseException as error:  # as pycolmap does, whose module's C is interrupted
             raise RuntimeError("cannot import it") from error
+
+    with pytest.raises(Interrupted) as raised, raising():
+        loaded()
     assert raised.value.exit_code == 129
 
 
