@@ -40,7 +40,7 @@ def draw_scene(table: pd.DataFrame) -> Figure:
                     axes.set_yscale("log")
         for j, words in enumerate(ACROSS.values()):
             panels[1, j].set_xlabel(words)
-        panels[0, 0].legend()
+        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     return figure
 
 
