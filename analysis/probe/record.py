@@ -256,7 +256,7 @@ def _slice(plane: PlaneSlice, pairs: Eigenpairs) -> schema.Slice:
         ],
         loss_scale=plane.loss_scale,
         **plane.slice.record(),  # pyright: ignore[reportArgumentType]
-        note=f"±{units[0]:.3g} curvature units each way: ±{x:.3g} along e₁ and ±{y:.3g} along e₂, parameter units",
+        note=f"±{units[0]:.3g} curvature units each way: ±{x:.3g} along e₁ and ±{y:.3g} along e₂, stored units",
     )
 
 

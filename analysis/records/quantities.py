@@ -184,7 +184,12 @@ class Shade(Struct, frozen=True, kw_only=True):
         """Name of the map of matplotlib, which colour-blind eyes tell apart; what is fragile or wrong is bright."""
         if self.diverges:
             return "PuOr_r"
-        return {"error": "magma", "order_gap": "cividis_r"}.get(self.name, "cividis")
+        return "magma" if self.name == "error" else "cividis_r" if self.falls else "cividis"
+
+    @property
+    def falls(self) -> bool:
+        """Whether the scale is drawn from high to low: bright is at its right end, as everywhere."""
+        return self.name == "order_gap"
 
     @property
     def palette(self) -> UInt8[np.ndarray, "256 3"]:
@@ -201,10 +206,11 @@ class Shade(Struct, frozen=True, kw_only=True):
         stops = ", ".join(
             "rgb({}, {}, {})".format(*colour) for colour in self.palette[np.linspace(0, BYTES, 9, dtype=int)]
         )
-        ends = [quantity(self.value(t)) for t in (self.low, self.high)]
+        ends, way = [quantity(self.value(t)) for t in (self.low, self.high)], "left" if self.falls else "right"
+        ends = ends[::-1] if self.falls else ends
         middle = "<span>logarithmic</span>" if self.scale == "log" else ""
         return (
-            f'<span style="display:block;height:.5em;background:linear-gradient(to right, {stops})"></span><span '
+            f'<span style="display:block;height:.5em;background:linear-gradient(to {way}, {stops})"></span><span '
             f'style="display:flex;gap:.5em;justify-content:space-between"><span>{ends[0]}</span>{middle}<span>{ends[1]}</span></span>'
         )
 

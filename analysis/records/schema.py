@@ -1,7 +1,7 @@
 """The sections of a record, as typed structures: what each key means, its type, and how it is written and read (`msgspec`).
 
 The whole files `probe.json` and `slice.json` are `ProbeRecord` and `SliceRecord` in `analysis.records.records`.  Losses are
-dimensionless; curvatures are loss per squared parameter unit, with respect to the stored parameters.
+dimensionless; curvatures are loss per squared stored unit, with respect to the stored parameters.
 
 null (None)   not determined; the `note` beside it says why
 UNSET         the key is absent: not every file has it.  UNSET is false, as None is
@@ -323,7 +323,7 @@ class Direction(Struct, kw_only=True):
 
     kind: "eigenvectors", "random", "gradient" or "line".  slope, curvature: of the loss along it.  residual: of an
     eigenvector, else None.  unit: sqrt(2 loss_scale / |curvature|), the step within which the curvature alone changes the loss
-    by loss_scale; infinite without curvature.  length: of the vector, in parameter units.  scale: what a step of 1 is.
+    by loss_scale; infinite without curvature.  length: of the vector, in stored units.  scale: what a step of 1 is.
     views_error: of the curvature, as for `TraceOf`.
     """
 
