@@ -33,7 +33,7 @@ from landscape.errors import InputError
 from splat.curvature.traces import Dimension, curvature_scale
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
-from splat.model.typed import LARGEST, NonNegative, Positive, Settings, Share
+from splat.model.typed import LARGEST, NonNegative, Positive, Settings, Share, Typed
 from splat.projection.reference import NEEDLE, Splats, condition, on_screen
 
 Attribute = Literal["means", "log_scales", "quats", "opacity_logits", "sh"]
@@ -96,7 +96,7 @@ class ProbeSettings(Settings):
 
 
 @dataclass(frozen=True)
-class Magnitude(Settings):
+class Magnitude(Typed):
     """How far an attribute is probed and why: its trace as given, tau, rho of Eq. (5) uncapped, and rho under its cap."""
 
     trace: Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
