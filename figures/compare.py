@@ -69,7 +69,7 @@ def draw_traces(records: Records) -> Figure:
         axes.set_ylim(len(names) - 0.4, -0.6)
         axes.tick_params(axis="y", length=0)
         axes.grid(True, axis="x")
-        axes.set_xlabel("|trace| (loss per squared parameter unit)")
+        axes.set_xlabel("|trace|; attributes have units of their own and do not compare")
         axes.set_title("Trace by attribute", loc="left")
         _legend(figure, records, marker="o")
     return figure
@@ -106,7 +106,7 @@ def draw_densities(records: Records) -> Figure:
                 if sign * (end.value or 0.0) > 0:
                     ends.append(axes.axvline(sign * (end.value or 0.0), color=look["color"], **END))
         for axes, words in zip(panels, ("down", "up"), strict=True):
-            axes.set(xscale="log", yscale="log", xlabel="|curvature| (loss per squared parameter unit)")
+            axes.set(xscale="log", yscale="log", xlabel="|curvature| (loss per squared stored unit)")
             axes.set_title(f"Directions that curve {words}", loc="left")
             axes.grid(True)
             if all(line in ends for line in axes.lines):
@@ -172,7 +172,7 @@ def draw_slices(records: Records) -> Figure:
         for axes in panels.ravel()[len(planes) :]:
             axes.set_axis_off()
         scales = "" if same else " (axes differ in scale)"
-        figure.supxlabel(f"step along the steepest direction, param. units{unit_suffix(exponent)}{scales}", fontsize=7)
+        figure.supxlabel(f"step along the steepest direction, stored units{unit_suffix(exponent)}{scales}", fontsize=7)
         figure.supylabel(f"step along the second{unit_suffix(exponent)}", fontsize=7)
         figure.colorbar(filled, ax=panels, label=f"change of loss{unit_suffix(power)}")  # pyright: ignore[reportArgumentType]
     return figure
@@ -207,7 +207,7 @@ def draw_sections(records: Records) -> Figure:
                 line = field.change.take(other.centre, axis=1 - number) * 10.0 ** (field.exponent - power)
                 axes.plot(along.steps / 10.0**steps, line, **look)
         for axes, which in zip(panels, ("steepest", "second"), strict=True):
-            axes.set_xlabel(f"step, param. units{unit_suffix(steps)}")
+            axes.set_xlabel(f"step, stored units{unit_suffix(steps)}")
             axes.set_title(f"Along the {which} direction", loc="left")
             axes.xaxis.set_major_locator(MaxNLocator(5))
             axes.grid(True)

@@ -5,7 +5,7 @@
 sigma = BROADENING of the range; a peak narrower than sigma is not resolved.
 """
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,6 +22,7 @@ from landscape.errors import InputError
 BROADENING = 0.01
 POINTS = 2000
 DECADES = 8  # below the highest point
+ROOM = (5.0, 3.4, 1.6)  # decades above it: of words on the ends and the broadening
 
 
 class Quadrature(Protocol):
@@ -39,28 +40,38 @@ def draw_density(density: Quadrature) -> Figure:
     with style():
         figure = new_figure(2.2)
         axes = figure.subplots()
-        sigma = draw_on(axes, np.asarray(density.nodes), np.asarray(density.weights))
-        axes.set_title(f"Spectral density, broadened by σ = {quantity(sigma)}", loc="left")
+        draw_on(axes, np.asarray(density.nodes), np.asarray(density.weights))
+        axes.set_title("Spectral density", loc="left")
     return figure
 
 
-def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray, ends: Iterable[float] = ()) -> float:
-    """The density on axes, with a line at each of the ends of the spectrum; returns sigma."""
+def draw_on(axes: Axes, nodes: np.ndarray, weights: np.ndarray, ends: Mapping[str, float] | None = None) -> None:
+    """The density on axes, the width of its broadening, and a line at each of two ends of the spectrum, by name."""
     curvature, height, sigma = smooth_density(nodes, weights)
     exponent = exponent_of(curvature)
-    curvature, height = curvature / 10.0**exponent, height / height.max()
-    axes.fill_between(curvature, height, height.max() / 10**DECADES, color=BLUE, alpha=0.25, linewidth=0)
-    axes.plot(curvature, height, color=BLUE, linewidth=0.9)
-    for end in ends:
-        axes.axvline(end / 10.0**exponent, color=VERMILION, linewidth=0.6)
+    power = 10.0**exponent
+    axes.fill_between(curvature / power, height / height.max(), 10.0**-DECADES, color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(curvature / power, height / height.max(), color=BLUE, linewidth=0.9)
+    middle = 0.9 * curvature[0] + 0.1 * curvature[-1]
+    axes.errorbar(middle / power, 10.0 ** ROOM[2], xerr=sigma / power, color=BLUE, capsize=2, linewidth=0.9)
+    _say(axes, (middle + sigma) / power, ROOM[2], "left", f"2σ = {quantity(2 * sigma)}, width of the broadening")
+    sides = zip(("left", "right"), ROOM, sorted((ends or {}).items(), key=lambda each: each[1]), strict=False)
+    for side, room, (name, end) in sides:
+        axes.axvline(end / power, color=VERMILION, linewidth=0.6)
+        _say(axes, end / power, room, side, f"{name} = {quantity(end)}", color=VERMILION)
     axes.set_yscale("log")
     axes.set_yticks([10.0**-k for k in range(0, DECADES, 2)], [power_of_ten(-k) for k in range(0, DECADES, 2)])
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_ylim(height.max() / 10**DECADES, 3 * height.max())
-    axes.set_xlabel(f"curvature{unit_suffix(exponent)},\nloss per squared parameter unit")
+    axes.set_ylim(10.0**-DECADES, 10.0 ** (ROOM[0 if ends else 2] + 1))
+    axes.set_xlabel(f"curvature{unit_suffix(exponent)},\nloss per squared stored unit")
     axes.set_ylabel("density over\nits highest")
     axes.grid(True)
-    return sigma
+
+
+def _say(axes: Axes, x: float, power: float, side: str, words: str, **look: Any) -> None:
+    """Words to one side of a place."""
+    axes.annotate(words, (x, 10.0**power), (4 if side == "left" else -4, 0), textcoords="offset points", ha=side,
+                  va="center", fontsize=6.5, **look)  # fmt: skip
 
 
 def smooth_density(

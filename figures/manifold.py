@@ -1,6 +1,6 @@
 """Recorded slices of several landscapes to one scale, for the figures that compare them.
 
-Every slice is drawn along its own two steepest eigenvectors, but all share their axes: steps in stored parameter units, as far
+Every slice is drawn along its own two steepest eigenvectors, but all share their axes: steps in stored units, as far
 as the widest of them reaches, and the change of the loss from its own centre.  So a valley that is narrower looks narrower.
 Where a slice was not recorded that far there is nothing.
 """
@@ -68,7 +68,7 @@ class Scale:
 
     def flat_label(self, name: str) -> str:
         """Label of a horizontal axis, which has the room for the unit below."""
-        return f"{self.step_label(name)}\n(param. units)"
+        return f"{self.step_label(name)}\n(stored units)"
 
     def holding(self, other: Plane) -> "Scale":
         """Limits with the same steps that hold another landscape's sections too."""
@@ -163,8 +163,8 @@ def surface(
         axis.set_major_locator(FixedLocator(_inner_ticks(reach)))
     axes.zaxis.set_major_locator(MaxNLocator(3))
     axes.tick_params(labelsize=5, pad=-3)
-    axes.set_xlabel(scale.step_label("e₁"), fontsize=6, labelpad=-4)
-    axes.set_ylabel(scale.step_label("e₂"), fontsize=6, labelpad=-3)
+    axes.set_xlabel(f"e₁{unit_suffix(scale.steps)}", fontsize=6, labelpad=-4)
+    axes.set_ylabel(f"e₂{unit_suffix(scale.steps)}", fontsize=6, labelpad=-3)
     axes.set_title(f"{literal(title)}\n{scale.loss_label}", y=0.95)
     axes.view_init(elev=32, azim=-58)
     # the layout does not count the labels of such axes

@@ -28,6 +28,7 @@ from analysis.records.quantities import BYTES, Shade, percent, quantity
 from analysis.records.run_files import Carrier, MapRecord, Panel, Steepest, Swaps, read_map
 from figures.style import BLACK, BLUE, VERMILION, folder_script, literal, save, style
 
+BOUNDS = {"error": (0,), "one_view": (0, BYTES)}  # ends of a scale, in bytes, beyond which nothing is
 NEAR = 0.03  # of a scale's length, from its end
 WIDTH, TALLEST = 7.0, 9.0  # inches
 MARGIN, HEAD, LEGEND = 0.12, 0.22, 0.5  # inches: between pictures, above one, beneath one
@@ -41,17 +42,21 @@ class Sheet:
     Places are in inches from the top left.  Only plots have axes, which take longer to draw than pictures.
     """
 
-    def __init__(self, rows: int, columns: int, shape: tuple[int, int], legends: tuple[bool, ...]) -> None:
+    def __init__(
+        self, rows: int, columns: int, shape: tuple[int, int], legends: tuple[bool, ...], heading: str = ""
+    ) -> None:
         aspect = shape[0] / shape[1]
         self.across = (WIDTH - MARGIN * (columns + 1)) / columns
-        rest = rows * HEAD + sum(legends) * LEGEND + MARGIN
+        first = HEAD * (1 + bool(heading))
+        rest = first + (rows - 1) * HEAD + sum(legends) * LEGEND + MARGIN
         self.across = min(self.across, (TALLEST - rest) / rows / aspect)
         self.tall = self.across * aspect
         self.size = (columns * (self.across + MARGIN) + MARGIN, rest + rows * self.tall)
-        self.tops = [HEAD + sum(self.tall + HEAD + LEGEND * each for each in legends[:row]) for row in range(rows)]
+        self.tops = [first + sum(self.tall + HEAD + LEGEND * each for each in legends[:row]) for row in range(rows)]
         dots = shape[1] / self.across
         self.figure = Figure(figsize=self.size, dpi=dots if FEWEST <= dots <= DOTS else DOTS)
         self.inches = Affine2D().scale(1 / self.size[0], -1 / self.size[1]).translate(0, 1) + self.figure.transFigure
+        self.text(MARGIN, 0.06, heading, fontsize=8.5)
 
     def text(self, x: float, y: float, words: str, **how: Any) -> None:
         """Words from the record, below (x, y) where `how` does not say otherwise."""
@@ -75,13 +80,15 @@ class Sheet:
         self.show(row, column, shade.palette[share], title)
         left, top = self.corner(row, column)
         left, top, across = left + ARROW, top + self.tall + 0.05, self.across - 2 * ARROW
-        self._image(shade.palette[None, : BYTES + 1], left, top, across, BAR)
-        for end, x, out in ((0, left, -1), (BYTES, left + across, 1)):
-            if end or shade.name != "error":  # no error is below 0
+        way = -1 if shade.falls else 1
+        self._image(shade.palette[None, : BYTES + 1][:, ::way], left, top, across, BAR)
+        for end, x, out in zip((0, BYTES)[::way], (left, left + across), (-1, 1), strict=True):
+            if end not in BOUNDS.get(shade.name, ()):
                 corners = [(x, top), (x + out * ARROW, top + BAR / 2), (x, top + BAR)]
                 colour = shade.palette[end] / 255
                 self.figure.add_artist(Polygon(corners, color=colour, linewidth=0, transform=self.inches))
-        for place, words in ticks_of(shade):
+        for along, words in ticks_of(shade):
+            place = 1 - along if shade.falls else along
             x, y = left + place * across, top + BAR
             self.line([x, x], [y, y + TICK])
             side = "left" if place < NEAR else "right" if place > 1 - NEAR else "center"
@@ -141,17 +148,17 @@ def draw_fragility(maps: dict[str, np.ndarray], index: int, record: MapRecord) -
     fragile, shades = record.fragility, record.shades
     view = next((Path(panel.name).name for panel in record.panels if panel.place == index), "")
     titles = {
-        "order_gap": f"Position: to the next change of order, {view}",
+        "order_gap": "Position: how far to the next change of order",
         "condition": f"Conditioning: {percent(fragile.needles)} are needles, longer than 10 : 1",
         "one_view": f"Opacity: {percent(fragile.one_view)} have over 90% of their weight in one view",
     }
     with style():
-        sheet = Sheet(2, 2, maps["error"].shape, (True, True))
+        sheet = Sheet(2, 2, maps["error"].shape, (True, True), f"{view}: where it is fragile")
         for place, (name, title) in enumerate(titles.items()):
             sheet.show_scaled(
                 place // 2, place % 2, maps[name], shades[name], title, f"{shades[name].title}; bright: fragile"
             )
-        _draw_swaps(sheet.plot(1, 1, "Neighbours that change order when one moves so far"), fragile.swaps, index)
+        _draw_swaps(sheet.plot(1, 1, "Position: neighbours that change order when one moves"), fragile.swaps, index)
     return sheet.figure
 
 

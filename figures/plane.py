@@ -1,6 +1,6 @@
 """The recorded 2-D slice as the figures want it: losses relative to the centre, axes with their names and units.
 
-x, y        steps along the two directions: in units of the stored parameters where they are unit vectors, else as `scale` says
+x, y        steps along the two directions: in stored units where they are unit vectors, else as `scale` says
 change      loss minus the loss at the centre
 unit        sqrt(2 loss_scale / |curvature|): the step within which the curvature alone changes the loss by loss_scale
 evaluated   a point that is a true render; the others are interpolated, or unknown where the plane is not resolved
@@ -10,6 +10,7 @@ crossed     a render whose order of splats or set of visible ones is not the cen
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import UNSET
 
 from analysis.records import schema
 from analysis.records.findings import unresolved
@@ -30,7 +31,7 @@ class Direction:
     unit: float
     steps: np.ndarray
     exponent: int
-    scale: str = "param. units"
+    scale: str = "stored units"
     kind: str = ""
 
     @property
@@ -125,9 +126,8 @@ def plane(record: Record) -> Plane:
 def direction(about: schema.Direction, steps: np.ndarray, exponent: int) -> Direction:
     """An axis as it was recorded."""
     curvature, unit = (np.nan if number is None else number for number in (about.curvature, about.unit))
-    return Direction(
-        literal(about.name), curvature, unit, steps, exponent, literal(about.scale or Direction.scale), about.kind or ""
-    )
+    scale = Direction.scale if about.scale in (UNSET, "param. units") else about.scale  # as older records call it
+    return Direction(literal(about.name), curvature, unit, steps, exponent, literal(scale), about.kind or "")
 
 
 def _alike(arrays: dict[str, np.ndarray]) -> bool:

@@ -1,7 +1,7 @@
 """Figure: training loss and held-out PSNR of steps of second order beside Adam, over seconds and over passes.
 
-`python -m figures.second_order RUNS` draws what `analysis.runs.curves` wrote beside every run of a sweep; one picture for each
-scene, RUNS/SCENE.png.  Lines: means over the seeds that have ended, at equal steps; bands: from the lowest seed to the highest.
+`python -m figures.second_order RUNS` draws RUNS/curves.csv, which `analysis.runs.curves` wrote; one picture for each scene,
+RUNS/SCENE.png.  Lines: means over the seeds that have ended, at equal steps; bands: from the lowest seed to the highest.
 """
 
 from pathlib import Path
@@ -17,20 +17,8 @@ UP = {"loss": "training loss", "held_out": "held-out PSNR, dB"}
 PAGE = 6.9
 
 
-def gathered(runs: Path) -> pd.DataFrame:
-    """The curves of every run, with "scene", "method" and "seed".  InputError where there is none."""
-    found = [
-        pd.read_csv(path).assign(scene=scene, method=method, seed=seed)
-        for path in sorted(runs.glob("*/*/*/curve.csv"))
-        for scene, method, seed in [path.parts[-4:-1]]
-    ]
-    if not found:
-        raise InputError(f"expected curve.csv in runs of {runs}, found none; python -m analysis.runs.curves {runs}")
-    return pd.concat(found, ignore_index=True)
-
-
 def draw_scene(table: pd.DataFrame) -> Figure:
-    """table: the rows of one scene of `gathered`."""
+    """table: the rows of one scene."""
     with style():
         figure = new_figure(4.2)
         figure.set_figwidth(PAGE)
@@ -52,14 +40,18 @@ def draw_scene(table: pd.DataFrame) -> Figure:
                     axes.set_yscale("log")
         for j, words in enumerate(ACROSS.values()):
             panels[1, j].set_xlabel(words)
-        panels[0, 0].legend()
+        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.suptitle("lines: means over the seeds; bands: from the lowest to the highest", fontsize=7)
     return figure
 
 
 def draw(runs: Path, suffix: str) -> list[Path]:
+    path = runs / "curves.csv"
+    if not path.is_file():
+        raise InputError(f"expected {path}, found none; python -m analysis.runs.curves {runs}")
     return [
         save(draw_scene(pd.DataFrame(rows)), runs / f"{scene}.{suffix}")
-        for scene, rows in gathered(runs).groupby("scene")
+        for scene, rows in pd.read_csv(path).groupby("scene")
     ]
 
 

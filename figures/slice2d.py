@@ -129,19 +129,21 @@ def _draw_section(axes: Axes, direction: Direction, field: Plane, axis: int) -> 
 
 
 def _legend(field: Plane) -> list[Line2D]:
-    handles = [Line2D([], [], color=BLACK, label="loss, true renders")]
+    label, marker = "loss, true renders", ""
     if not field.evaluated.all():
         size = "unbounded" if field.error is None else f"<{100 * field.error:.2g}%"
-        label = f"dots: rendered ({field.evaluated.mean():.0%})\nline: interpolated (error {size})"
-        label = "loss, renders" if field.unresolved else label
-        handles = [Line2D([], [], color=BLACK, marker=".", markersize=4, label=label)]
+        label = f"loss; dots: rendered ({field.evaluated.mean():.0%}),\nline: interpolated (error {size})"
+        label, marker = "loss, renders" if field.unresolved else label, "."
+    handles = [Line2D([], [], color=BLACK, marker=marker, markersize=4, label=label)]
+    if field.crossed_share:
+        words = f"rendered, order changed ({field.crossed_share:.0%})"
+        handles.append(Line2D([], [], label=words, **{**CROSSED, "markersize": 6}))
     if field.model is not None:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))
-    if field.crossed_share:
-        handles.append(
-            Line2D([], [], label=f"order changed: {field.crossed_share:.0%}", **{**CROSSED, "markersize": 6})
-        )
-    handles.append(Line2D([], [], linestyle="none", label=f"1 unit: ΔL = {quantity(field.loss_scale)}"))
+    if not field.unresolved:
+        handles.append(Line2D([], [], color=VERMILION, linestyle="none", marker="+", label="the checkpoint"))
+    words = f"1 curvature unit:\nΔL = {quantity(field.loss_scale)}"
+    handles.append(Line2D([], [], linestyle="none", label=words))
     return handles
 
 

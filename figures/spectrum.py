@@ -16,8 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullLocator
+from matplotlib.transforms import ScaledTranslation
 
-from analysis.records.quantities import measured, power_of_ten, quantity
+from analysis.records.quantities import measured, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from figures.density import draw_on
 from figures.style import BLACK, NEGATIVE, POSITIVE, VERMILION, new_figure, script, style
@@ -26,6 +27,7 @@ from landscape.errors import InputError
 DECADES = 5  # shown on either side of 0
 FLAT = 0.01  # of the largest curvature
 CONVERGED = 0.1  # residual over |value|
+BELOW = 0.36  # inches, of a legend beneath its plot
 DIRECTIONS: dict[str, Any] = {"color": BLACK, "linewidth": 0.7}
 CURVATURE: dict[str, Any] = {"color": VERMILION, "linewidth": 0.7}
 
@@ -39,23 +41,18 @@ def draw(record: Record[ProbeRecord]) -> Figure:
     values, residuals = arrays["ritz_values"][order], arrays["residuals"][order]
     known = "nodes" in arrays
     with style():
-        figure = new_figure(5.6 if known else 2.7)
+        figure = new_figure(6.2 if known else 2.9)
         *above, last = figure.subplots(
-            3 if known else 1, 1, squeeze=False, height_ratios=[1, 1, 1.6] if known else [1]
+            3 if known else 1, 1, squeeze=False, height_ratios=[1.4, 1, 1.6] if known else [1]
         )[:, 0]
         _draw_values(last, values, residuals)
         _label_ends(last, record)
         if known:
-            found = (record.data.eigenvalues.min.value, record.data.eigenvalues.max.value)
-            ends = [end for end in found if end is not None and math.isfinite(end)]
-            sigma = draw_on(above[0], arrays["nodes"], arrays["weights"], ends)
-            above[0].set_title(
-                f"{_finding(arrays['nodes'], arrays['weights'])}\n"
-                f"broadened by σ = {quantity(sigma)}\norange: λ min and λ max",
-                loc="left",
-            )
+            found = {"λ min": record.data.eigenvalues.min.value, "λ max": record.data.eigenvalues.max.value}
+            ends = {name: end for name, end in found.items() if end is not None and math.isfinite(end)}
+            draw_on(above[0], arrays["nodes"], arrays["weights"], ends)
+            above[0].set_title(_finding(arrays["nodes"], arrays["weights"]), loc="left")
             _draw_distribution(above[1], arrays["nodes"], arrays["weights"])
-        figure.legend(handles=_legend(known), loc="outside lower center", ncols=2, handlelength=1.2)
     return figure
 
 
@@ -63,11 +60,11 @@ def _finding(nodes: np.ndarray, weights: np.ndarray) -> str:
     """How many directions are nearly flat, by the mean of the start vectors' quadratures.
 
     >>> _finding(np.array([[0.0, 10.0]]), np.array([[0.75, 0.25]]))
-    '75% of the directions have less than 1% of\\nthe largest curvature'
+    '75% of the directions have less than 1%\\nof the largest curvature (not broadened)'
     """
     flat = float((weights * (np.abs(nodes) < FLAT * np.abs(nodes).max())).sum() / weights.sum())
     words = f"{100 * flat:.3g}%" if flat < 0.9995 else "Over 99.9%"
-    return f"{words} of the directions have less than {FLAT:.0%} of\nthe largest curvature"
+    return f"{words} of the directions have less than {FLAT:.0%}\nof the largest curvature (not broadened)"
 
 
 def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
@@ -83,15 +80,20 @@ def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:
     _symmetric_log(axes, "y", values)
     axes.set_xlim(0, len(values) + 1)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-    axes.set_xlabel(f"rank among the {len(values)} Ritz values")
-    axes.set_ylabel("eigenvalue (loss per\nsquared parameter unit)")
-    axes.set_title("Eigenvalues as the search for the ends met them", loc="left")
+    axes.set_xlabel("rank of the eigenvalue")
+    axes.set_ylabel("eigenvalue (loss per\nsquared stored unit)")
+    axes.set_title(f"{len(values)} eigenvalues, met on the way to both ends", loc="left")
     axes.grid(True)
+    looks = [(f"residual < {CONVERGED:.0%} of the value", "0.3", "0.3"), ("not converged", "0.3", "white")]
+    looks += [("positive", POSITIVE, POSITIVE), ("negative", NEGATIVE, NEGATIVE)]
+    handles = [_handle(label, color=colour, markerfacecolor=face, marker="o") for label, colour, face in looks]
+    handles.insert(2, _handle("± residual", color="0.3", marker="|", markersize=8))
+    _legend_below(axes, handles)
 
 
 def _label_ends(axes: Axes, record: Record[ProbeRecord]) -> None:
     ends = {"max": record.data.eigenvalues.max, "min": record.data.eigenvalues.min}
-    lines = [f"{name} {measured(end.value, end.residual)}" for name, end in ends.items()]
+    lines = [f"λ {name} {measured(end.value, end.residual)}" for name, end in ends.items()]
     axes.set_title("\n".join([axes.get_title(loc="left"), *lines]), loc="left", linespacing=1.4)
 
 
@@ -106,9 +108,12 @@ def _draw_distribution(axes: Axes, nodes: np.ndarray, weights: np.ndarray) -> No
             axes.step(x, np.append(sums, sums[-1]) / (sums[-1] or 1.0), where="post", **look)
     axes.axvline(0, color=BLACK, linewidth=0.6)
     axes.set_ylim(-0.03, 1.03)
-    axes.set_xlabel("curvature x (loss per squared parameter unit)")
+    axes.set_xlabel("curvature x, loss per squared stored unit")
     axes.set_ylabel("share ≤ x")
+    axes.set_title(f"Share below x; a staircase for each of {len(nodes)} starts", loc="left")
     axes.grid(True)
+    lines = (("of all directions", DIRECTIONS), ("of all curvature, Σ|λ|", CURVATURE))
+    _legend_below(axes, [Line2D([], [], label=label, **look) for label, look in lines])
 
 
 def _symmetric_log(axes: Axes, axis: str, values: np.ndarray) -> None:
@@ -129,13 +134,17 @@ def _symmetric_log(axes: Axes, axis: str, values: np.ndarray) -> None:
     getattr(axes, f"{axis}axis").set_minor_locator(NullLocator())
 
 
-def _legend(distribution: bool) -> list[Line2D]:
-    handles = [
-        Line2D([], [], linestyle="none", marker="o", markersize=3, color="0.3", markerfacecolor=face, label=label)
-        for face, label in (("0.3", f"residual < {CONVERGED:.0%} of the value"), ("white", "not converged"))
-    ]
-    lines = ((DIRECTIONS, "of all directions"), (CURVATURE, "of the curvature, Σ|λ|"))
-    return [*handles, *(Line2D([], [], label=label, **look) for look, label in lines if distribution)]
+def _handle(label: str, **look: Any) -> Line2D:
+    return Line2D([], [], linestyle="none", label=label, **{"markersize": 3, **look})
+
+
+def _legend_below(axes: Axes, handles: list[Line2D]) -> None:
+    """What is in this plot, beneath the name of its axis."""
+    below = axes.transAxes + ScaledTranslation(0, -BELOW, axes.figure.dpi_scale_trans)
+    axes.legend(
+        handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=2, handlelength=1.2,
+        borderpad=0, columnspacing=1,
+    )  # fmt: skip
 
 
 def main() -> None:

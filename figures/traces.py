@@ -67,7 +67,8 @@ def _title(data: ProbeRecord) -> str:
     if (found := largest_steps(data)) is None:
         return "No attribute is the steepest for certain"
     first, second, ratio = found
-    return f"Per step, {attribute_name(first)} is steepest: {ratio:.2g} × {attribute_name(second)}"
+    text = f"Per step, {attribute_name(first)} is steepest: {ratio:.2g} × {attribute_name(second)}"
+    return f"{text}\n(beside the names: traces, each in its own unit)"
 
 
 def _draw_traces(axes: Axes, entries: dict[str, Trace], samples: dict[str, np.ndarray]) -> None:

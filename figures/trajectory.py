@@ -26,7 +26,7 @@ from figures.style import BLACK, RUNS, exponent_of, literal, new_figure, save, s
 from landscape.errors import InputError
 
 INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}
-UNITS = "traces, eigenvalues: loss per squared parameter unit"
+UNITS = "traces, eigenvalues: loss per squared stored unit"
 PANEL = 1.12  # inches of height
 LEGEND_LINE = 0.14
 

@@ -176,7 +176,7 @@ def synthetic_line(scale: float = 1.0) -> tuple[dict[str, Any], dict[str, dict[s
     data = {
         "objective": whole["objective"],
         "slice": {
-            "directions": [direction | {"unit": 2e-3, "length": 1.0, "scale": "param. units"}],
+            "directions": [direction | {"unit": 2e-3, "length": 1.0, "scale": "stored units"}],
             "loss_scale": 8e-5 * scale,
             "cosine": None,
             "center_loss": center,

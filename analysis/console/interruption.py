@@ -37,15 +37,18 @@ class Interruption(Event):
 def raising() -> Iterator[None]:
     """Signals raise `Interrupted` wherever the main thread is, so that what it has begun is cleaned up.
 
-    Where Python drops what is raised, in finalizers and what C calls, the signal is sent again until it is heard.
+    Where Python drops what is raised, in finalizers and what C calls, the signal is sent again until it is heard.  An error
+    after it stands for it: a library that is interrupted as it is loaded says that it cannot be.
     """
+    raised: list[Interrupted] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         while frame is not None:
             if frame.f_code.co_name.startswith(DEAF):
                 return _send_again(number)
             frame = frame.f_back
-        raise Interrupted(number)
+        raised.append(Interrupted(number))
+        raise raised[-1]
 
     def dropped(found: Any) -> None:
         if isinstance(found.exc_value, Interrupted):
@@ -57,6 +60,10 @@ def raising() -> Iterator[None]:
     try:
         with _handled(interrupt):
             yield
+    except Exception as error:
+        if raised:
+            raise raised[-1] from error
+        raise
     finally:
         sys.unraisablehook = before
 

@@ -1,6 +1,6 @@
 """Metrics of the parameter space: in which units curvature is compared, as D of D H D (`landscape.ScaledOperator`).
 
-parameters   D = 1: curvature per squared unit of the stored parameters
+parameters   D = 1: curvature per squared stored unit
 scene        positions in units of the scene's size, the rest as it is: what two scenes may be compared in
 optimiser    D the learning rate of every parameter at the first step: curvature per step of the training
 """
@@ -41,7 +41,7 @@ def scene_units(objective: SceneObjective, size: float | None = None) -> Float[T
 
 
 def step_lengths(rates: LearningRates, extent: float) -> dict[str, float]:
-    """How far Adam's first step moves a parameter, by attribute: its learning rate; of colour that of the constant band.
+    """Length of Adam's first step by attribute: its learning rate; of colour that of the constant band.
 
     >>> step_lengths(LearningRates(), 2.0)["means"]
     0.00032

@@ -92,7 +92,10 @@ def measure(
     with stages.stage("linearise") as report:
         hessian = SceneHessian(objective)
         operator = CountingOperator(hessian)
-        gradient, value = _linearised(objective, report)
+        report(0, 1, f"{len(objective.views)} views")
+        gradient = objective.gradient
+        report(1, 1, f"{len(objective.views)} views")
+        value = objective.loss(objective.active.flat)
         objective.approximate_blocks  # noqa: B018 (computed here so that its kernels compile here)
         if settings.block_coupling or not settings.trace_samples:
             _compile_blocks(objective)
@@ -146,7 +149,11 @@ def _all_stages(
     if settings.depth is not None:
         accuracy, steps = settings.depth, settings.depth_steps
         depth = kept.run("depth", Depth, lambda g, report, _: measure_depth(objective, accuracy, steps, g, report))
-    shares = kept.run("block shares", list[BlockShare], lambda g, report, _: _shares(at, g, report))
+
+    def share(generator: torch.Generator, report: Progress, _: list[str]) -> list[BlockShare]:
+        return block_shares(objective, generator, settings.block_samples, report, coupled=settings.block_coupling)
+
+    shares = kept.run("block shares", list[BlockShare], share)
     matvecs, spared = (first + more for first, more in zip(checks, kept.counts, strict=True))
     wanted = {"density": settings.density_matvecs, "finite probe": settings.probe_steps, "depth": settings.depth}
     return Measured(
@@ -174,14 +181,6 @@ def _all_stages(
 def _left_out(at: _Point, ends: EigenEnds, population: int) -> LeftOut:
     vectors = torch.cat([ends.largest.vectors[:, :2], ends.smallest.vectors[:, :1]], dim=1)
     return LeftOut(population, at.objective.losses, at.hessian.by_view(vectors))
-
-
-def _linearised(objective: SceneObjective, report: Progress) -> tuple[Tensor, float]:
-    """The gradient and the loss."""
-    report(0, 1, f"{len(objective.views)} views")
-    gradient = objective.gradient
-    report(1, 1, f"{len(objective.views)} views")
-    return gradient, objective.loss(objective.active.flat)
 
 
 def _compile_blocks(objective: SceneObjective) -> None:
@@ -243,11 +242,6 @@ def _spectrum(
         active=active, ends=ends, trace=total_trace(traces), watch=watch,
     )  # fmt: skip
     return Spectrum(density, iterates[0] if iterates else None)
-
-
-def _shares(at: _Point, generator: torch.Generator, report: Progress) -> list[BlockShare]:
-    settings = at.settings
-    return block_shares(at.objective, generator, settings.block_samples, report, coupled=settings.block_coupling)
 
 
 def _finite(at: _Point, ends: EigenEnds, report: Progress) -> FiniteProbe:

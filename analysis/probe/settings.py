@@ -1,4 +1,4 @@
-"""How much of everything a probe measures."""
+"""Settings of a probe: how much of everything it measures."""
 
 from dataclasses import dataclass, field
 
@@ -13,7 +13,7 @@ FEWEST_PRODUCTS = 16  # of a density
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """How much of everything; the defaults are for numbers to 1%.
+    """Amounts of everything; the defaults are for numbers to 1%.
 
     checked_vectors, checked_views: of the self-checks; None: all views.
     trace_samples: exactly so many for each trace; None: as many as `traces` asks for.
@@ -22,7 +22,7 @@ class ProbeSettings:
     slice_radius: half the slice's side, in curvature units sqrt(2 rise / |lambda|); slice_rise: the rise in these, as a share
         of the loss; slice_tolerance: error of the points that are not rendered, as a share of the slice's range;
         slice_plane: whether to render more than its two axes.
-    probe_steps: of the finite probe, in parameter units; (): it is left out.  noise_points: renders from which it tells the
+    probe_steps: of the finite probe, in stored units; (): it is left out.  noise_points: renders from which it tells the
         noise of a render.
     depth: for the traces along and across the rays; None: these and the finite steps there, of `depth_steps` px, are left out.
     block_samples: of the share of H within the Gaussians' blocks; block_coupling: with SSIM's coupling of pixels, too.

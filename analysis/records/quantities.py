@@ -1,4 +1,4 @@
-"""How numbers with errors are written for people: `(1.23 ± 0.04) × 10⁵`.
+"""Numbers with errors, written for people: `(1.23 ± 0.04) × 10⁵`.
 
 The error is rounded to two significant digits and the value to the same place; without an error a number keeps three
 significant digits.  None, *not determined* in a record, is an en dash.
@@ -119,7 +119,7 @@ def _fixed(value: float, exponent: int, places: int) -> str:
 
 
 def _exponent(value: float) -> int:
-    """Of the leading digit after rounding to three digits; 0 for 0."""
+    """Exponent of the leading digit after rounding to three digits; 0 for 0."""
     return int(f"{value:.2e}".partition("e")[2])
 
 
@@ -171,7 +171,7 @@ class Shade(Struct, frozen=True, kw_only=True):
 
     @property
     def title(self) -> str:
-        """What it is, and in which unit."""
+        """Name and unit."""
         return f"{self.words}, {self.unit}" if self.unit else self.words
 
     @property
@@ -184,7 +184,12 @@ class Shade(Struct, frozen=True, kw_only=True):
         """Name of the map of matplotlib, which colour-blind eyes tell apart; what is fragile or wrong is bright."""
         if self.diverges:
             return "PuOr_r"
-        return {"error": "magma", "order_gap": "cividis_r"}.get(self.name, "cividis")
+        return "magma" if self.name == "error" else "cividis_r" if self.falls else "cividis"
+
+    @property
+    def falls(self) -> bool:
+        """Whether the scale is drawn from high to low: bright is at its right end, as everywhere."""
+        return self.name == "order_gap"
 
     @property
     def palette(self) -> UInt8[np.ndarray, "256 3"]:
@@ -201,10 +206,11 @@ class Shade(Struct, frozen=True, kw_only=True):
         stops = ", ".join(
             "rgb({}, {}, {})".format(*colour) for colour in self.palette[np.linspace(0, BYTES, 9, dtype=int)]
         )
-        ends = [quantity(self.value(t)) for t in (self.low, self.high)]
+        ends, way = [quantity(self.value(t)) for t in (self.low, self.high)], "left" if self.falls else "right"
+        ends = ends[::-1] if self.falls else ends
         middle = "<span>logarithmic</span>" if self.scale == "log" else ""
         return (
-            f'<span style="display:block;height:.5em;background:linear-gradient(to right, {stops})"></span><span '
+            f'<span style="display:block;height:.5em;background:linear-gradient(to {way}, {stops})"></span><span '
             f'style="display:flex;gap:.5em;justify-content:space-between"><span>{ends[0]}</span>{middle}<span>{ends[1]}</span></span>'
         )
 
@@ -224,7 +230,7 @@ class Shade(Struct, frozen=True, kw_only=True):
         return 10.0**t if self.scale == "log" else self.soft * math.sinh(t) if self.scale == "signed" else t
 
     def share(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """How far t is from `low` to `high`, within [0, 1]; nan for what is not finite."""
+        """Position of t between `low` and `high`, within [0, 1]; nan for what is not finite."""
         t = self.shown(values)
         return np.where(np.isfinite(t), np.clip((t - self.low) / (self.high - self.low), 0, 1), np.nan)
 

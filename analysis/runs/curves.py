@@ -1,6 +1,7 @@
 """`python -m analysis.runs.curves RUNS`: loss and scores along trainings that kept their checkpoints.
 
 RUNS/SCENE/METHOD/SEED/curve.csv    of every run of a sweep with `keep_checkpoints = "all"`: a row for each checkpoint
+RUNS/curves.csv                     all of them, with scene, method and seed
 
     step, cpu       steps so far, and the seconds of all processors that they took (train.csv)
     passes          over the pixels of one view: two a step of Adam, else as history.csv has them
@@ -8,6 +9,9 @@ RUNS/SCENE/METHOD/SEED/curve.csv    of every run of a sweep with `keep_checkpoin
     held_out        dB of the held-out views
 
 What is there already is not made again.  `python -m figures.second_order RUNS` draws them.
+
+`--against METHOD` prints, as means over the seeds that both have with standard deviations, how many of METHOD's seconds each
+method takes to METHOD's last loss (on a straight line of ln loss between checkpoints), and the last held-out dB.
 """
 
 import argparse
@@ -16,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.progress import track
@@ -27,7 +32,7 @@ from splat.scenes.view import View
 from splat.training.checkpoint import load_checkpoint, write_atomically
 from splat.training.score.evaluate import evaluate
 
-CURVE, LOG, HISTORY = "curve.csv", "train.csv", "history.csv"
+CURVE, CURVES, LOG, HISTORY = "curve.csv", "curves.csv", "train.csv", "history.csv"
 OF_ADAM = 2  # forward and backward
 
 
@@ -72,16 +77,53 @@ def _views(path: Path) -> tuple[list[View], list[View]]:
 
 
 def _passes(run: Path) -> "pd.Series | None":
-    """Of each step, where the method counts them."""
+    """Passes of each step, where the method counts them."""
     if not (run / HISTORY).is_file():
         return None
     return pd.read_csv(run / HISTORY).get("passes")
 
 
+def against(table: pd.DataFrame, reference: str) -> pd.DataFrame:
+    """A row for each scene and method of `curves.csv`: seeds, how many reached the reference's last loss, its seconds over the
+    reference's (mean and standard deviation over these), and the last held-out dB, its mean and deviation over all seeds."""
+    runs: dict[Any, pd.DataFrame] = dict(iter(table.groupby(["scene", "method", "seed"], sort=False)))
+    rows = []
+    for (scene, method, seed), run in runs.items():
+        if (other := runs.get((scene, reference, seed))) is not None:
+            time = reached(run, float(other["loss"].iloc[-1])) / float(other["cpu"].iloc[-1])
+            rows.append({"scene": scene, "method": method, "seconds": time, "held_out": run["held_out"].iloc[-1]})
+    if not rows:
+        raise InputError(f"expected runs of {reference!r}, got {', '.join(map(repr, table['method'].unique()))}")
+    groups = pd.DataFrame(rows).groupby(["scene", "method"], sort=False)
+    found = groups.agg(["mean", "std"])
+    found.columns = ["seconds", "seconds_sd", "held_out", "held_out_sd"]
+    found.insert(0, "seeds", groups.size())
+    found.insert(1, "reached", groups["seconds"].count())
+    return found.reset_index()
+
+
+def reached(run: pd.DataFrame, loss: float) -> float:
+    """The seconds that a run takes to a loss; nan where it does not get there.
+
+    >>> round(reached(pd.DataFrame({"cpu": [1.0, 3.0], "loss": [0.1, 0.001]}), 0.01), 9)
+    2.0
+    """
+    losses, seconds = run["loss"].to_numpy(), run["cpu"].to_numpy()
+    if not (losses <= loss).any():
+        return float("nan")
+    after = int(np.argmax(losses <= loss))
+    if after == 0:
+        return float(seconds[0])
+    share = np.log(losses[after - 1] / loss) / np.log(losses[after - 1] / losses[after])
+    return float(seconds[after - 1] + share * (seconds[after] - seconds[after - 1]))
+
+
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="analysis.runs.curves", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("runs", type=Path, metavar="RUNS")
-    runs = parser.parse_args(words).runs
+    parser.add_argument("--against", metavar="METHOD")
+    arguments = parser.parse_args(words)
+    runs = arguments.runs
     ended = sorted(path.parent for path in runs.glob("*/*/*/metrics.json"))
     console = Console(stderr=True)
     try:
@@ -89,6 +131,15 @@ def main(words: Sequence[str] | None = None) -> int:
             raise InputError(f"expected runs that have ended in {runs}, got none; landscape sweep makes them")
         for run in track([run for run in ended if not (run / CURVE).is_file()], "curves", console=console):
             write_atomically(run / CURVE, curve(run).to_csv(index=False).encode())
+        tables = [
+            pd.read_csv(run / CURVE).assign(scene=scene, method=method, seed=seed)
+            for run in ended
+            for scene, method, seed in [run.parts[-3:]]
+        ]
+        table = pd.concat(tables, ignore_index=True)
+        write_atomically(runs / CURVES, table.to_csv(index=False).encode())
+        if arguments.against:
+            say(against(table, arguments.against).to_string(index=False), console=Console())
     except (InputError, FileNotFoundError) as error:
         say(f"analysis.runs.curves: {error}", console=console)
         return 2

@@ -1,7 +1,7 @@
 """`landscape slice`: one checkpoint in, its loss along a line or over a plane out, as a record with pictures.
 
     load            the checkpoint, its scene, the other checkpoints of a line or a plane
-    linearise       every view held still
+    linearise       derivatives of every view
     directions      eigenvectors from the probe beside the checkpoint or by Lanczos, and their curvatures
     slice           renders in parallel; of a plane where needed, interpolated elsewhere (`landscape.slices.refinement`)
     finite steps    along a line: second differences at steps over four decades, beside the infinitesimal curvature
@@ -107,7 +107,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
 
 
 def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
-    """As asked for; a GPU is full with one render."""
+    """Settings as asked for; a GPU is full with one render."""
     most = torch.get_num_threads() if device.type == "cpu" else 1
     workers = most if options.workers is None else options.workers
     if options.all_points:
@@ -212,7 +212,7 @@ def _measure(
 
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:
-    """For the run that continues this one, should it be killed."""
+    """Keep eigenvectors for the run that continues this one, should it be killed."""
     vectors = [direction.vector.cpu().numpy() for direction in directions if direction.kind == "eigenvectors"]
     if not vectors:
         return
@@ -245,7 +245,8 @@ def _conclude(data: SliceRecord, out: Path) -> None:
         say(_finite_curvature(data.finite_probe))
     say(*(line.text for line in of_slice(data.slice, data.provenance)))
     say(*data.notes, style="yellow")
-    say(f"{data.timing['total']:.1f} s, {data.counts.renders:,} renders of a view")
+    seconds = data.timing.get("total", sum(data.timing.values()))  # a file may lack it
+    say(f"{seconds:.1f} s, {data.counts.renders:,} renders of a view")
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))) or "none"
     say(f"pictures: {pictures}; numbers: {data.FILE}, in {out}")
 

@@ -3,7 +3,7 @@
     eigenvectors    e₁, e₂: unit eigenvectors of the two largest eigenvalues of H.  Radius in curvature units; 3
     random          r₁, r₂: Gaussian, of every attribute of every Gaussian as long as that attribute is (of a mean: as its
                     distance from the origin), so that a radius of 0.001 changes each by about a thousandth; 0.001
-    gradient        unit vector of the steepest ascent.  Radius in parameter units; 3 curvature units
+    gradient        unit vector of the steepest ascent.  Radius in stored units; 3 curvature units
     line            from the checkpoint, at 0, to the other, at 1.  Radius: how far beyond both; 0.5.  With a third checkpoint a
                     plane through all three, at (0, 0), (1, 0) and (0, 1): line₁, line₂
 
@@ -113,7 +113,7 @@ class Direction:
     name: str
     vector: Float[Tensor, " n"]
     residual: float | None = None
-    scale: str = "param. units"
+    scale: str = "stored units"
 
 
 def find_directions(
@@ -135,7 +135,7 @@ def find_directions(
         elif kind == "random":
             groups = groups_of(objective.blocks, len(objective.active), center.numel())
             vectors = random_directions(center, groups, generators[kind], count)
-            scale = "share of param. sizes"
+            scale = "share of the size"
             found += [Direction(kind, f"r{'₁₂'[i]}", vectors[:, i], scale=scale) for i in range(count)]
         elif kind == "gradient":
             found.append(Direction(kind, "gradient", gradient_direction(objective.gradient)[:, 0]))
@@ -158,7 +158,7 @@ def at_right_angles(found: Sequence[Direction]) -> list[Direction]:
 
 
 def cosine(directions: Sequence[Direction]) -> float | None:
-    """Of the angle between two directions as they are found."""
+    """Cosine of the angle between two directions as they are found."""
     if len(directions) < 2:
         return None
     unit = [direction.vector.double() / direction.vector.double().norm() for direction in directions]

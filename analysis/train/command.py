@@ -100,7 +100,7 @@ class Run:
             raise
 
     def save(self, spent: TrainingTime, *, stays: bool) -> None:
-        """Write the checkpoint and what belongs to it.  stays: also among those that are kept, of which the oldest go."""
+        """Write the checkpoint and what belongs to it.  stays: also as one of those that are kept; the oldest goes."""
         if stays and self.keep:
             self._save_within(self.out / KEPT.format(self.training.step))
         save_checkpoint(self.out / CHECKPOINT, self.training, self.reference)

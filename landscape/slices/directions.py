@@ -1,4 +1,4 @@
-"""Directions for slices, as columns (n, d), in parameter units and in the dtype of the argument.
+"""Directions for slices, as columns (n, d), in the units of the parameters and in the dtype of the argument.
 
     random, filter-normalised   d_g <- d_g |theta_g| / |d_g| for every group g of parameters (a filter, or one attribute of one
                                 item): a step of 1 changes each group by its size (Li et al. 2018, Sec. 4)

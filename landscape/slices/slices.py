@@ -4,8 +4,8 @@
                                                       never on the axes
     model(x) = L + b . x + x^T A x / 2                b = E^T g,  A = E^T H E
 
-x is in multiples of the directions: in parameter units for unit vectors.  `curvature_reach` gives ranges in units of the
-curvature instead: the distance r sqrt(2 dL / |lambda|), at which the quadratic term along an eigenvector is r^2 dL.
+x is in multiples of the directions: for unit vectors in units of the parameters.  `curvature_reach` gives ranges in units of
+the curvature instead: the distance r sqrt(2 dL / |lambda|), at which the quadratic term along an eigenvector is r^2 dL.
 """
 
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ def symmetric_axis(radius: float, points: int = 41) -> Float64[Tensor, " points"
 def curvature_reach(curvature: float, rise: float, multiple: float = 1.0) -> float:
     """multiple * sqrt(2 rise / |curvature|).  With multiple = 1: the distance at which the quadratic term equals rise.
 
-    For a unit direction: curvature in loss per squared parameter unit, rise in loss, the result in parameter units.
+    For a unit direction: curvature in loss per squared unit of the parameters, rise in loss, the result in these units.
     Raises InputError where the curvature is 0 or not finite, or rise or multiple is not positive.
 
     >>> curvature_reach(curvature=-8.0, rise=1.0)
@@ -53,7 +53,7 @@ def curvature_reach(curvature: float, rise: float, multiple: float = 1.0) -> flo
     if curvature == 0 or not isfinite(curvature) or rise <= 0 or multiple <= 0:
         raise InputError(
             f"expected a curvature that is not zero, rise > 0 and multiple > 0, got {curvature}, {rise} and {multiple};"
-            " give the range in parameter units instead"
+            " give the range in units of the parameters instead"
         )
     return multiple * sqrt(2 * rise / abs(curvature))
 

@@ -35,7 +35,10 @@ from splat.curvature.objective import SceneObjective
 from splat.render.sight import Sight, sight
 
 Values = dict[str, Float64[Tensor, " n"]]
-PER_UNIT = {"means": "per world unit²", "log_scales": "", "quats": "", "opacity_logits": "per logit²", "sh": ""}
+PER_UNIT = {
+    "means": "per world unit²", "log_scales": "per log unit²", "quats": "per quaternion unit²", "opacity_logits": "per logit²",
+    "sh": "per SH unit²",
+}  # fmt: skip
 WORDS = {"means": "position", "log_scales": "scale", "quats": "rotation", "opacity_logits": "opacity", "sh": "colour"}
 PREFIXES = ("", "gn_")
 MIXED = "per stored unit²"
@@ -43,8 +46,8 @@ MIXED = "per stored unit²"
 
 @dataclass(frozen=True)
 class Field:
-    """What a field is, in words; its unit, empty where it has none; scale: as a picture shows it; log: of positive numbers,
-    signed: about 0."""
+    """A field in words; its unit, empty where it has none; scale: as a picture shows it; log: of positive numbers, signed:
+    about 0."""
 
     words: str
     unit: str
@@ -54,9 +57,9 @@ class Field:
 OF_BLOCKS = {
     **{f"trace_{name}": Field(f"trace of {WORDS[name]}", unit, "signed") for name, unit in PER_UNIT.items()},
     "largest": Field("largest curvature", MIXED, "log"),
-    "log_det": Field("log-determinant", "", "linear"),
-    "rank": Field("rank of the block", "", "linear"),
-    "negative": Field("negative curvatures of the block", "", "linear"),
+    "log_det": Field("log-determinant", "ln of stored units", "linear"),
+    "rank": Field("rank of the block", "of 10", "linear"),
+    "negative": Field("negative curvatures of the block", "of 10", "linear"),
     "depth": Field("curvature along the ray", PER_UNIT["means"], "signed"),
     "lateral": Field("curvature across the ray", PER_UNIT["means"], "signed"),
 }
@@ -65,13 +68,13 @@ OF_VIEWS = {
     "pixels": Field("pixels that see it", "", "log"),
     "weight": Field("weight in the images", "px", "log"),
     "one_view": Field("share of its weight in one view", "", "linear"),
-    "condition": Field("condition of its splat", "long : short axis, squared", "log"),
+    "condition": Field("condition of its splat", "(long : short axis)²", "log"),
     "order_gap": Field("distance along the ray to the next in front", "px", "log"),
 }
 FIELDS = {
     **OF_BLOCKS,
     **{f"gn_{name}": replace(field, words=f"{field.words} (Gauss-Newton)") for name, field in OF_BLOCKS.items()},
-    "split": Field("least curvature of H − G", MIXED, "signed"),
+    "split": Field("least curvature of Hessian minus Gauss-Newton", MIXED, "signed"),
     **OF_VIEWS,
 }
 
@@ -114,7 +117,7 @@ def block_fields(
     rays: Float64[Tensor, "n 3"],
     precision: torch.dtype,
 ) -> Values:
-    """The fields of the blocks.  quats: of unit length; precision: in which the blocks were worked out."""
+    """The fields of the blocks.  quats: of unit length; precision: in which the blocks were computed."""
     found: Values = {}
     across = [on_complement(blocks.geometry.double(), quats.double()) for blocks in (hessian, gauss_newton)]
     for prefix, blocks, B in zip(PREFIXES, (hessian, gauss_newton), across, strict=True):

@@ -182,7 +182,7 @@ class LinearizedView:
             )
         found = []
         for gauss_newton in parts:
-            blocks = raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton) + coupled
+            blocks = self._raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton) + coupled
             found.append(PerGaussianBlocks(*self._projection.blocks(blocks, not gauss_newton)))
             if not gauss_newton:
                 found[-1].add_diagonal(self._regularizers.second)

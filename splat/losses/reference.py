@@ -12,7 +12,6 @@ Images are (3, h, w) in [0, 1].  Every loss is a mean over pixels and channels.
 """
 
 from dataclasses import dataclass
-from math import inf
 from typing import Literal
 
 import torch
@@ -21,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from landscape.errors import InputError
+from splat.model.typed import NonNegative, Positive, Settings, Share
 
 WINDOW, SIGMA = 11, 1.5
 REACH = WINDOW // 2
@@ -30,7 +30,7 @@ Border = Literal["padded", "valid"]
 
 
 @dataclass(frozen=True)
-class LossSettings:
+class LossSettings(Settings):
     """Which loss a view contributes: the pixel loss, and ssim_weight = lambda in [0, 1], of 1 - SSIM.
 
     eps: Charbonnier's, in units of intensity.  literal: the pixel loss has the weight 1 instead of 1 - lambda.
@@ -42,24 +42,12 @@ class LossSettings:
     """
 
     pixel: PixelLoss = "l1"
-    ssim_weight: float = 0.2
-    eps: float = 0.01
+    ssim_weight: Share = 0.2
+    eps: Positive = 0.01
     literal: bool = False
     border: Border = "padded"
-    opacity_reg: float = 0.0
-    scale_reg: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.pixel not in ("l1", "charbonnier", "l2"):
-            raise InputError(f"expected the pixel loss 'l1', 'charbonnier' or 'l2', got {self.pixel!r}")
-        if not (0 <= self.ssim_weight <= 1 and self.eps > 0):
-            raise InputError(f"expected 0 <= ssim_weight <= 1 and eps > 0, got {self.ssim_weight} and {self.eps}")
-        if self.border not in ("padded", "valid"):
-            raise InputError(f"expected the border 'padded' or 'valid', got {self.border!r}")
-        if not (0 <= self.opacity_reg < inf and 0 <= self.scale_reg < inf):
-            raise InputError(
-                f"expected opacity_reg and scale_reg of at least 0, got {self.opacity_reg} and {self.scale_reg}"
-            )
+    opacity_reg: NonNegative = 0.0
+    scale_reg: NonNegative = 0.0
 
     @property
     def margin(self) -> int:

@@ -3,7 +3,8 @@
     Positive, NonNegative    finite real numbers above 0, of at least 0      Share    in [0, 1]
     Count, Length            whole numbers of 64 bits of at least 0, of at least 1
 
-A whole number stands for a real one.
+A whole number stands for a real one.  Real numbers of settings are also such that float32, in which they work, holds them, and
+the squares of large ones: `MOST`, `LEAST`; or infinite, where their type does not say finite.
 """
 
 import re
@@ -12,6 +13,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import is_dataclass
 from functools import cache
+from math import inf
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -20,6 +22,7 @@ from torch import Tensor
 from landscape.errors import InputError
 
 LARGEST = sys.float_info.max
+MOST, LEAST = 1e18, 2.0**-126  # of a setting's size, unless it is 0
 Positive = Annotated[float, msgspec.Meta(gt=0, le=LARGEST)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0, le=LARGEST)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -29,14 +32,25 @@ Length = Annotated[int, msgspec.Meta(ge=1, le=2**63 - 1)]
 _hints = cache(lambda kind: get_type_hints(kind, include_extras=True))
 
 
-class Settings:
-    """Base of frozen dataclasses of settings.  InputError that names the field where a value is not what its hint says."""
+class Typed:
+    """Base of frozen dataclasses.  InputError that names the field where a value is not what its hint says."""
 
     def __post_init__(self) -> None:
         for name, hint in _hints(type(self)).items():
             value = getattr(self, name)
             if get_origin(hint) is not ClassVar and not is_dataclass(value):
-                typed(hint, value, name)
+                self.require(name, typed(hint, value, name))
+
+    def require(self, name: str, value: Any) -> None:
+        """Raise InputError where a value of the right type is none for the field."""
+
+
+class Settings(Typed):
+    """Base of frozen dataclasses of settings."""
+
+    def require(self, name: str, value: Any) -> None:
+        if isinstance(value, float) and value not in (0, inf) and not LEAST <= abs(value) <= MOST:  # nan fails
+            raise InputError(f"{name!r}: expected 0 or a number of a size from {LEAST:.3g} to {MOST:g}, got {value}")
 
 
 def typed(kind: Any, content: Any, where: str = "") -> Any:

@@ -110,7 +110,7 @@ def test_the_page_of_the_splats_needs_no_network_and_switches_colours(browser, v
     browser.set_network_conditions(offline=True, latency=0, throughput=0)
     browser.get(path.as_uri())
     shown = splats_of(browser, lambda _: True)
-    assert "long : short axis, squared" in browser.find_element("id", "legend").text
+    assert "(long : short axis)²" in browser.find_element("id", "legend").text
     keys_to(browser, "#fields select", "appearance")
     splats_of(browser, lambda pixels: apart(pixels, shown) > 3)
     assert browser.find_element("id", "legend").text == ""

@@ -190,7 +190,7 @@ def test_renders_and_interpolated_points_are_told_apart(tmp_path):
     }
     assert dots == {BLACK: 3 * 5, SKY: 2 * 5}
     said = " ".join(text for text, _ in words(figure, laid_out(figure)))
-    assert "dots: rendered (7%)\nline: interpolated (error <0.4%)" in said and "order changed: 40%" in said
+    assert "dots: rendered (7%),\nline: interpolated (error <0.4%)" in said and "order changed (40%)" in said
     sections = [axes for axes in figure.axes if "step along" in axes.get_xlabel()]
     along = [
         [len(np.asarray(line.get_xdata())) for line in axes.lines if line.get_marker() == "."] for axes in sections

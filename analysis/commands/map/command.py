@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from msgspec import structs
 from rich.console import Console
 
 from analysis.commands.map.files import coloured_ply, csv_text, fields_ply, top_table
@@ -36,7 +37,7 @@ from analysis.measures.steepest import End, steepest
 from analysis.probe.command import opened, scene_objective
 from analysis.probe.record import provenance_of
 from analysis.records.json_files import json_text, plain
-from analysis.records.quantities import Shade, quantity
+from analysis.records.quantities import Shade, percent, quantity
 from analysis.records.records import record_folder, require_replaceable
 from analysis.records.run_files import MAP, Fragility, MapRecord, Panel, Steepest
 from analysis.slice.directions import recorded_probe
@@ -68,8 +69,20 @@ class Fields:
         return self.values["weight"].numpy()
 
     def shade(self, name: str) -> Shade:
-        kind = self.kinds[name]
-        return Shade.of(name, kind.words, kind.unit, kind.scale, self.values[name].numpy(), self.weight)
+        """The scale of a field; that of the share in one view runs from equal parts to all."""
+        kind, views = self.kinds[name], len(self.sights)
+        shade = Shade.of(name, kind.words, kind.unit, kind.scale, self.values[name].numpy(), self.weight)
+        return structs.replace(shade, low=1 / views, high=1.0) if name == "one_view" and views > 1 else shade
+
+
+def in_words(kind: Field, value: float) -> str:
+    """A value of a field with its unit: whole numbers as such, shares in percent.
+
+    >>> [in_words(FIELDS[name], x) for name, x in (("views", 2.0), ("one_view", 1.0), ("weight", 2.5))]
+    ['2', '100%', '2.50 px']
+    """
+    whole = f"{value:,.0f}" if value.is_integer() else quantity(value)
+    return f"{percent(value) if kind.words.startswith('share') else whole} {kind.unit}".rstrip()
 
 
 def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
@@ -142,7 +155,7 @@ def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
 
 
 def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
-    """What the blocks and the views say, and the masses in the eigenvectors of the probe, where it is of this loss here."""
+    """Fields of the blocks and the views, and the masses in the eigenvectors of the probe, where it is of this loss here."""
     values, sights = scene_fields(objective, report)
     ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, objective, notes)
     if recorded is not None:
@@ -218,9 +231,7 @@ def _conclude(data: MapRecord, first: Mapping[str, Any], kind: Field, out: Path)
     say(f"{data.seen:,} of {data.gaussians:,} Gaussians are in sight", *data.sentences)
     if not data.steepest:
         say("for the Gaussians that carry the steepest directions: landscape probe, then map again")
-    say(
-        f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {quantity(float(first[data.field]))} {kind.unit}"
-    )
+    say(f"{kind.words}: most of it at Gaussian {int(first['gaussian']):,}, {in_words(kind, float(first[data.field]))}")
     say(*data.notes, style="yellow")
     pictures = ", ".join(path.name for path in sorted(out.glob("*.png"))[:4]) or "none"
     more = "" if len(data.panels) <= 4 else ", ..."

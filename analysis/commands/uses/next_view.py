@@ -35,7 +35,7 @@ from splat.training.checkpoint import Checkpoint
 
 
 class NextViewRecord:
-    """What marks a folder of this command."""
+    """Mark of a folder of this command."""
 
     FILE: ClassVar[str] = "next-view.json"
 
@@ -93,7 +93,7 @@ def informations(
     settings: RenderSettings,
     report: Progress | None = None,
 ) -> dict[str, Information]:
-    """What each camera tells about the Gaussians."""
+    """Information of each camera about the Gaussians."""
     gaussians, found = gaussians.aligned_to(gaussians), {}
     for name, camera in cameras.items():
         found[name] = information(gaussians, camera, background, settings)

@@ -56,7 +56,7 @@ Row = dict[str, str | int | float]
 
 
 class PruneRecord:
-    """What marks a folder of this command."""
+    """Mark of a folder of this command."""
 
     FILE: ClassVar[str] = "prune.json"
 
@@ -189,7 +189,7 @@ def _scored(gaussians: Gaussians, objective: SceneObjective, held_out: Sequence[
 
 
 def lost(curve: pd.DataFrame, removed: float, steps: int, column: str) -> dict[str, float]:
-    """How much of a measure each score loses against the scene with all its Gaussians."""
+    """Loss of a measure by each score, against the scene with all its Gaussians."""
     rows = {(row["score"], row["removed"], row["steps"]): row[column] for row in curve.to_dict("records")}
     return {score: rows[score, 0, 0] - rows[score, removed, steps] for score in SCORES}
 

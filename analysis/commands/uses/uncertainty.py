@@ -40,7 +40,7 @@ SHARES = 100
 
 
 class UncertaintyRecord:
-    """What marks a folder of this command."""
+    """Mark of a folder of this command."""
 
     FILE: ClassVar[str] = "uncertainty.json"
 
@@ -90,7 +90,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
 
 
 def agreement(variance: Float[np.ndarray, "h w"], error: Float[np.ndarray, "h w"]) -> dict[str, float]:
-    """Of a map that predicts with one that is true.
+    """Agreement of a map of predicted errors with one of true errors.
 
     >>> perfect = agreement(np.arange(1000.0).reshape(50, 20), np.arange(1000.0).reshape(50, 20))
     >>> {name: round(value, 2) for name, value in perfect.items()}

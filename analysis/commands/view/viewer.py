@@ -2,7 +2,7 @@
 
     field       what colours the splats; the ends of its scale, and which splats are shown, are percentiles
     cameras     the training views, with their photographs; the chosen one is rendered by our own renderer
-    click       the splat with most weight in the pixel there, again by our own renderer, and its numbers
+    click       the splat with most weight in the pixel there, again by our own renderer: outlined, and its numbers
     e₁, e₂      steps along the steepest directions of a probe beside the checkpoint: splats, render and loss there
 
 viser's covariances are float16, so the scene is moved and scaled until its Gaussians lie within RADIUS.  Its colours are those
@@ -18,7 +18,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from analysis.commands.map.command import Fields
+from analysis.commands.map.command import Fields, in_words
 from analysis.commands.map.pictures import rendered
 from analysis.measures.steepest import in_bytes
 from analysis.records.quantities import Shade, percent, quantity
@@ -36,6 +36,8 @@ APPEARANCE = "appearance"
 RADIUS, WITHIN = 20.0, 0.95  # viser's units, and the share of the Gaussians that lies within
 LARGEST = 6e4  # of a covariance, just below the end of float16
 NARROW = 2000.0  # focal length of a click's pixel, px
+OUTLINE, SEGMENTS = 2.0, 48  # of a picked splat: standard deviations, and of each of its three rings
+MARK = (213, 94, 0)  # vermilion
 
 
 class Frame:
@@ -53,13 +55,26 @@ class Frame:
     def back(self, point: Any) -> Tensor:
         return torch.tensor(point, dtype=torch.float64) / self.scale + self.centre
 
+    def axes(self, gaussians: Gaussians) -> Tensor:
+        """[n, 3, 3]: the standard deviations along the axes of each, in columns."""
+        gaussians = baked(gaussians)
+        return (
+            rotation_matrices(gaussians.quats.double()) * (gaussians.log_scales.double().exp() * self.scale)[:, None, :]
+        )
+
     def splats(self, gaussians: Gaussians) -> dict[str, np.ndarray]:
         """centers and covariances, float32, that float16 can hold."""
-        gaussians = baked(gaussians)
-        quats = gaussians.quats.double()
-        axes = rotation_matrices(quats) * (gaussians.log_scales.double().exp() * self.scale)[:, None, :]
+        axes = self.axes(gaussians)
         covariances = (axes @ axes.mT).clamp(-LARGEST, LARGEST)
         return {"centers": self.place(gaussians.means).astype(np.float32), "covariances": covariances.float().numpy()}
+
+    def outline(self, gaussians: Gaussians, index: int) -> np.ndarray:
+        """[m, 2, 3]: the segments of a Gaussian's rings around its three axes, OUTLINE standard deviations from its centre."""
+        first = OUTLINE * self.axes(gaussians)[index].mT  # a row an axis
+        turn = torch.linspace(0, 2 * torch.pi, SEGMENTS + 1, dtype=first.dtype)[:, None]
+        rings = turn.cos() * first[:, None] + turn.sin() * first.roll(-1, 0)[:, None]
+        points = self.place(gaussians.means[index]) + rings.numpy()
+        return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
 class Viewer:
@@ -71,6 +86,7 @@ class Viewer:
         self.names = {APPEARANCE: APPEARANCE}  # of the fields, by what they are in words
         self.steps: Mapping[str, tuple[Tensor, float]] = {}
         self.sliders: dict[str, Any] = {}
+        self.picked: tuple[int, float] | None = None  # a Gaussian in sight, and its share of the pixel
         self._drawing = Lock()  # callbacks come from several threads
         active = objective.active
         self.plain = (0.5 + Y00 * active.sh[:, 0]).clamp(0, 1).float().numpy()
@@ -78,6 +94,7 @@ class Viewer:
         self.splats = server.scene.add_gaussian_splats(
             "/splats", **self.frame.splats(active), rgbs=self.plain, opacities=self.opacities
         )
+        self.mark = server.scene.add_frame("/picked", show_axes=False, visible=False)
         self._add_cameras()
         gui = server.gui
         self.field = gui.add_dropdown("field", (APPEARANCE,), hint="what colours the splats")
@@ -134,7 +151,8 @@ class Viewer:
             self.sliders[name].on_update(lambda _: self.step())
 
     def recolour(self) -> None:
-        """The splats' colours, which of them are shown, and the legend."""
+        """The splats' colours, which of them are shown, the legend, and the number of the picked one that comes first."""
+        self._tell()
         name = self.names[self.field.value]
         if self.fields is None or name == APPEARANCE:
             self.splats.rgbs, self.splats.opacities, self.legend.content = self.plain, self.opacities, ""
@@ -153,15 +171,20 @@ class Viewer:
     def step(self) -> None:
         """The splats, the render of the chosen view and the loss where the sliders are."""
         with self._drawing:
-            flat, active = self.objective.active.flat.clone(), self.objective.active
-            for name, (vector, reach) in self.steps.items():
-                flat += self.sliders[name].value / UNITS * reach * vector.to(flat)
-            there = active.with_flat(flat)
+            there = self._here()
             self.splats.set_gaussians(
                 **self.frame.splats(there), rgbs=self.splats.rgbs.copy(), opacities=self.splats.opacities.copy()
             )
+            self._mark(there)
             self.render.image = self._image(there)
-            self.loss.content = f"loss {quantity(self.objective.loss(flat))}"
+            self.loss.content = f"loss {quantity(self.objective.loss(there.flat))}"
+
+    def _here(self) -> Gaussians:
+        """The Gaussians where the sliders are."""
+        flat = self.objective.active.flat.clone()
+        for name, (vector, reach) in self.steps.items():
+            flat += self.sliders[name].value / UNITS * reach * vector.to(flat)
+        return self.objective.active.with_flat(flat)
 
     def _image(self, gaussians: Gaussians) -> np.ndarray:
         return in_bytes(rendered(self.objective, self._place(), gaussians)).transpose(1, 2, 0)
@@ -170,26 +193,49 @@ class Viewer:
         return [view.name for view in self.objective.views].index(self.view.value)
 
     def click(self, origin: Any, direction: Any) -> None:
-        """The numbers of the splat at a ray, in viser's coordinates."""
-        found = heaviest_on_ray(self.objective, self.frame.back(origin), torch.tensor(direction, dtype=torch.float64))
-        self.numbers.content = "Nothing there." if found is None else self.told(*found)
+        """Pick the splat at a ray, in viser's coordinates."""
+        self.picked = heaviest_on_ray(
+            self.objective, self.frame.back(origin), torch.tensor(direction, dtype=torch.float64)
+        )
+        if self.picked is None:
+            self.numbers.content = "Nothing there."
+        self._tell()
+        with self._drawing:
+            self._mark(self._here())
 
-    def told(self, gaussian: int, share: float) -> str:
-        """A Gaussian in sight, and its share of the pixel."""
-        lines = [
-            f"**Gaussian {int(self.objective.mask.nonzero()[gaussian, 0]):,}**, {percent(share)} of this pixel",
-            "",
-        ]
+    def _tell(self) -> None:
+        if self.picked is not None:
+            self.numbers.content = self.told(*self.picked)
+
+    def _mark(self, gaussians: Gaussians) -> None:
+        """Outline the picked splat where it is now, with its number."""
+        self.mark.visible = self.picked is not None
+        if self.picked is not None:
+            index, scene = self.picked[0], self.server.scene
+            scene.add_line_segments(
+                "/picked/outline", self.frame.outline(gaussians, index), MARK, thickness=2.0, thickness_units="screen"
+            )
+            place = tuple(self.frame.place(gaussians.means[index]).tolist())
+            words = f"● Gaussian {self._number(index):,}"  # the dot lies on it, above all splats
+            scene.add_label("/picked/label", words, position=place, anchor="center-left")
+
+    def _number(self, index: int) -> int:
+        """Of a Gaussian in sight, among all."""
+        return int(self.objective.mask.nonzero()[index, 0])
+
+    def told(self, index: int, share: float) -> str:
+        """A Gaussian in sight, and its share of the pixel: its numbers, that of the field shown first."""
+        title = f"**Gaussian {self._number(index):,}**, {percent(share)} of this pixel"
         if self.fields is None:
-            return lines[0]
-        kinds = self.fields.kinds
-        values = {name: float(self.fields.values[name][gaussian]) for name in kinds}
-        numbers = {name: f"{value:,.0f}" if value.is_integer() else quantity(value) for name, value in values.items()}
+            return title
+        kinds, shown = self.fields.kinds, self.names[self.field.value]
+        numbers = {name: in_words(kinds[name], float(self.fields.values[name][index])) for name in kinds}
         pairs = {name: f"gn_{name}" for name in kinds if f"gn_{name}" in kinds}
-        single = [name for name in kinds if name not in pairs and name not in pairs.values()]
-        lines += [f"- {kinds[name].words}: {numbers[name]} {kinds[name].unit}" for name in single]
+        single = [name for name in kinds if name not in (shown, *pairs, *pairs.values())]
+        lines = [title, "", *(f"**{kinds[name].words}: {numbers[name]}**" for name in (shown,) if name in kinds), ""]
+        lines += [f"- {kinds[name].words}: {numbers[name]}" for name in single]
         lines += ["", "| | Hessian | Gauss-Newton |", "| --- | --- | --- |"]
-        lines += [f"| {kinds[a].words} {kinds[a].unit} | {numbers[a]} | {numbers[b]} |" for a, b in pairs.items()]
+        lines += [f"| {kinds[a].words} | {numbers[a]} | {numbers[b]} |" for a, b in pairs.items()]
         return "\n".join(lines)
 
 

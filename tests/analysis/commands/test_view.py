@@ -92,6 +92,26 @@ def test_the_controls_colour_hide_and_step(viewer, objective):
     assert "Gaussian" in viewer.numbers.content and "largest curvature" in viewer.numbers.content
 
 
+def test_a_pick_is_outlined_and_lists_the_field_shown_first(viewer, objective):
+    viewer.add_fields(measured_fields(objective, Path("nowhere"), [], lambda *_: None), "largest")
+    viewer.click(*_ray(viewer, objective))
+    index, _ = viewer.picked
+    told = viewer.numbers.content.splitlines()
+    assert told[2].startswith("**largest curvature: ") and told[2].endswith("per stored unit²**")
+    assert f"- views that see it: {int(viewer.fields.values['views'][index])}" in told
+    viewer.field.value = "views that see it"
+    viewer.recolour()
+    assert viewer.numbers.content.splitlines()[2].startswith("**views that see it: ")
+    assert viewer.mark.visible
+    ring, at = (axes[index].double() for axes in (viewer.frame.axes(objective.active), objective.active.means))
+    distance = torch.tensor(viewer.frame.outline(objective.active, index)) - torch.tensor(viewer.frame.place(at))
+    assert torch.linalg.norm(torch.linalg.solve(ring, distance.mT), dim=1).sub(view.OUTLINE).abs().max() < 1e-9
+    viewer.click(
+        viewer.frame.place(objective.views[0].camera.centre).tolist(), (-objective.views[0].camera.forward).tolist()
+    )
+    assert not viewer.mark.visible and viewer.numbers.content == "Nothing there."
+
+
 def _ray(viewer: view.Viewer, objective: SceneObjective) -> tuple[list[float], list[float]]:
     camera = objective.views[0].camera
     return viewer.frame.place(camera.centre).tolist(), camera.forward.tolist()

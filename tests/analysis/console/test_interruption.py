@@ -42,3 +42,21 @@ def test_a_signal_in_what_llvm_calls_lets_it_do_its_work_first():
     with pytest.raises(Interrupted) as raised, raising():
         waits_after(_raw_object_cache_notify)
     assert done and raised.value.exit_code == 130
+
+
+def test_what_a_library_makes_of_a_signal_is_that_signal():
+    def loaded() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGHUP)
+            time.sleep(1)
+        except BaseException as error:  # as pycolmap does, whose module's C is interrupted
+            raise RuntimeError("cannot import it") from error
+
+    with pytest.raises(Interrupted) as raised, raising():
+        loaded()
+    assert raised.value.exit_code == 129
+
+
+def test_an_error_that_no_signal_came_before_stays_what_it_is():
+    with pytest.raises(RuntimeError, match="cannot import it"), raising():
+        raise RuntimeError("cannot import it")

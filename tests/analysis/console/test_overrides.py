@@ -1,10 +1,13 @@
 """Settings changed by name, from text and from plain values."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
 from analysis.console.overrides import assignments, overridden
+from landscape.errors import InputError
+from splat.model.typed import leaves
+from splat.training.methods.methods import METHODS
 from splat.training.methods.stablegs.stablegs import StableGS
 from splat.training.state import TrainConfig
 
@@ -85,3 +88,18 @@ def test_an_unknown_name_is_answered_with_those_of_all_single_settings():
         overridden(STABLE, {"nothing like it": "50"})
     for name in ("densify.start", "render.near", "warm_up", "probe.gamma"):
         assert f"{name}," in str(refused.value)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_setting_takes_a_number_that_float32_cannot_hold(method):
+    config = TrainConfig(method=METHODS[method]())
+    every = leaves({**asdict(replace(config, method=TrainConfig().method)), **asdict(config.method)})
+    numbers = [name for name, value in every.items() if isinstance(value, float)]
+    assert len(numbers) > 20
+    for name in numbers:
+        endless = [] if "caps." in name or name == "accuracy" else ["inf"]  # of which it stands for none
+        for value in ("1e39", "-1e39", "1e308", "1e-320", "nan", "-inf", *endless):
+            with pytest.raises(InputError, match="expected"):
+                overridden(config, {name: value})
+            with pytest.raises(InputError, match="expected"):
+                overridden(config, {name: float(value)})

@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from analysis.commands.cli import main
-from analysis.runs.curves import CURVE
+from analysis.runs.curves import CURVE, CURVES, against
 from analysis.runs.curves import main as curves
 from figures.second_order import draw
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -61,10 +61,30 @@ def test_a_cell_starts_from_the_checkpoint_of_its_seed(runs):
     assert f"from {first / 'checkpoint.pt'}" in (polished.parent / "1.log").read_text()
     losses = [pd.read_csv(run / "train.csv").to_dict("list")["loss"][0] for run in (polished, first)]
     assert losses[0] != losses[1]
+    whole = pd.read_csv(runs / CURVES)
+    assert len(whole) == 8 and set(whole["scene"]) == {"still", "polish"} and set(whole["method"]) == {"gn-cg", "3dgs"}
 
 
 def test_the_picture_is_drawn_for_every_scene(runs):
     assert [path.name for path in draw(runs, "png")] == ["polish.png", "still.png"]
+
+
+def test_seconds_to_the_loss_of_another_method_are_shares_of_its_own():
+    def run(method: str, seed: int, seconds: list[float], losses: list[float]) -> pd.DataFrame:
+        return pd.DataFrame({"cpu": seconds, "loss": losses, "held_out": 20.0 + seed}).assign(
+            scene="still", method=method, seed=seed
+        )
+
+    table = pd.concat(
+        [run("adam", 0, [5.0, 10.0], [1e-1, 1e-3]), run("adam", 1, [5.0, 20.0], [1e-1, 1e-2])]
+        + [run("fast", 0, [1.0, 3.0], [1e-2, 1e-4]), run("fast", 1, [1.0, 3.0], [1e-1, 2e-2])]
+    )
+    adam, fast = against(table, "adam").to_dict("records")
+    assert (adam["seconds"], adam["seconds_sd"]) == (1.0, 0.0)
+    assert (fast["seeds"], fast["reached"]) == (2, 1) and fast["seconds"] == pytest.approx(0.2)
+    assert (fast["held_out"], fast["held_out_sd"]) == (20.5, pytest.approx(0.5**0.5))
+    with pytest.raises(ValueError, match="'adam', 'fast'"):
+        against(table, "sgd")
 
 
 def test_runs_without_checkpoints_are_refused(tmp_path, capsys):

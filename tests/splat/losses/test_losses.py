@@ -328,10 +328,9 @@ def test_l1_has_no_slope_at_its_kink():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"pixel": "l3"}, "expected the pixel loss 'l1', 'charbonnier' or 'l2', got 'l3'"),
-        ({"ssim_weight": 1.5}, "expected 0 <= ssim_weight <= 1"),
-        ({"eps": 0.0}, "eps > 0"),
-        ({"eps": float("nan")}, "eps > 0"),
+        ({"pixel": "l3"}, "'pixel': expected 'l1' or 'charbonnier' or 'l2', got 'l3'"),
+        ({"ssim_weight": 1.5}, "'ssim_weight': expected float <= 1"),
+        ({"eps": 0.0}, "'eps': expected float > 0"),
     ],
 )
 def test_wrong_settings_are_refused(wrong, message):

@@ -54,7 +54,7 @@ class SecondOrder(MethodSettings):
     ITERATIONS: ClassVar[int] = 50
 
     def density_control(self, config: TrainConfig) -> DensifySettings:
-        """None: the Gaussians stay those of the start."""
+        """Switched off: the Gaussians stay those of the start."""
         return replace(config.densify, enabled=False)
 
 

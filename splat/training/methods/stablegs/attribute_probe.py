@@ -34,7 +34,7 @@ from landscape.errors import InputError
 from splat.curvature.traces import Dimension, curvature_scale
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
-from splat.model.typed import LARGEST, NonNegative, Positive, Settings, Share
+from splat.model.typed import LARGEST, NonNegative, Positive, Settings, Share, Typed
 from splat.projection.reference import NEEDLE, Splats, condition, on_screen
 
 Attribute = Literal["means", "log_scales", "quats", "opacity_logits", "sh"]
@@ -97,7 +97,7 @@ class ProbeSettings(Settings):
 
 
 @dataclass(frozen=True)
-class Magnitude(Settings):
+class Magnitude(Typed):
     """The step length rho of an attribute, and what it follows from: trace, tau, and rho of Eq. (5) before its cap."""
 
     trace: Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]

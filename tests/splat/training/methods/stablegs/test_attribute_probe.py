@@ -93,7 +93,7 @@ def test_rho_is_c_over_the_root_of_the_mean_curvature():
 
 
 def test_the_papers_dimension_makes_rho_smaller_by_the_root_of_n():
-    wide = ProbeSettings(caps=UNCAPPED, eps=1e-300, dimension="active")
+    wide = ProbeSettings(caps=UNCAPPED, eps=1e-30, dimension="active")
     ours = magnitudes(TRACES, 100, 2, EXTENT, wide)
     papers = magnitudes(TRACES, 100, 2, EXTENT, replace(wide, dimension="attribute"))
     for name in ATTRIBUTES:
@@ -112,7 +112,7 @@ def test_a_trace_that_is_not_positive_gives_the_cap_and_says_so(trace):
 
 def test_the_position_probe_scales_with_the_world():
     """L(x) in units u times as small is L(x / u): its gradients shrink by u, its traces by u^2."""
-    u, settings = 1000.0, ProbeSettings(eps=1e-300)
+    u, settings = 1000.0, ProbeSettings(eps=1e-30)
     for trace in (5.0, -5.0):
         here = magnitudes({"means": trace}, 6, 0, EXTENT, replace(settings, attributes=("means",)))["means"]
         there = magnitudes({"means": trace / u**2}, 6, 0, EXTENT * u, replace(settings, attributes=("means",)))["means"]
