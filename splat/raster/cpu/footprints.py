@@ -1,4 +1,4 @@
-"""What every splat does to the pixels under it: w = alpha T, and D_c = dI_c/dq of the three colours c, q = ln alpha.
+"""Effect of every splat on the pixels under it: w = alpha T, and D_c = dI_c/dq of the three colours c, q = ln alpha.
 
 They are found tile by tile, from back to front as in `blocks.py`, and laid out splat by splat for passes that look at a splat
 as a whole: four vectors (w, D) for each row of each intersection, an intersection's rows one after the other, the
@@ -35,7 +35,7 @@ FOOTPRINT = 4  # vectors of a row: w, D
 
 
 class Footprints(NamedTuple):
-    """Where the rows of each splat lie.
+    """Places of the rows of each splat.
 
     tiles, rows: (accumulators,) tile of an intersection, and its rows as in `Lists`; place: (accumulators + 1,) which row is an
     intersection's first; splat_start: (n + 1,) the first accumulator of each splat.
@@ -60,7 +60,7 @@ def number_rows(lists, tiles, rows, place):
 
 
 def footprints_of(lists: Lists, splat_start: np.ndarray) -> Footprints:
-    """Of the intersections of lists that are numbered splat by splat."""
+    """Footprints of the intersections of lists, which are numbered splat by splat."""
     tiles, rows = np.empty((2, splat_start[-1]), np.int32)
     place = np.empty(splat_start[-1] + 1, np.int64)
     number_rows(lists, tiles, rows, place)
@@ -105,8 +105,8 @@ def footprint_of(params, lists, e, k, x0, y0, frame, state, found, at):
 
 @kernel
 def find_neighbours(counter, params, lists, frame, pixels, width, height, covered, before):
-    """Of every intersection: `covered`, in how many pixels of the image its splat has weight, and `before`, the splat next in
-    front of it among those of its tile that have weight in one of these pixels, or -1."""
+    """For every intersection fill `covered`, the number of pixels of the image in which its splat has weight, and `before`, the
+    splat next in front of it among those of its tile that have weight in one of these pixels, or -1."""
     L = lanes(params)
     state, row = scratch(params, 2 * L * TILE_ROWS), scratch(params, L)  # state: stop, last intersection with weight
     tile = next_tile(counter, lists)
@@ -127,7 +127,7 @@ def find_neighbours(counter, params, lists, frame, pixels, width, height, covere
 
 @formula
 def neighbours_of(params, lists, e, k, x0, y0, frame, state, row):
-    """In how many pixels intersection e has weight, and the nearest intersection in front of it in one of them, or -1."""
+    """Number of pixels in which intersection e has weight, and the nearest intersection in front in one of them, or -1."""
     L = lanes(params)
     _splat, _u, terms, _colour, index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
     none, one = broadcast(params, 0.0), broadcast(params, 1.0)

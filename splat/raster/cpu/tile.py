@@ -45,7 +45,7 @@ TAU, DREST, DGRAD, BACKWARD_TANGENT = 0, 1, 2, 5  # after those of `backward`, f
 
 
 class Lists(NamedTuple):
-    """Which splats touch which tiles, in order of depth within a tile.
+    """Splats that touch each tile, in order of depth.
 
     start: (tiles + 1,) first intersection of each tile; splat: (intersections,); rows: (intersections,) first row |
     last row << 8 within the tile, and CAPPED; accumulator: (intersections,) where their sums go, splat by splat;
@@ -60,7 +60,7 @@ class Lists(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What all pixels share: tiles in a row, floats in a row of a plane, floats in a plane, cap, floor, background (3,).
+    """Constants of all pixels: tiles in a row, floats in a row of a plane, floats in a plane, cap, floor, background (3,).
 
     row_offsets: 0, ..., TILE_ROWS - 1, each `lanes` times: read as vectors, they cost the kernels less than a conversion.
     """
@@ -75,7 +75,7 @@ class Frame(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """What `forward` leaves in each pixel: planes (red, green, blue, alpha), the final T, and where it stopped."""
+    """Results of `forward` in each pixel: planes (red, green, blue, alpha), the final T, and where it stopped."""
 
     planes: np.ndarray
     transmittance: np.ndarray
