@@ -92,7 +92,7 @@ class Check(Struct, kw_only=True):
 
 
 class Skip(Struct, kw_only=True):
-    """What the scene did not need.  seconds_saved: about, by the time of what was done; None where that is not known."""
+    """Work that the scene did not need.  seconds_saved: estimated from the time of the work done; None where not known."""
 
     count: Count
     seconds_saved: Number
@@ -102,7 +102,7 @@ Shapes = dict[str, dict[str, list[Count]]]
 
 
 class ProbeRecord(Struct, kw_only=True):
-    """What `landscape probe` found.
+    """Results of `landscape probe`.
 
     traces: by attribute (means, log_scales, quats, opacity_logits, sh).  quantiles: share -> the eigenvalue that this share of
     all active ones does not exceed; None without a density.  finite_probe, depth, slice: None where they were left out.
@@ -142,7 +142,7 @@ class ProbeRecord(Struct, kw_only=True):
 
 
 class SliceRecord(Struct, kw_only=True):
-    """What `landscape slice` found; fields as in `ProbeRecord`.  finite_probe: along a line; None with two directions."""
+    """Results of `landscape slice`; fields as in `ProbeRecord`.  finite_probe: along a line; None with two directions."""
 
     COMMAND: ClassVar[str] = "slice"
     FILE: ClassVar[str] = "slice.json"
