@@ -280,8 +280,8 @@ def _traces(hessian: SceneHessian, scale: Tensor | None, generator: torch.Genera
 def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnds | None) -> Lead:
     """Start vectors for a search: from an earlier one for the whole, else from the diagonal blocks of Gaussians.
 
-    Both of the Hessian's whole and of rotations; of positions the largest, as several Gaussians make their least curvatures
-    together, and of Gauss-Newton, which has a null space for its smallest.
+    For both ends of the Hessian's whole and of rotations; for the largest alone of positions, whose least curvatures several
+    Gaussians make together, and of Gauss-Newton, whose smallest is 0.
     """
     if name not in (WHOLE, "means", "quats"):
         return Lead()

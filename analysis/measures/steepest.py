@@ -1,4 +1,4 @@
-"""Where an eigenvector of the loss's Hessian acts: the Gaussians that carry it, and renders of steps along it.
+"""Carriers of an eigenvector of the loss's Hessian: the Gaussians in which it lies, and renders of steps along it.
 
 mass       of Gaussian i in a unit vector v: the sum of v^2 over its parameters
 carriers   the Gaussians with most mass, at least LEAST each

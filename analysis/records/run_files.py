@@ -197,7 +197,7 @@ class Fragility(Struct, kw_only=True):
 
 
 class MapRecord(Struct, kw_only=True):
-    """What `landscape map` found.  gaussians, seen: how many, and of these in sight; field: the one that the panels show.
+    """Results of `landscape map`.  gaussians, seen: how many, and of these in sight; field: the one that the panels show.
 
     shades: of the maps, by name; that of "error" is of the mean over the channels of |render - photograph|.
     sentences: what the map says.  steepest: the ends of the spectrum, where a probe has found them.

@@ -131,7 +131,7 @@ def _split(section: str, runs: Sequence[Run], operator: Operator, block: str, na
 
 
 def _method(method: MethodSettings) -> Entry:
-    """Its name, and beneath it the settings that are not the published ones.
+    """Name of a method, and beneath it the settings that are not the published ones.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS
     >>> _method(StableGS(vsp_weight=0.0)).cell

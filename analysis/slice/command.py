@@ -77,7 +77,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
     settings = _settings(options, shape, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
     unfinished, console, start = out.with_name(f".{out.name}.unfinished"), Console(stderr=True), perf_counter()
-    require_replaceable(out, SliceRecord)
+    require_replaceable(out, SliceRecord.FILE)
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
@@ -86,7 +86,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
         expected_peak(objective)  # which may be too much
     # a folder that is being written by another command, or cannot be, is noticed before anything is rendered
-    with record_folder(out, SliceRecord) as folder, stages, telling_needs(objective):
+    with record_folder(out, SliceRecord.FILE) as folder, stages, telling_needs(objective):
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:

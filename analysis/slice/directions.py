@@ -53,7 +53,7 @@ RTOL, MAX_MATVECS = 1e-3, 300  # of the eigenvectors
 
 @dataclass(frozen=True)
 class Shape:
-    """What to slice along: one or two kinds of directions, in how many dimensions, a radius for each or none."""
+    """Directions to slice along: one or two kinds of directions, in how many dimensions, a radius for each or none."""
 
     kinds: tuple[Along, ...]
     dimension: int

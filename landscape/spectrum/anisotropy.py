@@ -1,4 +1,4 @@
-"""How unequal the curvatures are: indices of the spectrum lambda_1 >= ... >= lambda_n (signed), each with a bracket.
+"""Anisotropy of curvatures: indices of the spectrum lambda_1 >= ... >= lambda_n (signed), each with a bracket.
 
     literal         lambda_1 / lambda_n                            the condition number as the paper writes it, signed
     saddle          lambda_1 / |lambda_n|                          of an indefinite operator only

@@ -140,7 +140,7 @@ class CpuRaster:
         return torch.from_numpy(found)
 
     def coupled_blocks(self, loss: Coupling, index: Int[Tensor, " m"]) -> Float64[Tensor, "m 9 9"]:
-        """What the coupling of pixels by the loss adds to the diagonal blocks of the splats at index (ascending)."""
+        """The part of the diagonal blocks of the splats at index (ascending) that the loss's coupling of pixels adds."""
         (lists, splat_start), splats = self.reached, index.numpy()
         blocks = np.zeros((len(splats), SPLAT, SPLAT))
         layout, row = footprints.footprints_of(lists, splat_start), footprints.FOOTPRINT * lanes_of(self.dtype)
@@ -164,7 +164,7 @@ class CpuRaster:
         return torch.from_numpy(blocks)
 
     def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of every intersection: its splat, in how many pixels it has weight, and the splat next in front of it among those of
+        """Every intersection's splat, the number of pixels with weight of it, and the splat next in front of it among those of
         its tile that have weight in one of these pixels (-1: none)."""
         lists = self.reached[0]
         covered, before = np.empty((2, lists.splat.size), np.int32)

@@ -104,7 +104,7 @@ class CudaRaster:
         return self.number_accumulators()
 
     def number_accumulators(self) -> Accumulators:
-        """Where the sums go of the intersections that some pixel reaches."""
+        """Places of the sums of the intersections that some pixel reaches."""
         return binning.number_accumulators(self.lists, self._reached)
 
     @property
