@@ -9,6 +9,7 @@ import gzip
 import io
 import math
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,9 @@ def write_report(folder: str | Path, surface: str | None = None) -> Path:
     return path
 
 
+@cache
 def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environment:
-    """Of the pages whose templates lie in a folder, by default beside this file."""
+    """Of the pages whose templates lie in a folder, by default beside this file; each is compiled once."""
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(folder),
         autoescape=True,

@@ -2,7 +2,7 @@
 
 It brings a zlib whose functions the system's own libz would call too where pycolmap is what loads that, and end the process at
 the next PNG: Python's zlib loads it before.  It takes SIGTERM for itself, to print a C++ stack trace: the handler is put back.
-And what a signal raises as it loads it takes for a fault of its own, or drops: signals that have a handler wait until it is done.
+And what a signal raises as it loads it takes for a fault of its own, or drops: signals that have a handler wait so long.
 """
 
 import signal
