@@ -215,7 +215,7 @@ def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
     elif saddle:
         text = f"The ratio of the two ends of the spectrum is not determined{_in_brackets(saddle.note)}."
         lines.append(Line(text, "caution"))
-    if share and _is_finite(share.value) and not (is_open(share) or is_wide(share)):
+    if share and _is_finite(share.value) and not is_loose(share):
         text = f"The steepest direction alone holds {share.value:.2%} of all absolute curvature"
         lines.append(Line(f"{text}{_bracket(share, '{:.2%}'.format)}."))
     return lines
@@ -234,6 +234,11 @@ def is_wide(index: schema.Index | schema.Effect) -> bool:
         return False
     near, far = sorted((abs(index.low), abs(index.high)))
     return (index.low > 0) != (index.high > 0) or far > WIDEST * near
+
+
+def is_loose(index: schema.Index) -> bool:
+    """Whether its bracket is open or wide, so that no value is shown."""
+    return is_open(index) or is_wide(index)
 
 
 def remedy(data: ProbeRecord, name: str) -> str:
@@ -268,7 +273,7 @@ def _of_open(data: ProbeRecord) -> list[Line]:
             "open" if is_open(index) else "caution",
         )
         for name, index in data.anisotropy.items()
-        if is_open(index) or is_wide(index)
+        if is_loose(index)
     ]
 
 
