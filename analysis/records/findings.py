@@ -1,4 +1,4 @@
-"""What a record says, in sentences: which attribute carries the curvature, saddle or basin, how anisotropic, what was skipped.
+"""Sentences on a record: which attribute carries the curvature, saddle or basin, how anisotropic, what was skipped.
 
 Every sentence follows from numbers of the record and their errors alone; where an error does not decide, it says so.
 """
@@ -70,7 +70,7 @@ def headline(data: ProbeRecord) -> list[Line]:
 
 
 def of_checks(checks: Mapping[str, Check]) -> list[Line]:
-    """What failed or could not run of a probe's self-checks, or that all passed."""
+    """Lines on self-checks that failed or could not run, or that all passed."""
     lines = []
     for name, check in checks.items():
         label, note = name.replace("_", " "), _in_brackets(check.note)
@@ -110,7 +110,7 @@ def _of_traces(data: ProbeRecord) -> list[Line]:
 
 
 def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
-    """By attribute, what a trace of 1 changes of the loss in a random step, as a share of it; empty where that is not known."""
+    """Share of the loss by which a trace of 1 changes it in a random step, by attribute; empty where that is not known."""
     loss = data.objective.value
     if not data.steps or not loss or not loss > 0 or set(data.traces) - set(data.steps):
         return {}
@@ -189,7 +189,7 @@ def _of_ends(data: ProbeRecord) -> list[Line]:
 
 
 def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
-    """Which searches, for the ends "max" and "min", ended at a budget.
+    """Lines on the searches, for the ends "max" and "min", that ended at a budget.
 
     The residual of what they found says that an eigenvalue is near, not that none lies beyond.
     """
@@ -304,7 +304,7 @@ def _of_finite_probe(probe: schema.FiniteProbe | None) -> list[Line]:
 
 
 def resolved(probe: schema.FiniteProbe) -> list[bool]:
-    """At which finite steps round-off does not hide the curvature."""
+    """Mask of the finite steps at which round-off does not hide the curvature."""
     here = abs(probe.infinitesimal or 0.0)
     pairs = zip(probe.curvatures, probe.round_off, strict=True)
     return [
@@ -334,7 +334,7 @@ def _of_depth(depth: schema.Depth | None) -> list[Line]:
 
 
 def _of_block_shares(shares: Sequence[schema.BlockShare]) -> list[Line]:
-    """What methods assume that keep the Gaussians' own blocks, or the diagonal, of an operator."""
+    """Lines on what methods assume that keep the diagonal blocks of Gaussians, or the diagonal, of an operator."""
     names, parts = {"hessian": "the Hessian", "gauss-newton": "Gauss-Newton"}, []
     for one in shares:
         if one.blocks is not None and one.diagonal is not None:
@@ -347,7 +347,7 @@ def _of_block_shares(shares: Sequence[schema.BlockShare]) -> list[Line]:
 
 
 def _of_skips(skipped: Mapping[str, Skip]) -> list[Line]:
-    """What was left out, the largest saving first."""
+    """Lines on work left out, the largest saving first."""
     parts = []
     for name, skip in sorted(skipped.items(), key=lambda item: -(item[1].seconds_saved or 0.0)):
         if skip.count:

@@ -141,7 +141,7 @@ def numbers(data: ProbeRecord) -> list[dict[str, str]]:
     ends, found = data.eigenvalues, []
     lowest = "most negative" if (ends.min.value or 0.0) < 0 else "smallest"
     for end, words in ((ends.max, "largest curvature, λ max"), (ends.min, f"{lowest} curvature, λ min")):
-        found.append({"value": measured(end.value, end.residual), "words": words})
+        found.append({"value": measured(end.value, end.residual), "words": f"{words}, per stored unit²"})
     found += _steepest_attribute(data)
     if index := data.anisotropy.literal:
         cell = bracketed(None if is_open(index) else index)
@@ -220,8 +220,8 @@ def where(record: Record[ProbeRecord], said: str) -> list[dict[str, str]]:
     for end in found.steepest:
         text = end.rendered if end.sentence == said else f"{end.sentence} {end.rendered}"
         shown.append((end.file, text, end.sentence, carriers_in_words(end)))
-    fragile = " ".join(found.sentences[len(found.steepest) :])
-    panel = found.panels[0] if found.panels else None
+    fragile, named = "\n".join(found.sentences[len(found.steepest) :]), {end.view for end in found.steepest[:1]}
+    panel = next((panel for panel in found.panels if panel.name in named), found.panels[0] if found.panels else None)
     words = f"{panel.name}: maps of its fragility in position, conditioning and opacity." if panel else ""
     shown.append((panel.file.replace("view", "fragility") if panel else "", fragile, words, words))
     return [

@@ -173,8 +173,8 @@ def test_every_picture_has_words_with_its_numbers(tmp_path):
 def test_the_five_numbers_carry_their_errors_and_one_without_bracket_is_none():
     data, _ = synthetic()
     found = {each["words"]: each["value"] for each in numbers(probe_of(data))}
-    assert found["largest curvature, λ max"] == "(3.1000 ± 0.0012) × 10⁴"
-    assert found["most negative curvature, λ min"] == "−220.0 ± 3.0"
+    assert found["largest curvature, λ max, per stored unit²"] == "(3.1000 ± 0.0012) × 10⁴"
+    assert found["most negative curvature, λ min, per stored unit²"] == "−220.0 ± 3.0"
     assert found["trace of position, the largest of five in their own units"] == "(3.991 ± 0.093) × 10⁵"
     assert found["λ max / |λ min|, of opposite signs"] == "140.9 ± 2.1"
     data["anisotropy"]["literal"] |= {"value": -361.0, "low": 0.0, "high": None}
@@ -183,7 +183,7 @@ def test_the_five_numbers_carry_their_errors_and_one_without_bracket_is_none():
     data["eigenvalues"]["min"] |= {"value": 5.0}
     data["anisotropy"]["literal"] |= {"value": 6200.0, "low": 3900.0, "high": 15500.0}
     found = {each["words"]: each["value"] for each in numbers(probe_of(data))}
-    assert found["smallest curvature, λ min"] == "5.0 ± 3.0"
+    assert found["smallest curvature, λ min, per stored unit²"] == "5.0 ± 3.0"
     assert found["λ max / λ min (3900 … 1.55 × 10⁴)"] == "6200"
 
 
