@@ -21,6 +21,7 @@ KINDS = {"all": "all runs", "between": "means of methods", "within": "seeds of a
 VERDICTS = {"holds": BLUE, "holds in part": BLUE, "does not hold": VERMILION, "cannot be tested here": UNDETERMINED}
 ROW, PANEL, WRAP = 0.17, 0.8, 76  # inches; characters
 SMALL = 150  # dots per inch of a statement's own picture
+CROWDED = 1e3  # from the least ratio to the largest: powers of ten alone are labelled
 FAR = 1e4  # a ratio beyond this, or below its inverse, ends at the edge
 
 
@@ -32,6 +33,8 @@ def draw_claims(table: pd.DataFrame) -> Figure:
         panels = figure.subplots(len(parts), 1, squeeze=False, height_ratios=[len(part) + 2 for part in parts])[:, 0]
         for axes, part in zip(panels, parts, strict=True):
             _effects(axes, part)
+        words = "dot: measured, with its 95% interval; diamond: the paper; upright line: no effect, or the bound"
+        figure.supxlabel(words, fontsize=6.5)
     return figure
 
 
@@ -42,7 +45,9 @@ def _effects(axes: Axes, part: pd.DataFrame) -> None:
     several = part["n"].to_numpy() >= 2
     if unit == "×":
         axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
+        ends = np.concatenate([x[np.isfinite(x) & (x > 0)] for x in (value, low, high, claimed)])
+        wide = ends.size and ends.max() > CROWDED * ends.min()
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0), numticks=8))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
         value, low, high = (np.clip(x, 1 / FAR, FAR) for x in (value, low, high))

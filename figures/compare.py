@@ -69,7 +69,7 @@ def draw_traces(records: Records) -> Figure:
         axes.set_ylim(len(names) - 0.4, -0.6)
         axes.tick_params(axis="y", length=0)
         axes.grid(True, axis="x")
-        axes.set_xlabel("|trace| (loss per squared stored unit)")
+        axes.set_xlabel("|trace|; attributes have units of their own and do not compare")
         axes.set_title("Trace by attribute", loc="left")
         _legend(figure, records, marker="o")
     return figure

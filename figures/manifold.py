@@ -163,8 +163,8 @@ def surface(
         axis.set_major_locator(FixedLocator(_inner_ticks(reach)))
     axes.zaxis.set_major_locator(MaxNLocator(3))
     axes.tick_params(labelsize=5, pad=-3)
-    axes.set_xlabel(scale.step_label("e₁"), fontsize=6, labelpad=-4)
-    axes.set_ylabel(scale.step_label("e₂"), fontsize=6, labelpad=-3)
+    axes.set_xlabel(f"e₁{unit_suffix(scale.steps)}", fontsize=6, labelpad=-4)
+    axes.set_ylabel(f"e₂{unit_suffix(scale.steps)}", fontsize=6, labelpad=-3)
     axes.set_title(f"{literal(title)}\n{scale.loss_label}", y=0.95)
     axes.view_init(elev=32, azim=-58)
     # the layout does not count the labels of such axes

@@ -40,7 +40,8 @@ def draw_scene(table: pd.DataFrame) -> Figure:
                     axes.set_yscale("log")
         for j, words in enumerate(ACROSS.values()):
             panels[1, j].set_xlabel(words)
-        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.suptitle("lines: means over the seeds; bands: from the lowest to the highest", fontsize=7)
     return figure
 
 

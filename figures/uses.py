@@ -8,6 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from analysis.records.quantities import quantity
 from figures.style import (
     BLACK,
     BLUE,
@@ -125,14 +126,20 @@ PICTURES = {"curve": draw_curve, "gains": draw_gains, "study": draw_study}
 
 def draw_uncertainty(path: Path) -> Figure:
     """A held-out view: its photograph, its error, and the standard deviations of its pixels by blocks and by the diagonal."""
-    words = {"photograph": "photograph", "error": "|error|", "block": "uncertainty, blocks", "diagonal": "and diagonal"}
+    words = {
+        "photograph": "photograph",
+        "error": "|error|",
+        "block": "uncertainty (blocks)",
+        "diagonal": "uncertainty (diagonal)",
+    }
     with style(), np.load(path, allow_pickle=False) as maps:
         height, width = maps["error"].shape
         figure = new_figure(6.6 / len(words) * height / width + 0.4, 6.6)
         for axes, (name, title) in zip(figure.subplots(1, len(words)), words.items(), strict=True):
             top = None if name == "photograph" else np.quantile(maps[name], 0.99) or 1.0
             axes.imshow(maps[name], cmap=FIELD_MAP, vmin=0, vmax=top)
-            axes.set(title=title, xticks=[], yticks=[])
+            scale = "" if top is None else f"from 0 to {quantity(float(top))}"
+            axes.set(title=title, xticks=[], yticks=[], xlabel=scale)
     return figure
 
 

@@ -216,7 +216,8 @@ class Viewer:
                 "/picked/outline", self.frame.outline(gaussians, index), MARK, thickness=2.0, thickness_units="screen"
             )
             place = tuple(self.frame.place(gaussians.means[index]).tolist())
-            scene.add_label("/picked/label", f"Gaussian {self._number(index):,}", position=place)
+            words = f"● Gaussian {self._number(index):,}"  # the dot lies on it, above all splats
+            scene.add_label("/picked/label", words, position=place, anchor="center-left")
 
     def _number(self, index: int) -> int:
         """Of a Gaussian in sight, among all."""
