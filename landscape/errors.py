@@ -19,7 +19,7 @@ class InputError(ValueError):
 
 
 class TooLittleMemory(MemoryError):
-    """There is less memory than is known to be needed: says how much, and what would fit."""
+    """Less memory than is known to be needed: says how much, and what would fit."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -26,7 +26,7 @@ def slice_of(data: dict[str, Any]) -> SliceRecord:
 def written(folder: Path, data: dict[str, Any], arrays: dict[str, dict[str, np.ndarray]]) -> Record[Any]:
     """The record in a folder: of a probe, or of a slice where there are no traces."""
     record = probe_of(data) if "traces" in data else slice_of(data)
-    with record_folder(folder, type(record)) as partial:
+    with record_folder(folder, record.FILE) as partial:
         write_record(partial, record, arrays)
     return read_record(folder)
 

@@ -34,7 +34,7 @@ class Size:
 
     @classmethod
     def parse(cls, text: str) -> "Size":
-        """From "10k@504x378"."""
+        """Size from "10k@504x378"."""
         match = re.fullmatch(r"(\d+)(k?)@(\d+)x(\d+)", text)
         size = cls(int(match[1]) * (1000 if match[2] else 1), int(match[3]), int(match[4])) if match else None
         if size is None or min(size.count, size.width, size.height) < 1:

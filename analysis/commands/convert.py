@@ -30,7 +30,7 @@ FAINT = 0.01  # of alpha: what is less covered is as far as the farthest that is
 
 @dataclass(frozen=True)
 class Seen:
-    """How Gaussians were rendered.  centred: with the principal points in the images' middles; moved: in another world."""
+    """Rendering of Gaussians.  centred: with the principal points in the images' middles; moved: in another world."""
 
     render: RenderSettings
     centred: bool

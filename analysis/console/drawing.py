@@ -33,7 +33,7 @@ def draw(module: str, target: Path, *options: str) -> list[str]:
 
 
 def draw_or_say(module: str, target: Path) -> list[str]:
-    """As `draw`; where it fails, with its words: the numbers stand without pictures."""
+    """Files of `draw`; where it fails, its words: the numbers stand without pictures."""
     try:
         return draw(module, target)
     except RuntimeError as error:

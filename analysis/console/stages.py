@@ -25,7 +25,7 @@ STRAYS = 4.0  # by which the time of a unit may be wrong
 
 
 class Work(NamedTuple):
-    """What a stage is expected to take.  seconds: in all; units: of its progress, 0 where these take unlike times."""
+    """Expected work of a stage.  seconds: in all; units: of its progress, 0 where these take unlike times."""
 
     seconds: float
     units: float = 0.0

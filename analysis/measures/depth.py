@@ -251,7 +251,7 @@ def _signs(
 def _directions(
     objective: SceneObjective, index: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Along and across the rays, of the length of a pixel."""
+    """Steps along and across the rays, as long as a pixel is there."""
     ray, camera, means = rays_of(objective, index), objective.views[index].camera, objective.active.means
     pixel = (means - camera.centre.to(means)).norm(dim=1, keepdim=True) / float(camera.fx)
     z = draw_probes(4 * len(ray), 1, generator, torch.float64, "gaussian").view(-1, 4).to(means)

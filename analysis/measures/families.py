@@ -77,7 +77,7 @@ class FamilyOptions:
 
 @dataclass(frozen=True, eq=False)
 class FamilyRow:
-    """One family and what it is of.  dim: rows of the operator, those of the null space (see `Family.rank`) counted."""
+    """One family: its scene, operator and block.  dim: rows of the operator, with its null space (see `Family.rank`)."""
 
     scene: SceneName
     operator: schema.Operator
@@ -182,7 +182,7 @@ def measure_families(
 
 
 def expected_families(options: FamilyOptions) -> dict[str, tuple[int, float, float]]:
-    """What every stage takes: units, as its progress counts them, products of as many vectors as a batch has, and renders."""
+    """Expected work of every stage: units of its progress, products of as many vectors as a batch has, and renders."""
     scenes: dict[SceneName, float] = {"trained": 1.0}
     if options.split_control:
         scenes["split"] = SPLIT
@@ -278,10 +278,10 @@ def _traces(hessian: SceneHessian, scale: Tensor | None, generator: torch.Genera
 
 
 def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnds | None) -> Lead:
-    """Where an earlier search knows the ends of the whole to lie, or the Gaussians' own blocks those of it or an attribute.
+    """Start vectors for a search: from an earlier one for the whole, else from the diagonal blocks of Gaussians.
 
-    Both of the Hessian's whole and of rotations; of positions the largest, as several Gaussians make their least curvatures
-    together, and of Gauss-Newton, which has a null space for its smallest.
+    For both ends of the Hessian's whole and of rotations; for the largest alone of positions, whose least curvatures several
+    Gaussians make together, and of Gauss-Newton, whose smallest is 0.
     """
     if name not in (WHOLE, "means", "quats"):
         return Lead()
@@ -298,7 +298,7 @@ def _lead(hessian: SceneHessian, name: str, scale: Tensor | None, ends: EigenEnd
 
 
 def _seconds_a_product(operator: SymmetricOperator, batch: int, objective: SceneObjective) -> float:
-    """With `batch` vectors where the scene is; the kernels may be compiled for the first."""
+    """Seconds of a product with `batch` vectors; the second counts, as kernels may compile in the first."""
     V, start = objective.active.flat.new_ones(operator.dim, batch), 0.0
     for _ in range(2):
         start = monotonic()

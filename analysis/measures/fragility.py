@@ -60,7 +60,7 @@ def fragility(
 
 
 def share_of(amounts: Tensor, chosen: Tensor) -> float:
-    """Of the sum of amounts, what those chosen have; nan where it is 0."""
+    """Share of the chosen in the sum of amounts; nan where that is 0."""
     return float(amounts[chosen].sum() / amounts.sum())
 
 
@@ -76,7 +76,7 @@ def opacity_one_view(values: Values) -> float:
 
 
 def _ranks(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Those that are equal have the mean of theirs; scipy.stats would take half a second to load."""
+    """Ranks, of equal values their mean rank; scipy.stats would take half a second to load."""
     _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
     return (np.cumsum(counts) - counts / 2)[place]
 

@@ -51,7 +51,7 @@ def masses(vector: Float[Tensor, " p"], gaussians: Gaussians) -> Float64[Tensor,
 
 
 def participation(mass: Float[Tensor, " n"]) -> float:
-    """Over how many Gaussians the mass is spread.
+    """Number of Gaussians over which the mass is spread.
 
     >>> participation(torch.tensor([0.0, 2.0, 2.0, 0.0]))
     2.0

@@ -1,4 +1,4 @@
-"""What fits into memory: how many vectors; and, where it ran out, what a probe or a slice takes and what would fit."""
+"""Limits by memory: how many vectors fit; and, where it ran out, what a probe or a slice takes and what would fit."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -89,7 +89,7 @@ def _gb(size: float) -> str:
 
 @contextmanager
 def telling_needs(objective: SceneObjective) -> Iterator[None]:
-    """Where memory runs out, MemoryError that says what products with the Hessian take, what was free, and what would fit."""
+    """Make a MemoryError say what products with the Hessian take, what was free, and what would fit."""
     free = free_memory(objective.active.flat.device)
     try:
         yield

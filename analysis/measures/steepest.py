@@ -1,13 +1,13 @@
-"""An eigenvector of the loss shown where it acts: the Gaussians that carry it, in the view where they weigh most.
+"""Carriers of an eigenvector of the loss's Hessian: the Gaussians in which it lies, and renders of steps along it.
 
-    mass       of Gaussian i in a unit vector v: the sum of v^2 over its parameters; carriers have at least LEAST of it
-    steps      sqrt(2 RISE L / |lambda|), by which the curvature alone changes the loss L by RISE L, and its halves
-    factor     of a step s: the mean change of the loss by +s and -s, rendered, over lambda s^2 / 2.  The slope drops out; 1
-               where the second-order model holds
-    renders    at -step, 0 and +step along v, all Gaussians moved at once, in the part of the view around the first carrier, at
-               the longest step whose factor is within AGREES of 1, else whose sign is the curvature's, else of all
-
-The sentence names the attribute in which the first carrier has most of its mass.
+mass       of Gaussian i in a unit vector v: the sum of v^2 over its parameters
+carriers   the Gaussians with most mass, at least LEAST each
+view       the one in which the first carrier has most weight
+steps      sqrt(2 RISE L / |lambda|), at which curvature alone changes the loss L by RISE L, halved again and again
+factor     of a step s: the mean change of the rendered loss at +s and -s, over lambda s^2 / 2; the slope cancels, and the
+           factor is 1 where the second-order model holds
+renders    of the view around the first carrier, all Gaussians moved by -step, 0 and +step along v; the step is the longest
+           whose factor is within AGREES of 1, else the longest with a factor above 0, else the longest
 """
 
 from collections.abc import Sequence
@@ -33,12 +33,15 @@ from splat.render.render import render
 from splat.render.sight import Sight
 from splat.scenes.view import View
 
-LEAST, MOST = 0.05, 5  # share of a carrier; how many at most
-RISE, STEPS = 0.01, 7  # of the loss, at the longest; at the shortest 2e-6 of it, fifty times the rounding of float32
-AGREES = 0.2  # of the change by curvature
-SIGMAS = 2.0  # of an outline
-ROOM, SMALLEST = 1.3, 8  # around an outline; a crop is at least 1 / SMALLEST of its view
-WORDS = {"means": "moves", "log_scales": "stretches", "quats": "turns", "opacity_logits": "fades", "sh": "recolours"}
+LEAST, MOST = 0.05, 5  # share of the mass that makes a carrier; most carriers
+RISE, STEPS = (
+    0.01,
+    7,
+)  # share of the loss, at the longest step (at the shortest 2e-6: fifty times float32's rounding); steps
+AGREES = 0.2  # largest |factor - 1| that counts as agreement
+SIGMAS = 2.0  # standard deviations at which an outline is drawn
+ROOM, SMALLEST = 1.3, 8  # size of a crop: in outlines; at least 1 / SMALLEST of its view
+VERBS = {"means": "moves", "log_scales": "stretches", "quats": "turns", "opacity_logits": "fades", "sh": "recolours"}
 PLACES = (
     ("in the upper left", "at the top", "in the upper right"),
     ("at the left", "in the middle", "at the right"),
@@ -49,7 +52,7 @@ Pictures = dict[str, UInt8[np.ndarray, "..."]]
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """An end of the spectrum: unit vector and eigenvalue; title: in words, as in "the steepest direction"."""
+    """An end of the spectrum: unit eigenvector and eigenvalue; title: such as "the steepest direction"."""
 
     name: str
     title: str
@@ -60,9 +63,9 @@ class End:
 def steepest(
     objective: SceneObjective, end: End, values: Values, sights: Sequence[Sight], file: str
 ) -> tuple[Steepest, Pictures]:
-    """Where an eigenvector acts, and its pictures: view, photograph, minus, zero, plus (h, w, 3), difference (h, w), in bytes.
+    """Carriers, steps and pictures of an eigenvector; pictures in bytes: view, photograph, minus, zero, plus, difference.
 
-    values, sights: of the objective's fields.  file: the pictures' name.
+    values, sights: from `scene_fields`.  file: name of the pictures' file, for the record.
     """
     mass = masses(end.vector, objective.active)
     mass = mass / mass.sum()
@@ -96,7 +99,7 @@ def steepest(
 def _losses_at(
     objective: SceneObjective, vector: Float[Tensor, " p"], steps: Sequence[float]
 ) -> list[tuple[float, float]]:
-    """The loss at -step and at +step, for every step; as many at once as there are threads."""
+    """The loss at -step and at +step for every step, computed in parallel."""
 
     @single_threaded()
     def loss(step: float) -> float:
@@ -108,7 +111,7 @@ def _losses_at(
 
 
 def shown_step(factors: Sequence[float]) -> int:
-    """The longest of the steps at which renders agree with the curvature, else have its sign, else of all.
+    """Index of the longest step whose factor is within AGREES of 1, else above 0, else of the longest; the longest come first.
 
     >>> shown_step([0.5, 1.1, 0.9]), shown_step([-0.2, 0.5]), shown_step([-0.2, -1.0])
     (1, 1, 0)
@@ -118,7 +121,7 @@ def shown_step(factors: Sequence[float]) -> int:
 
 
 def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Sequence[float]) -> str:
-    """What renders say of the curvature, at the step that is shown and over all steps, which begin with the longest."""
+    """Sentence that compares renders with the curvature, at the step shown and over all steps, the longest first."""
     best = shown_step(factors)
     step, factor, alone = steps[best], factors[best], end.curvature * steps[best] ** 2 / 2 / loss
     extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])}"
@@ -142,10 +145,10 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
 def _carrier(
     objective: SceneObjective, view: View, end: End, values: Values, mass: Float64[Tensor, " n"], i: int
 ) -> Carrier:
-    active = objective.active
-    own = active.with_flat(end.vector).select(torch.tensor([i]))
-    shares = mass_shares(own.flat, own.blocks)
-    splats, _, _ = projected(active.select(torch.tensor([i])), lens_of(view.camera, objective.settings))
+    active, index = objective.active, torch.tensor([i])
+    part = active.with_flat(end.vector).select(index)
+    shares = mass_shares(part.flat, part.blocks)
+    splats, _, _ = projected(active.select(index), lens_of(view.camera, objective.settings))
     outline = outline_of(splats[0].double())
     return Carrier(
         gaussian=int(objective.mask.nonzero()[i, 0]),
@@ -161,7 +164,7 @@ def _carrier(
 
 
 def outline_of(splat: Float64[Tensor, "9"]) -> list[float]:
-    """Centre x, y, half axes at SIGMAS standard deviations, px, and the angle of the longer one.
+    """Ellipse of a splat at SIGMAS standard deviations: centre x, y and half axes in px, angle of the longer axis.
 
     >>> outline_of(torch.tensor([5.0, 6.0, 0.25, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
     [5.0, 6.0, 4.0, 2.0, 0.0]
@@ -174,7 +177,7 @@ def outline_of(splat: Float64[Tensor, "9"]) -> list[float]:
 
 
 def crop_around(outline: Sequence[float], width: int, height: int) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of a part of a picture, of the picture's shape, around what it has of an outline.
+    """Left, top, right, bottom of a crop, with the picture's aspect ratio, around the part of an outline in the picture.
 
     >>> crop_around([10.0, 90.0, 3.0, 1.0, 0.0], 160, 120)
     (0, 82, 20, 97)
@@ -218,12 +221,15 @@ def _pictures(
 
 
 def in_bytes(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "3 h w"]:
-    """An image, clamped to [0, 1]."""
+    """An image clamped to [0, 1], as bytes."""
     return (image.detach().clamp(0, 1) * 255).round().byte().numpy()
 
 
 def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, count: int) -> str:
-    """What the first carrier is, and how much of the vector it has.  spread: the participation; count: of views."""
+    """Sentence on the first carrier: its share of the vector, its shape, its place.  spread: participation; count: of views.
+
+    The verb is that of the attribute with most of its mass.
+    """
     first = carriers[0]
     name = max(first.attributes, key=first.attributes.__getitem__)
     kind = f"a splat of {first.aspect:.1f} : 1"
@@ -240,6 +246,6 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
         seen += f", one of which has {first.one_view:.0%} of its weight"
     alone = "" if first.share >= 0.5 else f"; it is spread over {spread:.0f} Gaussians"
     return (
-        f"{percent(first.share)} of {end.name}, {end.title}, lies on Gaussian {first.gaussian:,}, which it {WORDS[name]}: "
+        f"{percent(first.share)} of {end.name}, {end.title}, lies on Gaussian {first.gaussian:,}, which it {VERBS[name]}: "
         f"{kind} {PLACES[row][column]} of {view.name.rpartition('/')[2]}{outside}, seen by {seen}{alone}."
     )

@@ -41,7 +41,7 @@ def scene_units(objective: SceneObjective, size: float | None = None) -> Float[T
 
 
 def step_lengths(rates: LearningRates, extent: float) -> dict[str, float]:
-    """How far Adam's first step moves a parameter, by attribute: its learning rate; of colour that of the constant band.
+    """Length of Adam's first step by attribute: its learning rate; of colour that of the constant band.
 
     >>> step_lengths(LearningRates(), 2.0)["means"]
     0.00032

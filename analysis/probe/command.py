@@ -27,8 +27,9 @@ from analysis.console.recording import write_with_pictures
 from analysis.console.stages import Stages
 from analysis.measures.memory import expected_peak, require_pictures, size_of, telling_needs
 from analysis.measures.units import step_lengths
-from analysis.probe.measurement import Expected, expected_seconds, measure, seconds_of_render
+from analysis.probe.measurement import measure
 from analysis.probe.options import ProbeOptions
+from analysis.probe.plan import Expected, expected_seconds, seconds_of_render
 from analysis.probe.record import probe_arrays, probe_record, provenance_of
 from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import remarks, summary
@@ -74,12 +75,8 @@ def _run(
     start, begun = perf_counter(), monotonic()
     settings, family_options = _settings(options), _family_options(options)
     limit = inf if options.seconds is None else options.seconds
-    if ranks is not None and isfinite(limit):  # no process's clock may decide what all measure
-        raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {limit:g}")
-    if ranks is not None and family_options is not None:
-        raise InputError(
-            "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
-        )
+    if ranks is not None:
+        _require_same_in_all_processes(limit, family_options)
     writes = ranks is None or ranks.rank == 0
     console, unfinished = Console(stderr=True, quiet=not writes), out.with_name(f".{out.name}.unfinished")
     require_replaceable(out)
@@ -91,12 +88,11 @@ def _run(
     say(_introduction(scene, checkpoint, objective), console=console)
     after = _expected_after(family_options)
     say(_expected(objective, settings, after), console=console)
+    pictures = digests(scene.select(checkpoint.scene.train))
     told = (
-        f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} "
-        f"{digests(scene.select(checkpoint.scene.train))} {settings} "
+        f"{_digest(options.checkpoint)} {options.foreign} {options.loss} {scene.root} {pictures} {settings} "
         f"{options.seed} {device} {versions()}"
     )
-    deadline = begun + limit - DRAWING
     # a folder that is being written by another command, or cannot be, is noticed before anything is measured
     with (
         record_folder(out) if writes else nullcontext() as folder,
@@ -105,26 +101,16 @@ def _run(
         telling_needs(objective),
     ):
         generator = torch.Generator(device).manual_seed(options.seed)
-        found = measure(
-            objective,
-            settings,
-            generator,
-            stages,
-            None if ranks else unfinished,
-            told,
-            deadline,
-            checkpoint.all_views,
-            after,
-        )
+        kept, views, deadline = None if ranks else unfinished, checkpoint.all_views, begun + limit - DRAWING
+        found = measure(objective, settings, generator, stages, kept, told, deadline, views, after)
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         data, arrays = probe_record(found, objective, made, stages.timing), probe_arrays(found)
         data.steps = step_lengths(checkpoint.training.config.rates, checkpoint.training.extent)
         if family_options is not None:
             from analysis.measures.families import measure_families
 
-            stream = spawn(generator)
             families = measure_families(
-                objective, checkpoint.training, family_options, stream, stages.stage, found.ends
+                objective, checkpoint.training, family_options, spawn(generator), stages.stage, found.ends
             )
             data, arrays["families"] = families.added_to(data), families.arrays()
             data.provenance.families = asdict(family_options)
@@ -139,9 +125,18 @@ def _run(
     return CHECK_FAILED if options.strict and failed else 0
 
 
+def _require_same_in_all_processes(limit: float, families: "FamilyOptions | None") -> None:
+    if isfinite(limit):  # no process's clock may decide what all measure
+        raise InputError(f"expected --seconds inf under torchrun, as without --seconds, got {limit:g}")
+    if families is not None:
+        raise InputError(
+            "expected no --families, --split-control or --metric under torchrun, got one; run it in one process"
+        )
+
+
 @contextmanager
 def _kept(folder: Path, command: Sequence[str], console: Console) -> Iterator[None]:
-    """Says of an interrupted probe how to go on."""
+    """Tell how to go on after an interrupted probe."""
     try:
         yield
     except KeyboardInterrupt:
@@ -223,7 +218,7 @@ def _settings(options: ProbeOptions) -> ProbeSettings:
 
 
 def _family_options(options: ProbeOptions) -> "FamilyOptions | None":
-    """None where no families are asked for; the split control and a metric ask for them too."""
+    """Options of the families, None where they are not asked for; the split control and a metric ask for them too."""
     if not (options.families or options.split_control or options.metric != "parameters"):
         return None
     from analysis.measures.families import FamilyOptions  # a fifth of a second of imports

@@ -1,4 +1,4 @@
-"""What a probe measured as a record (`analysis.records.records.ProbeRecord`) and its arrays."""
+"""Record (`analysis.records.records.ProbeRecord`) and arrays of a probe's results."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from analysis.measures.gradient_check import ENOUGH
 from analysis.measures.localization import conditions, localize, mass_shares
-from analysis.probe.measurement import LeftOut, Measured, PlaneSlice
+from analysis.probe.measured import LeftOut, Measured, PlaneSlice
 from analysis.records import schema
 from analysis.records.provenance import Provenance, provenance
 from analysis.records.records import Check, Counts, ProbeRecord, Skip
@@ -96,7 +96,7 @@ def grid_arrays(grid: Grid) -> dict[str, np.ndarray]:
 def provenance_of(
     seed: int, path: Path, command: Sequence[str], settings: Any, checkpoint: Checkpoint, scene: Scene
 ) -> Provenance:
-    """Where the numbers of a probe or a slice come from.  path: of the checkpoint; settings: a dataclass; command: as typed."""
+    """Provenance of a probe or a slice.  path: of the checkpoint; settings: a dataclass; command: as typed."""
     return provenance(
         seed,
         lanes=lanes_of(np.float32),
@@ -133,7 +133,7 @@ def loss_name(loss: LossSettings) -> str:
 
 
 def left_out_note(views: int, population: int | None) -> list[str]:
-    """What can be said of the views left out, and what cannot."""
+    """Note on the effect of views left out, where it is known and where not."""
     if population is None:
         return []
     return [
@@ -291,7 +291,7 @@ def _counts(found: Measured, objective: SceneObjective) -> Counts:
 
 
 def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, float]) -> dict[str, Skip]:
-    """What products of the exact Hessian leave out, over all views, and what estimators that had finished left undone.
+    """Work that products of the exact Hessian skip, over all views, and that estimators did not need.
 
     The latter's time is that of as many samples or renders as were made.  Products on the GPU also leave out the tiles in which
     their vectors move nothing, which is not counted.
@@ -299,7 +299,7 @@ def _skipped(found: Measured, objective: SceneObjective, timing: Mapping[str, fl
     counts, probes = objective.counts, [trace.probes for trace in found.traces.values()]
 
     def total(count: int) -> int:
-        """Over the views of all processes."""
+        """Sum over the views of all processes."""
         return int(objective.ranks.sum(torch.tensor(count)))
 
     products = {

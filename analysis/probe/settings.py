@@ -1,4 +1,4 @@
-"""How much of everything a probe measures."""
+"""Settings of a probe: how much of everything it measures."""
 
 from dataclasses import dataclass, field
 
@@ -13,7 +13,7 @@ FEWEST_PRODUCTS = 16  # of a density
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """How much of everything; the defaults are for numbers to 1%.
+    """Amounts of everything; the defaults are for numbers to 1%.
 
     checked_vectors, checked_views: of the self-checks; None: all views.
     trace_samples: exactly so many for each trace; None: as many as `traces` asks for.

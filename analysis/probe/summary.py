@@ -13,7 +13,7 @@ SHORT = {"means": "position", "log_scales": "scale", "quats": "rotation", "opaci
 
 
 def summary(data: ProbeRecord, report: Path) -> list[str]:
-    """What scene, both ends of the spectrum, the traces' order, an index, the checks, and the page to open."""
+    """Lines on the scene, both ends of the spectrum, the traces' order, an index, the checks, and the page to open."""
     counts, made = data.counts, data.provenance
     scene = f"{made.scene or 'scene'} after {made.iteration or 0:,} steps"
     return [
@@ -27,14 +27,14 @@ def summary(data: ProbeRecord, report: Path) -> list[str]:
 
 
 def _views(counts: Counts) -> str:
-    """How many; where some were left out, what stands beside the numbers."""
+    """Number of views; where some were left out, what stands beside the numbers."""
     if not counts.views_of:
         return f"{counts.views} views"
     return f"{counts.views} of {counts.views_of} views (∓: what the others may change)"
 
 
 def remarks(data: ProbeRecord, verbose: bool) -> list[Line]:
-    """What failed and what is not known; verbose: every caution."""
+    """Remarks on what failed and what is not known; verbose: every caution."""
     levels = ("failure", "open", "caution") if verbose else ("failure", "open")
     return [line for line in findings(data) if line.level in levels]
 

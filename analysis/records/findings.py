@@ -1,4 +1,4 @@
-"""What a record says, in sentences: which attribute carries the curvature, saddle or basin, how anisotropic, what was skipped.
+"""Sentences on a record: which attribute carries the curvature, saddle or basin, how anisotropic, what was skipped.
 
 Every sentence follows from numbers of the record and their errors alone; where an error does not decide, it says so.
 """
@@ -24,6 +24,7 @@ ATTRIBUTES = {
     "sh": "colour (SH)",
 }
 END_NAMES = {"max": "largest", "min": "smallest"}
+WIDEST = 10.0  # times its other end: a bracket that still has a value
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def headline(data: ProbeRecord) -> list[Line]:
 
 
 def of_checks(checks: Mapping[str, Check]) -> list[Line]:
-    """What failed or could not run of a probe's self-checks, or that all passed."""
+    """Lines on self-checks that failed or could not run, or that all passed."""
     lines = []
     for name, check in checks.items():
         label, note = name.replace("_", " "), _in_brackets(check.note)
@@ -109,7 +110,7 @@ def _of_traces(data: ProbeRecord) -> list[Line]:
 
 
 def shares_per_trace(data: ProbeRecord) -> dict[str, float]:
-    """By attribute, what a trace of 1 changes of the loss in a random step, as a share of it; empty where that is not known."""
+    """Share of the loss by which a trace of 1 changes it in a random step, by attribute; empty where that is not known."""
     loss = data.objective.value
     if not data.steps or not loss or not loss > 0 or set(data.traces) - set(data.steps):
         return {}
@@ -188,7 +189,7 @@ def _of_ends(data: ProbeRecord) -> list[Line]:
 
 
 def of_budgets(reasons: Mapping[str, str | None]) -> list[Line]:
-    """Which searches, for the ends "max" and "min", ended at a budget.
+    """Lines on the searches, for the ends "max" and "min", that ended at a budget.
 
     The residual of what they found says that an eigenvalue is near, not that none lies beyond.
     """
@@ -214,7 +215,7 @@ def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
     elif saddle:
         text = f"The ratio of the two ends of the spectrum is not determined{_in_brackets(saddle.note)}."
         lines.append(Line(text, "caution"))
-    if share and _is_finite(share.value) and not is_open(share):
+    if share and _is_finite(share.value) and not is_loose(share):
         text = f"The steepest direction alone holds {share.value:.2%} of all absolute curvature"
         lines.append(Line(f"{text}{_bracket(share, '{:.2%}'.format)}."))
     return lines
@@ -225,6 +226,19 @@ def is_open(index: schema.Index) -> bool:
     return (index.low is None) != (index.high is None) or (
         index.low is None and index.high is None and index.value is not None
     )
+
+
+def is_wide(index: schema.Index | schema.Effect) -> bool:
+    """Whether the ends of its bracket are too far apart for any value between them to be one."""
+    if index.low is None or index.high is None:
+        return False
+    near, far = sorted((abs(index.low), abs(index.high)))
+    return (index.low > 0) != (index.high > 0) or far > WIDEST * near
+
+
+def is_loose(index: schema.Index) -> bool:
+    """Whether its bracket is open or wide, so that no value is shown."""
+    return is_open(index) or is_wide(index)
 
 
 def remedy(data: ProbeRecord, name: str) -> str:
@@ -252,11 +266,14 @@ def _with(command: str, option: str, value: int) -> str:
 
 
 def _of_open(data: ProbeRecord) -> list[Line]:
-    """The indices without a finite bracket: the bracket, and the command that resolves it."""
+    """The indices without a finite or useful bracket: the bracket, and the command that resolves it."""
     return [
-        Line(f"{name.replace('_', ' ').capitalize()}: {UNDETERMINED}{_bracket(index)}; {remedy(data, name)}.", "open")
+        Line(
+            f"{name.replace('_', ' ').capitalize()}: {UNDETERMINED}{_bracket(index)}; {remedy(data, name)}.",
+            "open" if is_open(index) else "caution",
+        )
         for name, index in data.anisotropy.items()
-        if is_open(index)
+        if is_loose(index)
     ]
 
 
@@ -287,7 +304,7 @@ def _of_finite_probe(probe: schema.FiniteProbe | None) -> list[Line]:
 
 
 def resolved(probe: schema.FiniteProbe) -> list[bool]:
-    """At which finite steps round-off does not hide the curvature."""
+    """Mask of the finite steps at which round-off does not hide the curvature."""
     here = abs(probe.infinitesimal or 0.0)
     pairs = zip(probe.curvatures, probe.round_off, strict=True)
     return [
@@ -317,7 +334,7 @@ def _of_depth(depth: schema.Depth | None) -> list[Line]:
 
 
 def _of_block_shares(shares: Sequence[schema.BlockShare]) -> list[Line]:
-    """What methods assume that keep the Gaussians' own blocks, or the diagonal, of an operator."""
+    """Lines on what methods assume that keep the diagonal blocks of Gaussians, or the diagonal, of an operator."""
     names, parts = {"hessian": "the Hessian", "gauss-newton": "Gauss-Newton"}, []
     for one in shares:
         if one.blocks is not None and one.diagonal is not None:
@@ -330,7 +347,7 @@ def _of_block_shares(shares: Sequence[schema.BlockShare]) -> list[Line]:
 
 
 def _of_skips(skipped: Mapping[str, Skip]) -> list[Line]:
-    """What was left out, the largest saving first."""
+    """Lines on work left out, the largest saving first."""
     parts = []
     for name, skip in sorted(skipped.items(), key=lambda item: -(item[1].seconds_saved or 0.0)):
         if skip.count:

@@ -22,7 +22,7 @@ MISSING = "Object missing required field `"
 
 
 def read_json(path: Path, kind: type[T], what: str, remedy: str) -> T:
-    """What a file holds.  InputError names the file and, where its content is not of this kind, the key.
+    """Content of a file.  InputError names the file and, where its content is not of this kind, the key.
 
     what: what the file should be; remedy: what to do about one that is not.
     """

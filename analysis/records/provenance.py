@@ -1,4 +1,4 @@
-"""Where numbers come from: the time, the seed, the versions of the packages, the commit, the machine.  Needs no torch."""
+"""Provenance of numbers: the time, the seed, the versions of the packages, the commit, the machine.  Needs no torch."""
 
 import importlib.metadata
 import os
@@ -26,7 +26,7 @@ class Machine(Struct, kw_only=True):
 
 
 class Provenance(Struct, kw_only=True):
-    """Where the numbers come from.  versions: of Python and packages, None for what is not installed.
+    """Origin of numbers.  versions: of Python and packages, None for what is not installed.
 
     commit: of the checkout that the code lies in, ending in + where files differ from it; None without git or outside of one.
     origin: of another tool's file, what was assumed.  photographs: what tells the file of each view from any other.
@@ -60,7 +60,7 @@ def require_seed(seed: int) -> None:
 
 
 def provenance(seed: int, *, lanes: int | None = None, **more: Any) -> Provenance:
-    """Of now and here.  lanes: as in `Machine`; more: the other fields of `Provenance`."""
+    """Provenance of a run here and now.  lanes: as in `Machine`; more: the other fields of `Provenance`."""
     created = datetime.now(UTC).isoformat(timespec="seconds")
     return Provenance(created=created, seed=seed, versions=versions(), machine=machine(lanes), commit=commit(), **more)
 
@@ -77,7 +77,7 @@ def versions() -> dict[str, str | None]:
 
 
 def commit() -> str | None:
-    """That of the checkout with this code; see `Provenance`."""
+    """Commit of the checkout with this code; see `Provenance`."""
     command = [
         "git",
         "-C",
@@ -101,7 +101,7 @@ def machine(lanes: int | None = None) -> Machine:
 
 
 def usable_cores() -> int:
-    """Those that this process may use; all of the machine's where the system does not say (macOS)."""
+    """Cores that this process may use; all of the machine's where the system does not say (macOS)."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

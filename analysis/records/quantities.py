@@ -1,4 +1,4 @@
-"""How numbers with errors are written for people: `(1.23 ± 0.04) × 10⁵`.
+"""Numbers with errors, written for people: `(1.23 ± 0.04) × 10⁵`.
 
 The error is rounded to two significant digits and the value to the same place; without an error a number keeps three
 significant digits.  None, *not determined* in a record, is an en dash.
@@ -119,7 +119,7 @@ def _fixed(value: float, exponent: int, places: int) -> str:
 
 
 def _exponent(value: float) -> int:
-    """Of the leading digit after rounding to three digits; 0 for 0."""
+    """Exponent of the leading digit after rounding to three digits; 0 for 0."""
     return int(f"{value:.2e}".partition("e")[2])
 
 
@@ -171,7 +171,7 @@ class Shade(Struct, frozen=True, kw_only=True):
 
     @property
     def title(self) -> str:
-        """What it is, and in which unit."""
+        """Name and unit."""
         return f"{self.words}, {self.unit}" if self.unit else self.words
 
     @property
@@ -230,7 +230,7 @@ class Shade(Struct, frozen=True, kw_only=True):
         return 10.0**t if self.scale == "log" else self.soft * math.sinh(t) if self.scale == "signed" else t
 
     def share(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """How far t is from `low` to `high`, within [0, 1]; nan for what is not finite."""
+        """Position of t between `low` and `high`, within [0, 1]; nan for what is not finite."""
         t = self.shown(values)
         return np.where(np.isfinite(t), np.clip((t - self.low) / (self.high - self.low), 0, 1), np.nan)
 

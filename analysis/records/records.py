@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Generic, Protocol, TypeVar, cast
+from typing import Any, BinaryIO, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
 from msgspec import UNSET, Struct, field
@@ -92,7 +92,7 @@ class Check(Struct, kw_only=True):
 
 
 class Skip(Struct, kw_only=True):
-    """What the scene did not need.  seconds_saved: about, by the time of what was done; None where that is not known."""
+    """Work that the scene did not need.  seconds_saved: estimated from the time of the work done; None where not known."""
 
     count: Count
     seconds_saved: Number
@@ -102,7 +102,7 @@ Shapes = dict[str, dict[str, list[Count]]]
 
 
 class ProbeRecord(Struct, kw_only=True):
-    """What `landscape probe` found.
+    """Results of `landscape probe`.
 
     traces: by attribute (means, log_scales, quats, opacity_logits, sh).  quantiles: share -> the eigenvalue that this share of
     all active ones does not exceed; None without a density.  finite_probe, depth, slice: None where they were left out.
@@ -142,7 +142,7 @@ class ProbeRecord(Struct, kw_only=True):
 
 
 class SliceRecord(Struct, kw_only=True):
-    """What `landscape slice` found; fields as in `ProbeRecord`.  finite_probe: along a line; None with two directions."""
+    """Results of `landscape slice`; fields as in `ProbeRecord`.  finite_probe: along a line; None with two directions."""
 
     COMMAND: ClassVar[str] = "slice"
     FILE: ClassVar[str] = "slice.json"
@@ -159,12 +159,6 @@ class SliceRecord(Struct, kw_only=True):
     arrays: Shapes = {}
 
 
-class Kind(Protocol):
-    """A kind of record: the file by which its folder is known."""
-
-    FILE: ClassVar[str]
-
-
 Data = TypeVar("Data", bound=ProbeRecord | SliceRecord)
 Arrays = dict[str, dict[str, np.ndarray]]
 
@@ -179,14 +173,15 @@ class Record(Generic[Data]):
 
 
 @contextmanager
-def record_folder(folder: str | Path, kind: type[Kind] = ProbeRecord) -> Iterator[Path]:
+def record_folder(folder: str | Path, mark: str = ProbeRecord.FILE) -> Iterator[Path]:
     """A new, empty folder that becomes `folder` when the block ends, all at once; nothing changes if the block fails.
 
-    An old record at `folder` is replaced.  Killed at any point, `folder` is the old record, the new one, or (between
-    two renames) absent with the old record complete in `.NAME.previous` beside it, from where the next use restores it.
+    mark: the file by which a record of this kind is known; an old one at `folder` is replaced.  Killed at any point, `folder`
+    is the old record, the new one, or (between two renames) absent with the old record complete in `.NAME.previous` beside it,
+    from where the next use restores it.
     """
     folder = Path(folder).resolve()  # a link stays one
-    require_replaceable(folder, kind)
+    require_replaceable(folder, mark)
     folder.parent.mkdir(parents=True, exist_ok=True)
     previous = folder.with_name(f".{folder.name}.previous")
     with locked(beside(folder), f"no other command that writes {folder}"):
@@ -344,18 +339,18 @@ def _why_not_found(folder: Path, command: str, file: str) -> str:
     return f"{expected}{state}; run `landscape {command} CHECKPOINT` first"
 
 
-def require_replaceable(folder: Path, kind: type[Kind] = ProbeRecord) -> None:
-    """Replacing deletes: raise InputError unless folder is absent, empty or an older record of this kind."""
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / kind.FILE).is_file():
+def require_replaceable(folder: Path, mark: str = ProbeRecord.FILE) -> None:
+    """Replacing deletes: raise InputError unless folder is absent, empty or an older record, which has the file `mark`."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / mark).is_file():
         raise InputError(
-            f"expected an empty folder or an older record to replace, got {folder} without {kind.FILE}; move it away"
+            f"expected an empty folder or an older record to replace, got {folder} without {mark}; move it away"
         )
     if folder.exists() and not folder.is_dir():
         raise InputError(f"expected a folder to write a record to, got the file {folder}; move it away")
 
 
 def _clean_up_after_kills(folder: Path, previous: Path) -> None:
-    """The lock is ours: what is partial is nobody's."""
+    """Remove what killed commands left: under our lock, no partial folder belongs to a command that runs."""
     if folder.exists():  # else `previous` is the only record there is
         _remove(previous)
     for partial in folder.parent.glob(f".{glob.escape(folder.name)}.partial-*"):

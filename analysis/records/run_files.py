@@ -67,7 +67,7 @@ class Clock(Struct, kw_only=True):
 
 
 class Made(Struct, kw_only=True):
-    """When, where and with which code, as in `Provenance`."""
+    """Time, machine and code, as in `Provenance`."""
 
     created: str = ""
     machine: Machine | None = None
@@ -75,7 +75,7 @@ class Made(Struct, kw_only=True):
 
 
 class Scores(Struct, kw_only=True):
-    """What a training came to; test: None without held-out views."""
+    """Scores of a training; test: None without held-out views."""
 
     gaussians: Count
     train: ViewScores | None = None
@@ -85,7 +85,7 @@ class Scores(Struct, kw_only=True):
 
 
 class Seconds(Struct, kw_only=True):
-    """How long the steps of a training took until its last checkpoint, at `step`; fields as in `Clock`."""
+    """Seconds that the steps of a training took until its last checkpoint, at `step`; fields as in `Clock`."""
 
     step: Count
     wall: float
@@ -161,7 +161,7 @@ class Steepest(Struct, kw_only=True):
 
 
 class Swaps(Struct, kw_only=True):
-    """What happens when a Gaussian changes places with the one next in front of it, on its ray.
+    """Effect of Gaussians changing places with those next in front of them, on their rays.
 
     lengths: of ways along the ray, px.  share: of the pairs that such a way swaps, by view and length; pairs: in each view.
     jump: the mean |change of the mean loss| where a pair of the sample swaps, with its standard error; sampled: how many.
@@ -197,7 +197,7 @@ class Fragility(Struct, kw_only=True):
 
 
 class MapRecord(Struct, kw_only=True):
-    """What `landscape map` found.  gaussians, seen: how many, and of these in sight; field: the one that the panels show.
+    """Results of `landscape map`.  gaussians, seen: how many, and of these in sight; field: the one that the panels show.
 
     shades: of the maps, by name; that of "error" is of the mean over the channels of |render - photograph|.
     sentences: what the map says.  steepest: the ends of the spectrum, where a probe has found them.

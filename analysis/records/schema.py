@@ -32,10 +32,10 @@ def _require_error(name: str, value: Number) -> None:
 
 
 class Named(Struct, Generic[T]):
-    """Entries of one kind under names, of which some may be absent."""
+    """Entries of one kind under names; some may be absent."""
 
     def items(self) -> Iterator[tuple[str, T]]:
-        """Those that there are, by name."""
+        """Entries that are there, by name."""
         return ((name, getattr(self, name)) for name in self.__struct_fields__ if getattr(self, name))
 
 
@@ -94,7 +94,7 @@ class TraceOf(Struct, kw_only=True):
 
 
 class Trace(TraceOf, kw_only=True):
-    """Of one attribute's diagonal block over its active parameters.  tau: sqrt(max(value, 0) / dim), its curvature scale."""
+    """Trace of one attribute's block over its active parameters.  tau: sqrt(max(value, 0) / dim), its curvature scale."""
 
     tau: Number
 
@@ -104,7 +104,7 @@ class Trace(TraceOf, kw_only=True):
 
 
 class LivesOn(Struct, kw_only=True):
-    """Where an eigenvector lives (`analysis.measures.localization`).
+    """Localization of an eigenvector (`analysis.measures.localization`).
 
     attributes: its shares of the squared mass.  participation: over how many Gaussians it is spread.  needles, needles_bare:
     share of the mass on Gaussians with a condition number above 100, with and without the blur of 0.3 px^2; needle_count,
@@ -141,7 +141,7 @@ class End(Struct, kw_only=True):
 
 
 class Eigenvalue(End, kw_only=True):
-    """Of the active operator.  matvecs: products H v of the search for it.  shares: attribute -> share of v's squared mass."""
+    """Eigenvalue of the active operator.  matvecs: products H v of its search.  shares: of v's squared mass by attribute."""
 
     matvecs: Count | None = None
     method: str = ""
@@ -229,7 +229,7 @@ class Rise(Struct, kw_only=True):
 
 
 class DepthTraces(Struct, kw_only=True):
-    """Of the curvature of the positions, along the rays and across them."""
+    """Traces of the positions' curvature, along the rays and across them."""
 
     depth: TraceOf
     lateral: TraceOf
@@ -251,7 +251,7 @@ class Depth(Struct, kw_only=True):
 
 
 class BlockShare(Struct, kw_only=True):
-    """Which share of an operator's squared entries lies within Gaussians' own blocks (`splat.curvature.scores.shares`).
+    """Share of an operator's squared entries within the diagonal blocks of Gaussians (`splat.curvature.scores.shares`).
 
     coupled: with SSIM's coupling of pixels.  blocks, attributes, diagonal: the share within the 11 x 11 of geometry and the
     diagonal of SH, within the attributes' blocks of these, and on the diagonal; None where the operator is 0.  norm: squared.
@@ -306,7 +306,7 @@ class Effect(Struct, kw_only=True):
 
 
 class SplitControl(Struct, kw_only=True):
-    """What splitting every Gaussian in two does (`analysis.measures.split_control`).
+    """Effect of splitting every Gaussian in two (`analysis.measures.split_control`).
 
     gaussians: after it.  rms, largest, psnr (dB): of the images' change; psnr is None where nothing changed.
     """

@@ -9,7 +9,7 @@ from msgspec import UNSET, UnsetType
 from rich import box
 from rich.table import Table
 
-from analysis.records.findings import attribute_name, is_open
+from analysis.records.findings import attribute_name, is_open, is_wide
 from analysis.records.quantities import UNDETERMINED, apart, limits, measured, quantity
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import INDICES, BlockShare, Depth, Effect, End, Family, Index, Number
@@ -67,7 +67,7 @@ Row = tuple[str, str, str]
 
 
 def wrapped(text: str, width: int) -> str:
-    """In lines of this width at most; a number with its error stays in one.
+    """Text in lines of this width at most; a number with its error stays in one.
 
     >>> print(wrapped("(8.6 ± 0.6) × 10⁻⁶ over (1.37 ± 0.10) × 10⁻⁴", 22).replace("\u00a0", " "))
     (8.6 ± 0.6) × 10⁻⁶
@@ -107,7 +107,7 @@ def _count_rows(counts: Counts) -> Iterator[Row]:
 
 
 def _check_rows(checks: Mapping[str, Check]) -> Iterator[Row]:
-    """Those that passed in one row."""
+    """Rows of the checks; those that passed in one."""
     if good := [name.replace("_", " ") for name, check in checks.items() if check.passed]:
         yield "checks passed", f"{len(good)} of {len(checks)}", ", ".join(good)
     for name, check in checks.items():
@@ -125,7 +125,7 @@ def _reason(reason: str | None) -> str:
 
 
 def _of_views(error: float | UnsetType | None) -> str:
-    """What views left out may change, where some were."""
+    """Possible change by views left out, where some were."""
     return "" if error is UNSET else f", views left out{apart(error)}"
 
 
@@ -135,7 +135,7 @@ def _outcome(check: Check) -> str:
 
 
 def _depth_rows(depth: Depth | None) -> Iterator[Row]:
-    """Of positions: along the rays, over a direction across them."""
+    """Rows of positions along the rays, over a direction across them."""
     if depth is None:
         return
     median = f"median {quantity(depth.gradient_median)}, {depth.pairs:,} pairs of Gaussian and view"
@@ -147,7 +147,7 @@ def _depth_rows(depth: Depth | None) -> Iterator[Row]:
 
 
 def _share_rows(shares: Iterable[BlockShare]) -> Iterator[Row]:
-    """Of the operators' squared entries."""
+    """Rows of the shares of operators' squared entries."""
     for one in shares:
         coupling = "" if one.coupled else ", no coupling"
         about = f"attributes' blocks {quantity(one.attributes)}, diagonal {quantity(one.diagonal)}"
@@ -192,7 +192,7 @@ class Line:
 
 
 def family_lines(data: ProbeRecord) -> list[Line]:
-    """Of every operator and block: the families, that of the split scene beneath the other, and what the split changes."""
+    """Lines of every operator and block: the families, the split scene's beneath, and what the split changes."""
     rows, control = data.families or [], data.split_control
     lines = []
     for row in (row for row in rows if not row.split):
@@ -227,7 +227,7 @@ def family_table(data: ProbeRecord) -> Table:
 
 
 def _folded(text: str, width: int = WIDTH) -> str:
-    """In two lines where it is too wide for a column.
+    """Text in two lines where it is too wide for a column.
 
     >>> _folded("7.45 × 10⁻⁴ … 1.02 × 10⁴"), _folded("34.1 … 120")
     ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
@@ -236,12 +236,14 @@ def _folded(text: str, width: int = WIDTH) -> str:
 
 
 def bracketed(index: Index | Effect | None) -> Cell:
-    """An index as text: a narrow bracket as an error, and one without upper end as the bound that it is.
+    """An index as text: a narrow bracket as an error, one without upper end as the bound that it is, a wide one alone.
 
     >>> bracketed(Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")).value
     '≥ 34.2'
     >>> bracketed(Index(value=2.0, low=1.95, high=2.04, note="")).value
     '2.000 ± 0.050'
+    >>> bracketed(Index(value=2.0, low=1.0, high=30.0, note=""))
+    Cell(value='–', bracket='1.00 … 30.0', note='')
     """
     if index is None:
         return Cell(UNDETERMINED)
@@ -252,11 +254,11 @@ def bracketed(index: Index | Effect | None) -> Cell:
         return Cell(f"≥ {quantity(low)}" if high is None else f"≤ {quantity(high)}", "", note)
     if value is not None and low <= value <= high and high - low < NARROW * abs(value):
         return Cell(measured(value, max(high - value, value - low)), "", note)
-    return Cell(quantity(value), " … ".join(limits(low, high)), note)
+    return Cell(UNDETERMINED if is_wide(index) else quantity(value), " … ".join(limits(low, high)), note)
 
 
 def factor(effect: Effect | None) -> Cell:
-    """What the split multiplies an index by."""
+    """Factor of the split on an index."""
     cell = bracketed(effect)
     return cell if cell.value == UNDETERMINED else replace(cell, value=f"× {cell.value}")
 

@@ -123,7 +123,7 @@ def require_same_loss(runs: Sequence[Run]) -> None:
 
 
 def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
-    """What differs between the runs, or is missing from some, that a reader has to keep in mind.  seeds: which differ here."""
+    """Differences between the runs, and lacks of some, that a reader has to keep in mind.  seeds: which differ here."""
     settings: dict[str, Callable[[Run], Any]] = {
         "scene": lambda run: run.data.provenance.scene,
         "steps": lambda run: run.checkpoint.training.step,
@@ -169,7 +169,7 @@ def cautions(runs: Sequence[Run], seeds: bool = False) -> list[str]:
 
 
 def split_controls(runs: Sequence[Run]) -> list[str]:
-    """What the split changes in the images of each run that has a split control."""
+    """Lines on what the split changes in the images of each run that has a split control."""
     lines = []
     for run in runs:
         if control := run.data.split_control:
@@ -185,7 +185,7 @@ def split_controls(runs: Sequence[Run]) -> list[str]:
 
 
 def _once(lines: Sequence[tuple[Run, str]]) -> list[str]:
-    """What is said of runs, once of all of whom the same is said but for the command that mends it."""
+    """Remarks on runs; one for all runs whose remarks differ only in the command that mends them."""
     alike: dict[str, list[tuple[Run, str]]] = {}
     for run, text in lines:
         alike.setdefault(text.partition("; landscape ")[0], []).append((run, text))

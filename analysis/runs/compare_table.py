@@ -111,7 +111,7 @@ def _depth(runs: Sequence[Run]) -> Iterable[Row]:
 
 
 def _families(runs: Sequence[Run]) -> Iterable[Row]:
-    """Of every operator and block that a run has families of."""
+    """Rows of every operator and block that a run has families of."""
     of_runs: list[dict[tuple[Operator, str], Anisotropy]] = [
         {(row.operator, row.block): row.indices for row in run.data.families or () if not row.split} for run in runs
     ]
@@ -124,14 +124,14 @@ def _families(runs: Sequence[Run]) -> Iterable[Row]:
 
 
 def _split(section: str, runs: Sequence[Run], operator: Operator, block: str, name: str) -> Iterable[Row]:
-    """What splitting every Gaussian in two multiplies an index by, where a run has that."""
+    """Factor of splitting every Gaussian in two on an index, where a run has that."""
     effects = [_effect(run.data, operator, block, name) for run in runs]
     if any(effects):
         yield Row(section, "  split control", tuple(_index(effect, factor(effect)) for effect in effects))
 
 
 def _method(method: MethodSettings) -> Entry:
-    """Its name, and beneath it the settings that are not the published ones.
+    """Name of a method, and beneath it the settings that are not the published ones.
 
     >>> from splat.training.methods.stablegs.stablegs import StableGS
     >>> _method(StableGS(vsp_weight=0.0)).cell
@@ -202,10 +202,6 @@ def frame(rows: Sequence[Row], labels: Sequence[str]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def _is_missing(entry: Entry) -> bool:
-    return (entry.cell.value, entry.cell.bracket) == (MISSING.cell.value, "")
-
-
 def compare_table(rows: Sequence[Row], labels: Sequence[str]) -> Table:
     """A column a run; the families are left to the page, and what no run has."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
@@ -214,7 +210,8 @@ def compare_table(rows: Sequence[Row], labels: Sequence[str]) -> Table:
         table.add_column(escape(label), justify="right")
     section = ""
     for row in rows:
-        if row.section == FAMILIES or all(_is_missing(entry) for entry in row.entries):
+        known = [entry for entry in row.entries if (entry.cell.value, entry.cell.bracket) != (MISSING.cell.value, "")]
+        if row.section == FAMILIES or not known:
             continue
         if row.section != section:
             table.add_section()

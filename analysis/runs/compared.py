@@ -1,4 +1,4 @@
-"""What `landscape compare` compares: folders of landscape train and files of other tools, their checkpoints and their probes.
+"""Subjects of `landscape compare`: folders of landscape train and files of other tools, their checkpoints and their probes.
 
 The probe of a file is `probe` beside it, where that is of this file, else `probe-NAME`.  A file that was probed is opened as it
 was then, so that nothing has to be said twice; where something is said, the probe has to be of the same.
@@ -31,7 +31,7 @@ def checkpoint_path(run: Path) -> Path:
 
 
 def probe_folder(run: Path) -> Path:
-    """Where the run's probe is, or would be."""
+    """Folder of the run's probe, which may not exist."""
     if not run.is_file():
         return run / PROBE
     usual = run.with_name(PROBE)
@@ -99,5 +99,5 @@ def probe(run: Path, options: CompareOptions, loss: Loss) -> None:
 
 
 def scores_of(run: Path) -> Scores | None:
-    """None of what was not scored: a run that was stopped before, a file of another tool."""
+    """Scores of a run; None where it was stopped before, or is another tool's file."""
     return read_scores(run) if (run / METRICS).is_file() else None

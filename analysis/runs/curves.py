@@ -77,7 +77,7 @@ def _views(path: Path) -> tuple[list[View], list[View]]:
 
 
 def _passes(run: Path) -> "pd.Series | None":
-    """Of each step, where the method counts them."""
+    """Passes of each step, where the method counts them."""
     if not (run / HISTORY).is_file():
         return None
     return pd.read_csv(run / HISTORY).get("passes")

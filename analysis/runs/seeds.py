@@ -54,7 +54,7 @@ def groups_of(runs: Sequence[Path], named: Sequence[str]) -> list[Group]:
 
 
 def identical(labels: Sequence[str], checkpoints: Sequence[Checkpoint]) -> list[str]:
-    """Which runs have the parameters of one before, to the bit, in words."""
+    """Lines on runs with the parameters of an earlier one, to the bit."""
     first: dict[bytes, int] = {}
     lines = []
     for i, checkpoint in enumerate(checkpoints):
@@ -97,7 +97,7 @@ def _together(entries: Sequence[Entry]) -> Entry:
 
 
 def sayings(rows: Sequence[Row], groups: Sequence[Group]) -> list[str]:
-    """Which differences from the first group are larger than the spread of seeds, and which indices contradict each other.
+    """Lines on differences from the first group beyond the spread of seeds, and on indices that contradict each other.
 
     rows: those of `grouped`.
     """
@@ -133,7 +133,7 @@ def _differences(rows: Sequence[Row], i: int, pair: str) -> str:
 
 
 def _contradictions(rows: Sequence[Row], i: int, label: str, first: str, seeds: bool) -> str:
-    """Which of two groups the indices say is more anisotropic.  seeds: whether both have several runs."""
+    """Lines on indices that disagree about which of two groups is more anisotropic.  seeds: whether both have several runs."""
     pair = f"{label} and {first}"
     votes: dict[str, list[str]] = {label: [], first: []}
     for row in rows:

@@ -1,7 +1,7 @@
 """`landscape slice`: one checkpoint in, its loss along a line or over a plane out, as a record with pictures.
 
     load            the checkpoint, its scene, the other checkpoints of a line or a plane
-    linearise       every view held still
+    linearise       derivatives of every view
     directions      eigenvectors from the probe beside the checkpoint or by Lanczos, and their curvatures
     slice           renders in parallel; of a plane where needed, interpolated elsewhere (`landscape.slices.refinement`)
     finite steps    along a line: second differences at steps over four decades, beside the infinitesimal curvature
@@ -77,7 +77,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
     settings = _settings(options, shape, device)
     out = options.out or options.checkpoint.parent / f"slice-{shape.name}"
     unfinished, console, start = out.with_name(f".{out.name}.unfinished"), Console(stderr=True), perf_counter()
-    require_replaceable(out, SliceRecord)
+    require_replaceable(out, SliceRecord.FILE)
     stages = Stages(console)
     with stages.stage("load"):  # shown from when nothing about the input can be wrong any more
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
@@ -86,7 +86,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
         objective = scene_objective(checkpoint, scene, keep_unseen=bool(others))
         expected_peak(objective)  # which may be too much
     # a folder that is being written by another command, or cannot be, is noticed before anything is rendered
-    with record_folder(out, SliceRecord) as folder, stages, telling_needs(objective):
+    with record_folder(out, SliceRecord.FILE) as folder, stages, telling_needs(objective):
         notes: list[str] = []
         known = _known(options.checkpoint.parent / "probe", unfinished, objective, notes)
         try:
@@ -107,7 +107,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
 
 
 def _settings(options: SliceOptions, shape: Shape, device: torch.device) -> SliceSettings:
-    """As asked for; a GPU is full with one render."""
+    """Settings as asked for; a GPU is full with one render."""
     most = torch.get_num_threads() if device.type == "cpu" else 1
     workers = most if options.workers is None else options.workers
     if options.all_points:
@@ -212,7 +212,7 @@ def _measure(
 
 
 def _keep_eigenvectors(directions: Sequence[Direction], unfinished: Path) -> None:
-    """For the run that continues this one, should it be killed."""
+    """Keep eigenvectors for the run that continues this one, should it be killed."""
     vectors = [direction.vector.cpu().numpy() for direction in directions if direction.kind == "eigenvectors"]
     if not vectors:
         return

@@ -53,7 +53,7 @@ RTOL, MAX_MATVECS = 1e-3, 300  # of the eigenvectors
 
 @dataclass(frozen=True)
 class Shape:
-    """What to slice along: one or two kinds of directions, in how many dimensions, a radius for each or none."""
+    """Directions to slice along: one or two kinds of directions, in how many dimensions, a radius for each or none."""
 
     kinds: tuple[Along, ...]
     dimension: int
@@ -158,7 +158,7 @@ def at_right_angles(found: Sequence[Direction]) -> list[Direction]:
 
 
 def cosine(directions: Sequence[Direction]) -> float | None:
-    """Of the angle between two directions as they are found."""
+    """Cosine of the angle between two directions as they are found."""
     if len(directions) < 2:
         return None
     unit = [direction.vector.double() / direction.vector.double().norm() for direction in directions]

@@ -1,4 +1,4 @@
-"""What a slice found as a record (`analysis.records.records.SliceRecord`) and its arrays."""
+"""Record (`analysis.records.records.SliceRecord`) and arrays of a slice."""
 
 from dataclasses import dataclass
 from math import inf, sqrt
@@ -35,7 +35,7 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """What tells the error of fewer views than the `population` that the training has: the directions' curvatures in each."""
+    """Curvatures of the directions in each view, for the error of fewer views than the `population` that the training has."""
 
     population: int
     curvatures: Float64[Tensor, "m d"]

@@ -100,7 +100,7 @@ class Run:
             raise
 
     def save(self, spent: TrainingTime, *, stays: bool) -> None:
-        """Write the checkpoint and what belongs to it.  stays: also among those that are kept, of which the oldest go."""
+        """Write the checkpoint and what belongs to it.  stays: also as one of those that are kept; the oldest goes."""
         if stays and self.keep:
             self._save_within(self.out / KEPT.format(self.training.step))
         save_checkpoint(self.out / CHECKPOINT, self.training, self.reference)
@@ -183,7 +183,7 @@ def _run(run: Run, options: TrainOptions, command: Sequence[str], along: Traject
 
 
 def planned(options: TrainOptions, out: Path) -> tuple[Scene, Split, TrainConfig, SceneReference]:
-    """What the options stand for, before any image is read.  ValueError or FileNotFoundError where they are wrong."""
+    """Plan of a training from its options, before any image is read.  ValueError or FileNotFoundError where they are wrong."""
     colour, preset = COLOURS.get(options.background or "scene"), presets(options.method, options.protocol)
     scene = load_scene(
         options.scene, options.images, options.downscale, colour, options.masks, options.depths,

@@ -1,4 +1,4 @@
-"""How a training goes: rows of RUN/train.csv, a line of the terminal for each where no bar is shown, TensorBoard where asked.
+"""Progress of a training: rows of RUN/train.csv, a line of the terminal for each where there is no bar, TensorBoard if asked.
 
 RUN/train.csv           a row before the first step, every --log-every steps and after the last; complete lines at any time
 RUN/tensorboard/        with --tensorboard: the same numbers as TensorBoard's scalars

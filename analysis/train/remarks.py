@@ -37,7 +37,7 @@ def remarks(scene: Scene, asked: TrainConfig, config: TrainConfig, begun: tuple[
 
 
 def begins(scene: Scene, views: Sequence[View], held_out: int, training: Training, source: Source | Path) -> str:
-    """What a training is about to do, in two lines.  source: a checkpoint where it starts from that."""
+    """Two lines on what a training is about to do.  source: a checkpoint where it starts from that."""
     config, camera, step = training.config, views[0].camera, training.step
     names = [view.name for view in views]
     if len(names) > NAMED:
@@ -53,7 +53,7 @@ def begins(scene: Scene, views: Sequence[View], held_out: int, training: Trainin
 
 
 def poor_start(scene: Scene, source: Source, gaussians: int) -> str:
-    """That a training starts at random or from few points, and what to do, in words; else empty.
+    """Warning of a start at random or from few points, and what to do; else empty.
 
     >>> from splat import SyntheticSettings, synthetic_scene
     >>> scene = synthetic_scene(SyntheticSettings(gaussians=50, views=3, width=16, height=12)).scene
@@ -68,12 +68,12 @@ def poor_start(scene: Scene, source: Source, gaussians: int) -> str:
 
 
 def _kind(scene: Scene, source: Source) -> Source:
-    """What "scene" stands for."""
+    """Source that "scene" stands for."""
     return source if source != "scene" else "random" if scene.points is None else "points"
 
 
 def _skipped(scene: Scene) -> str:
-    """How many frames of the scene have no image, in words; none: empty."""
+    """Note on the number of frames without an image; empty if there is none."""
     count, listed = len(scene.skipped), len(scene.skipped) + len(scene.frames)
     if not count:
         return ""
@@ -82,7 +82,7 @@ def _skipped(scene: Scene) -> str:
 
 
 def _scaled(asked: TrainConfig, config: TrainConfig) -> str:
-    """Which settings of a published schedule were scaled to the length of the training, in words; none: empty."""
+    """Note on settings of a published schedule that were scaled to the length of the training; empty if there is none."""
     before, after = (leaves(asdict(settings)) for settings in (asked, config))
     changes = [
         f"{key.removeprefix('method.')} {before[key]} to {after[key]}" for key in after if before[key] != after[key]
@@ -96,7 +96,7 @@ def _scaled(asked: TrainConfig, config: TrainConfig) -> str:
 
 
 def _of_second_order(config: TrainConfig) -> list[str]:
-    """What a method in place of Adam leaves out, in words."""
+    """Notes on what a method in place of Adam leaves out."""
     method, found = config.method, []
     if isinstance(method, SecondOrder) and config.densify.enabled:
         found.append(f"{method.name}: no Gaussian is cloned, split or removed, and no opacity is reset")
@@ -106,7 +106,7 @@ def _of_second_order(config: TrainConfig) -> list[str]:
 
 
 def _not_reached(config: TrainConfig) -> str:
-    """Which parts of a method a run does not reach, in words; none: empty."""
+    """Note on parts of a method that a run does not reach; empty if there is none."""
     parts = config.method.parts(config)
     late = [f"{name} = {begins}" for name, begins in parts.items() if begins >= config.iterations]
     if not late:

@@ -21,7 +21,7 @@ Planned = tuple[Scene, Split, TrainConfig, SceneReference]
 
 
 def of_trainer(ask: TrainerOptions) -> Foreign:
-    """What was said of the trainer of another tool's file."""
+    """Options on the trainer of another tool's file."""
     return Foreign(
         trained_by=ask.trained_by,
         antialiased=ask.antialiased or None,

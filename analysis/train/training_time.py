@@ -33,7 +33,7 @@ class TrainingTime:
 
     @classmethod
     def read(cls, run: Path) -> "TrainingTime":
-        """That of a run folder; none where it has not been saved yet."""
+        """Time of a run folder; zero where it has not been saved yet."""
         if not (run / SECONDS).is_file():
             return cls()
         found = read_seconds(run)

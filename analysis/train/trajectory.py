@@ -166,7 +166,7 @@ class Trajectory:
 
     @property
     def thinned(self) -> str:
-        """How many records were skipped or coarse, and what to do, as a sentence; empty where all are whole."""
+        """Sentence on records that were skipped or coarse, and what to do; empty where all are whole."""
         counts = {state: sum(row["state"] == state for row in self.rows) for state in ("skipped", "coarse")}
         said = " and ".join(f"{count} {state}" for state, count in counts.items() if count)
         if not said:
@@ -249,7 +249,7 @@ def _columns(found: Found) -> Row:
 
 
 def _read_rows(path: Path, step: int) -> list[Row]:
-    """Those up to a step, as text, which is written back to the same bits."""
+    """Rows up to a step, as text, which is written back to the same bits."""
     if not path.is_file():
         return []
     table, text = read_trajectory(path), pd.read_csv(path, dtype=str, na_filter=False)

@@ -23,7 +23,7 @@ CHUNK = 1 << 16  # entries of vectors that are combined at a time
 
 @dataclass(frozen=True)
 class EigenSettings:
-    """How many pairs at each end, to which residual, with how much memory and work.
+    """Number of pairs at each end, their residual, and limits of memory and work.
 
     largest, smallest: numbers of pairs of the largest and of the smallest (signed) eigenvalues.
     rtol, atol: a pair is done when its residual |H v - lambda v| is at most max(rtol |lambda|, atol).

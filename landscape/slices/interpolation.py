@@ -61,7 +61,7 @@ class PlaneInterpolant:
         return np.array(found, int)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """At all points, from values [points] that are nan where not known.  nan where the axes have no finite value."""
+        """Interpolation at all points, from values [points], nan where not known.  nan where the axes have no finite value."""
         f = values.reshape(len(self._x), len(self._y))
         along = f[:, [self._j]] + f[[self._i]] - f[self._i, self._j]
         products = np.outer(self._x, self._y)
@@ -93,7 +93,7 @@ def share_beyond(judged: int, looks: int) -> float:
 
 
 def error_bound(errors: np.ndarray, others: int, looks: int) -> float:
-    """Of the error at every one of so many other points, from the errors at random ones.  Infinite without any.
+    """Bound of the error at every one of so many other points, from the errors at random ones; infinite without any.
 
     >>> round(error_bound(np.linspace(0, 1, 64), others=1000, looks=1), 1)
     1.9

@@ -28,7 +28,7 @@ COARSE = 16  # points
 
 @dataclass(frozen=True)
 class SliceSettings:
-    """Which points of a plane are evaluated; the others are interpolated.
+    """Rules for the points of a plane to evaluate; the others are interpolated.
 
     tolerance: of the interpolation, as a share of the range of the values; None: every point is evaluated.
     holdout: random points of a hold-out, at least.  From 64 of which the largest error is within the tolerance follows, with

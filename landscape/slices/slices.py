@@ -72,13 +72,12 @@ def evaluate_slice(
 ) -> Slice:
     """loss on the grid coordinates[0] x coordinates[1] (d = 2) or along coordinates[0] (d = 1).
 
-    loss(theta): the objective, or (objective, smooth_piece) if it is piecewise smooth (`grid_evaluations`); it must be safe to
-    call from settings.workers threads.  coordinates: increasing, in multiples of the directions.  gradient, operator: both at
-    center, or neither.  They give the quadratic model, for d matvecs; none if the operator is given as the matrix E^T H E.
+    loss(theta): the objective, or (objective, smooth_piece) if it is piecewise smooth (`grid_evaluations`); it is called from
+    settings.workers threads.  coordinates: increasing, in multiples of the directions.  gradient, operator: both at center, for
+    the quadratic model, or neither; the model takes d matvecs, or none if the operator is given as the matrix E^T H E.
     settings: for a plane; every point of a line is evaluated.  generator: draws the hold-out points (`refinement`) of a plane;
-    may be None only if settings.tolerance is.  store: a file that keeps
-    the evaluations, from which an interrupted run continues.  Raises InputError if the objective at the centre is not finite,
-    or store holds another slice.
+    may be None only if settings.tolerance is.  store: a file that keeps evaluations, from which an interrupted run continues.
+    Raises InputError if the objective at the centre is not finite, or store holds another slice.
 
     >>> axis, generator = symmetric_axis(2.0, 41), torch.Generator().manual_seed(0)
     >>> bowl = evaluate_slice(lambda x: (x * x).sum(), torch.zeros(3), torch.eye(3)[:, :2], [axis, axis], generator=generator)
@@ -87,17 +86,7 @@ def evaluate_slice(
     """
     _require_slice(center, directions, coordinates)
     _require_model(gradient, operator, directions)
-    if len(coordinates) == 2 and settings.tolerance is not None:
-        if generator is None:
-            raise ValueError(
-                "expected a generator for the hold-out points of a plane, got none; "
-                "pass torch.Generator().manual_seed(0), or SliceSettings(tolerance=None) to evaluate every point"
-            )
-        if not all((axis == 0).any() for axis in coordinates):
-            raise InputError(
-                "expected coordinates of a plane with 0 among them, for the axes through the centre, got others; "
-                "take symmetric_axis, or SliceSettings(tolerance=None) to evaluate every point"
-            )
+    _require_refinable(coordinates, settings, generator)
     axes = [axis.detach().double() for axis in coordinates]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
     shape, points = grid.shape[:-1], grid.reshape(-1, len(axes))
@@ -108,13 +97,7 @@ def evaluate_slice(
         slope, curvature = _derivatives(gradient, operator, directions)
         model = found.center_loss + points @ slope + ((points @ curvature) * points).sum(dim=1) / 2
         model = model.reshape(shape)
-    if len(axes) == 1 or settings.tolerance is None or generator is None:
-        found.require(range(len(points)))
-        refined = Refined(found.value, np.empty(0), 0, "exact")
-    else:
-        mixed = None if curvature is None else float(curvature[0, 1])
-        plane = PlaneInterpolant(axes[0].numpy(), axes[1].numpy(), mixed)
-        refined = evaluate_adaptively(found, plane, settings, generator)
+    refined = _refined(found, axes, None if curvature is None else float(curvature[0, -1]), settings, generator)
     return Slice(
         coordinates=tuple(axes),
         loss=torch.from_numpy(refined.values).reshape(shape),
@@ -130,6 +113,21 @@ def evaluate_slice(
         tolerance=None if found.known.all() else settings.tolerance,
         looks=refined.looks,
     )
+
+
+def _refined(
+    found: GridEvaluations,
+    axes: Sequence[Float64[Tensor, " _"]],
+    mixed: float | None,
+    settings: SliceSettings,
+    generator: torch.Generator | None,
+) -> Refined:
+    """Every point of a line evaluated; a plane refined adaptively.  mixed: the model's mixed derivative, for a plane."""
+    if len(axes) == 1 or settings.tolerance is None or generator is None:
+        found.require(range(len(found.value)))
+        return Refined(found.value, np.empty(0), 0, "exact")
+    plane = PlaneInterpolant(axes[0].numpy(), axes[1].numpy(), mixed)
+    return evaluate_adaptively(found, plane, settings, generator)
 
 
 def _derivatives(
@@ -174,3 +172,21 @@ def _require_slice(center: Tensor, directions: Tensor, coordinates: Sequence[Ten
     if not all(axis.isfinite().all() and (axis.diff() > 0).all() for axis in coordinates):
         raise ValueError("expected finite coordinates that increase, got others; sort them and drop repeated ones")
     column_lengths(directions, "directions")
+
+
+def _require_refinable(
+    coordinates: Sequence[Tensor], settings: SliceSettings, generator: torch.Generator | None
+) -> None:
+    """Raise unless a plane that is to be refined has what that takes: random numbers, and axes through the centre."""
+    if len(coordinates) == 1 or settings.tolerance is None:
+        return
+    if generator is None:
+        raise ValueError(
+            "expected a generator for the hold-out points of a plane, got none; "
+            "pass torch.Generator().manual_seed(0), or SliceSettings(tolerance=None) to evaluate every point"
+        )
+    if not all((axis == 0).any() for axis in coordinates):
+        raise InputError(
+            "expected coordinates of a plane with 0 among them, for the axes through the centre, got others; "
+            "take symmetric_axis, or SliceSettings(tolerance=None) to evaluate every point"
+        )

@@ -1,13 +1,14 @@
-"""sum |lambda_i| from the Gauss rules of stochastic Lanczos quadrature, bracketed without any assumption on the spectrum.
+"""The nuclear norm sum |lambda_i| from the Gauss rules of stochastic Lanczos quadrature, bracketed for any spectrum.
 
-|x| has a kink at 0.  The measures of at most m points that share the moments of degree up to 2m - 2 are the rules of T(a),
-which is T with any number a for its last diagonal entry (Golub 1973).  The least and the largest integral of |x| over all
-measures with these moments are among theirs, as a polynomial of degree 2m - 2 on one side of |x| touches it in m points at
-most.  The least has a node at 0: T(a) is singular.
+Lanczos with m steps gives a tridiagonal T (m, m), which fixes the moments of degree up to 2m - 2 of the start vector's spectral
+measure.  The measures of at most m points with these moments are the rules of T(a): T with any number a for its last diagonal
+entry (Golub 1973).  Among them are those with the least and the largest integral of |x| over all measures with these moments,
+as a polynomial of degree 2m - 2 on one side of |x| touches it in m points at most.  The least has a node at 0, the kink of |x|,
+so that T(a) is singular; the largest is searched for over a.
 
-The value is the mean of two rules.  The Gauss rule of m - 1 points is off to one side or the other, depending on where 0 lies
-between its nodes; its anti-Gauss rule, that of T with its last off-diagonal entries times the root of 2, is off about as far to
-the other side (Laurie 1996).
+The value is the mean of two rules.  The Gauss rule of m - 1 points errs to a side that depends on where 0 lies between its
+nodes; its anti-Gauss rule, that of T with its last off-diagonal entries times sqrt 2, errs about as far to the other side
+(Laurie 1996).
 """
 
 from functools import lru_cache
@@ -23,15 +24,14 @@ from landscape.results import Bracket
 from landscape.spectrum.rules import SpectralDensity
 
 REACH, RESOLUTION = 20.0, 40  # a = centre +- sinh(20) |b| in steps of half an e-fold
-ROUNDS, FINER = 7, 11  # of these steps, each round but the first refines them by a factor of 5
-FAR = 1e8  # in units of the largest node; a node there adds 1 / FAR to the integral at most, and costs eps FAR in precision
+ROUNDS, FINER = 7, 11  # of the search for the largest; points of each round but the first, which refine its steps by 5
+FAR = 1e8  # largest |a|, in units of the largest node: a node there adds at most 1 / FAR to the integral, and costs eps FAR
 
 
 def absolute_sum(density: SpectralDensity, confidence: float = 0.95) -> Bracket:
     """sum_i |lambda_i|, the nuclear norm: the mean of `absolute_integral` over start vectors.
 
-    The bracket is made of the means of its lower and upper bounds, widened by what start vectors differ by (`rules`) at this
-    confidence.
+    Bracket: the means of its lower and upper bounds, widened by the spread over start vectors (`rules`) at this confidence.
     """
     certain = float(density.known.abs().sum())
     shift, error = density.by_trace(torch.abs, confidence)
@@ -46,12 +46,12 @@ def absolute_sum(density: SpectralDensity, confidence: float = 0.95) -> Bracket:
 
 @lru_cache(maxsize=16)
 def integrals_of_rules(density: SpectralDensity) -> Float64[Tensor, "3 starts"]:
-    """`absolute_integral` of each start vector; several indices need them."""
+    """`absolute_integral` of each start vector; cached, as several indices need them."""
     return torch.tensor([absolute_integral(*rule) for rule in density.rules()], dtype=torch.float64).T
 
 
 def absolute_integral(nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"]) -> tuple[float, float, float]:
-    """The integral of |x| over a measure that has this m-point Gauss rule: its lower bound, value and upper bound.
+    """Lower bound, value and upper bound of the integral of |x| over a measure that has this m-point Gauss rule.
 
     A rule with weights of 0 is that of an invariant subspace: the measure itself.
 
@@ -74,20 +74,20 @@ def absolute_integral(nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m
     centre = least if abs(least) < FAR else float(T[-1, -1])
 
     def integrals(steps: Tensor) -> Float64[Tensor, " s"]:
-        """At a = centre + unit sinh(step)."""
+        """Integrals by T(a), a = centre + unit sinh(step)."""
         return size * _absolute_integrals(T, centre + unit * torch.sinh(steps))
 
     steps = torch.linspace(-REACH, REACH, 2 * RESOLUTION + 1, dtype=torch.float64)
-    for _ in range(ROUNDS):  # the largest lies between the neighbours of the largest of the grid
+    for _ in range(ROUNDS):  # the maximum lies between the neighbours of the best point of the grid
         found = integrals(steps)
         best = int(found.argmax().clamp(1, len(steps) - 2))
         steps = torch.linspace(float(steps[best - 1]), float(steps[best + 1]), FINER, dtype=torch.float64)
     below = size * float(_absolute_integrals(T, torch.tensor([least], dtype=torch.float64)))
     low, high = min(below, gauss), max(float(found.max()), gauss)
-    return low, min(max(size * _averaged(T), low), high), high
+    return low, min(max(size * _anti_gauss_mean(T), low), high), high
 
 
-def _averaged(T: Float64[Tensor, "m m"]) -> float:
+def _anti_gauss_mean(T: Float64[Tensor, "m m"]) -> float:
     """The integral of |x| by the mean of the (m - 1)-point Gauss rule and its anti-Gauss rule."""
     anti = T.clone()
     anti[-1, -2] *= 2**0.5
@@ -106,9 +106,9 @@ def _singular_end(T: Float64[Tensor, "m m"]) -> float:
 
 
 def _absolute_integrals(T: Float64[Tensor, "m m"], ends: Float64[Tensor, " s"]) -> Float64[Tensor, " s"]:
-    """The integral of |x| by the rules of T with each of `ends` as its last diagonal entry, for T of size 1.
+    """The integral of |x| by the rules of T(a), a in ends, for nodes in units of the largest.
 
-    Beyond FAR that entry's node has no weight left, and the rule is that of T without its last row.
+    Beyond FAR the node at a has no weight left: the rule is that of T without its last row.
     """
     rules = T.repeat(len(ends), 1, 1)
     rules[:, -1, -1] = ends.clamp(-FAR, FAR)

@@ -1,4 +1,4 @@
-"""How unequal the curvatures are: indices of the spectrum lambda_1 >= ... >= lambda_n (signed), each with a bracket.
+"""Anisotropy of curvatures: indices of the spectrum lambda_1 >= ... >= lambda_n (signed), each with a bracket.
 
     literal         lambda_1 / lambda_n                            the condition number as the paper writes it, signed
     saddle          lambda_1 / |lambda_n|                          of an indefinite operator only
@@ -139,7 +139,7 @@ def mass_quantile(ends: EigenEnds, density: SpectralDensity, p: float = 0.05) ->
 
 
 def _intervals(ends: EigenEnds) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Where lambda_max and lambda_min lie: residuals, plus one unit of round-off of the larger magnitude.
+    """Intervals of lambda_max and lambda_min: their residuals, plus one unit of round-off of the larger magnitude.
 
     A residual says that an eigenvalue is near, not that none is farther out: an end that ran out of its budget reaches
     out by `ends.beyond`.  Neither end lies beyond what the other one may be.

@@ -59,7 +59,7 @@ CONFIDENCE = 0.95  # of the interval that is to be short
 
 @dataclass(frozen=True, eq=False)
 class ActiveSpace:
-    """What the known null space of an operator P H P leaves: the orthogonal projector `project(V) -> P V` and its rank."""
+    """Complement of the known null space of an operator P H P: the orthogonal projector `project(V) -> P V` and its rank."""
 
     project: Callable[[Tensor], Tensor]
     rank: int
@@ -121,9 +121,9 @@ def spectral_density(
 
 
 class Lengths:
-    """Where runs end that are as long as pays: the interval of sum |lambda| that all products buy is then shortest.
+    """Stopping rule for the length of runs: it seeks the shortest interval of sum |lambda| for all products.
 
-    It is looked at as the first runs grow; they end with the first look that is worse than the one before.  best: steps.
+    The interval is estimated as the first runs grow; they end with the first estimate that is wider.  best: steps.
     traced: whether the trace is known.
     """
 
@@ -143,7 +143,7 @@ class Lengths:
         return False
 
     def half_width(self, runs: Sequence[tuple[Float64[Tensor, "m m"], float]], steps: int) -> float:
-        """Of the interval that runs of so many steps leave products for, from as many start vectors."""
+        """Half width of the interval from runs of so many steps, with as many start vectors as products allow."""
         nodes, weights, found = [], [], 0
         for T, length in runs:
             values, S = torch.linalg.eigh(T)
@@ -290,7 +290,7 @@ def missed(values: Float64[Tensor, " k"], residuals: Float64[Tensor, " k"]) -> F
 def pushed(
     values: Float64[Tensor, " k"], known: Float64[Tensor, " l"], residuals: Float64[Tensor, " l"]
 ) -> Float64[Tensor, " k"]:
-    """How far eigenvalues of what known pairs leave may lie from eigenvalues of H, which couples them by the pairs' residuals.
+    """Bound of the distance of eigenvalues on the complement of known pairs from eigenvalues of H; they couple by residuals.
 
     (hypot(g, 2 r) - g) / 2 for each pair at the distance g (Li and Li 2005).
     """
@@ -299,7 +299,7 @@ def pushed(
 
 
 def settled(values: Float64[Tensor, " m"], S: Float64[Tensor, "m m"], length: float) -> Bool[Tensor, " m"]:
-    """Which Ritz pairs are eigenpairs.  values, S: of T; length: of r."""
+    """Mask of the Ritz pairs that are eigenpairs.  values, S: of T; length: of r."""
     far = torch.tensor([inf], dtype=torch.float64)
     gaps = torch.diff(values, prepend=-far, append=far)
     return length * S[-1].abs() <= SETTLED * torch.minimum(gaps[:-1], gaps[1:])

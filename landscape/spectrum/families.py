@@ -41,7 +41,7 @@ class FamilySettings:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Lead(Brief):
-    """What is known of a part beforehand.
+    """Prior knowledge of a part.
 
     start: vectors in which the search for both ends begins (`extreme_eigenpairs`).  trace: its value and standard error.
     """

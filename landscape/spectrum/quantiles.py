@@ -121,7 +121,7 @@ def _sum_above(
 
 
 class _Tail:
-    """What one start vector says of the curvature at magnitudes above t."""
+    """Curvature at magnitudes above t, as one start vector estimates it."""
 
     def __init__(
         self, nodes: Float64[Tensor, " m"], weights: Float64[Tensor, " m"], total: tuple[float, float]
@@ -218,7 +218,7 @@ def _middle_of_magnitudes(density: SpectralDensity, tails: Sequence[_Tail], p: f
 
 
 def _mean_quantile(share: Float64[Tensor, " g"], size: float, level: float) -> Float64[Tensor, " g"]:
-    """Of the mean over start vectors that see, each with its error, this share: by the beta distribution of `size`."""
+    """Quantile of the mean share over start vectors, given theirs with their errors: of the beta distribution of `size`."""
     inner = share.clamp(TINY, 1 - EPS).numpy()
     return torch.from_numpy(betaincinv(size * inner, size * (1 - inner), level))
 

@@ -72,7 +72,7 @@ class SpectralDensity:
 
     @property
     def rest(self) -> int:
-        """How many eigenvalues are not known."""
+        """Number of eigenvalues that are not known."""
         return self.dim - len(self.known)
 
     def rules(self) -> Iterator[tuple[Float64[Tensor, " m"], Float64[Tensor, " m"]]]:
@@ -112,7 +112,7 @@ class SpectralDensity:
         confidence: float,
         other: float = 0.0,
     ) -> tuple[float, float]:
-        """How far below and above the mean of what start vectors see of a sum (samples) its interval reaches.
+        """Reach of a sum's interval below and above the mean over start vectors (samples).
 
         values: of the summed function, at the nodes.  other: an independent error of the mean, at the same confidence.
         """
@@ -135,7 +135,7 @@ class SpectralDensity:
         return hypot(unit * (half - middle), other), hypot(unit * (half + middle), other)
 
     def of_known(self, function: Callable[[Tensor], Tensor]) -> float:
-        """How far the known eigenvalues' residuals, and round-off of the largest in all, may take sum f(lambda) off.
+        """Largest error of sum f(lambda) by the known eigenvalues' residuals, and by round-off of the largest of all.
 
         With H in the basis of v and its complement, the trace of f(H) less f(lambda) and that of f of the rest is
         sum_j r_j^2 (f'(lambda) - f'(mu_j)) / (lambda - mu_j) to second order: 2 r^2 for lambda^2, and 2 r^2 / |lambda| at most
@@ -147,7 +147,7 @@ class SpectralDensity:
 
     @property
     def residuals(self) -> Float64[Tensor, " k"]:
-        """Of the known eigenvalues: within it of each of them lies an eigenvalue of H."""
+        """Residuals of the known eigenvalues: within its residual of each lies an eigenvalue of H."""
         if self.missed is None:
             return torch.zeros_like(self.known)
         return self.known.abs() * torch.maximum(self.missed / 4, self.missed.sqrt() / 2)
@@ -155,7 +155,7 @@ class SpectralDensity:
     def by_trace(
         self, function: Callable[[Tensor], Tensor], confidence: float
     ) -> tuple[Float64[Tensor, " starts"], float]:
-        """What the trace corrects in each start vector's sum of f(lambda), and how far its own error may take that off.
+        """Correction of each start vector's sum of f(lambda) by the trace, and its error by that of the trace.
 
         What start vector z says of the trace is off by what is known of it; c times that is taken off what z says of
         sum f(lambda) (a control variate).  For random signs variances are 2 sum f(lambda)^2 at most, and

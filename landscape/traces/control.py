@@ -12,9 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 EPS = torch.finfo(torch.float64).eps
-ROUND_OFFS = (
-    10  # units of round-off of the sum of squares: a smaller spread of the other controls means that they are equal
-)
+ROUND_OFFS = 10  # of the sum of squares: a smaller spread of the other controls means that they are equal
 
 
 def controlled(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> Float64[Tensor, " s"]:
@@ -26,15 +24,11 @@ def controlled(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], m
     """
     if len(samples) < 3:
         return samples
-    x, (y, unit) = samples - samples.mean(), _in_units(control - control.mean())
+    x, y = samples - samples.mean(), control - control.mean()
+    unit = float(y.abs().max()) or 1.0
+    y = y / unit  # squares of y may leave the range of floats
     left = len(samples) / (len(samples) - 1)  # the means move, too, when a sample is left out
     cross, spread = (x * y).sum() - left * x * y, y.square().sum() - left * y.square()
     varies = spread > ROUND_OFFS * EPS * y.square().sum()
     slope = torch.where(varies, cross / spread.clamp_min(1e-300), torch.zeros_like(cross))
     return samples - slope * ((control - mean) / unit)
-
-
-def _in_units(y: Float64[Tensor, " s"]) -> tuple[Float64[Tensor, " s"], float]:
-    """y over its largest modulus, and that modulus: squares of y may leave the range of floats."""
-    unit = float(y.abs().max()) or 1.0
-    return y / unit, unit

@@ -34,7 +34,7 @@ GROUP = 32  # probes whose vectors are kept at a time, for the pairs in `quadrat
 
 @dataclass(frozen=True)
 class TraceSettings:
-    """How many probe vectors of which kind, and by which method.
+    """Number and kind of probe vectors, and the method.
 
     distribution: entries of a probe are random signs ("rademacher") or standard normal ("gaussian").
     reading, method: see `landscape.traces.trace`.

@@ -1,4 +1,4 @@
-"""Traces by sketching: the part of H that a few eigenvalues dominate is taken exactly, and only the rest by probes.
+"""Traces by sketching: exact on the range of a few products, which the large eigenvalues dominate, by probes on the rest.
 
 Hutch++ (Meyer, Musco, Musco and Woodruff 2021), with a third of the matvecs each for H S, H Q and the probes:
 
@@ -12,27 +12,27 @@ omega_i serves twice: in the sketch of the others, and as the probe for the sket
 
 All t_i follow from one QR decomposition Y = H Omega = Q R: the range of Q_i is that of Q without the unit vector Q s_i, where
 s_i is the normalised column i of R^-T.  The factor (n - s + 1) / |u|^2 replaces the squared length of u by its expectation.
-Test vectors that were random signs before (`choice`) keep their lengths: the factor is 1 for them.
+For random signs (test vectors taken over from Hutchinson's estimator, `choice.py`) the factor is 1.
 
-**The error.**  The published one, the standard deviation of the t_i over sqrt(s), is too small: it takes the t_i as
-independent, but they share a sketch.  With V = Var t_i and C = Cov(t_i, t_j)
+**The error.**  The published one, the standard deviation of the t_i over sqrt(s), takes the t_i as independent; they share a
+sketch, and it is too small.  With V = Var t_i and C = Cov(t_i, t_j)
 
     Var(mean) = (V + (s - 1) C) / s,    and the sample variance s_t^2 of the t_i has the expectation V - C
 
-C can be estimated, too.  Let t_i^j be t_i with j left out of the sketch as well.  Given the other test vectors, t_i^j and t_j^i
-are independent and unbiased; so is t_j for any omega_i, and t_i^j depends on omega_i only.  So all products except t_i t_j have
-the mean (tr H)^2, and
+To estimate C, let t_i^j be t_i with j left out of the sketch as well.  Given the other test vectors, t_i^j and t_j^i are
+independent and unbiased; t_j is unbiased for any omega_i, and t_i^j depends on omega_i only.  All products but t_i t_j
+therefore have the mean (tr H)^2, and
 
     C = E (t_i - t_i^j) (t_j - t_j^i),      error^2 = s_t^2 / s + |C^|,    C^ the mean over all pairs
 
 This is unbiased except for the modulus, which prevents a C^ that is negative by chance from shortening the interval.  The
 interval is Student's with s - 1 degrees of freedom.  All t_i^j follow from the one QR decomposition.
 
-An adaptive run stops only if one test vector more leaves its error below the tolerance, because an error that is small by
-chance goes with a value that is off.
+An adaptive run stops only if its error is below the tolerance with one test vector more, too: errors that are small by chance
+go with values that are off.
 
-Products are taken in the operator's dtype, small matrices in float64.  Directions of H Omega that are only round-off are left
-out of Q and cost nothing: a matrix of low rank r is exact after s + r products.
+Products are computed in the operator's dtype, small matrices in float64.  Directions of H Omega that are only round-off are
+left out of Q and cost nothing: a matrix of low rank r is exact after s + r products.
 """
 
 from dataclasses import replace
@@ -53,7 +53,7 @@ from landscape.traces.hutchinson import LEAST, Hutchinson, StoppingRule, TraceSe
 
 EPS = torch.finfo(torch.float64).eps
 GIB = 2**30
-VECTORS = 4  # vectors kept for each test vector of XTrace: of Omega, Y, Q and H Q
+VECTORS = 4  # kept for each test vector of XTrace: its columns of Omega, Y, Q and H Q
 CONFIRMATION = 1  # test vectors between reaching the tolerance and stopping
 
 
@@ -66,7 +66,7 @@ def hutch_plus_plus(
 ) -> TraceEstimate:
     """The trace of an operator by Hutch++.
 
-    A third of max_probes, or of the time, goes into the sketch.  An adaptive run saves probes on the rest.
+    A third of max_probes, or of the time, goes into the sketch.  An adaptive run may use fewer probes for the rest.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> v = torch.linspace(-1, 1, 101, dtype=torch.float64)
@@ -102,7 +102,7 @@ def xtrace(
 ) -> TraceEstimate:
     """The trace of an operator by XTrace.
 
-    start: test vectors of settings.distribution to begin with, and their products; None: directions are uniformly distributed.
+    start: first test vectors, of settings.distribution, and their products; None: test vectors of uniform direction.
 
     >>> from landscape.operators.operator import DenseOperator
     >>> v = torch.linspace(-1, 1, 101, dtype=torch.float64)
@@ -119,7 +119,7 @@ def xtrace(
     kind = "gaussian" if start is None else settings.distribution
     count = max(settings.min_probes, settings.least) // 2 if start is None else start[0].shape[1]
     Omega, Y, Q, HQ = (torch.empty(n, 0, dtype=operator.dtype, device=generator.device),) * 4
-    looks = StoppingRule(count, most, CONFIRMATION)
+    rule = StoppingRule(count, most, CONFIRMATION)
     while True:
         if start is None:
             Z = draw_probes(n, count - Omega.shape[1], generator, operator.dtype, kind)
@@ -132,12 +132,12 @@ def xtrace(
         value, error, spent = float(samples.mean()), _error(samples, without), count + Q.shape[1]
         half = t_quantile(count - 1, settings.confidence) * error
         late, reached = monotonic() > deadline, settings.reached(value, value - half, value + half)
-        complete = Q.shape[1] < count  # the range of H is complete: its trace is that of Q^T H Q
-        if late or (reached and complete) or looks.end(count, reached):
+        complete = Q.shape[1] < count  # Q spans the range of H: its trace is that of Q^T H Q
+        if late or (reached and complete) or rule.end(count, reached):
             reason: StopReason = "tolerance" if reached else "time budget" if late else "matvec budget"
             interval = value, error, value - half, value + half, settings.confidence
             return TraceEstimate(name, n, *interval, count, spent, reason, samples, "xtrace")
-        count = looks.next
+        count = rule.next
         if spent + n <= 2 * count:
             return by_identity(operator, settings, name, generator.device, spent)
 
@@ -149,7 +149,7 @@ def most_test_vectors(operator: SymmetricOperator, settings: TraceSettings) -> i
 
 
 def added_directions(Q: Float[Tensor, "n r"], Y: Float[Tensor, "n s"]) -> Float[Tensor, "n a"]:
-    """Orthonormal directions that Y adds to those of Q, without those that are only round-off."""
+    """An orthonormal basis of what Y adds to the span of Q, without directions that are only round-off."""
     rest = Y.clone(memory_format=torch.contiguous_format)
     for _ in range(2):
         rest -= Q @ (Q.T @ rest)
@@ -171,10 +171,11 @@ def _error(samples: Tensor, without: Tensor) -> float:
 def _leave_out(
     Omega: Tensor, Y: Tensor, Q: Tensor, HQ: Tensor, spherical: bool
 ) -> tuple[Float64[Tensor, " s"], Float64[Tensor, "s s"]]:
-    """All t_j; and t_j without test vector i in the sketch, in row i and column j.  spherical: lengths of u are replaced.
+    """All t_j; and t_j^i, without test vector i in the sketch either, in row i and column j.
 
-    Without the columns in P the sketch is Q without Q S_P.  With g = S_P^T S_P, b = S_P^T w, y = g^-1 b and w = Q^T omega:
-    u = omega - Q (w - S_P y).  |u|^2 and u^T H u follow from products of small matrices.
+    spherical: apply the factor (n - s + 1) / |u|^2.  Without the test vectors in a set P the sketch is Q without Q S_P.  With
+    g = S_P^T S_P, b = S_P^T w, y = g^-1 b and w = Q^T omega: u = omega - Q (w - S_P y), so that |u|^2 and u^T H u follow from
+    products of small matrices.
     """
     (n, count), rank = Omega.shape, Q.shape[1]
     R, W, core, T = gram(Q, Y), gram(Q, Omega), gram(Q, HQ), gram(HQ, Omega)
@@ -187,7 +188,7 @@ def _leave_out(
     quadratic = products + 2 * b_jj * pull_jj + b_jj.square() * inner_jj
     length = (n - rank + less) / (squares + b_jj.square()) if spherical else 1.0
     t = core.trace() - inner_jj + length * quadratic
-    # the same without i (rows) for the probe j (columns): a 2 x 2 system for y = (y_i, y_j)
+    # t_j^i, i in rows and j in columns: P = {i, j}, a 2 x 2 system for y = (y_i, y_j)
     det = (1 - angles.square()).fill_diagonal_(1)
     y_i, y_j = (b - angles * b_jj) / det, (b_jj - angles * b) / det
     squares = squares + b * y_i + b_jj * y_j
@@ -199,7 +200,7 @@ def _leave_out(
 
 
 def left_out_directions(R: Float64[Tensor, "r s"]) -> Float64[Tensor, "r s"] | None:
-    """Unit vectors s_i (columns): the columns of Q R without the i-th span Q without Q s_i.  They are those of R^-T.
+    """Columns of R^-T, normalised: unit vectors s_i such that Q R without its column i spans Q without Q s_i.
 
     None where R has fewer rows than columns: then the other columns span all of Q.
     """

@@ -74,7 +74,8 @@ def estimate_traces(
     most = len(names) * settings.max_probes
     for index, name in enumerate(names):
         block, stream = RestrictedOperator(operator, name), spawn(generator)
-        report = _from(progress, index * settings.max_probes, most)
+        before = index * settings.max_probes
+        report = progress and (lambda done, _, state, before=before: progress(before + done, most, state))
         # the remaining time is shared evenly among the remaining blocks
         end = monotonic() + max(deadline - monotonic(), 0) / (len(names) - index)
         if settings.method == "hutchinson":
@@ -84,8 +85,3 @@ def estimate_traces(
             if report:
                 report(settings.max_probes, most, f"trace of {name}: {estimates[name].matvecs} matvecs")
     return estimates
-
-
-def _from(progress: Progress | None, before: int, most: int) -> Progress | None:
-    """The progress of one block, after `before` of all `most` matvecs."""
-    return progress and (lambda done, _, state: progress(before + done, most, state))

@@ -128,7 +128,7 @@ def _number(path: Path) -> int | None:
 
 
 def _cached(path: Path) -> int:
-    """Bytes of files that a group keeps for nobody."""
+    """Bytes of cached files that a group can give up."""
     try:
         entries = dict(line.split() for line in path.read_text().splitlines())
     except OSError:

@@ -46,8 +46,8 @@ MIXED = "per stored unit²"
 
 @dataclass(frozen=True)
 class Field:
-    """What a field is, in words; its unit, empty where it has none; scale: as a picture shows it; log: of positive numbers,
-    signed: about 0."""
+    """A field in words; its unit, empty where it has none; scale: as a picture shows it; log: of positive numbers, signed:
+    about 0."""
 
     words: str
     unit: str
@@ -117,7 +117,7 @@ def block_fields(
     rays: Float64[Tensor, "n 3"],
     precision: torch.dtype,
 ) -> Values:
-    """The fields of the blocks.  quats: of unit length; precision: in which the blocks were worked out."""
+    """The fields of the blocks.  quats: of unit length; precision: in which the blocks were computed."""
     found: Values = {}
     across = [on_complement(blocks.geometry.double(), quats.double()) for blocks in (hessian, gauss_newton)]
     for prefix, blocks, B in zip(PREFIXES, (hessian, gauss_newton), across, strict=True):

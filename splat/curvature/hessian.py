@@ -111,7 +111,7 @@ class SceneHessian:
         return self.project(self.objective.mean_over_views(total)).to(V.device)
 
     def _argument(self, V: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-        """What H is applied to in place of P V, with the same result."""
+        """Vectors that H maps to the same as P V, at less cost."""
         V = V.to(self.objective.active.flat.device)
         return V if self.keep_null else self.projector.without_lengths(V)
 

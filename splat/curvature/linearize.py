@@ -1,19 +1,18 @@
-"""One view, linearised: the loss, its gradient, and exact derivatives of first and second order as products with blocks.
+"""The loss of one view, linearised: its value and gradient, and exact products of its Hessian with vectors.
 
-Everything that depends on the scene alone is done once: projection with its Jacobian and curvature per Gaussian, order,
-tile lists, final transmittances, first-order adjoints, the loss's own derivatives.  Each product is then two passes over
-the pixels for K vectors together.  With y the splats, P the projection, R the compositing, g = dl/dI, a = R'(y)^T g:
+The loss is l(R(P(theta))): the projection P gives splats, the compositing R an image I, and l compares it with the photograph.
+With g = dl/dI and a = R'^T g,
 
     gradient  P'^T R'^T g
     J u       R' P' u
     G u       P'^T R'^T l'' R' P' u                                          (Gauss-Newton; l'' may be indefinite: SSIM)
     H u       P'^T [ R'^T l'' R' P' u + (g . R'')(P' u) ] + (a . P'') u
 
-Vectors are columns of (p, K) blocks laid out like `Gaussians.flat`.  The order of the splats, the alpha_min cut, the stop and
-the clamps are constants of every derivative; they are piecewise constant.
+P' and P'' of every Gaussian, tile lists, final transmittances, g and a are computed once.  Each product is then two passes over
+the pixels for K vectors together: the columns of U (p, K), laid out like `Gaussians.flat`.  The order of the splats, the
+alpha_min cut, the stop and the clamps are piecewise constant and count as constants.
 
-Between P and R tangents and adjoints of splats are in the coordinates of `projection/whitening.py`.  The pieces (raster,
-projection, loss) are those of the device of the Gaussians.  On a GPU no product waits for the device.
+Tangents and adjoints of splats are in the coordinates of `projection/whitening.py`.  On a GPU no product waits for the device.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -39,9 +38,9 @@ from splat.raster.dispatch import Adjoint, Raster, Tangent
 from splat.raster.formulas import BLOCK_SUMS
 from splat.render.forward import rasterize_view, touches
 
-LOSS_PLANES = 16  # target, its moments, gradient and a blurred one
-DOUBLE_BLOCK = 8 * 9 * 9  # bytes
-VECTORS = 8  # at a time in a product: a wider block gains nothing more, because it leaves the second-level cache
+LOSS_PLANES = 16  # planes that a linearised loss keeps: target, its moments, gradient, and a blurred one
+DOUBLE_BLOCK = 8 * 9 * 9  # bytes of a 9 x 9 block in double precision
+VECTORS = 8  # of a product at a time: more would not fit into the second-level cache
 
 
 class LinearizedView:
@@ -75,8 +74,8 @@ class LinearizedView:
 
     @property
     def gradient(self) -> Float[Tensor, " p"]:
-        """Of the loss; worked out from its adjoint every time, so that a view that is kept does not hold p numbers more."""
-        return self._regularizers.add_gradient(self._pulled([self._adjoint])[:, 0])
+        """The gradient of the loss, computed anew at each call: keeping it would take p numbers for every view."""
+        return self._regularizers.add_gradient(self._pullback([self._adjoint])[:, 0])
 
     @property
     def image(self) -> Float[Tensor, "3 h w"]:
@@ -84,7 +83,7 @@ class LinearizedView:
 
     @staticmethod
     def size_of(raster: Raster, gaussians: Gaussians, settings: RenderSettings) -> tuple[int, int, int]:
-        """About how many bytes a view of this raster takes: `bytes`, `workspace(1)`, and the pass of `block_diagonal`."""
+        """Estimated bytes of a view with this raster: `bytes`, `workspace(1)`, and the workspace of `block_diagonal`."""
         size, drawn = gaussians.flat.element_size(), len(raster.touched)
         plane = raster.planes[0].nbytes
         rows = row_shapes(antialiased=settings.antialias != "none" or gaussians.filter_widths is not None)
@@ -94,44 +93,44 @@ class LinearizedView:
 
     @property
     def intersections(self) -> int:
-        """How many (splat, tile) pairs a product passes over."""
+        """Number of (splat, tile) pairs that a product passes over."""
         return self._raster.intersections_reached
 
     @property
     def intersections_behind(self) -> int:
-        """How many (splat, tile) pairs are left out because every pixel has stopped in front of them."""
+        """Number of (splat, tile) pairs that products skip because every pixel has stopped in front of them."""
         return self._raster.intersections - self.intersections
 
     @property
     def dark_tiles(self) -> int:
-        """How many tiles with splats are left out of products: the loss has neither slope nor curvature there."""
+        """Number of tiles with splats that products skip because the loss has neither slope nor curvature there."""
         return self._raster.dark_tiles(self._adjoint, self._loss.diagonal)
 
     @property
     def touched(self) -> int:
-        """How many Gaussians reach a tile of this view before its pixels stop."""
+        """Number of Gaussians that reach a tile of this view before its pixels stop."""
         return len(self._index)
 
     @property
     def jacobian(self) -> ProjectionJacobian:
-        """The projection's derivatives of the Gaussians that have weight in a pixel; takes a pass over the pixels."""
+        """Derivatives of the projection of the Gaussians that have weight in a pixel, found by a pass over the pixels."""
         jacobian = self._projection.jacobian
-        seen = touches(self._raster)[jacobian.index]
-        return ProjectionJacobian(*(part[seen] for part in jacobian))
+        visible = touches(self._raster)[jacobian.index]
+        return ProjectionJacobian(*(part[visible] for part in jacobian))
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept for the products; the adjoint's cotangent is the loss's gradient."""
+        """Memory kept for the products; the adjoint's cotangent is the loss's gradient and counted there."""
         return self._raster.bytes + self._projection.bytes + self._loss.bytes + self._adjoint.bytes
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that `hvp` of so many vectors takes beside its argument, its result and the loss's few rows a thread."""
+        """Bytes that `hvp` of so many vectors takes beside argument, result and the loss's few rows for each thread."""
         return self._raster.workspace(vectors) + self._loss.workspace(vectors)
 
     def affects(self, U: Float[Tensor, "p k"]) -> bool:
-        """Whether a vector moves any Gaussian that the view draws: where none does, all products are 0.
+        """Whether products can be other than 0: some vector changes a Gaussian that the view draws.
 
-        On a GPU always True: to look would be to wait for the device.
+        Always True on a GPU, where testing it would wait for the device.
         """
         return self._projection.affects(U) or self._regularizers.affects(U)
 
@@ -141,33 +140,33 @@ class LinearizedView:
 
     def vjp(self, G: Float[Tensor, "k 4 h w"]) -> Float[Tensor, "p k"]:
         """J^T G for cotangents of colour and accumulated alpha."""
-        return self._pulled([self._raster.backward(self._raster.pad(g)) for g in G])
+        return self._pullback([self._raster.backward(self._raster.pad(g)) for g in G])
 
     def hvp(
         self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, coupled: bool = True
     ) -> Float[Tensor, "p k"]:
-        """H U of the view's loss.  total: what it is added to.  coupled: False for the pixel-diagonal of l''."""
+        """H U, added to total where it is given.  coupled: False for the pixel-diagonal of l'' in place of l''."""
         return self._regularizers.add_product(self._projection.vjp(self._adjoint_tangent(U, coupled), U, total), U)
 
     def ggn(
         self, U: Float[Tensor, "p k"], total: Float[Tensor, "p k"] | None = None, *, coupled: bool = True
     ) -> Float[Tensor, "p k"]:
         """G U, the Gauss-Newton part of H U; total, coupled: see `hvp`."""
-        cotangents = self._curved(self._tangent(U), coupled)
-        return self._pulled([self._raster.backward(cotangent) for cotangent in cotangents], total)
+        cotangents = self._loss_product(self._tangent(U), coupled)
+        return self._pullback([self._raster.backward(cotangent) for cotangent in cotangents], total)
 
     def block_diagonal(self, *, gauss_newton: bool = False, approximate: bool = False) -> PerGaussianBlocks:
-        """Every Gaussian's diagonal block of the Hessian, or of its Gauss-Newton part, exactly.
+        """The diagonal block of every Gaussian in the Hessian, or in its Gauss-Newton part.
 
-        approximate: in one pass over the pixels, with the diagonal of l'' in place of l'': without SSIM's coupling of pixels.
-        The exact ones of a loss with SSIM are made on the CPU alone (InputError on a GPU).
+        approximate: with the pixel-diagonal of l'' in place of l'', which takes one pass over the pixels.  Exact blocks of a
+        loss with SSIM, which couples pixels, are computed on the CPU only (InputError on a GPU).
         """
         return self.block_diagonals(approximate=approximate, parts=(gauss_newton,))[0]
 
     def block_diagonals(
         self, *, approximate: bool = False, parts: Sequence[bool] = (False, True)
     ) -> list[PerGaussianBlocks]:
-        """`block_diagonal` of several parts at once, which share the pass of the coupling; parts: which are Gauss-Newton."""
+        """`block_diagonal` for each of parts (True: Gauss-Newton); they share the pass for the coupling of pixels."""
         raster, index = self._raster, self._index
         if approximate or not self._couples:
             curvature, coupled = self._loss.diagonal, 0.0
@@ -190,19 +189,19 @@ class LinearizedView:
         return found
 
     def loss_curvatures(self, U: Float[Tensor, "p k"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-        """(J u)^T l'' (J u) of every column, and the same with l'' replaced by its pixel-diagonal: no backward pass."""
+        """(J u)^T l'' (J u) of every column, and the same with the pixel-diagonal of l''; takes no backward pass."""
         return self._loss.curvatures(self._tangent(U).planes)
 
     def _tangent(self, U: Float[Tensor, "p k"]) -> Tangent:
         return self._raster.jvp(self._projection.jvp(U))
 
     def _adjoint_tangent(self, U: Float[Tensor, "p k"], coupled: bool) -> Float[Tensor, "n k 9"]:
-        """The tangent of the splats' adjoint; all else that it takes is free again before the result is made."""
+        """The tangent of the splats' adjoint; a method, so that its planes are freed before `hvp` allocates the result."""
         tangent = self._tangent(U)
-        return tangent.backward_tangent(self._adjoint, self._curved(tangent, coupled))
+        return tangent.backward_tangent(self._adjoint, self._loss_product(tangent, coupled))
 
-    def _curved(self, tangent: Tangent, coupled: bool) -> Float[Tensor, "k 4 H W"]:
-        """l'' of the image's tangents, which it takes the place of."""
+    def _loss_product(self, tangent: Tangent, coupled: bool) -> Float[Tensor, "k 4 H W"]:
+        """l'' times the tangents of the image, in their place."""
         planes = tangent.planes
         if coupled:
             return self._loss.hvp(planes, out=planes)
@@ -210,19 +209,17 @@ class LinearizedView:
         planes[:, 3] = 0
         return planes
 
-    def _pulled(self, adjoints: Sequence[Adjoint], total: Float[Tensor, "p k"] | None = None) -> Float[Tensor, "p k"]:
-        """P'^T of adjoints of the splats."""
+    def _pullback(self, adjoints: Sequence[Adjoint], total: Float[Tensor, "p k"] | None = None) -> Float[Tensor, "p k"]:
+        """P'^T times adjoints of the splats."""
         return self._projection.vjp(torch.stack([adjoint.moments for adjoint in adjoints], dim=1), total=total)
 
 
 class KeptViews:
     """Iterates over linearized views: the first `kept` stay in memory, the others are linearized anew every time.
 
-    linearize: makes the view of an index; count: how many views; memory: bytes for views and the workspace of a product with
-    VECTORS vectors.  The first view is made here, always kept, and stands for the size of all.  Memory decides how many views
-    are kept and nothing else, so that results do not depend on it.
-
-    first: the first view.
+    linearize: makes the view of an index; count: of views; memory: bytes for views and the workspace of a product with VECTORS
+    vectors, which affects `kept` alone and no result.  `first`, the first view, is made at once, always kept, and stands for
+    the size of all.
     """
 
     def __init__(self, linearize: Callable[[int], LinearizedView], count: int, memory: int):
@@ -245,5 +242,5 @@ class KeptViews:
             yield self._views[index]
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that a product with so many vectors takes at a time in the first view."""
+        """Bytes that a product with so many vectors takes in the first view, VECTORS at a time."""
         return self.first.workspace(min(vectors, VECTORS))

@@ -51,7 +51,7 @@ class NothingInSight(InputError):
 
 @dataclass(frozen=True)
 class ActiveCounts:
-    """How much of a set of Gaussians is left in the objective, and how much was removed because L is exactly flat there.
+    """Counts of what is left of a set of Gaussians in the objective, and of what was removed because L is exactly flat there.
 
     active_gaussians: those that touch a pixel of some view.  parameters: stored numbers of all Gaussians.  active_parameters:
     those of the active ones in the SH bands in use, less one for each quaternion, whose length does not count.
@@ -70,8 +70,8 @@ class ActiveCounts:
 
 @dataclass(frozen=True)
 class Needs:
-    """Bytes, about: of a vector over the active parameters; of a linearised view; of a product for each of its vectors; of the
-    Gaussians' own blocks that are kept, and of the pass that makes them.
+    """Estimated bytes of a vector over the active parameters, a linearised view, a product for each of its vectors, the kept
+    diagonal blocks of Gaussians, and the pass that makes them.
     """
 
     vector: int
@@ -82,7 +82,7 @@ class Needs:
 
     @property
     def beside(self) -> int:
-        """What is needed beside linearised views: blocks, a small basis, and the larger of a product and the blocks' pass."""
+        """Memory needed beside linearised views: blocks, a small basis, and the larger of a product and the blocks' pass."""
         return self.blocks + FEWEST * self.vector + max(AT_ONCE * self.product, self.making_blocks)
 
 
@@ -167,7 +167,7 @@ class SceneObjective:
         self._memory = memory
 
     def _seen(self, gaussians: Gaussians) -> Bool[Tensor, " n"]:
-        """Which Gaussians touch a pixel of some view of any rank."""
+        """Mask of the Gaussians that touch a pixel of some view of any rank."""
         seen, self._sizes = gaussians.flat.new_zeros(len(gaussians), dtype=torch.bool), (0, 0, 0)
         for view in self.views:
             raster = rasterize_view(gaussians, view.camera, self.background, self.settings, finite=True)
@@ -260,7 +260,7 @@ class SceneObjective:
         return KeptViews(self.linearizer(self.active), len(self.views), self._memory)
 
     def linearizer(self, gaussians: Gaussians) -> Callable[[int], LinearizedView]:
-        """What linearizes a view, by its index, at the active Gaussians or, for comparison, at others.
+        """Function that linearizes the view of an index, at the active Gaussians or, for comparison, at others.
 
         It does not refer to this objective, which would otherwise be freed only when Python looks for circles.
         """

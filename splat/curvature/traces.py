@@ -188,10 +188,11 @@ class SampledTrace:
             self.open = not self.looks.end(self.count, self.estimate().reason == "tolerance")
 
     def estimate(self) -> TraceEstimate:
-        settings = self.settings
+        settings, terms = self.settings, None if self.views is None else _terms(self.views)
         if self.pixelwise is None:
-            terms = None if self.views is None else _terms(self.views)
             return TraceEstimate.exact(self.name, self.dim, self.known, settings.confidence, terms=terms)
+        if terms is not None:
+            terms += torch.cat(self.apart, dim=1).mean(dim=1)  # T_b + E[x - y] of every view
         samples = self.known - self.pixelwise + controlled(self.full, self.diagonal, self.pixelwise)
         value = float(samples.mean())
         error = max(float(samples.std()) / sqrt(self.count), regression_error(self.full, self.diagonal, self.pixelwise))
@@ -203,12 +204,8 @@ class SampledTrace:
             reason = "tolerance"
         return TraceEstimate(
             self.name, self.dim, value, error, value - half, value + half, settings.confidence, self.count, self.count,
-            reason, samples, terms=self._terms_of_views(),
+            reason, samples, terms=terms,
         )  # fmt: skip
-
-    def _terms_of_views(self) -> Float64[Tensor, " m"] | None:
-        """T_b + E[x - y] of every view."""
-        return None if self.views is None else _terms(self.views) + torch.cat(self.apart, dim=1).mean(dim=1)
 
 
 def regression_error(samples: Float64[Tensor, " s"], control: Float64[Tensor, " s"], mean: float) -> float:

@@ -50,7 +50,7 @@ class ImageLoss(Protocol):
     """A loss of images of one size."""
 
     def padded(self, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 H W"]:
-        """An image as the other methods take it."""
+        """An image as the other methods take it, 0 in the padding."""
         ...
 
     def cropped(self, planes: Float[Tensor, "k H W"]) -> Float[Tensor, "3 h w"]:

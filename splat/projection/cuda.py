@@ -107,7 +107,6 @@ class CudaProjection:
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept per Gaussian in sight."""
         return sum(array.nbytes for array in self._at[1:])
 
     def _grid(self, vectors: int) -> tuple[tuple[int, int], int, int]:
@@ -117,11 +116,9 @@ class CudaProjection:
         return (cdiv(self._at.index.numel(), rows), cdiv(vectors, wide)), rows, wide
 
     def affects(self, block: Float[Tensor, "p k"]) -> bool:
-        """True: to look whether a vector moves any of the Gaussians at index would be to wait for the device."""
         return True
 
     def jvp(self, block: Float[Tensor, "p k"]) -> Float[Tensor, "n k 9"]:
-        """P' U."""
         at, vectors = self._at, block.shape[1]
         out = block.new_zeros(self.n, vectors, 9)
         grid, rows, wide = self._grid(vectors)
@@ -137,7 +134,6 @@ class CudaProjection:
         block: Float[Tensor, "p k"] | None = None,
         total: Float[Tensor, "p k"] | None = None,
     ) -> Float[Tensor, "p k"]:
-        """P'^T cotangents, plus (a . P'') block where a block is given, added to total."""
         vectors, m = cotangents.shape[1], self._at.index.numel()
         out = self._at.jacobian.new_zeros(self.parameters, vectors)
         grid, rows, wide = self._grid(vectors)
@@ -151,7 +147,6 @@ class CudaProjection:
     def blocks(
         self, blocks: Float64[Tensor, "m 9 9"], second_order: bool
     ) -> tuple[Float[Tensor, "n 11 11"], Float[Tensor, "n b 3"]]:
-        """The blocks of splats in stored parameters."""
         like, m = self._at.jacobian, self._at.index.numel()
         geometry = like.new_zeros(self.n, GEOMETRY + 1, GEOMETRY + 1)
         sh = like.new_zeros(self.n, self.bands, 3)

@@ -122,7 +122,7 @@ def curved(packed, u, h):
 
 @jit
 def start_of(attribute: tl.constexpr, n):
-    """Where an attribute begins in the flat vector: 0 means, 1 log-scales, 2 quaternions, 3 opacity logits, 4 SH."""
+    """Index of an attribute in the flat vector: 0 means, 1 log-scales, 2 quaternions, 3 opacity logits, 4 SH."""
     return n * (11 if attribute == 4 else 10 if attribute == 3 else 3 * attribute)
 
 
@@ -160,7 +160,7 @@ def geometry_at(flat, i, n, mask):
 
 @jit
 def place_of(j: tl.constexpr, i, n):
-    """Where number j of the ten of mean, log-scales and quaternion lies in the flat vector."""
+    """Index in the flat vector of number j of the ten of mean, log-scales and quaternion."""
     return start_of(2, n) + i * 4 + (j - 6) if j >= 6 else start_of(j // 3, n) + i * 3 + j % 3
 
 

@@ -65,7 +65,7 @@ class Raster(Protocol):
 
     @property
     def intersections_reached(self) -> int:
-        """How many some pixel reaches: a pass goes through these."""
+        """Number of intersections that some pixel reaches: a pass goes through these."""
         ...
 
     @property
@@ -92,7 +92,7 @@ class Raster(Protocol):
         ...
 
     def pad(self, planes: Float[Tensor, "*k h w"]) -> Float[Tensor, "*k H W"]:
-        """Planes with padding of 0, in the precision of the pixels."""
+        """Planes with padding of 0, which has no weight in any derivative, in the precision of the pixels."""
         ...
 
     def backward(self, cotangent: Float[Tensor, "4 H W"]) -> Adjoint:
@@ -113,7 +113,7 @@ class Raster(Protocol):
         ...
 
     def dark_tiles(self, adjoint: Any, curvature: Float[Tensor, "3 H W"]) -> int:
-        """How many tiles with intersections have neither slope nor curvature (as in `gaussian_blocks`) in any pixel."""
+        """Number of tiles with intersections that have neither slope nor curvature (as in `gaussian_blocks`) in any pixel."""
         ...
 
 

@@ -42,6 +42,6 @@ def background_of(gaussians: Gaussians, colour: Float[Tensor, "3"] | None) -> Fl
 
 
 def touches(raster: Raster) -> Bool[Tensor, " n"]:
-    """Which splats have any weight in any pixel of the image: the exact support of the view's derivatives."""
+    """Mask of the splats with weight in some pixel of the image: the exact support of the view's derivatives."""
     ones = torch.ones_like(raster.crop(raster.planes))
     return raster.backward(raster.pad(ones)).moments[:, 6] != 0

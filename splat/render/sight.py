@@ -1,4 +1,4 @@
-"""How a view sees each Gaussian: its weight, its pixels, the shape of its splat, and what is next in front of it."""
+"""Visibility of each Gaussian in a view: its weight, its pixels, the shape of its splat, and what is next in front of it."""
 
 from dataclasses import dataclass
 
@@ -39,12 +39,12 @@ class Sight:
 
     @property
     def seen(self) -> Bool[Tensor, " n"]:
-        """Which have weight in a pixel."""
+        """Mask of those with weight in a pixel."""
         return self.pixels > 0
 
 
 def sight(gaussians: Gaussians, camera: Camera, settings: RenderSettings = RenderSettings()) -> Sight:
-    """How a camera sees the Gaussians.  InputError on a GPU: the pass over the pixels is one of the CPU's kernels.
+    """Visibility of the Gaussians for a camera.  InputError on a GPU: the pass over the pixels is one of the CPU's kernels.
 
     >>> from splat.model.camera import look_at
     >>> z, down = torch.tensor([0.0, 0.0, 4.0]), torch.tensor([0.0, 1.0, 0.0])
@@ -80,7 +80,7 @@ def _places(depths: Float64[Tensor, " n"], drawn: Bool[Tensor, " n"]) -> np.ndar
 
 
 def _nearest(splat: np.ndarray, before: np.ndarray, places: np.ndarray) -> Int64[Tensor, " n"]:
-    """Of the splats in front that each splat has in its tiles, the last in the order; -1 where it has none."""
+    """Index of the last in the order among the splats in front of each splat in its tiles; -1 where there is none."""
     there, order = before >= 0, np.argsort(places)
     last = np.full(len(places), -1, np.int64)
     np.maximum.at(last, splat[there], places[before[there]])

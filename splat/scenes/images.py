@@ -127,7 +127,7 @@ def image_pixels(path: Path, turned: bool = False) -> Float32[np.ndarray, "h w c
 
 
 def _colours_of_sixteen_bits(file: Image.Image) -> str | None:
-    """rgb or rgba of a PNG that has 16 bits of each colour, of which Pillow would keep 8."""
+    """rgb or rgba of a PNG with 16 bits a colour; Pillow would keep 8."""
     stored = [STORED.get(str(tile.args)) for tile in getattr(file, "tile", ())] if file.format == "PNG" else []
     return stored[0] if stored and "transparency" not in file.info else None
 
@@ -274,7 +274,7 @@ def _at_size(layers: Float[Tensor, "c h w"], size: tuple[int, int], path: Path) 
 def _warp(
     lens: pycolmap.Camera, pinhole: pycolmap.Camera, size: tuple[int, int], layers: Float[Tensor, "c h w"]
 ) -> Tensor:
-    """From the pixels of the file to those of the final camera: undistort, downscale."""
+    """Undistort and downscale: from the pixels of the file to those of the final camera."""
     if pinhole is not lens:
         layers = _undistort(layers, lens, pinhole)
     return resize_by_area(layers, *size)

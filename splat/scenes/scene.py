@@ -164,7 +164,7 @@ def _colour(values: Sequence[float]) -> Float[Tensor, "3"]:
 
 
 class _Found(NamedTuple):
-    """What the files of a scene say."""
+    """Content of the files of a scene."""
 
     kind: Kind
     photos: list[Photo]

@@ -131,7 +131,7 @@ def dtu_split(names: Sequence[str], n: int | None = None) -> Split:
 
 
 def _every_eighth(names: Sequence[str]) -> tuple[str, ...]:
-    """By the number in the name, so that a folder of only these stays as it is; by place where there is none."""
+    """Every eighth name, by the number in it, so that a folder of only these stays whole; by place where there is none."""
     numbers = [_number(name) for name in names]
     return tuple(name for i, (name, k) in enumerate(zip(names, numbers)) if (i if k is None else k) % HOLD_OUT == 0)
 
@@ -172,7 +172,7 @@ def _middle(centres: Float[Tensor, "n 3"], members: Bool[Tensor, " n"]) -> int:
 
 
 def explicit_split(names: Sequence[str], train: Sequence[str | int], test: Sequence[str | int] | None = None) -> Split:
-    """These views train; `test`, or else all others, test.  A view is a name, its last part, or a number."""
+    """Split with these training views; `test`, else all others, are held out.  A view is a name, its last part, or a number."""
     chosen = tuple(_resolve(names, key) for key in train)
     if not chosen or len(set(chosen)) < len(chosen):
         raise InputError(f"expected training views, each once, got {list(train)}")

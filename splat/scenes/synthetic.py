@@ -224,7 +224,7 @@ def _points(
     settings: SyntheticSettings,
     generator: torch.Generator,
 ) -> Points:
-    """What structure from motion might have found: a noisy share of the centres, with the views that see each."""
+    """Points as structure from motion might find them: a noisy share of the centres, with the views that see each."""
     means = truth.means.double()
     scale = truth.log_scales.double().exp().amax(dim=1)
     visible = torch.stack([_unoccluded(f.camera, means, scale, r) for f, r in zip(frames, renderings)], dim=1)

@@ -81,12 +81,12 @@ class Frame:
 
     @property
     def bytes(self) -> int:
-        """Of the view's numbers, about."""
+        """Estimated memory of the view."""
         return (3 + len(self.layers)) * self.camera.width * self.camera.height * torch.float32.itemsize
 
 
 class Shelf:
-    """Views of frames, of which those that were used last stay in memory: as many as fit into so many bytes, at least one."""
+    """Views of frames; the last used stay in memory, as many as fit into so many bytes, at least one."""
 
     def __init__(self, memory: int):
         self._memory, self._kept, self._lock = memory, OrderedDict[Frame, View](), Lock()
@@ -120,7 +120,7 @@ class Photograph(View):
 
 
 def digests(frames: Sequence[Frame]) -> list[str] | None:
-    """What tells each picture's file from any other, by its bytes; None where one is not on disk."""
+    """Digest of each picture's file; None where one is not on disk."""
     paths = [frame.path for frame in frames if frame.path is not None]
     if len(paths) < len(frames):
         return None
@@ -177,7 +177,7 @@ def pixel_coordinates(camera: Camera, xyz: Float[Tensor, "n 3"]) -> tuple[Float[
 def inside_image(
     camera: Camera, xyz: Float[Tensor, "n 3"], depth_range: tuple[float, float] | None = None
 ) -> Bool[Tensor, " n"]:
-    """Which points lie in front of the camera, within the depth range (z), and inside its image."""
+    """Mask of the points in front of the camera, within the depth range (z), and inside its image."""
     pixel, z = pixel_coordinates(camera, xyz)
     near, far = depth_range or (0.0, float("inf"))
     u, v = pixel.unbind(-1)

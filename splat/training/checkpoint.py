@@ -77,7 +77,7 @@ class Checkpoint(Brief):
         return [said.format(**self.origin), *self.origin["notes"]]
 
     def thinned(self, scene: Scene, count: int | None) -> "Checkpoint":
-        """With at most so many of its training views, spread evenly over their cameras; None: all."""
+        """Checkpoint with at most so many of its training views, spread evenly over their cameras; None: all."""
         if count is None or count >= len(self.scene.train):
             return self
         chosen = set(spread_views(scene.select(self.scene.train), count))
@@ -253,7 +253,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def _instead(path: Path) -> str:
-    """What there is in place of a checkpoint, and what to name."""
+    """Words on what there is in place of a checkpoint, and what to name."""
     if not path.exists():
         near = path.parent if path.name == "checkpoint.pt" else path
         beside = [each.name for each in near.parent.iterdir()] if near.parent.is_dir() else []

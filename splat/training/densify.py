@@ -43,7 +43,7 @@ NEIGHBOURS = 3
 
 @dataclass(frozen=True)
 class DensifySettings(Settings):
-    """When and what to densify, in a run of T steps: after min(start, start_share T), before min(stop, stop_share T).
+    """Settings of density control in a run of T steps: after min(start, start_share T), before min(stop, stop_share T).
 
     The interval is `every`, but at most every_share T.  3DGS trains for 30,000 steps, where the shares change nothing;
     with them short runs densify too, and have half of their steps to settle.

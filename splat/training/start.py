@@ -167,7 +167,7 @@ def points_in_common_volume(
 
 
 def _transparent(view: View, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    """Which points fall on a pixel of the view whose alpha is 0."""
+    """Mask of the points on a pixel of the view whose alpha is 0."""
     found = torch.zeros(len(xyz), dtype=torch.bool)
     if view.alpha is not None:
         inside = inside_image(view.camera, xyz)

@@ -64,7 +64,7 @@ class Step:
     def loss_and_gradient(
         self, gaussians: Gaussians, opacity_scale: Float[Tensor, " n"] | None = None
     ) -> LossAndGradient:
-        """Of the sampled view, with the regularisers, at these Gaussians.  opacity_scale: see `render`."""
+        """Loss and gradient of the sampled view, with the regularisers, at these Gaussians.  opacity_scale: see `render`."""
         found = loss_and_gradient(gaussians, self.camera, self.loss, self.background, self.config.render, opacity_scale)
         regularizers = Regularizers(gaussians, self.config.loss, len(gaussians))
         return replace(found, loss=found.loss + regularizers.value, gradient=regularizers.add_gradient(found.gradient))
@@ -96,7 +96,7 @@ class MethodSettings(Settings):
         return {self.name: 0}
 
     def density_control(self, config: "TrainConfig") -> DensifySettings:
-        """When and how Gaussians are cloned, split and removed."""
+        """Settings for cloning, splitting and removing Gaussians."""
         return config.densify
 
     def scaled(self, config: "TrainConfig", keep: Collection[str] = ()) -> "TrainConfig":

@@ -24,7 +24,7 @@ def slice_at(run: Path, scale: float) -> None:
     run.mkdir(parents=True, exist_ok=True)
     (run / "checkpoint.pt").touch()
     data, arrays = synthetic(scale)
-    with record_folder(run / "slice-eigenvectors-2d", SliceRecord) as folder:
+    with record_folder(run / "slice-eigenvectors-2d", SliceRecord.FILE) as folder:
         write_record(folder, slice_of(data), {"slice": arrays["slice"]})
 
 
@@ -60,7 +60,7 @@ def test_contours_have_the_ticks_of_the_sections(runs):
         record = read_record(run / "slice-eigenvectors-2d")
         for axis in "xy":
             record.arrays["slice"][axis] *= reach / record.arrays["slice"][axis].max()
-        with record_folder(run / "slice-eigenvectors-2d", SliceRecord) as anew:
+        with record_folder(run / "slice-eigenvectors-2d", SliceRecord.FILE) as anew:
             write_record(anew, record.data, record.arrays)
     figure = fig1.draw(runs)
     laid_out(figure)
@@ -94,7 +94,7 @@ def test_a_start_that_slopes_down_is_not_cut_off_at_the_ends_own_limits(runs):
     record = read_record(folder)
     x = record.arrays["slice"]["x"]
     record.arrays["slice"]["loss"][:] = record.data.slice.center_loss - 2e-2 * (x / x.max())[:, None]
-    with record_folder(folder, SliceRecord) as anew:
+    with record_folder(folder, SliceRecord.FILE) as anew:
         write_record(anew, record.data, record.arrays)
     along_e1 = fig7.draw(runs).axes[-2]
     start, *_ = (np.asarray(line.get_ydata(), float) for line in along_e1.lines)
@@ -163,7 +163,7 @@ def test_landscapes_of_different_functions_are_not_drawn_beside_each_other(
         folder = run / "slice-eigenvectors-2d"
         record = read_record(folder)
         setattr(getattr(record.data, section), key, value)
-        with record_folder(folder, SliceRecord) as anew:
+        with record_folder(folder, SliceRecord.FILE) as anew:
             write_record(anew, record.data, record.arrays)
 
     recorded(runs[0], first)

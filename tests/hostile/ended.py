@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import torch
 
 from analysis.commands.cli import main
-from analysis.commands.uses.prune import PruneRecord
+from analysis.commands.uses.prune import RECORD
 from analysis.records.records import ProbeRecord, SliceRecord, read_record
 from analysis.records.run_files import COMPARISON, MapRecord
 from analysis.runs.compare import PAGE, TABLE
@@ -244,7 +244,7 @@ class Prune(Ended):
         return ["prune", str(self.checkpoint), "--sample", "10", "--out", str(self.out)]
 
     def numbers(self) -> Numbers:
-        json.loads((self.out / PruneRecord.FILE).read_text())
+        json.loads((self.out / RECORD).read_text())
         tables = {
             name: digest((self.out / name).read_bytes()) for name in ("scores.csv", "correlations.csv", "pruned.ply")
         }

@@ -195,7 +195,7 @@ def _lanczos(text: str, settings: EigenSettings, origin: Origin = "own", applies
 
 
 def _from_blocks(case: Case, operator: MeteredOperator, seed: int) -> list[Answer]:
-    """As `landscape probe` does it, but for the pixelwise part, which that has from the traces."""
+    """Ends from the start vectors of `landscape probe`, but without the pixelwise part, which that has from the traces."""
     start = BlockEigenvectors(case.scene, case.scene.block_diagonal(approximate=True)).warm_start()
     operator.charge(PASS)
     return _end_answers(extreme_eigenpairs(operator, generator(seed), start=start))

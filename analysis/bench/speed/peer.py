@@ -11,7 +11,7 @@ from splat.scenes.view import View
 
 
 class MissingPeer(Exception):
-    """There is nothing to compare with, for this reason."""
+    """Lack of anything to compare with, with its reason."""
 
 
 def gsplat_gradient(workload: Workload, view: View, loss: Any) -> Callable[[], object]:

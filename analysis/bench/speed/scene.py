@@ -23,7 +23,7 @@ Wholes:
     rasterizer          bin to forward, slots, backward + reduce
     gradient            every stage
     gradient, autograd  the same as a training makes it, through torch
-    gradient, atomic    ... with sums as they come (on a GPU)
+    gradient, atomic    ... with sums by atomic additions (on a GPU)
     gsplat              ... by that package's kernels (on a GPU)
     linearize           what `LinearizedView` does once
     H v K               a product with K vectors, per vector
@@ -104,9 +104,6 @@ class ViewBench:
         w = self.workload
         return LinearizedView(w.gaussians, self.view.camera, self.loss, self.background, w.settings)
 
-    def _rasterizer(self) -> Any:
-        return self._rasterize().backward(self.cotangent)
-
     def gradient(self) -> torch.Tensor:
         """Gradient of the view's loss in the stored parameters, laid out like `Gaussians.flat`."""
         splats, depths, drawn = projected(self.workload.gaussians, self.lens)
@@ -164,7 +161,7 @@ class ViewBench:
         """Calls whose times the ratios compare."""
         products = {f"H v {K}": lambda U=U: self.linearized.hvp(U) for K, U in self.vectors.items()}
         return {
-            "rasterizer": self._rasterizer,
+            "rasterizer": lambda: self._rasterize().backward(self.cotangent),
             "gradient": self.gradient,
             "gradient, autograd": self.gradient_by_autograd,
             "linearize": self._linearize,
@@ -174,7 +171,7 @@ class ViewBench:
         }
 
     def peers(self) -> Calls:
-        """On a GPU, gradients to compare with: by the faster sums, and by gsplat where there is one."""
+        """Gradients to compare with on a GPU: by the faster sums, and by gsplat where it is installed."""
         if not by_triton(self.like):
             return {}
         calls: Calls = {"gradient, atomic": lambda: self.gradient_by_autograd("atomic")}

@@ -94,13 +94,13 @@ def run_map(options: MapOptions, command: Sequence[str], drawn: Draw) -> int:
             f"expected --field {', '.join(known)}, got {options.shown!r}{did_you_mean(options.shown, known)}"
         )
     console, start, notes = Console(stderr=True), perf_counter(), list[str]()
-    require_replaceable(out, MapRecord)
+    require_replaceable(out, MapRecord.FILE)
     stages = Stages(console)
     with stages.stage("load"):
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         objective = scene_objective(checkpoint, scene)
         chosen = _chosen(options.draw, objective.views)
-    with record_folder(out, MapRecord) as folder, stages, ThreadPoolExecutor(1) as beside:
+    with record_folder(out, MapRecord.FILE) as folder, stages, ThreadPoolExecutor(1) as beside:
         with stages.stage("fields") as report:
             found = measured_fields(objective, options.checkpoint.parent / PROBE, notes, report)
         if options.shown not in found.values:
@@ -155,7 +155,7 @@ def _chosen(names: Sequence[str], views: Sequence[View]) -> list[int]:
 
 
 def measured_fields(objective: SceneObjective, probe: Path, notes: list[str], report: Progress) -> Fields:
-    """What the blocks and the views say, and the masses in the eigenvectors of the probe, where it is of this loss here."""
+    """Fields of the blocks and the views, and the masses in the eigenvectors of the probe, where it is of this loss here."""
     values, sights = scene_fields(objective, report)
     ends, kinds, recorded = {}, dict(FIELDS), recorded_probe(probe, objective, notes)
     if recorded is not None:

@@ -31,7 +31,7 @@ def rendered(objective: SceneObjective, index: int, gaussians: Gaussians | None 
 
 
 def error_shade(objective: SceneObjective) -> Shade:
-    """From 0 to a high percentile of the errors of a view in the middle."""
+    """Shade from 0 to a high percentile of the errors of a view in the middle."""
     index = len(objective.views) // 2
     error = (rendered(objective, index) - objective.views[index].image).abs().mean(dim=0)
     high = float(np.quantile(error.numpy(), WORST)) or 1.0
@@ -62,6 +62,6 @@ def composited(objective: SceneObjective, camera: Camera, share: Float64[Tensor,
 
 
 def write_maps(path: Path, maps: Mapping[str, np.ndarray]) -> None:
-    """Not compressed: photographs would shrink by a quarter, and take a tenth of a second each."""
+    """Write maps without compression, which would shrink photographs by a quarter and take a tenth of a second each."""
     arrays: dict[str, np.ndarray] = dict(maps)
     np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]

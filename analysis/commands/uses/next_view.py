@@ -7,7 +7,6 @@ next-view.json  where it comes from
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
 
 import pandas as pd
 import torch
@@ -33,11 +32,7 @@ from splat.model.settings import RenderSettings
 from splat.scenes.scene import Scene
 from splat.training.checkpoint import Checkpoint
 
-
-class NextViewRecord:
-    """What marks a folder of this command."""
-
-    FILE: ClassVar[str] = "next-view.json"
+RECORD = "next-view.json"  # the file by which a folder of results is known
 
 
 def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
@@ -45,7 +40,7 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
     if options.by not in GAINS:
         raise InputError(f"expected --by {', '.join(GAINS)}, got {options.by!r}{did_you_mean(options.by, GAINS)}")
     out = options.out or options.checkpoint.parent / "next-view"
-    require_replaceable(out, NextViewRecord)
+    require_replaceable(out, RECORD)
     stages = Stages(Console(stderr=True))
     with stages.stage("load"):
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
@@ -54,7 +49,7 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
             raise InputError(f"expected --take of 1 to {len(candidates)}, the candidates, got {options.take}")
         config = checkpoint.training.config
         cameras = {frame.name: frame.camera for frame in scene.select((*checkpoint.scene.train, *candidates))}
-    with record_folder(out, NextViewRecord) as folder, stages:
+    with record_folder(out, RECORD) as folder, stages:
         with stages.stage("information") as report:
             background = config.background_colour(torch.float32)
             known = informations(checkpoint.training.gaussians, cameras, background, config.render, report)
@@ -67,7 +62,7 @@ def run_next_view(options: NextViewOptions, command: Sequence[str]) -> int:
             table = table.sort_values(["pick", options.by], ascending=[True, False])
             table.to_csv(folder / "gains.csv")
         made = provenance_of(0, options.checkpoint, command, options, checkpoint, scene)
-        (folder / NextViewRecord.FILE).write_text(json_text(plain(made)), encoding="utf-8")
+        (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     _conclude(table, options, out)
     say(*notes, style="yellow", console=Console(stderr=True))
@@ -93,7 +88,7 @@ def informations(
     settings: RenderSettings,
     report: Progress | None = None,
 ) -> dict[str, Information]:
-    """What each camera tells about the Gaussians."""
+    """Information of each camera about the Gaussians."""
     gaussians, found = gaussians.aligned_to(gaussians), {}
     for name, camera in cameras.items():
         found[name] = information(gaussians, camera, background, settings)

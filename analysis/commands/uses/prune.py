@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pandas as pd
@@ -47,18 +46,14 @@ from splat.training.loop import train
 from splat.training.score.evaluate import evaluate
 from splat.training.state import ThreeDGS, Training
 
+RECORD = "prune.json"  # the file by which a folder of results is known
+
 L2 = LossSettings("l2", ssim_weight=0)
 REMOVED = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 REFINED = (0.5, 0.9)
 TRUTH = "error"
 STAGES = ("true removals", *SCORES, *(f"{name} refined" for name in SCORES))
 Row = dict[str, str | int | float]
-
-
-class PruneRecord:
-    """What marks a folder of this command."""
-
-    FILE: ClassVar[str] = "prune.json"
 
 
 def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
@@ -74,14 +69,14 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
         )
     out = options.out or options.checkpoint.parent / "prune"
     console, unfinished = Console(stderr=True), out.with_name(f".{out.name}.unfinished")
-    require_replaceable(out, PruneRecord)
+    require_replaceable(out, RECORD)
     stages = Stages(console)
     with stages.stage("load"):
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
         objective, l2 = (scene_objective(checkpoint, scene, loss=loss) for loss in (None, L2))
         held_out = scene.load(checkpoint.scene.test) if checkpoint.scene.test else []
     told = f"{sha256(options.checkpoint.read_bytes()).hexdigest()} {replace(options, out=None, keep=1, score='', refine=0)}"
-    with record_folder(out, PruneRecord) as folder, stages:
+    with record_folder(out, RECORD) as folder, stages:
         kept = Kept(stages, torch.Generator().manual_seed(options.seed), STAGES, folder=unfinished, told=told)
         with stages.stage("scores"):
             scores = removal_scores(objective, l2)
@@ -103,7 +98,7 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
             save_checkpoint(folder / "checkpoint.pt", training, reference)
             (folder / "pruned.ply").write_bytes(splat_ply(training.gaussians))
         made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
-        (folder / PruneRecord.FILE).write_text(json_text(plain(made)), encoding="utf-8")
+        (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder) if curve is not None else []
         result = _scored(training.gaussians, objective, held_out)
     kept.remove()
@@ -189,7 +184,7 @@ def _scored(gaussians: Gaussians, objective: SceneObjective, held_out: Sequence[
 
 
 def lost(curve: pd.DataFrame, removed: float, steps: int, column: str) -> dict[str, float]:
-    """How much of a measure each score loses against the scene with all its Gaussians."""
+    """Loss of a measure by each score, against the scene with all its Gaussians."""
     rows = {(row["score"], row["removed"], row["steps"]): row[column] for row in curve.to_dict("records")}
     return {score: rows[score, 0, 0] - rows[score, removed, steps] for score in SCORES}
 

@@ -106,7 +106,7 @@ def run_study(file: Path) -> int:
 
 
 def _kept(path: Path, told: str) -> list[Row] | None:
-    """What the cell found before, under the same settings."""
+    """Earlier result of the cell, under the same settings."""
     if not path.is_file():
         return None
     content = msgspec.json.decode(path.read_bytes())

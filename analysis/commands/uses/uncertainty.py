@@ -11,7 +11,7 @@ that knows nothing.
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,14 +35,10 @@ from splat.curvature.scores.uncertainty import pixel_variance
 from splat.losses.autograd import loss_against
 from splat.losses.reference import LossSettings
 
+RECORD = "uncertainty.json"  # the file by which a folder of results is known
+
 PRECISIONS = {"block": False, "diagonal": True}
 SHARES = 100
-
-
-class UncertaintyRecord:
-    """What marks a folder of this command."""
-
-    FILE: ClassVar[str] = "uncertainty.json"
 
 
 def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
@@ -50,7 +46,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
     if options.samples < 2:
         raise InputError(f"expected --samples of at least 2, got {options.samples}")
     out = options.out or options.checkpoint.parent / "uncertainty"
-    require_replaceable(out, UncertaintyRecord)
+    require_replaceable(out, RECORD)
     stages, generator, rows = Stages(Console(stderr=True)), torch.Generator().manual_seed(options.seed), []
     with stages.stage("load"):
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, out)
@@ -59,7 +55,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         held_out, training = scene.load(checkpoint.scene.test), checkpoint.training
         gaussians, config = training.gaussians.aligned_to(training.gaussians), training.config
         background = config.background_colour(gaussians.flat.dtype)
-    with record_folder(out, UncertaintyRecord) as folder, stages:
+    with record_folder(out, RECORD) as folder, stages:
         with stages.stage("information") as report:
             cameras = {frame.name: frame.camera for frame in scene.select(checkpoint.scene.train)}
             seen = [*informations(gaussians, cameras, background, config.render, report).values()]
@@ -81,7 +77,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
         table = pd.DataFrame(rows)
         table.to_csv(folder / "agreement.csv", index=False)
         made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
-        (folder / UncertaintyRecord.FILE).write_text(json_text(plain(made)), encoding="utf-8")
+        (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder)
     means = table.drop(columns="view").pivot_table(index="precision")  # by default means
     words = f"means over {len(held_out)} held-out views; agreement.csv, view-*.png in {out}"
@@ -90,7 +86,7 @@ def run_uncertainty(options: UncertaintyOptions, command: Sequence[str]) -> int:
 
 
 def agreement(variance: Float[np.ndarray, "h w"], error: Float[np.ndarray, "h w"]) -> dict[str, float]:
-    """Of a map that predicts with one that is true.
+    """Agreement of a map of predicted errors with one of true errors.
 
     >>> perfect = agreement(np.arange(1000.0).reshape(50, 20), np.arange(1000.0).reshape(50, 20))
     >>> {name: round(value, 2) for name, value in perfect.items()}

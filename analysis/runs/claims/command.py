@@ -49,7 +49,7 @@ def run_claims(options: ClaimsOptions) -> int:
 
 
 def runs_of(rows: pd.DataFrame) -> pd.DataFrame:
-    """How many seeds of each method there are, by scene, steps and views."""
+    """Number of seeds of each method, by scene, steps and views."""
     counts = rows.groupby(["scene", "views", "steps", "method"], sort=False)["seed"].nunique()
     return pd.DataFrame(counts).reset_index().rename(columns={"seed": "seeds"})
 

@@ -1,15 +1,14 @@
-"""Effects of a study's methods, their intervals over seeds, and the verdict that an interval allows.
+"""Effects of methods in a study, their intervals over seeds, and the verdict on each of the paper's claims.
 
-An effect is an average over trainings, or over pairs of a scene and a seed that both methods have, with Student's 95% interval;
-ratios are averaged as logarithms, a cell that was trained on
-several machines counts once.  The verdict compares the interval with no effect and with the size that the paper states:
+An effect is a mean over trainings, or over pairs (scene, seed) that both methods have, with Student's 95% interval.  Ratios are
+averaged as logarithms.  A training repeated on several machines counts once.  The verdict compares the interval with no effect
+and with the size that the paper claims:
 
-    interval                                  verdict
-    beyond no effect, reaches the size        holds
-    beyond no effect, falls short of it       holds in part
-    falls short of the size, else             does not hold
-    holds no effect and the size              cannot be tested here: the seeds do not decide
-    fewer than three trainings or pairs       cannot be tested here
+    interval beyond no effect, reaches the claimed size         holds
+    interval beyond no effect, falls short of that size         holds in part
+    interval not beyond no effect, falls short of that size     does not hold
+    interval includes no effect and that size                   cannot be tested here: the seeds do not decide
+    fewer than three trainings or pairs                         cannot be tested here
 """
 
 from collections.abc import Sequence
@@ -26,14 +25,14 @@ Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested h
 LEAST, CONFIDENCE = 3, 0.95
 BASE, STABLE = "3dgs", "stablegs"
 SCORE = "psnr"
-STRETCHED = ("quats", "log_scales")  # what needles are said to dominate
+STRETCHED = ("quats", "log_scales")  # attributes whose curvature the paper ascribes to needles
 PAIR = ("scene", "seed")
-SURROUNDINGS = ("machine", "threads")  # without which times do not compare
+SURROUNDINGS = ("machine", "threads")  # in which times have to agree to be compared
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over n trainings or pairs, and its 95% interval; unbounded for n below 2."""
+    """A mean over n trainings or pairs with its 95% interval, unbounded for n below 2."""
 
     value: float
     low: float
@@ -42,7 +41,7 @@ class Interval:
 
     @classmethod
     def of(cls, values: Sequence[float] | pd.Series) -> "Interval":
-        """Of the values that are finite.
+        """The interval of the mean of all finite values.
 
         >>> Interval.of([1.0, 2.0, 3.0])
         Interval(value=2.0, low=-0.484..., high=4.484..., n=3)
@@ -56,12 +55,12 @@ class Interval:
         return cls(float(known.mean()), float(known.mean()) - half, float(known.mean()) + half, n)
 
     def exp(self) -> "Interval":
-        """Of a ratio, from that of its logarithm."""
+        """The interval of a ratio, from that of its logarithm."""
         value, low, high = (float(np.exp(x)) for x in (self.value, self.low, self.high))
         return Interval(value, low, high, self.n)
 
     def text(self, unit: str = "") -> str:
-        """In words.
+        """Value, interval and n in words.
 
         >>> Interval(1.5, 1.0, 2.0, 3).text(" dB")
         '1.50 dB (1.00 to 2.00; n = 3)'
@@ -73,9 +72,9 @@ class Interval:
 
 @dataclass(frozen=True)
 class Effect:
-    """One measured effect; null: what no effect would be; claimed: the paper's size, None where it states none.
+    """A measured effect.  null: its value without any effect; claimed: the paper's value, None where it has none.
 
-    unit: "×" of a ratio, "dB", or "" of a share or a correlation.
+    unit: "×" for a ratio, "dB", or "" for a share or a correlation.
     """
 
     name: str
@@ -86,7 +85,7 @@ class Effect:
 
 
 def decide(effect: Effect) -> Verdict:
-    """By the table above; the effect is claimed to lie on that side of `null` where `claimed` is.
+    """The verdict of the table above; the claim is an effect on the side of `null` where `claimed` lies, or above it.
 
     >>> decide(Effect("", Interval(1.2, 1.0, 1.4, 3), 0.0, 1.3)), decide(Effect("", Interval(0.5, 0.3, 0.7, 3), 0.0, 1.3))
     ('holds', 'holds in part')
@@ -105,7 +104,7 @@ def decide(effect: Effect) -> Verdict:
 
 
 def numbers(rows: pd.DataFrame, name: str, method: str | None = None, keys: Sequence[str] = PAIR) -> pd.Series:
-    """A quantity of all runs, or of one method's, by scene and seed, the mean of those alike; none where no run has it."""
+    """A quantity by keys: of every run, or the means of one method's runs with the same keys; empty where no run has it."""
     part = rows if method is None else rows[rows["method"] == method]
     values = np.asarray(part[name], float) if name in part else np.full(len(part), np.nan)
     found = pd.Series(values, pd.MultiIndex.from_frame(pd.DataFrame(part[list(keys)])))
@@ -114,17 +113,17 @@ def numbers(rows: pd.DataFrame, name: str, method: str | None = None, keys: Sequ
 
 
 def gains(rows: pd.DataFrame, method: str) -> pd.Series:
-    """PSNR over that of 3DGS, dB, by scene and seed."""
+    """PSNR minus that of 3DGS, dB, by scene and seed."""
     return (numbers(rows, SCORE, method) - numbers(rows, SCORE, BASE)).dropna()
 
 
 def log_ratios(rows: pd.DataFrame, name: str, method: str = STABLE) -> pd.Series:
-    """ln of the magnitude over that of 3DGS, by scene and seed; of times, only of trainings in the same surroundings."""
+    """ln |quantity / that of 3DGS| by scene and seed; times are compared only within the same surroundings."""
     keys = [*PAIR, *(key for key in SURROUNDINGS if key in rows and name.endswith("_seconds"))]
     found = (numbers(rows, name, method, keys) / numbers(rows, name, BASE, keys)).dropna().abs()
     return pd.Series(pd.Series(np.log(found[found > 0])).groupby(level=list(PAIR)).mean())
 
 
 def ratio_effect(name: str, logarithms: pd.Series, claimed: float | None) -> Effect:
-    """Of a ratio whose logarithms were averaged."""
+    """The effect of a ratio, from its logarithms."""
     return Effect(name, Interval.of(logarithms).exp(), 1.0, claimed, "×")

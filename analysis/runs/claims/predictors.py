@@ -1,4 +1,4 @@
-"""Which measured quantity goes with the score on held-out views, over all trainings of a study.
+"""Correlation of measured quantities with the score on held-out views, over all trainings of a study.
 
     rho         Spearman's rank correlation with PSNR
     all         over the runs of each scene, ranked within it

@@ -80,7 +80,7 @@ def depth(rows: pd.DataFrame) -> Judgement:
 
 
 def needles(rows: pd.DataFrame) -> Judgement:
-    """By the curvature of both attributes; where no map has these, by the steepest eigenvector of the whole Hessian."""
+    """Judge by the curvature of both attributes; where no map has these, by the steepest eigenvector of the whole Hessian."""
     number = Interval.of(numbers(rows, "needle_count", BASE))
     null = number.value if number.n else 0.0
     blocks = {f"share of the curvature of {attribute_name(name)} on needles": f"needles_{name}" for name in STRETCHED}

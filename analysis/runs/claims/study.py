@@ -159,7 +159,7 @@ def _text(value: Any) -> str:
 
 
 def _more(data: ProbeRecord, rates: LearningRates, extent: float) -> dict[str, float]:
-    """What the statements and predictors need beside the columns of a sweep."""
+    """Columns that statements and predictors need beside those of a sweep."""
     second, lives = data.eigenvalues.second, data.eigenvalues.max.lives_on
     row = {"lambda_second": _number(second and second.value)}
     if data.depth:

@@ -74,7 +74,7 @@ def only(sweep: Sweep, names: Sequence[str]) -> Sweep:
 
 
 def missing(cell: Cell, sweep: Sweep) -> list[Stage]:
-    """What is still to be done for a cell.  ValueError or FileNotFoundError where it cannot be, or has other settings."""
+    """Stages that a cell still needs.  ValueError or FileNotFoundError where it cannot be, or has other settings."""
     try:
         _, _, config, reference = planned(cell.training, cell.out)
         wanted: list[Stage] = ["train", "probe"] if sweep.probe else ["train"]
@@ -100,7 +100,7 @@ def _probed(cell: Cell, options: ProbeOptions, loss: LossSettings) -> bool:
 
 
 class _Cells:
-    """The cells under way.  to_do: by a cell's name; whole: also those not asked for; failed: what to say of whom."""
+    """The cells under way.  to_do: by a cell's name; whole: also those not asked for; failed: words by cell."""
 
     def __init__(
         self,
@@ -212,7 +212,7 @@ def log_of(cell: Cell) -> Path:
 
 
 def _environment(jobs: int) -> dict[str, str]:
-    """Of a command: its share of the processors, or of the threads that this process was given."""
+    """Environment of a command: its share of the processors, or of the threads that this process was given."""
     environment = module_environment()
     if jobs > 1:
         given = os.environ.get("OMP_NUM_THREADS", "")

@@ -136,7 +136,7 @@ def _sweep(content: dict[str, Any], file: Path, out: Path | None, probe: bool) -
 
 
 def _options(options: Mapping[str, Any], seed: int, out: Path) -> TrainOptions:
-    """Of a cell; {seed} in the checkpoint that it starts from is its seed."""
+    """Options of a cell; {seed} in the checkpoint that it starts from is its seed."""
     start = options.get("from")
     foreign = TrainerOptions(**{name: value for name, value in options.items() if name in TRAINER})
     rest = {name: value for name, value in options.items() if name not in {"from", *TRAINER}}

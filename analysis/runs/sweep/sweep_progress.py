@@ -1,4 +1,4 @@
-"""How far a sweep is, and about how long it will take: a line for every cell that ends, and a bar.
+"""Progress of a sweep and its expected end: a line for every cell that ends, and a bar.
 
 The time of a whole training is estimated from the pace of the steps up to each run's last checkpoint: that of the same scene
 and method where it is known, else of the same method, else the mean time of those that are known, since a step of one method

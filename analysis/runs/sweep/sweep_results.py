@@ -1,4 +1,4 @@
-"""What the cells of a sweep came to: a row a cell, and mean and standard deviation over the seeds.
+"""Results of the cells of a sweep: a row a cell, and mean and standard deviation over the seeds.
 
 OUT/results.csv   scene, method, seed, status ("done", "failed", "under way" or "to do"); of what has been trained: psnr (dB),
                   ssim, lpips of the held-out views, train_psnr, ..., gaussians, wall_seconds, cpu_seconds, threads (that
@@ -139,7 +139,7 @@ def _bounded(index: Index | Effect) -> float | None:
 
 
 def unfinished(rows: pd.DataFrame) -> list[str]:
-    """Which ends of the spectrum may lie farther out than the means have them, with the cells."""
+    """Lines on ends of the spectrum that may lie farther out than the means have them, with the cells."""
     cells: dict[str, list[str]] = {}
     for row in rows.reindex(columns=["scene", "method", "seed", *REASONS]).dropna().to_dict("records"):
         for line in of_budgets({end: row[name] for name, end in REASONS.items()}):
@@ -148,7 +148,7 @@ def unfinished(rows: pd.DataFrame) -> list[str]:
 
 
 def of_other_threads(rows: pd.DataFrame) -> list[str]:
-    """Which cells' times by the clock are not compared, in a line if there are any."""
+    """Line on the cells whose times by the clock are not compared, if there are any."""
     found = rows.reindex(columns=["scene", "method", "seed", "wall_ratio", "cpu_ratio"]).dropna(subset="cpu_ratio")
     cells = found.to_dict("records")
     names = [f"{c['scene']}/{c['method']}/{c['seed']}" for c in cells if math.isnan(c["wall_ratio"])]

@@ -90,7 +90,7 @@ def projector_of(objective: SceneObjective, *, gauss_newton: bool = False, apart
 def active_spaces(
     objective: SceneObjective, projector: Projector, scale: Float[Tensor, " p"] | None = None
 ) -> dict[str, ActiveSpace]:
-    """What the exact null space leaves of the whole operator and of each attribute's block, for `landscape.families`.
+    """Complements of the exact null space, of the whole operator and of each attribute's block, for `landscape.families`.
 
     projector: of the whole operator (`SceneHessian.projector`).  scale: D > 0, 1 by default.  The blocks of Gauss-Newton are
     given the spaces of the Hessian's; they may be flat along more.

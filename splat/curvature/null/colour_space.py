@@ -1,7 +1,7 @@
-"""What the Hessian sees of each Gaussian's SH coefficients (`null_space.py`): harmonics channel by channel, and slopes.
+"""Row space of the Hessian in the SH coefficients of each Gaussian, of which `null_space.py` has the formulas.
 
-The channels of a Gaussian see the same harmonics but where a view clamps one of them, so that one basis of `bands` columns
-serves all three; only the slopes, at most three, go across the channels.
+It is spanned by the harmonics Y(d_m) of the views m, for each channel that m does not clamp, and by at most three slopes
+sum_m a_mc dY(d_m)/dmu_j, vectors over all channels.  Mostly the channels have the same harmonics, and share a basis of them.
 """
 
 from collections.abc import Iterable, Sequence
@@ -34,8 +34,8 @@ from splat.projection.formulas import ProjectionJacobian
 class ColourSpace:
     """A space of SH coefficients for each Gaussian, laid out like `Gaussians.sh`: d = bands x 3 channels.
 
-    harmonics: spaces of the coefficients of one channel; row: which of them each channel has.  slopes: directions in all
-    channels, at right angles to the harmonics.
+    harmonics: spaces of the coefficients of one channel; row: index of each channel's space in it.  slopes: directions over all
+    channels, orthogonal to the harmonics.
     """
 
     harmonics: RowSpace
@@ -64,11 +64,11 @@ class ColourSpace:
         return torch.stack(kept, dim=2).view(x.shape) + slopes.mT @ (slopes @ x)
 
     def without(self, rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n r d"]:
-        """The part of rows at right angles to the space."""
+        """The components of rows orthogonal to the space."""
         return rows - self.project(rows.mT.contiguous()).mT
 
     def scaled(self, scale: Float[Tensor, "n d"]) -> RowSpace:
-        """The space of all D x, D = diag(scale) > 0 and x in this space."""
+        """The space of all D x with x in this space, D = diag(scale) > 0."""
         bases = [self.slopes.basis]
         for c, space in enumerate(self._channels):
             wide = scale.new_zeros(*space.basis.shape[:2], scale.shape[1])
@@ -96,21 +96,21 @@ def seen_colours(
     *,
     apart: bool = False,
 ) -> ColourSpace:
-    """The directions of a Gaussian's SH coefficients in which the Hessian can be non-zero; count: of these views.
+    """The directions of each Gaussian's SH coefficients in which the Hessian can be non-zero; count: of these views.
 
-    stacked, summed: complete the rows of these views, and what is summed over them (up to a factor), to those of all views,
-    where other processes hold some.  apart: of the block of SH by itself, without the slopes.
+    stacked, summed: turn rows of these views, and sums over them, into those of the views of all processes (sums up to a
+    factor).  apart: for the Hessian's block of SH alone, which has no slopes.
     """
     like, (n, bands) = gaussians.flat, gaussians.sh.shape[:2]
     rows = like.new_zeros(n, count, bands + 3)  # harmonics, and which channels are not clamped
     slopes, sizes = like.new_zeros(n, 3, 3 * bands), like.new_zeros(n)
-    for m, held in enumerate(views):
-        index, harmonic, slope = (torch.as_tensor(part) for part in (held.index, held.harmonic, held.slope))
-        bar, visible = (torch.as_tensor(part) for part in (held.colour_bar, held.visible))
+    for m, view in enumerate(views):
+        index, visible = torch.as_tensor(view.index), torch.as_tensor(view.visible)
+        harmonic, slope, bar = (torch.as_tensor(part) for part in (view.harmonic, view.slope, view.colour_bar))
         rows[index, m] = torch.cat([harmonic[:, :bands], visible], dim=1)
-        bent = torch.einsum("ekj,ec->ejkc", slope[:, :bands], bar).flatten(2)
-        slopes.index_add_(0, index, bent)
-        sizes.index_add_(0, index, bent.flatten(1).norm(dim=1))
+        terms = torch.einsum("ekj,ec->ejkc", slope[:, :bands], bar).flatten(2)
+        slopes.index_add_(0, index, terms)
+        sizes.index_add_(0, index, terms.flatten(1).norm(dim=1))
     rows, slopes, sizes = stacked(rows), summed(slopes)[:, : 0 if apart else 3], summed(sizes)
 
     def part(start: int) -> ColourSpace:
@@ -124,26 +124,25 @@ def seen_colours(
 def _colours_of(
     rows: Float[Tensor, "n m _"], slopes: Float[Tensor, "n s d"], sizes: Float[Tensor, " n"], tolerance: float
 ) -> ColourSpace:
-    """Of some Gaussians: the harmonics of each channel, and what the slopes add to them."""
+    """The spaces of some Gaussians: a harmonic one for channel 0, others where channels 1 and 2 differ from it, and slopes."""
     (harmonics, visible), n = rows.split([rows.shape[2] - 3, 3], dim=2), len(rows)
-    first = torch.arange(n, device=rows.device)
-    row, lit = first[:, None].repeat(1, 3), [visible[:, :, 0]]
-    gaussian = [first]
+    everyone = torch.arange(n, device=rows.device)
+    row, weights, gaussian = everyone[:, None].repeat(1, 3), [visible[:, :, 0]], [everyone]
     for c in (1, 2):
         other = torch.nonzero((visible[:, :, c] != visible[:, :, 0]).any(dim=1))[:, 0]
         row[other, c] = sum(map(len, gaussian)) + torch.arange(len(other), device=rows.device)
         gaussian.append(other)
-        lit.append(visible[other, :, c])
-    found = row_space(harmonics[torch.cat(gaussian)] * torch.cat(lit)[:, :, None], tolerance)
-    colours = ColourSpace(found, row, RowSpace(slopes[:, :0], row.new_zeros(n)))
+        weights.append(visible[other, :, c])
+    spaces = row_space(harmonics[torch.cat(gaussian)] * torch.cat(weights)[:, :, None], tolerance)
+    colours = ColourSpace(spaces, row, RowSpace(slopes[:, :0], row.new_zeros(n)))
     added = spanned(colours.without(slopes), sizes, tolerance)
-    for _ in range(2):  # what rounding leaves of the harmonics goes in the second go
+    for _ in range(2):  # the second time removes what rounding left of the harmonics
         added = orthonormal(colours.without(added.basis), added.rank)
     return replace(colours, slopes=added)
 
 
 def _joined(parts: Sequence[ColourSpace]) -> ColourSpace:
-    """Those of all Gaussians, given those of some at a time."""
+    """The space of all Gaussians, from those of consecutive ones; indices of harmonics are shifted by those before."""
     rows, before = [], 0
     for part in parts:
         rows.append(part.row + before)

@@ -33,7 +33,7 @@ class RowSpace:
 
     @cached_property
     def _basis(self) -> Float[Tensor, "m r d"]:
-        """Theirs."""
+        """The bases of these Gaussians."""
         return self.basis if len(self._partial) == len(self.basis) else self.basis[self._partial]
 
     def project(self, x: Float[Tensor, "n d k"]) -> Float[Tensor, "n d k"]:
@@ -73,7 +73,7 @@ def alone(rows: Tensor) -> Tensor:
 
 
 def joined(parts: Sequence[RowSpace]) -> RowSpace:
-    """Those of all Gaussians, given those of some at a time."""
+    """The row spaces of all Gaussians, from those of consecutive ones."""
     width = max(part.basis.shape[1] for part in parts)
     padded = [torch.nn.functional.pad(part.basis, (0, 0, 0, width - part.basis.shape[1])) for part in parts]
     return RowSpace(torch.cat(padded), torch.cat([part.rank for part in parts]))
@@ -102,12 +102,10 @@ def _singular(rows: Float[Tensor, "n r d"]) -> tuple[Float[Tensor, "n m"], Float
     def decompose(first: int, last: int) -> None:
         for start in range(first, last, CHUNK):
             some = slice(start, min(start + CHUNK, last))
-            _, values[some], basis[some] = torch.linalg.svd(_shortened(rows[some]), full_matrices=False)
+            part = rows[some]
+            if rows.is_cuda and r > d:  # there, faster of d rows, with the same values and right vectors
+                part = torch.linalg.qr(part, mode="r").R
+            _, values[some], basis[some] = torch.linalg.svd(part, full_matrices=False)
 
     over_batch(n, decompose, rows.device)
     return values.to(home), basis.to(home)
-
-
-def _shortened(rows: Float[Tensor, "n r d"]) -> Float[Tensor, "n _ d"]:
-    """On a GPU no more rows than columns, which have the same singular values and right singular vectors."""
-    return torch.linalg.qr(rows, mode="r").R if rows.is_cuda and rows.shape[1] > rows.shape[2] else rows

@@ -1,4 +1,4 @@
-"""What views tell about each Gaussian: blocks of J^T J, which need cameras and no photographs, and what a further view adds.
+"""Information of views about each Gaussian: blocks of J^T J, which need cameras and no photographs, and gains by further views.
 
 J is the Jacobian of a view's image, all its pixels and channels: under noise of one size in each channel J^T J is the Fisher
 information of the parameters, and twice the Gauss-Newton part of half the squared error.  Of every Gaussian the 10 x 10 of its
@@ -41,7 +41,7 @@ COLUMNS = {"means": slice(0, 3), "log_scales": slice(3, 6), "quats": slice(6, 9)
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Of n Gaussians.  geometry: positive semi-definite.  summed: FisherRF's diagonal."""
+    """Information about n Gaussians.  geometry: positive semi-definite.  summed: FisherRF's diagonal."""
 
     geometry: Float64[Tensor, "n 10 10"]
     sh: Float64[Tensor, "n k 3"]
@@ -84,7 +84,7 @@ def prior_of(seen: Information, share: float = PRIOR) -> Information:
 
 
 def gains(seen: Information, prior: Information, candidate: Information) -> dict[str, float]:
-    """What a candidate adds to the views seen, by every criterion."""
+    """Gain of a candidate over the views seen, by every criterion."""
     before = seen + prior
     after, root = before + candidate, prior.geometry.diagonal(dim1=1, dim2=2).rsqrt()
     sh_gain = float((after.sh / before.sh).log().sum())

@@ -1,4 +1,4 @@
-"""How good "block-diagonal" is: the share of a scene's Hessian that lies within the blocks of single Gaussians.
+"""Share of a scene's Hessian within the blocks of single Gaussians: how good "block-diagonal" approximations are.
 
 With B the part of H (or of Gauss-Newton) that a method keeps, and R = H - B the rest, which has zeros where B has not:
 

@@ -1,4 +1,4 @@
-"""What a scene does not know of a view: the variance of its pixels, J B^-1 J^T, from what its training views tell (B).
+"""Uncertainty of a view: the variance of its pixels, J B^-1 J^T, given the information B of the training views.
 
 B is the prior and the information of the training views (`splat.curvature.scores.information`): a Laplace approximation whose
 precision is block-diagonal over Gaussians, or diagonal.  Vectors u with the covariance B^-1 are pushed forward:

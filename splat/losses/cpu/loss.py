@@ -26,7 +26,7 @@ NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 
 class CpuImageLoss:
-    """A loss of images of one size: planes for them, and the sizes and weights that its kernels take."""
+    """`losses.protocols.ImageLoss`: planes for them, and the sizes and weights that its kernels take."""
 
     def __init__(self, shape: Sequence[int], settings: LossSettings, dtype: type | np.dtype):
         _, height, width = shape
@@ -44,7 +44,6 @@ class CpuImageLoss:
         return aligned((sets, 3, self.frame.plane_rows, self.frame.stride), self.dtype)
 
     def padded(self, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 H W"]:
-        """Padded planes of an image, 0 outside it."""
         planes = self.planes(1)[0]
         planes[:] = 0
         planes[:, : self.frame.height, : self.frame.width] = image.detach().numpy()
@@ -56,7 +55,6 @@ class CpuImageLoss:
         return self.structural > 0
 
     def cropped(self, planes: Float[Tensor, "k H W"]) -> Float[Tensor, "3 h w"]:
-        """The first three planes without their padding."""
         return planes[:3, : self.frame.height, : self.frame.width].contiguous()
 
     def _sweep(self, *images: np.ndarray | None) -> float:
@@ -68,14 +66,13 @@ class CpuImageLoss:
     def consistency(
         self, x: Float[Tensor, "3 H W"], y: Float[Tensor, "3 H W"]
     ) -> tuple[Float[Tensor, ""], Float[Tensor, "2 3 H W"]]:
-        """The loss between two padded images, and its gradients in both."""
         gradients = self.planes(2)
         value = self._sweep(x.numpy().reshape(-1), y.numpy().reshape(-1), None, *gradients.reshape(2, -1))
         return x.new_tensor(value), torch.from_numpy(gradients)
 
 
 class CpuViewLoss(CpuImageLoss):
-    """The loss of images against one target; what depends on the target alone is computed once."""
+    """`losses.protocols.ViewLoss`; what depends on the target alone is computed once."""
 
     def __init__(self, target: Float[Tensor, "3 h w"], settings: LossSettings, dtype: torch.dtype):
         super().__init__(target.shape, settings, NUMPY[dtype])
@@ -95,10 +92,6 @@ class CpuViewLoss(CpuImageLoss):
         return self._sweep(*self._against(image), None, np.empty(0, self.dtype))
 
     def linearize(self, image: Float[Tensor, "k H W"], second_order: bool = True) -> "CpuLinearLoss":
-        """Value, gradient and Hessian's products at padded planes (at least three), which must not change.
-
-        second_order: also keep what the products need.
-        """
         gradient = aligned((4, self.frame.plane_rows, self.frame.stride), self.dtype)
         blurred = self.planes(1).reshape(-1) if second_order and self.structural else np.empty(0, self.dtype)
         gradient[:, self.frame.height :] = 0
@@ -108,17 +101,15 @@ class CpuViewLoss(CpuImageLoss):
 
 
 class CpuLinearLoss:
-    """A loss, linearised at an image: value, gradient (4 padded planes; that of alpha is 0) and Hessian-vector products."""
+    """`losses.protocols.LinearLoss`: value, gradient (4 padded planes; that of alpha is 0) and Hessian-vector products."""
 
     def __init__(self, loss: CpuViewLoss, value: float, gradient: Tensor, image: Tensor, blurred: np.ndarray):
         self.loss, self.value, self.gradient, self._image, self._blurred = loss, value, gradient, image, blurred
 
     def scalar(self, like: Tensor) -> Float[Tensor, ""]:
-        """The value as a tensor like another."""
         return like.new_tensor(self.value)
 
     def hvp(self, tangents: Float[Tensor, "k 4 H W"], out: Tensor | None = None) -> Float[Tensor, "k 4 H W"]:
-        """l'' v for K padded tangents, to out (which may be the tangents themselves)."""
         loss, height, vectors = self.loss, self.loss.frame.height, tangents.numpy()
         products = aligned((len(vectors), *self.gradient.shape), loss.dtype) if out is None else out.numpy()
         found = loss.planes(min(self._together, len(vectors)))
@@ -137,7 +128,6 @@ class CpuLinearLoss:
         return max(1, RINGS // rows)
 
     def curvatures(self, tangents: Float[Tensor, "k p H W"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-        """v . l'' v for K padded tangents (at least three planes each), and v . D v with the diagonal D of l''."""
         forms = np.empty((2, len(tangents), 3 * self.loss.frame.height))
         self._products(tangents.numpy(), None, self.diagonal.numpy().reshape(-1), forms)
         full, pixelwise = torch.from_numpy(forms.sum(axis=2))
@@ -155,7 +145,6 @@ class CpuLinearLoss:
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept, the target's included, the image's not."""
         target = self.loss.target.nbytes + self.loss._target_moments.nbytes
         return target + self.gradient.nbytes + self._blurred.nbytes
 
@@ -164,7 +153,7 @@ class CpuLinearLoss:
         return min(vectors, self._together) * self.gradient[:3].nbytes
 
     def coupling(self) -> Coupling:
-        """l'' of a loss with SSIM, taken apart."""
+        """l'' of a loss with SSIM: the part that couples pixels, and the pixelwise rest."""
         loss = self.loss
         image, target, _ = loss._against(self._image)
         found = loss.planes(SECONDS + 1)

@@ -19,7 +19,7 @@ BLOCK = 256
 
 
 class CudaImageLoss:
-    """A loss of images of one size: the constants, sizes and flags that its kernels take."""
+    """`losses.protocols.ImageLoss`: the constants, sizes and flags that its kernels take."""
 
     def __init__(self, image: Float[Tensor, "3 h w"], settings: LossSettings):
         self.like, self.shape = image.new_empty(0), tuple(image.shape[-2:])
@@ -58,11 +58,9 @@ class CudaImageLoss:
         launch(kernel, (self.programs, vectors), *arguments, *self.shape, **flags, BLOCK=BLOCK)
 
     def padded(self, image: Tensor) -> Tensor:
-        """An image as the kernels take it."""
         return image.detach().to(self.like).contiguous()
 
     def cropped(self, planes: Tensor) -> Float[Tensor, "3 h w"]:
-        """The first three planes."""
         return planes[:3]
 
     def blurred(self, fields: Tensor, taps: Tensor) -> Tensor:
@@ -85,7 +83,6 @@ class CudaImageLoss:
         return out
 
     def consistency(self, x: Tensor, y: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """The loss between two images, and its gradients in both."""
         sums, slopes = self.sums(), self.like
         if self.ssim:
             r, slopes = x - y, self.fields(4)
@@ -100,7 +97,7 @@ class CudaImageLoss:
 
 
 class CudaViewLoss(CudaImageLoss):
-    """The loss of images against one target; what depends on the target alone is computed once."""
+    """`losses.protocols.ViewLoss`; what depends on the target alone is computed once."""
 
     def __init__(self, target: Float[Tensor, "3 h w"], settings: LossSettings, dtype: torch.dtype):
         super().__init__(target.to(dtype), settings)
@@ -131,12 +128,11 @@ class CudaViewLoss(CudaImageLoss):
         return float(self._evaluate(image, slopes=False, second=False)[0])
 
     def linearize(self, image: Tensor, second_order: bool = True) -> "CudaLinearLoss":
-        """Value and gradient at an image (at least three planes), and what the Hessian's product needs if second_order."""
         return CudaLinearLoss(self, *self._evaluate(image, slopes=True, second=second_order))
 
 
 class CudaLinearLoss:
-    """A loss, linearised at an image: value, gradient (4, h, w; that of alpha is 0) and Hessian-vector products."""
+    """`losses.protocols.LinearLoss`: value, gradient (4, h, w; that of alpha is 0) and Hessian-vector products."""
 
     def __init__(
         self, loss: CudaViewLoss, total: Tensor, gradient: Tensor, residual: Tensor, second: Tensor, blurred: Tensor
@@ -149,11 +145,9 @@ class CudaLinearLoss:
         return float(self.total)
 
     def scalar(self, like: Tensor) -> Float[Tensor, ""]:
-        """The value on the device, in the precision of another tensor."""
         return self.total.to(like.dtype)
 
     def hvp(self, tangents: Float[Tensor, "k p h w"], out: Tensor | None = None) -> Float[Tensor, "k 4 h w"]:
-        """l'' v for K tangents (at least three planes each), to out (which may be the tangents themselves)."""
         loss, K = self.loss, len(tangents)
         tangents, blurred = tangents.contiguous(), loss.like
         if loss.ssim:
@@ -169,7 +163,6 @@ class CudaLinearLoss:
         return products
 
     def curvatures(self, tangents: Float[Tensor, "k p h w"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-        """v . l'' v for K tangents (at least three planes each), and v . D v with the diagonal D of l''."""
         loss, K = self.loss, len(tangents)
         tangents = tangents.contiguous()
         fed, sums = loss.fed(tangents, self._residual, loss.target, 3) if loss.ssim else loss.like, loss.sums(K)
@@ -182,7 +175,6 @@ class CudaLinearLoss:
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept, the target's included."""
         kept = (self.gradient, self._residual, self._second, self._blurred, self.loss.target, self.loss.moments)
         return sum(tensor.nbytes for tensor in kept)
 
@@ -192,7 +184,6 @@ class CudaLinearLoss:
 
     @cached_property
     def diagonal(self) -> Float[Tensor, "3 h w"]:
-        """The pixel-diagonal of l''."""
         loss, diagonal = self.loss, self.loss.fields()
         along = loss.blurred(self._second, loss.squared) if loss.ssim else loss.like
         loss.run(

@@ -55,7 +55,7 @@ class Element:
     properties: tuple[Property, ...]
 
     def dtype(self, order: str) -> np.dtype:
-        """Of the single numbers of a row; order: < or >."""
+        """The type of the single numbers of a row; order: < or >."""
         return np.dtype([(p.name, order + p.kind) for p in self.properties if p.count is None])
 
     @property
@@ -63,7 +63,7 @@ class Element:
         return tuple(p for p in self.properties if p.count is not None)
 
     def least_bytes(self, order: str) -> int:
-        """Of all its rows; in text a digit and a space for each number."""
+        """Least size of all rows; in text a digit and a space for each number."""
         if not order:
             return 2 * len(self.properties) * self.rows
         return self.rows * (self.dtype(order).itemsize + sum(np.dtype(p.count).itemsize for p in self.lists))

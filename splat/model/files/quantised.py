@@ -198,7 +198,7 @@ def _check_labels(texture: bytes, count: int, palette: int) -> None:
 
 
 def _from_gsply(reader: str, content: bytes, kind: str, clamped: int = 0, *, antialiased: bool = False) -> SplatFile:
-    """What gsply's reader of this name makes of the content."""
+    """Gaussians that gsply's reader of this name finds in the content."""
     try:
         import gsply  # pyright: ignore[reportMissingImports]
         from gsply.sog_reader import sogread  # pyright: ignore[reportMissingImports]

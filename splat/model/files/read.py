@@ -91,7 +91,7 @@ def _read(path: Path, content: bytes) -> SplatFile:
 
 
 def _with_settings(found: SplatFile, path: Path) -> SplatFile:
-    """With what graphdeco's `cfg_args` beside the model says; it is of a training of graphdeco or of a relative of it."""
+    """The file with the settings in graphdeco's `cfg_args` beside the model, if it comes from graphdeco or a fork of it."""
     parts = path.resolve().parts
     model = path.resolve().parents[2] if parts[-3:-2] == ("point_cloud",) else path.resolve().parent
     settings = read_cfg_args(model / "cfg_args") if found.format in ("PLY", "graphdeco checkpoint") else {}
@@ -111,7 +111,7 @@ def _with_settings(found: SplatFile, path: Path) -> SplatFile:
 
 
 def read_yaml_lines(folder: Path) -> dict[str, Any]:
-    """What SETTINGS names of the files in a folder: numbers, true or false, and words.
+    """Settings that SETTINGS names in the files of a folder: numbers, true or false, and words.
 
     They are YAML with tags that would make Python objects, so that single lines are read and nothing is parsed; those of gsplat
     are not indented.

@@ -36,7 +36,7 @@ class SplatFile:
 
 
 def packed(attributes: Mapping[str, np.ndarray], filter_widths: np.ndarray | None = None) -> Gaussians:
-    """Gaussians from the five attributes, of which `sh` has all bands, and the widths of their 3-D filter.
+    """Gaussians from the five attributes, `sh` with all bands, and the widths of their 3-D filter.
 
     InputError where their shapes or the SH degree cannot be.  Numbers that are not finite are found by `require_finite`.
     """
@@ -68,5 +68,5 @@ def logit(opacity: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def clamped_note(count: int) -> tuple[str, ...]:
-    """Of byte opacities 0 and 255, whose logits would be infinite."""
+    """Note on byte opacities 0 and 255, whose logits would be infinite."""
     return (f"{count} opacities of 0 or 255 were moved to 0.5 or 254.5",) if count else ()

@@ -61,7 +61,7 @@ def read_tensor_file(path: Path, content: bytes) -> SplatFile:
 
 
 def load_tensors(content: bytes) -> Any:
-    """What `torch.save` wrote, on the CPU.  Its members are as large as in the file, and their checksums right."""
+    """Content that `torch.save` wrote, on the CPU.  Its members are as large as in the file, and their checksums right."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             require_modest(archive)
@@ -81,7 +81,7 @@ def load_tensors(content: bytes) -> Any:
 
 
 def _numpy_scalars() -> list[Any]:
-    """What a NumPy number in a checkpoint is made of, under the names of NumPy 1 and 2."""
+    """Types that a NumPy number in a checkpoint consists of, under the names of NumPy 1 and 2."""
     from numpy._core import multiarray  # numpy.core in NumPy 1
 
     scalar: Any = multiarray.scalar

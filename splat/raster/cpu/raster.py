@@ -23,7 +23,7 @@ FOOTPRINT_BYTES = 1 << 28  # of the splats whose footprints are kept at a time
 
 
 class CpuRaster:
-    """One view of one set of splats, composited; `draw_order`, `lists` and `planes` are those of the rendering."""
+    """`raster.dispatch.Raster` by Numba kernels, on NumPy views of tensors; lists: those of the rendering."""
 
     def __init__(
         self,
@@ -72,11 +72,9 @@ class CpuRaster:
         return torch.from_numpy(self.pixels.planes).view(4, *self.plane)
 
     def crop(self, planes: Float[Tensor, "*k H W"]) -> Float[Tensor, "*k h w"]:
-        """A view of padded planes without the padding."""
         return planes[..., : self.height, : self.width]
 
     def pad(self, planes: Float[Tensor, "*k h w"]) -> Float[Tensor, "*k H W"]:
-        """Padded copies of planes, 0 outside the image, so that pixels outside it have no weight in any derivative."""
         padded = aligned((*planes.shape[:-2], *self.plane), self.dtype)
         padded[..., : self.height, : self.width] = planes.numpy()
         padded[..., self.height :, :] = 0
@@ -101,45 +99,37 @@ class CpuRaster:
 
     @property
     def draw_order(self) -> int:
-        """The same number for rasters of which every tile draws the same splats in the same order."""
         return hash((self.lists.start.tobytes(), self.lists.splat.tobytes()))
 
     @property
     def intersections_reached(self) -> int:
-        """How many intersections some pixel reaches."""
         return int(self.reached[1][-1])
 
     @property
     def touched(self) -> Int[Tensor, " m"]:
-        """The splats that have intersections that some pixel reaches."""
         return torch.from_numpy(np.flatnonzero(np.diff(self.reached[1])))
 
     def dark_tiles(self, adjoint: "CpuAdjoint", curvature: Float[Tensor, "3 H W"]) -> int:
-        """How many tiles with intersections have no slope and no curvature (as in `gaussian_blocks`) in any pixel."""
         planes = torch.cat([adjoint.cotangent, curvature]).numpy()
         lit = self._tiles(planes != 0).any(axis=(0, 2, 4)).reshape(-1)
         return int(((np.diff(self.reached[0].start) > 0) & ~lit).sum())
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept."""
         lists, splat_start = self.reached
         arrays = (self.splats, self.params, *self.lists, *lists, *self.pixels, splat_start)
         return sum(array.nbytes for array in arrays)
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that `jvp` and `backward_tangent` of so many tangents take, tangents and result included."""
         n, pixels = len(self.splats), 5 * self.frame.size
         return vectors * self.dtype.itemsize * (pixels + SPLAT * (self.intersections_reached + 2 * n))
 
     def backward(self, cotangent: Float[Tensor, "4 H W"]) -> "CpuAdjoint":
-        """The adjoint of the splats, given that of the planes."""
         return CpuAdjoint(self, cotangent)
 
     def gaussian_blocks(
         self, adjoint: "CpuAdjoint", curvature: Float[Tensor, "3 H W"], index: Int[Tensor, " m"], gauss_newton: bool
     ) -> Float64[Tensor, "m 9 9"]:
-        """Diagonal blocks of the splats at index: of the Hessian or of its Gauss-Newton part."""
         (lists, splat_start), found = self.reached, np.empty((len(index), SPLAT, SPLAT))
         sums = aligned((splat_start[-1] * blocks.BLOCK_SUMS,), self.dtype)
         v_planes = torch.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent
@@ -150,7 +140,7 @@ class CpuRaster:
         return torch.from_numpy(found)
 
     def coupled_blocks(self, loss: Coupling, index: Int[Tensor, " m"]) -> Float64[Tensor, "m 9 9"]:
-        """What the coupling of pixels by the loss adds to the diagonal blocks of the splats at index (ascending)."""
+        """The part of the diagonal blocks of the splats at index (ascending) that the loss's coupling of pixels adds."""
         (lists, splat_start), splats = self.reached, index.numpy()
         blocks = np.zeros((len(splats), SPLAT, SPLAT))
         layout, row = footprints.footprints_of(lists, splat_start), footprints.FOOTPRINT * lanes_of(self.dtype)
@@ -174,7 +164,7 @@ class CpuRaster:
         return torch.from_numpy(blocks)
 
     def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of every intersection: its splat, in how many pixels it has weight, and the splat next in front of it among those of
+        """Every intersection's splat, the number of pixels with weight of it, and the splat next in front of it among those of
         its tile that have weight in one of these pixels (-1: none)."""
         lists = self.reached[0]
         covered, before = np.empty((2, lists.splat.size), np.int32)
@@ -183,7 +173,6 @@ class CpuRaster:
         return lists.splat, covered, before
 
     def jvp(self, directions: Float[Tensor, "n k 9"]) -> "CpuTangent":
-        """J u for tangents of the splats."""
         return CpuTangent(self, directions)
 
     def flat(self, planes: Float[Tensor, "..."]) -> np.ndarray:
@@ -192,7 +181,7 @@ class CpuRaster:
 
 
 class CpuAdjoint:
-    """The adjoint of the splats: moments, and the cotangent that they are of."""
+    """`raster.dispatch.Adjoint`: moments, and the cotangent that they are of."""
 
     def __init__(self, raster: CpuRaster, cotangent: Float[Tensor, "4 H W"]):
         lists, splat_start = raster.reached
@@ -206,12 +195,11 @@ class CpuAdjoint:
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept beside the cotangent."""
         return self.moments.nbytes
 
 
 class CpuTangent:
-    """J u of K tangents of the splats, and what the second-order pass needs of it."""
+    """`raster.dispatch.Tangent`: J u of K tangents, and what the second-order pass needs of it."""
 
     def __init__(self, raster: CpuRaster, tangents_of_splats: Float[Tensor, "n k 9"]):
         self.raster, self._directions = raster, np.ascontiguousarray(tangents_of_splats.numpy(), raster.dtype)
@@ -224,7 +212,6 @@ class CpuTangent:
         self.planes: Float[Tensor, "k 4 H W"] = torch.from_numpy(planes).view(K, 4, *raster.plane)
 
     def backward_tangent(self, adjoint: CpuAdjoint, cotangents: Float[Tensor, "k 4 H W"]) -> Float[Tensor, "n k 9"]:
-        """The tangent of `backward` along the splats' tangents, given those of the adjoint's cotangent."""
         raster, (lists, splat_start) = self.raster, self.raster.reached
         n, K = self._directions.shape[:2]
         sums = aligned((splat_start[-1] * K * SPLAT,), raster.dtype)

@@ -37,7 +37,7 @@ rows_of_strip = triton_formula(formulas.rows_of_strip)
 
 
 class Lists(NamedTuple):
-    """Which splats touch which tiles. An intersection is a splat in a tile; those of a tile are in order of depth.
+    """Splats that touch each tile.  An intersection is a splat in a tile; those of a tile are in order of depth.
 
     start: (tiles + 1,) first intersection of each tile; tile, splat: (intersections,); place: (intersections,) their numbers,
     splat by splat; splat_start: (n + 1,) first place of the splats in order of depth; order: (n,) which splats these are.
@@ -52,7 +52,7 @@ class Lists(NamedTuple):
 
 
 class Accumulators(NamedTuple):
-    """Where the sums go of the intersections that some pixel reaches.
+    """Places of the sums of the intersections that some pixel reaches.
 
     place: (intersections,), without meaning for those that none reaches; first, last: (n,), splat i's are first[i] ..
     last[i] - 1.
@@ -190,7 +190,7 @@ def bin_splats(
 
 
 def kept_intersections(lists: Lists, reached: Int[Tensor, "tiles"]) -> Bool[Tensor, "intersections"]:
-    """Which intersections some pixel reaches, given how many of each tile's."""
+    """Mask of the intersections that some pixel reaches, given their number in each tile."""
     tile = lists.tile.to(torch.int32)
     index = torch.arange(len(tile), dtype=torch.int32, device=tile.device)
     return index < (lists.start[:-1] + reached)[tile]

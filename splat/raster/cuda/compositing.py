@@ -169,7 +169,7 @@ def threads(x, K: tl.constexpr):
 
 @jit
 def place_of_sums():
-    """Which sum lies at each of the 16 places that `nine_sums` fills, (1, 16), and where it is no copy."""
+    """Index of the sum at each of the 16 places that `nine_sums` fills, (1, 16), and where it is no copy."""
     place = tl.arange(0, 16)[None, :]
     even = place % 2 == 0
     return tl.where(even, place // 8 + place // 4 % 2 * 2 + place // 2 % 2 * 4, 8), even | (place == 1)

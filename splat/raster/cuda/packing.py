@@ -1,4 +1,4 @@
-"""From splats to what the compositing kernels on the GPU read, and from their sums back to splats.
+"""Packing of splats for the compositing kernels on the GPU, and reduction of their sums back to splats.
 
 Every thread holds one splat, in double precision.  A splat's numbers for the kernels are those of the CPU but for the mean, of
 which a pixel near by is kept, and the whitened offset from it: an offset between pixels is a whole number, exact in single

@@ -35,7 +35,7 @@ SIDE_BY_SIDE = 256  # numbers of a splat's accumulators that it reads at a time
 
 
 class CudaRaster:
-    """One view of one set of splats, composited."""
+    """`raster.dispatch.Raster` by Triton kernels."""
 
     def __init__(
         self,
@@ -88,12 +88,11 @@ class CudaRaster:
 
     @property
     def intersections(self) -> int:
-        """How many pairs of a splat and a tile the lists have."""
+        """Number of pairs of a splat and a tile in the lists."""
         return len(self.lists.splat)
 
     @property
     def draw_order(self) -> int:
-        """The same number for rasters of which every tile draws the same splats in the same order."""
         numbers = torch.cat([self.lists.start, self.lists.splat]).long()
         place = torch.arange(len(numbers), device=self.device)
         mixed = (numbers + 1) * 0x1E3779B97F4A7C15 ^ place * 0x3F58476D1CE4E5B9
@@ -105,12 +104,12 @@ class CudaRaster:
         return self.number_accumulators()
 
     def number_accumulators(self) -> Accumulators:
-        """Where the sums go of the intersections that some pixel reaches."""
+        """Places of the sums of the intersections that some pixel reaches."""
         return binning.number_accumulators(self.lists, self._reached)
 
     @property
     def intersections_reached(self) -> int:
-        """How many intersections some pixel reaches; reads their number back."""
+        """Number of intersections that some pixel reaches, read back from the device."""
         return int(self._reached.sum())
 
     @property
@@ -121,20 +120,18 @@ class CudaRaster:
         return count.index_add_(0, self.lists.splat, kept.to(torch.int32)).nonzero()[:, 0]
 
     def dark_tiles(self, adjoint: "CudaAdjoint", curvature: Float[Tensor, "3 h w"]) -> int:
-        """How many tiles have neither cotangent nor curvature in any pixel; reads their number back."""
+        """Number of tiles with neither cotangent nor curvature in any pixel, read back from the device."""
         lit = ((adjoint.cotangent != 0).any(0) | (curvature != 0).any(0)).float()
         tiles = torch.nn.functional.max_pool2d(lit[None], (HEIGHT, WIDTH), ceil_mode=True).flatten()
         return int(((self._reached > 0) & (tiles == 0)).sum())
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept."""
         tensors = [self.splats, self.params, *self.lists, self.planes, self._transmittance, self._stop, self._reached]
         tensors += vars(self).get("accumulators", ())
         return sum(tensor.nbytes for tensor in tensors)
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that `jvp` and `backward_tangent` of so many tangents take, tangents and result included."""
         n, pixels, item = len(self.splats), 5 * self.height * self.width, self.dtype.itemsize
         return vectors * (item * (pixels + SPLAT * (self.intersections + 2 * n)) + (SPLAT * 8 + 1) * n)
 
@@ -165,19 +162,16 @@ class CudaRaster:
         return totals
 
     def backward(self, cotangent: Float[Tensor, "4 h w"]) -> "CudaAdjoint":
-        """The adjoint of the splats, given that of the planes."""
         return CudaAdjoint(self, cotangent)
 
     def gaussian_blocks(
         self, adjoint: "CudaAdjoint", curvature: Float[Tensor, "3 h w"], index: Int[Tensor, " m"], gauss_newton: bool
     ) -> Float64[Tensor, "m 9 9"]:
-        """Diagonal blocks of the splats at index: of the Hessian or of its Gauss-Newton part."""
         v_planes = torch.zeros_like(adjoint.cotangent) if gauss_newton else adjoint.cotangent
         totals = self.totals(blocks.block_moments, 1, blocks.BLOCK_SUMS, v_planes, self.pad(curvature))[:, 0]
         return blocks.gaussian_blocks(totals[index], adjoint.moments[index], not gauss_newton)
 
     def jvp(self, directions: Float[Tensor, "n k 9"]) -> "CudaTangent":
-        """J u for tangents of the splats."""
         return CudaTangent(self, directions)
 
 
@@ -197,7 +191,7 @@ def _heaviest_first(work: Int[Tensor, " tiles"]) -> Int[Tensor, " tiles"]:
 
 
 class CudaAdjoint:
-    """The adjoint of the splats: moments, and the cotangent that they are of."""
+    """`raster.dispatch.Adjoint`: moments, and the cotangent that they are of."""
 
     def __init__(self, raster: CudaRaster, cotangent: Float[Tensor, "4 h w"]):
         self.cotangent = raster.pad(cotangent)
@@ -206,12 +200,11 @@ class CudaAdjoint:
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept beside the cotangent."""
         return self.moments.nbytes
 
 
 class CudaTangent:
-    """J u of K tangents of the splats, and what the second-order pass needs of it."""
+    """`raster.dispatch.Tangent`: J u of K tangents, and what the second-order pass needs of it."""
 
     def __init__(self, raster: CudaRaster, directions: Float[Tensor, "n k 9"]):
         self.raster, self._directions = raster, directions.to(raster.dtype).contiguous()
@@ -228,7 +221,6 @@ class CudaTangent:
             )  # fmt: skip
 
     def backward_tangent(self, adjoint: CudaAdjoint, cotangents: Float[Tensor, "k 4 h w"]) -> Float[Tensor, "n k 9"]:
-        """The tangent of `backward` along the splats' tangents, given those of the adjoint's cotangent."""
         raster, (n, K) = self.raster, self._directions.shape[:2]
         cotangents, product = raster.pad(cotangents), torch.empty_like(self._directions)
         for moves, part in zip(self._moves, _parts(K), strict=True):

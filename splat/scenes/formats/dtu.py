@@ -31,7 +31,7 @@ def is_dtu(root: Path) -> bool:
 
 
 def mask_folder(root: Path) -> Path:
-    """Where the masks of a scan lie beside `Rectified`."""
+    """Folder of the masks of a scan, beside `Rectified`."""
     return root.resolve().parents[1] / MASKS / root.resolve().name
 
 

@@ -218,7 +218,7 @@ def read_points(path: Path, names: tuple[str, ...]) -> Points:
 
 
 def _colours(values: np.ndarray) -> np.ndarray:
-    """In [0, 1]: real numbers of which none exceeds 1 are so already, others and whole numbers count to 255."""
+    """Colours in [0, 1]: real numbers up to 1 are so already; others, and whole numbers, count to 255."""
     if not ((values >= 0) & (values <= 255)).all():
         raise InputError("its colours are not between 0 and 255")
     shares = values.dtype.kind == "f" and (values <= 1).all()

@@ -153,7 +153,7 @@ def _warped(
 
 
 def _intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
-    """For pixels whose centres have whole numbers, as kornia counts them."""
+    """Intrinsics for pixels whose centres are at whole numbers, as in kornia."""
     rows = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
     return torch.tensor(rows, dtype=torch.float64)
 
@@ -197,7 +197,7 @@ def _confirmed(
 
 
 def _opaque(view: View, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    """Which points the view does not show as transparent."""
+    """Mask of the points that the view does not show as transparent."""
     if view.alpha is None:
         return torch.ones(len(xyz), dtype=torch.bool)
     u, v = pixel_coordinates(view.camera, xyz)[0].long().unbind(1)

@@ -140,7 +140,7 @@ def pseudo_view(cameras: Sequence[Camera], noise: float, generator: torch.Genera
 
 
 def confirmed(gaussians: Gaussians, others: Gaussians, distance: float) -> Bool[Tensor, " n"]:
-    """Which Gaussians have one of the others within this distance."""
+    """Mask of the Gaussians with one of the others within this distance."""
     own, theirs = (each.means.cpu().double().numpy() for each in (gaussians, others))
     nearest, _ = scipy.spatial.KDTree(theirs).query(own)
     return torch.as_tensor(nearest <= distance).to(gaussians.flat.device)

@@ -42,7 +42,7 @@ def update(
     scale: float,
     constants: tuple[float, float, float, float],
 ) -> None:
-    """In place.  root: sqrt(1 - beta2^t); scale: 1 / (1 - beta1^t); constants: beta1, beta2, eps and the grid of m."""
+    """Update in place.  root: sqrt(1 - beta2^t); scale: 1 / (1 - beta1^t); constants: beta1, beta2, eps and the grid of m."""
     numbers = torch.tensor([root, scale], dtype=torch.float64).to(parameters.device, non_blocking=True)
     launch(
         _step, (triton.cdiv(len(parameters), BLOCK),),

@@ -45,7 +45,7 @@ MCMC_DEFAULT = 0.01  # of both in 3DGS-MCMC, whose cfg_args does not have them
 
 @dataclass(frozen=True)
 class Foreign:
-    """What a file of another tool does not say.
+    """Facts that a file of another tool lacks.
 
     scene: folder.  views: how many, by the scene's protocol; train_list: names of the training views.  trained_by: a name of
     `PRESETS`.  images, downscale: as for `load_scene`.  antialiased: whether its renderer was, where the file does not know.
@@ -167,7 +167,7 @@ def _config(scene: Scene, found: SplatFile, loss: LossSettings, render: RenderSe
 
 
 def _weight(name: str, asked: float | Literal["trained"] | None, found: SplatFile) -> float:
-    """Of a regulariser.  InputError where it should be that of the training, of which nothing is known."""
+    """Weight of a regulariser.  InputError where that of the training is asked for, and is not known."""
     if asked != "trained":
         return asked or 0.0
     if isinstance(known := found.settings.get(name), float):
@@ -245,7 +245,7 @@ def _render(gaussians: Gaussians, view: View, config: TrainConfig) -> torch.Tens
 
 
 def _suspicion(image: torch.Tensor, config: TrainConfig, name: str, worlds: int) -> str:
-    """What is likely wrong."""
+    """Guess at what is wrong."""
     bare = (image - config.background_colour(image.dtype)[:, None, None]).abs().amax(dim=0) < 1 / 255
     if bare.float().mean() > 0.5:
         return (

@@ -102,7 +102,7 @@ def _from_cameras(cameras: Sequence[Camera]) -> Similarity:
 
 
 def nerfstudio_frame(checkpoint: Path, scene: Scene) -> Similarity:
-    """From the file in the checkpoint's folder or the one above.  InputError where there is none, or it is no similarity."""
+    """Similarity from the file in the checkpoint's folder or the one above.  InputError where there is none, or not one."""
     for path in (checkpoint.parent / NERFSTUDIO_FILE, checkpoint.resolve().parent.parent / NERFSTUDIO_FILE):
         if path.is_file():
             break

@@ -1,4 +1,4 @@
-"""What each trainer's renderer, loss and world are, as settings of this project.
+"""Renderer, loss and world of each trainer, as settings of this project.
 
                 graphdeco   gsplat <= 1.5   gsplat 1.6   nerfstudio   brush   lichtfeld   splat-landscape
     alpha cap   0.99        0.999           0.99         0.999        0.999   0.99        0.99
@@ -79,7 +79,7 @@ PRESETS: Mapping[str, Preset] = {
 
 
 def render_of(preset: Preset, settings: Mapping[str, Any], *, antialiased: bool) -> RenderSettings:
-    """What the renderer did; settings: of the tool, by its names (`SplatFile.settings`).
+    """Settings of the trainer's renderer; settings: of the tool, by its names (`SplatFile.settings`).
 
     >>> found = render_of(PRESETS["brush"], {}, antialiased=True)
     >>> found.antialias, found.blur

@@ -1,4 +1,4 @@
-"""Where the scene of a training lies, and how to load it as it was."""
+"""Reference to the scene of a training, to load it as it was."""
 
 import os
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from splat.training.start import Source
 
 @dataclass(frozen=True)
 class SceneReference:
-    """Which scene a training belongs to, and how to load it as it was.
+    """Reference to the scene of a training, to load it as it was.
 
     absolute, relative: the scene's folder, and the same from the checkpoint's folder.  images: the folder of images in
     it, where one was named; downscale: the factor by which its images were reduced further.  train, test: names of the views;

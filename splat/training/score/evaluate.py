@@ -97,7 +97,7 @@ def have_masks(views: Sequence[View]) -> bool:
 
 
 def score(image: Float[Tensor, "3 h w"], view: View, lpips: Perceptual | None = None) -> ViewScore:
-    """How much an image is like the view's picture, inside its mask."""
+    """Similarity of an image to the view's picture, inside its mask."""
     image, target = image.clamp(0, 1), view.image
     if view.mask is None:
         ratio = psnr(image, target)

@@ -8,7 +8,8 @@ import torch
 from analysis.bench.accuracy.cases import splat_cases
 from analysis.console.stages import Stages, Work
 from analysis.probe import measurement
-from analysis.probe.measurement import _plan, measure
+from analysis.probe.measurement import measure
+from analysis.probe.plan import plan_of
 from analysis.probe.settings import ProbeSettings
 from landscape import EigenSettings, TraceSettings, extreme_eigenpairs
 from landscape.eigen.power import power_iteration
@@ -40,11 +41,11 @@ def test_kernels_are_compiled_before_the_time_is_told_and_blocks_made_once(monke
         counted(SceneObjective, name)
     counted(LinearizedView, "block_diagonals")
     counted(measurement, "check_against_gradient")
-    counted(measurement, "_plan")
+    counted(measurement, "plan_of")
     objective = SceneObjective(random_gaussians(15, 1, logit=1.0), two_views(), LossSettings(), BACKGROUND)
     settings = replace(ProbeSettings.quick(), slice_points=5, block_coupling=True)
     found = measure(objective, settings, torch.Generator().manual_seed(0), Stages())
-    first = calls[: calls.index("_plan")]
+    first = calls[: calls.index("plan_of")]
     assert {"block_diagonal", "evaluate", "exact", "check_against_gradient"} <= {*first}
     assert calls.count("block_diagonal") == 1 and calls.count("gauss_newton") == 1
     assert found.value == pytest.approx(objective.loss(objective.active.flat))
@@ -115,13 +116,13 @@ def test_the_paper_s_power_iteration_is_read_from_the_density_without_products()
 
 
 def test_a_quick_probe_is_expected_to_take_what_it_makes_alone():
-    whole, quick = (_plan(settings, 1.0, 10.0) for settings in (ProbeSettings(), ProbeSettings.quick()))
+    whole, quick = (plan_of(settings, 1.0, 10.0) for settings in (ProbeSettings(), ProbeSettings.quick()))
     assert set(whole) - set(quick) == {"density", "finite probe", "depth"}
     assert quick["slice"].units == 2 * 21 < whole["slice"].units
     assert (
         quick["slice"].seconds == pytest.approx(1.5 * 21 * 10.0) and quick["traces"].seconds < whole["traces"].seconds
     )
-    assert _plan(ProbeSettings(), 2.0, 10.0, {"families": (6, 100, 1)})["families"] == Work(210.0, 6)
+    assert plan_of(ProbeSettings(), 2.0, 10.0, {"families": (6, 100, 1)})["families"] == Work(210.0, 6)
 
 
 def test_traces_that_samples_do_not_resolve_are_exact():

@@ -432,6 +432,17 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     assert "361" not in console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution(tmp_path):
+    data, arrays = synthetic()
+    data["anisotropy"]["mass_quantile"] = {"value": 361.25, "low": 15.0, "high": 151.0, "note": "4 start vectors"}
+    (line,) = (line for line in findings(probe_of(data)) if line.text.startswith("Mass quantile"))
+    assert line.level == "caution" and "– (between 15.0 and 151)" in line.text
+    text = Page(page(tmp_path / "probe", data, arrays)).text
+    assert "361" not in text
+    data["anisotropy"]["mass_quantile"]["high"] = 149.0
+    assert not any(line.text.startswith("Mass quantile") for line in findings(probe_of(data)))
+
+
 def test_the_page_of_the_splats_is_linked_where_it_is(tmp_path):
     path = with_views(tmp_path / "probe", ["a.png"])
     assert "view.html" not in path.read_text(encoding="utf-8")

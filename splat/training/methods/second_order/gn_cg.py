@@ -11,7 +11,7 @@ from typing import Literal
 from landscape.linalg import column_dots
 from landscape.operators.cg import conjugate_gradients
 from splat.model.typed import Length, Share
-from splat.training.methods.second_order.steps import Local, Proposal, SecondOrder, SecondOrderMethod
+from splat.training.methods.second_order.steps import LocalModel, Proposal, SecondOrder, SecondOrderMethod
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class GaussNewtonCG(SecondOrder):
 
 
 class GaussNewtonCGMethod(SecondOrderMethod[GaussNewtonCG]):
-    def propose(self, local: Local, damping: float) -> Proposal:
+    def propose(self, local: LocalModel, damping: float) -> Proposal:
         settings = self.settings
         M = local.metric.inverse(damping, diagonal=settings.preconditioner == "diagonal")
         found = conjugate_gradients(local.A, local.b, M, damping, settings.rtol, settings.products)

@@ -19,7 +19,7 @@ from landscape.errors import InputError
 from landscape.linalg import gram, norm
 from landscape.operators.operator import product
 from splat.model.gaussians import Gaussians
-from splat.training.methods.second_order.steps import Local, Proposal, SecondOrder, SecondOrderMethod
+from splat.training.methods.second_order.steps import LocalModel, Proposal, SecondOrder, SecondOrderMethod
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class NewtonBlocksMethod(SecondOrderMethod[NewtonBlocks]):
 
     last: Float[Tensor, " p"] | None = None
 
-    def propose(self, local: Local, damping: float) -> Proposal:
+    def propose(self, local: LocalModel, damping: float) -> Proposal:
         columns = [local.metric.inverse(damping)(local.b)]
         if self.settings.momentum and self.last is not None and len(self.last) == len(local.mask) * local.each:
             columns.append(local.in_unknowns(self.last.to(local.b)))

@@ -1,15 +1,15 @@
-"""A step of second order on all views at once, held to true renders (Levenberg 1944, Marquardt 1963).
+"""Levenberg-Marquardt steps on all views at once, accepted only if they lower the rendered loss (Marquardt 1963).
 
     L(theta + S y) ~ L - b.y + y.A y / 2      A = S P H P S, b = -S P grad L, H that of all views (`damped_blocks.py`)
-    y              solves (A + lambda) y = b, in a method's own way
-    ratio          fall of L in renders / fall of the model; lambda falls where it is high and rises where it is low
+    y              solves (A + lambda) y = b, as each method does it
+    ratio          decrease of L in renders / decrease of the model; lambda falls where it is above GOOD, rises below POOR
 
-A step after which L is not lower is not taken: it is halved up to HALVINGS times, then lambda rises and y is solved for anew.
-Quaternions move at right angles to themselves and are brought to unit length, which changes no render.  What no view sees stays
-as it is, and so does what has neither slope nor curvature.
+A step that does not lower L is halved up to HALVINGS times; then lambda rises and y is solved for again, up to TRIES times.
+Quaternions move orthogonally to themselves and are normalised, which changes no render.  Parameters that no view sees, or that
+have neither slope nor curvature, stay.
 
-In place of the L1 loss, whose second derivative is 0, L has its smooth form, Charbonnier's (`loss.eps`).  Each step is of all
-views, so that the seed makes no difference but to a start or a background that is random.
+In place of the L1 loss, whose second derivative is 0, L has the smooth one of Charbonnier (`loss.eps`).  As every step is on
+all views, the seed matters only to a random start or background.
 """
 
 from collections.abc import Sequence
@@ -34,15 +34,15 @@ from splat.training.methods.second_order.damped_blocks import DampedBlocks
 from splat.training.state import Method, MethodSettings, Step, TrainConfig, Training
 
 GOOD, POOR = 0.75, 0.25  # ratios beyond which lambda changes
-FALLS, RISES = 1 / 3, 4.0
+FALLS, RISES = 1 / 3, 4.0  # factors of lambda
 HALVINGS, TRIES = 2, 6
 LEAST, MOST = 1e-6, 1e6  # of lambda
-ROUNDOFF = 1e-7  # of L: a smaller fall cannot be told from the rounding of the renders
+ROUNDOFF = 1e-7  # of L: a smaller decrease is lost in the rounding of renders
 
 
 @dataclass(frozen=True)
 class SecondOrder(MethodSettings):
-    """damping: the first lambda; floor: see `damped_blocks.py`.  curvature: H's Gauss-Newton part, or H whole.
+    """damping: the first lambda; floor: see `damped_blocks.py`.  curvature: which matrix is H, Gauss-Newton or the Hessian.
 
     coupling: False leaves out SSIM's coupling of pixels from H and its blocks, as published methods do.
     """
@@ -54,21 +54,21 @@ class SecondOrder(MethodSettings):
     ITERATIONS: ClassVar[int] = 50
 
     def density_control(self, config: TrainConfig) -> DensifySettings:
-        """None: the Gaussians stay those of the start."""
+        """Switched off: the Gaussians stay those of the start."""
         return replace(config.densify, enabled=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """y, the fall of L that the model predicts, and whether negative curvature was met on the way."""
+    """A step y, the decrease of L that the model predicts, and whether the solver met negative curvature."""
 
     y: Float[Tensor, " p"]
     fall: float
     negative: bool = False
 
 
-class Local:
-    """The model of L at the Gaussians of a step.  mask: which of these the views see; each: parameters of one."""
+class LocalModel:
+    """The quadratic model of L at the Gaussians of a step.  mask: which of them the views see; each: parameters of one."""
 
     def __init__(self, objective: SceneObjective, settings: SecondOrder):
         self.objective, self.mask, gauss_newton = objective, objective.mask, settings.curvature == "gauss-newton"
@@ -79,26 +79,26 @@ class Local:
         H = SceneHessian(objective, gauss_newton=gauss_newton, keep_null=True, coupled=settings.coupling)
         self.A = CountingOperator(ScaledOperator(ProjectedOperator(H, self.metric.project), self.metric.scale))
         coupled = settings.coupling and objective.couples_pixels
-        # of a view: who is seen, forward, backward, blocks
+        # for each view: visibility, forward, backward, and one or two for blocks
         self.passes = len(objective.views) * (5 if coupled else 4)
         self.b = -self.metric.scale * self.metric.project(objective.gradient[:, None])[:, 0]
 
     def loss_at(self, gaussians: Gaussians) -> float:
-        """L elsewhere; infinite where it cannot be rendered."""
+        """L at other Gaussians; infinite where they cannot be rendered."""
         try:
             return self.objective.loss(gaussians.flat)
-        except InputError:  # sizes or colours beyond the renderer's range
+        except InputError:  # their sizes or colours are beyond the renderer's range
             return inf
 
     def moved(self, y: Float[Tensor, " p"]) -> Gaussians:
-        """The Gaussians at y, with unit quaternions."""
+        """The Gaussians after the step y, with unit quaternions."""
         at = self.objective.active
         found = at.with_flat(at.flat + self.metric.scale * y)
         found.quats.div_(found.quats.norm(dim=1, keepdim=True))
         return found
 
     def in_unknowns(self, change: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
-        """y of a change of all stored parameters."""
+        """The step y that makes a change of all stored parameters."""
         seen = Gaussians(change, self.objective.active.sh_degree).select(self.mask).flat
         y = torch.where(self.metric.scale > 0, seen / self.metric.scale, 0.0)
         return self.metric.project(y[:, None])[:, 0]
@@ -108,8 +108,11 @@ S = TypeVar("S", bound=SecondOrder)
 
 
 class SecondOrderMethod(Method[S], Generic[S]):
-    """history: a row a step: L before it, lambda, products with A, renders of all views, passes over a view's pixels, and the
-    ratio; 0 where no step was taken."""
+    """A training by such steps; `propose` solves for them.
+
+    history: of each step L before it, lambda, products with A, renders of all views, passes over a view's pixels, and the
+    ratio, 0 where no step was taken.
+    """
 
     def __init__(self, settings: S, seed: int):
         super().__init__(settings, seed)
@@ -127,21 +130,23 @@ class SecondOrderMethod(Method[S], Generic[S]):
                 "--set coupling=false, or --ssim-weight 0"
             )
 
-    def propose(self, local: Local, damping: float) -> Proposal:
-        """A step of the model."""
+    def propose(self, local: LocalModel, damping: float) -> Proposal:
+        """The step to try."""
         raise NotImplementedError
 
     def taken(self, before: Gaussians, after: Gaussians) -> None:
-        """Called after a step, with all Gaussians."""
+        """Hook after an accepted step; before, after: all Gaussians."""
 
     def own_step(self, step: Step) -> float:
         config, training = step.config, step.training
         old = config.background_colour(step.background.dtype)
         views = [view.with_image(with_background(view, old, step.background)) for view in step.views]
         loss = replace(config.loss, pixel="charbonnier") if config.loss.pixel == "l1" else config.loss
-        local = Local(SceneObjective(step.gaussians, views, loss, step.background, config.render), self.settings)
+        local = LocalModel(SceneObjective(step.gaussians, views, loss, step.background, config.render), self.settings)
         moved = self._descend(local, step.number)
-        vars(local.objective).pop("linearized", None)  # refers back: would wait for the garbage collector
+        vars(local.objective).pop(
+            "linearized", None
+        )  # a reference cycle, which would keep its memory until Python looks for cycles
         if moved is not None:
             after = step.gaussians.with_flat(step.gaussians.flat.clone())
             for name, values in after.attributes.items():
@@ -150,8 +155,8 @@ class SecondOrderMethod(Method[S], Generic[S]):
             training.gaussians = after
         return local.loss
 
-    def _descend(self, local: Local, number: int) -> Gaussians | None:
-        """The Gaussians after the step; None where none lowers L."""
+    def _descend(self, local: LocalModel, number: int) -> Gaussians | None:
+        """The Gaussians after the step; None where no step lowers L."""
         row: dict[str, Any] = {"step": number, "loss": local.loss, "damping": self.damping, "ratio": 0.0}
         found, renders = None, 0
         for _ in range(TRIES):
@@ -173,7 +178,7 @@ class SecondOrderMethod(Method[S], Generic[S]):
         return found
 
     def _adapt(self, ratio: float, negative: bool) -> None:
-        """Change lambda after a step of this ratio, 0 where it was shortened."""
+        """Change lambda after a step with this ratio, 0 for a step that was halved."""
         if ratio < POOR or negative:
             self.damping = min(self.damping * RISES, MOST)
         elif ratio > GOOD:

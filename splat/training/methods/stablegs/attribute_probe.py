@@ -1,9 +1,10 @@
-"""Attribute-space probes of StableGS: steps in all five attributes at once, towards where the loss rises or breaks.
+"""Attribute-space probes of StableGS: steps in all five attributes at once, along the gradient or at random.
 
     tau     of an attribute: sqrt(max(tr H, 0) / dim), `splat.curvature.traces.curvature_scale`; the trace of quats is that
             on the unit quaternions, without their radial directions, since H_quats scales with 1 / |q|^2
     rho     c / (tau + eps), at most the attribute's cap                                                       Eq. (5)
-    g, v    the gradient of the sampled view's loss; the unit vector from the camera's centre to the mean
+    g       the gradient of the sampled view's loss
+    v       the unit vector from that view's camera centre to the mean
     means   + rho u,  u the direction of gamma g_depth + (1 - gamma) g_lateral,  g_depth = (g.v) v             Eqs. (7), (8)
     quats   q x exp(omega), omega ~ N(0, rho_i^2 1), rho_i = rho min((kappa - 1) / kappa_full, 1), in radians  Eqs. (9), (10)
     scales  log_scales + delta, delta ~ N(0, rho^2 1)                                                          Eq. (11)
@@ -11,12 +12,12 @@
     sh      + w_l e, e ~ N(0, 1) for each coefficient and channel, w_l = rho (1 + l / l_max), rho if l_max = 0 Eq. (13)
 
 x is the Hamilton product, exp(omega) = (cos(|omega| / 2), sin(|omega| / 2) omega / |omega|), kappa the condition number of
-the splat in the sampled view, with its blur.  A Gaussian that the sampled view does not show has no g and no kappa: its
-mean, quaternion and opacity stay.  Scales and SH are drawn for all Gaussians, as Eqs. (11) and (13) have it, so that
-other poses that show the probed copy find them probed.
+the splat in the sampled view, with its blur.  A Gaussian out of that view has no g and no kappa: its mean, quaternion and
+opacity stay.  Scales and SH of all Gaussians are probed, as Eqs. (11) and (13) have it, for renders of the probed copy from
+other poses.
 
-The step is a constant, as in SAM: with Theta' = Theta + step (Eq. (14)), dTheta' / dTheta is the identity, but for the
-quaternions, where it is the right multiplication by exp(omega), an orthogonal matrix.
+The step counts as a constant, as in SAM: with Theta' = Theta + step (Eq. (14)), dTheta' / dTheta is the identity, but for the
+quaternions the right multiplication by exp(omega), an orthogonal matrix.
 """
 
 from collections.abc import Mapping
@@ -54,7 +55,7 @@ class Constants(Settings):
 
 @dataclass(frozen=True)
 class Caps(Settings):
-    """The largest rho of each attribute; inf for none.  Without them rho is 1e4 wherever a trace is not positive.
+    """The largest rho of each attribute; inf for none.  Uncapped, rho is c / eps where a trace is not positive.
 
     means: in units of the scene's extent (`splat/training/densify.py`); log_scales: 0.2 is a fifth in size;
     quats: radians; opacity_logits: 0.5 is at most 0.125 in opacity; sh: 0.05 is 0.1 in colour at SH degree 3.
@@ -69,11 +70,11 @@ class Caps(Settings):
 
 @dataclass(frozen=True)
 class ProbeSettings(Settings):
-    """attributes: which are probed; c, caps: of rho, for each; eps: of Eq. (5); kappa_full: the 100 of Eq. (10).
+    """Settings of the probes; c and eps of Eq. (5), caps of rho, gamma of Eq. (8), kappa_full of Eq. (10).
 
-    dimension: what tau divides a trace by (`splat.curvature.traces.curvature_scale`); "attribute", because with "active" rho is
-    larger by the root of the number of Gaussians, so that on any but a tiny scene the caps alone would decide.
-    gamma: how far means move along the viewing ray, 1: along it alone, 0.5: along the gradient itself.
+    dimension: what tau divides a trace by (`splat.curvature.traces.curvature_scale`); not "active", because rho would be larger
+    by the root of the number of Gaussians, and the caps alone would decide on any but a tiny scene.
+    gamma: 1 for steps of means along the viewing ray, 0.5 along the gradient itself.
     """
 
     attributes: tuple[Attribute, ...] = ("means", "log_scales", "quats", "opacity_logits", "sh")
@@ -91,13 +92,13 @@ class ProbeSettings(Settings):
 
     @property
     def on(self) -> tuple[Attribute, ...]:
-        """The attributes that are probed: those named whose c is not 0.  Only their traces are needed."""
+        """The attributes that are probed: those named whose c is above 0.  Only their traces are needed."""
         return tuple(name for name in self.attributes if getattr(self.c, name) > 0)
 
 
 @dataclass(frozen=True)
 class Magnitude(Typed):
-    """How far an attribute is probed and why: its trace as given, tau, rho of Eq. (5) uncapped, and rho under its cap."""
+    """The step length rho of an attribute, and what it follows from: trace, tau, and rho of Eq. (5) before its cap."""
 
     trace: Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
     tau: NonNegative
@@ -110,7 +111,7 @@ class Magnitude(Typed):
 
     @property
     def negative(self) -> bool:
-        """Whether the trace was below 0, so that tau counts as 0."""
+        """Whether the trace is below 0, so that tau is 0."""
         return self.trace < 0
 
 
@@ -119,19 +120,19 @@ def magnitudes(
 ) -> dict[str, Magnitude]:
     """The magnitude of each attribute that is on.
 
-    traces: of their Hessian blocks (of quats on the unit sphere), summed over `active` Gaussians; extent: of the scene, world
-    units, to which the cap of the means is relative.  InputError where a trace is missing or not finite.
+    traces: of its Hessian block (quats: on the unit sphere) over `active` Gaussians; extent: of the scene, in world units, by
+    which the cap of the means is multiplied.  InputError where a trace is missing or not finite.
     """
     if active < 1 or not 0 < extent < inf:
         raise ValueError(f"expected at least 1 active Gaussian and a finite extent above 0, got {active} and {extent}")
-    each = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 3 * (sh_degree + 1) ** 2}
+    dimensions = {"means": 3, "log_scales": 3, "quats": 3, "opacity_logits": 1, "sh": 3 * (sh_degree + 1) ** 2}
     result = {}
     for name in settings.on:
         c, cap = getattr(settings.c, name), getattr(settings.caps, name)
         trace = traces.get(name)
         if trace is None or not isfinite(trace):
             raise InputError(f"expected a finite trace of {name}, got {trace}; lower the rates or leave {name} out")
-        tau = curvature_scale(trace, each[name] * active, active, settings.dimension)
+        tau = curvature_scale(trace, dimensions[name] * active, active, settings.dimension)
         rho = c / (tau + settings.eps)
         result[name] = Magnitude(trace, tau, rho, min(rho, cap * extent if name == "means" else cap))
     return result
@@ -139,13 +140,13 @@ def magnitudes(
 
 @dataclass(frozen=True, eq=False)
 class Probed:
-    """The probed copy of a set of Gaussians (Eq. (14)), off the autograd graph.  turns: exp(omega), unit."""
+    """The probed copy of a set of Gaussians (Eq. (14)), off the autograd graph.  turns: exp(omega)."""
 
     gaussians: Gaussians
     turns: Float[Tensor, "n 4"]
 
     def pull(self, gradient: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
-        """The gradient in the parameters, given that at the probed ones (overwritten): (q x e).p = q.(p x conjugate e)."""
+        """The gradient in the parameters from that in the probed ones, in its place: (q x e).p = q.(p x conjugate e)."""
         pulled = self.gaussians.with_flat(gradient)
         pulled.quats.copy_(hamilton(pulled.quats, self.turns * self.turns.new_tensor([1, -1, -1, -1])))
         return gradient
@@ -161,31 +162,32 @@ def probe_attributes(
     settings: ProbeSettings,
     generator: torch.Generator,
 ) -> Probed:
-    """The Gaussians after a step of each attribute by its magnitude; those without one stay.
+    """The Gaussians after a step of each attribute by its magnitude; attributes without one stay.
 
-    gradient, splats: of the sampled view's loss and render.  Whatever is probed, the generator gives one number for each
-    attribute that is drawn, which seeds that attribute's own generator: no probe changes the draws of another, nor
-    what the generator gives next.
+    gradient, splats: of the sampled view's loss and render.  Each random attribute has a generator of its own, seeded from
+    `generator` whether it is probed or not: no probe changes the draws of another, nor what `generator` gives next.
     """
-    probed = gaussians.with_flat(torch.zeros_like(gaussians.flat))  # first the step, then what it leads to
+    probed = gaussians.with_flat(torch.zeros_like(gaussians.flat))  # holds the step, until the Gaussians are added
     step, slope = probed.attributes, gaussians.with_flat(gradient).attributes
     rho = {name: magnitude.rho for name, magnitude in magnitudes.items()}
     seeds = torch.randint(2**63 - 1, (len(DRAWN),), generator=generator).tolist()
-    own = {name: torch.Generator(probed.flat.device).manual_seed(seed) for name, seed in zip(DRAWN, seeds, strict=True)}
+    draws = {
+        name: torch.Generator(probed.flat.device).manual_seed(seed) for name, seed in zip(DRAWN, seeds, strict=True)
+    }
     omega = torch.zeros_like(probed.means)
     if "means" in rho:
         rays = gaussians.means.double() - camera.centre.to(probed.flat.device)
         step["means"].copy_(rho["means"] * depth_biased(slope["means"], rays, settings.gamma))
     if "log_scales" in rho:
-        step["log_scales"].normal_(0, rho["log_scales"], generator=own["log_scales"])
+        step["log_scales"].normal_(0, rho["log_scales"], generator=draws["log_scales"])
     if "quats" in rho:
         share = ((condition(splats.conics) - 1) / settings.kappa_full).clamp(0, 1) * on_screen(splats, camera)
-        omega.normal_(0, rho["quats"], generator=own["quats"]).mul_(share[:, None])
+        omega.normal_(0, rho["quats"], generator=draws["quats"]).mul_(share[:, None])
     if "opacity_logits" in rho:
         step["opacity_logits"].copy_(rho["opacity_logits"] * slope["opacity_logits"].sign())
     if "sh" in rho:
         weights = [1 + isqrt(k) / max(gaussians.sh_degree, 1) for k in range(step["sh"].shape[1])]
-        step["sh"].normal_(0, rho["sh"], generator=own["sh"]).mul_(step["sh"].new_tensor(weights)[:, None])
+        step["sh"].normal_(0, rho["sh"], generator=draws["sh"]).mul_(step["sh"].new_tensor(weights)[:, None])
     turns = exponential(omega)
     probed.flat.add_(gaussians.flat)
     probed.quats.copy_(hamilton(gaussians.quats, turns))
@@ -193,10 +195,7 @@ def probe_attributes(
 
 
 def depth_biased(gradient: Float[Tensor, "n 3"], rays: Float64[Tensor, "n 3"], gamma: float) -> Float64[Tensor, "n 3"]:
-    """The direction of gamma g_depth + (1 - gamma) g_lateral, 0 where that is 0.
-
-    In double precision, where the square of no single-precision gradient underflows.
-    """
+    """Unit vector along gamma g_depth + (1 - gamma) g_lateral, or 0; in float64, where the square of no float32 underflows."""
     v = _unit(rays)
     depth = (gradient * v).sum(dim=1, keepdim=True) * v
     return _unit(gamma * depth + (1 - gamma) * (gradient - depth))
@@ -208,13 +207,13 @@ def _unit(x: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3"]:
 
 
 def exponential(omega: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """The unit quaternions w x y z of turns by |omega| radians about omega."""
+    """exp(omega): the unit quaternions w x y z of rotations by |omega| radians about omega."""
     angle = omega.norm(dim=1, keepdim=True)
     return torch.cat([(angle / 2).cos(), omega * torch.sinc(angle / (2 * torch.pi)) / 2], dim=1)
 
 
 def hamilton(p: Float[Tensor, "n 4"], q: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """The product p x q of quaternions w x y z: of rotations, q first.
+    """The product p x q of quaternions w x y z; as rotations, q acts first.
 
     >>> i, j = torch.eye(4)[1:3]
     >>> hamilton(i[None], j[None]).tolist()  # k

@@ -7,7 +7,7 @@ derivative; k are probed viewpoints (`viewpoint_probe.py`), one for each trainin
 loss of training, between two renders.  Of the gradient in Theta, what comes from an image of Theta' is pulled back through
 Eq. (14).  L_recon is the sampled view's, as Algorithm 1 has it.  There is no released code.
 
-Probing starts after `warm_up` steps.  Every `every` steps the magnitudes rho are worked out anew from the traces of the
+Probing starts after `warm_up` steps.  Every `every` steps the magnitudes rho are computed anew from the traces of the
 Hessian's blocks over all training views, and with them the dominant occlusion edge of each view; both change slowly.  Density
 control sees the sampled view's gradient alone.  Where no training view sees a Gaussian, training goes on with the last
 magnitudes and edges, or none.  The history notes it, and counts the probed viewpoints that see none.
@@ -188,7 +188,7 @@ class StableGSMethod(Method[StableGS]):
             self.normals = [_edge_normal(step, view.camera) for view in step.views]
 
     def traces(self, objective: SceneObjective) -> dict[str, TraceEstimate]:
-        """Of the blocks of the attributes that are probed."""
+        """Traces of the blocks of the attributes that are probed."""
         settings, names = self.settings, self.settings.probe.on
         if not names:
             return {}

@@ -85,7 +85,8 @@ def composite_pose(
     t, phi = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
     gauss = torch.randn(5, generator=generator, dtype=torch.float64)
     theta, delta = gauss[:2].tolist()
-    if settings.parallax and _surrounding(settings, geometry):
+    surrounding = geometry.surrounding if settings.capture == "auto" else settings.capture == "360"
+    if settings.parallax and surrounding:
         rotation, centre = _on_shell(geometry, gauss[2:])
     else:
         rotation, centre = view.rotation, view.centre
@@ -128,10 +129,6 @@ def edge_axis(
     x, y = float(normal[0]) * camera.fx, float(normal[1]) * camera.fy
     lifted = (x, y, 0.0) if axis == "normal" else (-y, x, 0.0)
     return torch.nn.functional.normalize(torch.tensor(lifted, dtype=camera.rotation.dtype), dim=0)
-
-
-def _surrounding(settings: ViewpointSettings, geometry: CaptureGeometry) -> bool:
-    return geometry.surrounding if settings.capture == "auto" else settings.capture == "360"
 
 
 def _on_shell(geometry: CaptureGeometry, gauss: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:

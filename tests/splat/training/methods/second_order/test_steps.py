@@ -17,7 +17,7 @@ from splat.training.loop import train
 from splat.training.methods.second_order.damped_blocks import absolute
 from splat.training.methods.second_order.gn_cg import GaussNewtonCG
 from splat.training.methods.second_order.newton_blocks import NewtonBlocks, minimum
-from splat.training.methods.second_order.steps import FALLS, RISES, Local, SecondOrder
+from splat.training.methods.second_order.steps import FALLS, RISES, LocalModel, SecondOrder
 from splat.training.state import Training
 from tests.oracles import absolute_matrix
 from tests.splat.tiny import EXTENT, tiny_config, tiny_gaussians, tiny_views
@@ -27,14 +27,14 @@ GN, HESSIAN = NewtonBlocks(floor=0.3), NewtonBlocks(floor=0.3, curvature="hessia
 N, LAMBDA = 6, 0.4
 
 
-def local(settings: SecondOrder, loss: LossSettings = L2) -> Local:
+def local(settings: SecondOrder, loss: LossSettings = L2) -> LocalModel:
     double = torch.float64
     scene = SceneObjective(tiny_gaussians(N, dtype=double), tiny_views(double)[:2], loss, torch.zeros(3, dtype=double))
     assert len(scene.active) == N
-    return Local(scene, settings)
+    return LocalModel(scene, settings)
 
 
-def dense(local: Local, settings: SecondOrder) -> Tensor:
+def dense(local: LocalModel, settings: SecondOrder) -> Tensor:
     """S P H P S, from the scene's Hessian alone."""
     scene, S = local.objective, torch.diag(local.metric.scale)
     quats = scene.active.quats
@@ -46,14 +46,14 @@ def dense(local: Local, settings: SecondOrder) -> Tensor:
     return S @ P @ H.apply(torch.eye(len(P), dtype=torch.float64)) @ P @ S
 
 
-def rows_of(i: int, local: Local) -> list[int]:
+def rows_of(i: int, local: LocalModel) -> list[int]:
     """A Gaussian's unknowns but those of its SH."""
     blocks = local.objective.blocks
     widths = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
     return [blocks[name].start + width * i + k for name, width in widths.items() for k in range(width)]
 
 
-def inverted(A: Tensor, local: Local, damping: float = LAMBDA) -> Tensor:
+def inverted(A: Tensor, local: LocalModel, damping: float = LAMBDA) -> Tensor:
     """M of `damped_blocks.py`, from the dense A."""
     M = torch.zeros_like(A)
     for i in range(N):

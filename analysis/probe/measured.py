@@ -1,0 +1,70 @@
+"""Results of a probe's stages."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float64
+from torch import Tensor
+
+from analysis.measures.gradient_check import ProductCheck
+from analysis.records.schema import Depth
+from landscape import EigenEnds, OperatorCheck, Slice, SpectralDensity, TraceEstimate
+from landscape.slices.finite_probe import FiniteProbe
+from splat.curvature.scores.shares import BlockShare
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneSlice:
+    """A slice with its units: along each direction the step at which curvature alone raises the loss by loss_scale."""
+
+    slice: Slice
+    loss_scale: float
+    units: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """The density, None where memory is too small for it, and the power iteration that its runs hold."""
+
+    density: SpectralDensity | None
+    power: EigenEnds | None
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Numbers of each of the m views measured, for the standard error of measuring on fewer than the training has.
+
+    population: the training's views.  curvatures: v . H_m v of the eigenvectors of the two largest eigenvalues and of
+    the smallest.
+    """
+
+    population: int
+    losses: Float64[Tensor, " m"]
+    curvatures: Float64[Tensor, "m 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Results of all stages; density, power, finite, depth, plane and shares are None where a note says why.
+
+    matvecs: products H v of all stages; spared: products of single views, known to be 0 and left out; rank: number of
+    directions that are not exactly flat; unreached: stages that time did not reach; left_out: of training views, if any were.
+    """
+
+    value: float
+    gradient_norm: float
+    operator_check: OperatorCheck
+    gradient_check: ProductCheck
+    traces: dict[str, TraceEstimate]
+    ends: EigenEnds
+    power: EigenEnds | None
+    density: SpectralDensity | None
+    finite: FiniteProbe | None
+    depth: Depth | None
+    plane: PlaneSlice | None
+    shares: list[BlockShare] | None
+    matvecs: int
+    spared: int
+    rank: int
+    notes: tuple[str, ...]
+    unreached: tuple[str, ...] = ()
+    left_out: LeftOut | None = None
