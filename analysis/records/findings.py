@@ -24,6 +24,7 @@ ATTRIBUTES = {
     "sh": "colour (SH)",
 }
 END_NAMES = {"max": "largest", "min": "smallest"}
+WIDEST = 10.0  # times its other end: a bracket that still has a value
 
 
 @dataclass(frozen=True)
@@ -214,7 +215,7 @@ def _of_anisotropy(family: schema.Anisotropy) -> list[Line]:
     elif saddle:
         text = f"The ratio of the two ends of the spectrum is not determined{_in_brackets(saddle.note)}."
         lines.append(Line(text, "caution"))
-    if share and _is_finite(share.value) and not is_open(share):
+    if share and _is_finite(share.value) and not is_loose(share):
         text = f"The steepest direction alone holds {share.value:.2%} of all absolute curvature"
         lines.append(Line(f"{text}{_bracket(share, '{:.2%}'.format)}."))
     return lines
@@ -225,6 +226,19 @@ def is_open(index: schema.Index) -> bool:
     return (index.low is None) != (index.high is None) or (
         index.low is None and index.high is None and index.value is not None
     )
+
+
+def is_wide(index: schema.Index | schema.Effect) -> bool:
+    """Whether the ends of its bracket are too far apart for any value between them to be one."""
+    if index.low is None or index.high is None:
+        return False
+    near, far = sorted((abs(index.low), abs(index.high)))
+    return (index.low > 0) != (index.high > 0) or far > WIDEST * near
+
+
+def is_loose(index: schema.Index) -> bool:
+    """Whether its bracket is open or wide, so that no value is shown."""
+    return is_open(index) or is_wide(index)
 
 
 def remedy(data: ProbeRecord, name: str) -> str:
@@ -252,11 +266,14 @@ def _with(command: str, option: str, value: int) -> str:
 
 
 def _of_open(data: ProbeRecord) -> list[Line]:
-    """The indices without a finite bracket: the bracket, and the command that resolves it."""
+    """The indices without a finite or useful bracket: the bracket, and the command that resolves it."""
     return [
-        Line(f"{name.replace('_', ' ').capitalize()}: {UNDETERMINED}{_bracket(index)}; {remedy(data, name)}.", "open")
+        Line(
+            f"{name.replace('_', ' ').capitalize()}: {UNDETERMINED}{_bracket(index)}; {remedy(data, name)}.",
+            "open" if is_open(index) else "caution",
+        )
         for name, index in data.anisotropy.items()
-        if is_open(index)
+        if is_loose(index)
     ]
 
 

@@ -177,7 +177,7 @@ class Shade(Struct, frozen=True, kw_only=True):
     @property
     def diverges(self) -> bool:
         """Whether 0 is in the middle."""
-        return self.low == -self.high
+        return self.scale != "log" and self.low == -self.high
 
     @property
     def colours(self) -> str:

@@ -9,6 +9,7 @@ import gzip
 import io
 import math
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import plotly.io
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from analysis.records.findings import Line, attribute_name, findings, headline, is_open, largest_steps
+from analysis.records.findings import Line, attribute_name, findings, headline, is_loose, is_open, largest_steps
 from analysis.records.json_files import plain
 from analysis.records.quantities import limits, measured, percent, quantity
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
@@ -54,8 +55,9 @@ def write_report(folder: str | Path, surface: str | None = None) -> Path:
     return path
 
 
+@cache
 def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environment:
-    """Of the pages whose templates lie in a folder, by default beside this file."""
+    """Of the pages whose templates lie in a folder, by default beside this file; each is compiled once."""
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(folder),
         autoescape=True,
@@ -75,7 +77,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "attribute": attribute_name,
         "cell": _cell,
         "capitalise": lambda words: words[:1].upper() + words[1:],
-        "open_ended": is_open,
+        "loose": is_loose,
     }
     surface, views = embedded_surface(record) if surface is None else surface, views_in(record)
     first, start = opening(record), first_view(record, views)
@@ -141,7 +143,7 @@ def numbers(data: ProbeRecord) -> list[dict[str, str]]:
     ends, found = data.eigenvalues, []
     lowest = "most negative" if (ends.min.value or 0.0) < 0 else "smallest"
     for end, words in ((ends.max, "largest curvature, λ max"), (ends.min, f"{lowest} curvature, λ min")):
-        found.append({"value": measured(end.value, end.residual), "words": words})
+        found.append({"value": measured(end.value, end.residual), "words": f"{words}, per stored unit²"})
     found += _steepest_attribute(data)
     if index := data.anisotropy.literal:
         cell = bracketed(None if is_open(index) else index)
@@ -220,8 +222,8 @@ def where(record: Record[ProbeRecord], said: str) -> list[dict[str, str]]:
     for end in found.steepest:
         text = end.rendered if end.sentence == said else f"{end.sentence} {end.rendered}"
         shown.append((end.file, text, end.sentence, carriers_in_words(end)))
-    fragile = " ".join(found.sentences[len(found.steepest) :])
-    panel = found.panels[0] if found.panels else None
+    fragile, named = "\n".join(found.sentences[len(found.steepest) :]), {end.view for end in found.steepest[:1]}
+    panel = next((panel for panel in found.panels if panel.name in named), found.panels[0] if found.panels else None)
     words = f"{panel.name}: maps of its fragility in position, conditioning and opacity." if panel else ""
     shown.append((panel.file.replace("view", "fragility") if panel else "", fragile, words, words))
     return [

@@ -9,7 +9,7 @@ from msgspec import UNSET, UnsetType
 from rich import box
 from rich.table import Table
 
-from analysis.records.findings import attribute_name, is_open
+from analysis.records.findings import attribute_name, is_open, is_wide
 from analysis.records.quantities import UNDETERMINED, apart, limits, measured, quantity
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import INDICES, BlockShare, Depth, Effect, End, Family, Index, Number
@@ -236,12 +236,14 @@ def _folded(text: str, width: int = WIDTH) -> str:
 
 
 def bracketed(index: Index | Effect | None) -> Cell:
-    """An index as text: a narrow bracket as an error, and one without upper end as the bound that it is.
+    """An index as text: a narrow bracket as an error, one without upper end as the bound that it is, a wide one alone.
 
     >>> bracketed(Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")).value
     '≥ 34.2'
     >>> bracketed(Index(value=2.0, low=1.95, high=2.04, note="")).value
     '2.000 ± 0.050'
+    >>> bracketed(Index(value=2.0, low=1.0, high=30.0, note=""))
+    Cell(value='–', bracket='1.00 … 30.0', note='')
     """
     if index is None:
         return Cell(UNDETERMINED)
@@ -252,7 +254,7 @@ def bracketed(index: Index | Effect | None) -> Cell:
         return Cell(f"≥ {quantity(low)}" if high is None else f"≤ {quantity(high)}", "", note)
     if value is not None and low <= value <= high and high - low < NARROW * abs(value):
         return Cell(measured(value, max(high - value, value - low)), "", note)
-    return Cell(quantity(value), " … ".join(limits(low, high)), note)
+    return Cell(UNDETERMINED if is_wide(index) else quantity(value), " … ".join(limits(low, high)), note)
 
 
 def factor(effect: Effect | None) -> Cell:

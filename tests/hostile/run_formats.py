@@ -21,6 +21,7 @@ from tests.hostile.mutations import Random
 from tests.splat.tiny import EXTENT, REFERENCE, tiny_config, tiny_gaussians, tiny_views
 
 DRAWN = 0.01  # of the records that are accepted are drawn too, which takes most of the time
+BOMB = 3 * 10**6  # zeros, a hundred times what the file takes
 
 
 def tiny_training() -> Training:
@@ -106,16 +107,18 @@ def of_arrays(chance: Random, content: bytes, changes: int = 1, zipped_anew: flo
 def rezipped(chance: Random, content: bytes) -> bytes:
     """The same members compressed, in another order, one doubled, or one of a bomb's size."""
     result = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(result, "w", zipfile.ZIP_DEFLATED) as new:
+    with (
+        zipfile.ZipFile(io.BytesIO(content)) as old,
+        zipfile.ZipFile(result, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as new,
+    ):
         members = old.namelist()
         chance.shuffle(members)
         for member in members:
             data = old.read(member)
-            new.writestr(member, data + bytes(chance.choice([0, 0, 0, 3 * 10**7])))
+            new.writestr(member, data + bytes(chance.choice([0, 0, 0, BOMB])))
         if chance.random() < 0.2:
             new.writestr(
-                chance.choice(["x.npy", "../x.npy", "archive/data/99", members[0]]),
-                bytes(chance.choice([0, 3 * 10**7])),
+                chance.choice(["x.npy", "../x.npy", "archive/data/99", members[0]]), bytes(chance.choice([0, BOMB]))
             )
     return result.getvalue()
 

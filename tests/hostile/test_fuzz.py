@@ -7,7 +7,7 @@ import pytest
 from tests.hostile.formats import FORMATS
 from tests.hostile.fuzz import fuzzed
 
-CASES, SLOW = 100, {"study.csv": 20}
+CASES, SLOW = 300, {"study.csv": 40}
 MOST = int(os.environ.get("LANDSCAPE_FUZZ_CASES", 0))  # such as 10000; 0: as many as a minute has room for
 
 

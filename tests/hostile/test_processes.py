@@ -106,6 +106,18 @@ def test_a_signal_raises_while_pycolmap_is_imported(tmp_path):
     assert (done.stdout, done.stderr) == ("143\n", "")
 
 
+def test_a_signal_while_pycolmap_loads_is_heard_once_it_has(tmp_path):
+    program = (
+        "import os, signal, sys\nfrom analysis.console.interruption import Interrupted, raising\n"
+        "class Signals:\n    def find_spec(self, name, *_):\n        if name == 'pycolmap._core':\n"
+        "            os.kill(os.getpid(), signal.SIGHUP)\nsys.meta_path.insert(0, Signals())\n"
+        "with raising():\n    try:\n        import splat.scenes\n    except Interrupted as error:\n"
+        "        print(error.exit_code, 'pycolmap' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("129 True\n", "")
+
+
 def test_pictures_are_written_whichever_library_was_imported_first():
     program = (
         "import splat.scenes, io, zlib\nfrom PIL import Image\nfile = io.BytesIO()\n"

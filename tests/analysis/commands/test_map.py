@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.image import BboxImage
 from PIL import Image
 
 from analysis.commands.cli import main
 from analysis.commands.map.pictures import composited
 from analysis.records.quantities import Shade
 from analysis.records.run_files import read_map
+from figures.maps import Sheet
 from splat.curvature.fields import FIELDS, scene_fields
 from splat.curvature.objective import SceneObjective
 from splat.model.files.read import read_splats
@@ -133,3 +135,19 @@ def test_a_scale_with_both_signs_has_0_in_its_middle(sign):
     assert float(shade.share(values)[4]) == (1 + sign) / 2
     ticks = {text: place for place, text in shade.ticks()}
     assert ticks["0"] == 0.5 and len(ticks) > 2 and np.isfinite([*ticks.values()]).all()
+
+
+def test_the_distance_to_a_swap_is_drawn_from_far_to_near_and_bright():
+    shade = Shade(name="order_gap", words="", unit="px", scale="log", low=-1.0, high=1.0)
+    sheet = Sheet(1, 1, (4, 6), (True,))
+    sheet.show_scaled(0, 0, np.zeros((4, 6), np.uint8), shade, "", "")
+    bar = np.asarray(sheet.figure.findobj(BboxImage)[1].get_array())[0].astype(int)
+    assert bar[0].sum() < bar[-1].sum() and (bar[-1] == shade.palette[0]).all()
+    places = {text.get_text(): text.get_position()[0] for text in sheet.figure.texts}
+    assert places["10"] < places["1"] < places["0.1"]
+    assert "to left" in shade.legend and shade.legend.index("10.0<") < shade.legend.index("0.100<")
+
+
+def test_the_share_in_one_view_has_the_scale_of_what_its_title_says(folder):
+    shade = read_map(folder / "map").shades["one_view"]
+    assert (shade.low, shade.high) == (1 / 3, 1.0)

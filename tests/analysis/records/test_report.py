@@ -173,8 +173,8 @@ def test_every_picture_has_words_with_its_numbers(tmp_path):
 def test_the_five_numbers_carry_their_errors_and_one_without_bracket_is_none():
     data, _ = synthetic()
     found = {each["words"]: each["value"] for each in numbers(probe_of(data))}
-    assert found["largest curvature, λ max"] == "(3.1000 ± 0.0012) × 10⁴"
-    assert found["most negative curvature, λ min"] == "−220.0 ± 3.0"
+    assert found["largest curvature, λ max, per stored unit²"] == "(3.1000 ± 0.0012) × 10⁴"
+    assert found["most negative curvature, λ min, per stored unit²"] == "−220.0 ± 3.0"
     assert found["trace of position, the largest of five in their own units"] == "(3.991 ± 0.093) × 10⁵"
     assert found["λ max / |λ min|, of opposite signs"] == "140.9 ± 2.1"
     data["anisotropy"]["literal"] |= {"value": -361.0, "low": 0.0, "high": None}
@@ -183,7 +183,7 @@ def test_the_five_numbers_carry_their_errors_and_one_without_bracket_is_none():
     data["eigenvalues"]["min"] |= {"value": 5.0}
     data["anisotropy"]["literal"] |= {"value": 6200.0, "low": 3900.0, "high": 15500.0}
     found = {each["words"]: each["value"] for each in numbers(probe_of(data))}
-    assert found["smallest curvature, λ min"] == "5.0 ± 3.0"
+    assert found["smallest curvature, λ min, per stored unit²"] == "5.0 ± 3.0"
     assert found["λ max / λ min (3900 … 1.55 × 10⁴)"] == "6200"
 
 
@@ -430,6 +430,17 @@ def test_a_number_without_a_finite_bracket_is_none_and_names_the_command_that_re
     console = Console(width=120, file=StringIO())
     console.print(probe_table(probe_of(data), 120))
     assert "361" not in console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution(tmp_path):
+    data, arrays = synthetic()
+    data["anisotropy"]["mass_quantile"] = {"value": 361.25, "low": 15.0, "high": 151.0, "note": "4 start vectors"}
+    (line,) = (line for line in findings(probe_of(data)) if line.text.startswith("Mass quantile"))
+    assert line.level == "caution" and "– (between 15.0 and 151)" in line.text
+    text = Page(page(tmp_path / "probe", data, arrays)).text
+    assert "361" not in text
+    data["anisotropy"]["mass_quantile"]["high"] = 149.0
+    assert not any(line.text.startswith("Mass quantile") for line in findings(probe_of(data)))
 
 
 def test_the_page_of_the_splats_is_linked_where_it_is(tmp_path):
