@@ -26,7 +26,7 @@ from landscape.results import Brief
 from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.settings import current_settings
-from splat.model.typed import Count, leaves, typed
+from splat.model.typed import MOST, Count, leaves, typed
 from splat.model.untrusted import require_modest
 from splat.scenes.scene import Scene
 from splat.scenes.splits import spread_views
@@ -317,7 +317,7 @@ def restored_training(content: dict[str, Any]) -> Training:
     config = _config(saved.config)
     if saved.step > config.iterations:
         raise InputError(f"its step {saved.step} is not among its {config.iterations} iterations")
-    if not 0 < saved.extent < inf:
+    if not 0 < saved.extent <= MOST:
         raise InputError(f"its extent is {saved.extent}")
     if adam.updates > saved.step:
         raise InputError(f"its optimiser has made {adam.updates} updates in {saved.step} steps")

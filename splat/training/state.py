@@ -29,7 +29,7 @@ from splat.losses.regularizers import Regularizers
 from splat.model.camera import Camera
 from splat.model.gaussians import Gaussians
 from splat.model.settings import RenderSettings
-from splat.model.typed import Count, Length, NonNegative, Positive, Settings, Share, typed
+from splat.model.typed import MOST, Count, Length, NonNegative, Positive, Settings, Share, typed
 from splat.projection.antialias import sampling_widths
 from splat.render.loss_and_gradient import LossAndGradient, loss_and_gradient
 from splat.scenes.view import View
@@ -283,8 +283,8 @@ class Training(Brief):
                 f"expected a start of at most the training's SH degree {config.sh_degree}, got {gaussians.sh_degree}; "
                 "drop bands with Gaussians.select or raise sh_degree"
             )
-        if not 0 < extent < float("inf"):
-            raise InputError(f"expected a finite extent above 0, got {extent}")
+        if not 0 < extent <= MOST:
+            raise InputError(f"expected an extent above 0 and of at most {MOST:g}, got {extent}")
         gaussians.require_finite()
         flat = gaussians.flat.detach().clone()
         return cls(

@@ -204,7 +204,7 @@ CHANGES = {
     "version": (99, "format version is 99"),
     "torch": (2, "'torch': expected str, got int"),
     "step": (1000, "step 1000 is not among its 12"),
-    "extent": (float("inf"), "extent is inf"),
+    "extent": (1e300, "extent is 1e.300"),
     "sh_degree": (7, "sh_degree 0, 1, 2 or 3, got 7"),
     "flat": (torch.zeros(7), "expected a vector of n x 23 parameters"),
     "adam": ({"first": torch.zeros(3), "second": torch.zeros(3), "updates": 1}, "'first' is torch.float32 of shape"),
