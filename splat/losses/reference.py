@@ -31,7 +31,7 @@ Border = Literal["padded", "valid"]
 
 @dataclass(frozen=True)
 class LossSettings(Settings):
-    """Which loss a view contributes: the pixel loss, and ssim_weight = lambda in [0, 1], of 1 - SSIM.
+    """Loss of a view: the pixel loss, and ssim_weight = lambda in [0, 1], of 1 - SSIM.
 
     eps: Charbonnier's, in units of intensity.  literal: the pixel loss has the weight 1 instead of 1 - lambda.
     border: whether SSIM's windows may reach beyond the image.

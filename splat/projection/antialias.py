@@ -139,7 +139,7 @@ def log_sizes(gaussians: Gaussians) -> Float[Tensor, "n 3"]:
 
 @torch.no_grad()
 def filter_factor(gaussians: Gaussians) -> Float[Tensor, " n"]:
-    """What the 3-D filter multiplies opacities by: prod s / s'."""
+    """Factor of the 3-D filter on opacities: prod s / s'."""
     return (gaussians.log_scales.detach() - log_sizes(gaussians)).sum(dim=1).exp()
 
 

@@ -64,7 +64,7 @@ class ProjectionJacobian(NamedTuple):
 
 
 def row_shapes(*, antialiased: bool) -> tuple[tuple[int, ...], ...]:
-    """What a Gaussian's row of each field but index holds."""
+    """Shapes of a Gaussian's row in each field but index."""
     opacity = (GEOMETRY if antialiased else 0,)
     return (5, GEOMETRY), (SYMMETRIC,), (16,), (16, 3), (3,), (3,), (3, 3), (), (), opacity, opacity
 
@@ -183,7 +183,7 @@ def scales_of(log_scales):
 
 @formula
 def projected_axes(lens, mean, scales, quat):
-    """What `geometry` and its adjoint share; scales: standard deviations.
+    """Quantities that `geometry` and its adjoint share; scales: standard deviations.
 
     (x, y, z), 1 / z, (u, v), the unit quaternion, 1 / |quat|, the scales, (m0, m1, m2), shrink, and r1, r2 times shrink.
     """

@@ -322,7 +322,6 @@ class CpuProjection:
 
     @property
     def bytes(self) -> int:
-        """Memory of what is kept."""
         return sum(array.nbytes for array in self._at)
 
     def affects(self, block: Float[Tensor, "p k"]) -> bool:
@@ -331,7 +330,6 @@ class CpuProjection:
         return any(part[rows].any() for rows in (index[:FEW], index) for part in parts)
 
     def jvp(self, block: Float[Tensor, "p k"]) -> Float[Tensor, "n k 9"]:
-        """P' U."""
         out = np.zeros((self.n, block.shape[1], 9), self._at.jacobian.dtype)
         over_range(len(self._at.index), push_forward, self._at, *self._split(block.numpy()), out)
         return torch.from_numpy(out)
@@ -342,7 +340,6 @@ class CpuProjection:
         block: Float[Tensor, "p k"] | None = None,
         total: Float[Tensor, "p k"] | None = None,
     ) -> Float[Tensor, "p k"]:
-        """P'^T cotangents, plus (a . P'') block where a block is given, added to total."""
         if total is None:
             total = torch.from_numpy(np.zeros((self.parameters, cotangents.shape[1]), self._at.jacobian.dtype))
         outputs = self._split(total.numpy())
@@ -354,7 +351,6 @@ class CpuProjection:
     def blocks(
         self, blocks: Float64[Tensor, "m 9 9"], second_order: bool
     ) -> tuple[Float[Tensor, "n 11 11"], Float[Tensor, "n b 3"]]:
-        """The blocks of splats in stored parameters: `chain_blocks`."""
         shapes = ((GEOMETRY + 1, GEOMETRY + 1), ((self.sh_degree + 1) ** 2, 3))
         geometry, sh = (np.zeros((self.n, *shape), self._at.jacobian.dtype) for shape in shapes)
         over_range(len(self._at.index), chain_blocks, self._at, blocks.numpy(), second_order, geometry, sh)

@@ -108,7 +108,7 @@ def _compensation(
 
 
 def on_screen(splats: Splats, camera: Camera) -> Bool[Tensor, " n"]:
-    """Which Gaussians are drawn and have a 3-sigma bounding box that meets the image."""
+    """Mask of the Gaussians that are drawn and have a 3-sigma bounding box that meets the image."""
     a, b, c = splats.conics.unbind(-1)
     det = (a * c - b * b).clamp_min(torch.finfo(a.dtype).tiny)  # cancels for needles: the box is then too large
     reach = 3 * torch.stack([c / det, a / det], dim=-1).sqrt()

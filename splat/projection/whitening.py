@@ -6,11 +6,11 @@ factored into W^T W = log2(e) / 2 Q,
     W = [[along, 0], [across shear, across]],  shear = b / c,  across^2 = log2(e) / 2 c,  along^2 = log2(e) / 2 (a - b^2 / c)
 
 and an offset d (px) from the mean has the whitened coordinates (u, v) = W d: log2 alpha = log2 o - u^2 - v^2, where nothing
-cancels.  In plain coordinates a change of a needle's length is a difference of changes of a, b and c that are larger by the
-squared ratio of its axes, and so is an adjoint.  Projection and rasteriser therefore exchange derivatives of q = ln alpha:
+cancels.  In plain coordinates a change of a needle's length is a small difference of changes of a, b and c, which are larger by
+the squared ratio of its axes; so is an adjoint.  Projection and rasteriser therefore exchange derivatives of q = ln alpha:
 
     tangent   the coefficients of q' = Q0 + QU u + QV v + QUU u^2 + QUV u v + QVV v^2, and the colour's tangent
-    adjoint   the moments S, Su, Sv, Suu, Suv, Svv of dL/dq over pixels, and the colour's adjoint
+    adjoint   the sums S, Su, Sv, ... over pixels of dL/dq times 1, u, v, u^2, u v, v^2 (moments), and the colour's adjoint
 
 Both are linear in the plain ones at a fixed W.  Splats and plain derivatives are in double precision.
 
@@ -26,8 +26,8 @@ from splat.backend.cpu.jit import formula
 from splat.backend.cpu.simd import select
 
 LOG2_E = 1 / log(2)
-ROUND = 2 / LOG2_E  # the conic in whitened coordinates is this times the identity
-LEAST_RATIO = 2.0**-50  # of a - b^2 / c to a: beneath it, the difference is round-off
+ROUND = 2 / LOG2_E  # W^-T Q W^-1 is this times the identity
+LEAST_RATIO = 2.0**-50  # of a - b^2 / c to a: a smaller difference is round-off
 Q0, QU, QV, QUU, QUV, QVV = range(6)
 
 
@@ -43,7 +43,7 @@ def whitening(splat):
 
 @formula
 def cancellation(W):
-    """a c / (a c - b^2): how many times smaller than its terms a whitened tangent, and the conic's, may be."""
+    """a c / (a c - b^2): how many times larger than their sum the terms of a whitened tangent can be."""
     along, across, shear = W
     return 1 + (shear * across / along) ** 2
 
@@ -128,7 +128,7 @@ COEFFICIENTS, PLAIN_TANGENT, MOMENTS, PLAIN_GRADIENT = range(4)
 
 @formula
 def converted(way, splat, numbers):
-    """Six numbers of a splat in other coordinates; way: what they become, a constant from above."""
+    """Six numbers of a splat in other coordinates; way: COEFFICIENTS, ..., what they become."""
     W, opacity = whitening(splat), splat[5]
     if way == COEFFICIENTS:
         return coefficients(W, opacity, numbers)

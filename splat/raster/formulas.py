@@ -48,7 +48,7 @@ LEAST_LOG2_ALPHA = {torch.float32: -126.0, torch.float64: -1022.0}  # the range 
 
 
 class Thresholds(NamedTuple):
-    """Where a splat is drawn and a pixel stops.
+    """Thresholds at which a splat is drawn and a pixel stops.
 
     alpha_min, alpha_max: bounds of alpha; contour: of the distance in standard deviations, or infinite; least: of log2 alpha;
     free: alpha above which derivatives in ln alpha are 0, or infinite; floor: of the transmittance.
@@ -123,7 +123,7 @@ def plus(x, y, c):
 
 @formula
 def behind_all(v_pixel, background):
-    """What the final transmittance is multiplied by in the loss: v_image . background - v_alpha."""
+    """Factor of the final transmittance in the loss: v_image . background - v_alpha."""
     return v_pixel[0] * background[0] + v_pixel[1] * background[1] + v_pixel[2] * background[2] - v_pixel[3]
 
 
@@ -155,7 +155,7 @@ def step_backward_tangent(tau, dR, dv_image, w, beta, rR, dq, v_image, colour, d
 
 @formula
 def row_terms(v, s, w, h):
-    """What a row adds to its columns' sums."""
+    """Terms of a row in its columns' sums."""
     sv = s * v
     return s, sv, sv * v, w * h[0], w * h[1], w * h[2]
 
@@ -252,7 +252,7 @@ def box_of(splat, ellipse, width, height):
 
 
 def _moment_index() -> np.ndarray:
-    """Where the moment of u^j v^k lies among the fifteen, by [j, k]: powers of v outermost, as `store_powers` leaves them."""
+    """Index of the moment of u^j v^k among the fifteen, by [j, k]: powers of v outermost, as `store_powers` leaves them."""
     index = np.full((5, 5), -1, np.int64)
     place = 0
     for k in range(5):
@@ -267,7 +267,7 @@ MOMENT2 = np.array([[0, 3, 5], [1, 4, -1], [2, -1, -1]])  # of the six of degree
 
 
 def _block_index() -> np.ndarray:
-    """Which of a splat's sums is the entry of its diagonal block, (9, 9) over coefficients and colour; BLOCK_SUMS: none, 0."""
+    """Index of a splat's sum for each entry of its diagonal block, (9, 9) over coefficients and colour; BLOCK_SUMS: 0."""
     powers = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of u and v in q', by Q0, QU, ...
     index = np.full((9, 9), BLOCK_SUMS, np.int64)
     for p, (j, k) in enumerate(powers):

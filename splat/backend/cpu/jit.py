@@ -1,4 +1,4 @@
-"""How the CPU's kernels are compiled: where they are kept is said in `kernel_cache.py`, what a vector is in `simd.py`.
+"""Compilation of the CPU's kernels; they are kept by `kernel_cache.py`, and their vectors are those of `simd.py`.
 
 `kernel` marks what Python calls, without its lock; `formula` what kernels and other formulas call, inlined.  Division by 0
 gives infinity, and indices are not checked.

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept between runs: a folder named after the code they were compiled from.
+"""Cache of compiled kernels between runs: a folder named after the code they were compiled from.
 
 Numba looks at the date of the file that holds a kernel.  A kernel here has formulas of other files compiled into it, so a
 changed formula would leave a stale kernel behind, and with it wrong numbers.  Instead the folder is named after the width of
@@ -74,13 +74,13 @@ def _sources() -> list[Path]:
 
 
 def keep_kernels(register_bits: int) -> None:
-    """Tell Numba; to be called before the first kernel is defined."""
+    """Make Numba use the cache; to be called before the first kernel is defined."""
     config.CACHE_DIR = str(kernel_folder(register_bits))  # pyright: ignore[reportAttributeAccessIssue]
     caching.IndexDataCacheFile = _CacheFile  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class _CacheFile(caching.IndexDataCacheFile):
-    """Numba's, but for four things.
+    """Numba's cache file, but for four things.
 
     A damaged file, such as one that a full disk cut, counts as missing: its kernel is compiled anew.  Files have names of their
     own, as two processes that compile at a time would give one name to two kernels.  Dates of sources do not count: the folder

@@ -36,7 +36,7 @@ def single_threaded() -> Iterator[None]:
 
 
 def thread_count() -> int:
-    """How many threads a kernel that is called here runs on."""
+    """Number of threads that a kernel called here runs on."""
     return 1 if getattr(_here, "alone", False) else torch.get_num_threads()
 
 
@@ -59,7 +59,7 @@ def over_range(size: int, kernel: Callable, *arguments) -> None:
 
 
 def over_batch(size: int, kernel: Callable[[int, int], None], device: torch.device) -> None:
-    """kernel(start, stop) of a batch of small matrices that torch takes apart: on the CPU it has one thread for a batch.
+    """kernel(start, stop) over a batch of small matrices that torch decomposes: on the CPU it has one thread for a batch.
 
     LAPACK rounds a matrix as its address in the batch is aligned, so every part begins where the alignment does: with any
     number of threads a matrix is as far behind a boundary as it is in the whole batch.

@@ -1,4 +1,4 @@
-"""The second derivative of a loss, taken apart into what its windows couple and what stays in a pixel (`formulas.py`)."""
+"""The second derivative of a loss, split into the coupling of pixels by windows and the pixelwise rest (`formulas.py`)."""
 
 from typing import NamedTuple
 

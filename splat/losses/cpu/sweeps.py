@@ -292,10 +292,10 @@ def finish_forms(v, x, y, at, row, field, frame, ring, second, loss, blurred_sp,
 
 @kernel
 def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, products, diagonal, forms):
-    """Of every v in V (k, plane sets), unless None: the Hessian of the loss times v, to products (k, plane sets); the sums
-    over each row of v . l'' v and v . D v, D the diagonal of l'', to forms (2, k, 3 height).
+    """Multiply every v in V (k, plane sets) by l'', the Hessian of the loss; products and forms may be None.
 
-    products must not be V: another range may still read it.
+    products: l'' v, (k, plane sets); not V itself, which another range may still read.  forms: sums over each row of v . l'' v
+    and of v . D v, D the diagonal of l'', (2, k, 3 height).
     """
     K, rows, second = len(V), bordered_rows(x, 3, frame), bordered_rows(x, SECONDS, frame)
     own, ring, slopes = ring_buffer(x, 3, frame), ring_buffer(x, 3 * K, frame), ring_buffer(x, 3 * K, frame)

@@ -89,7 +89,7 @@ def leave_margin(rows, fields, margin, frame):
 
 @formula
 def begin_of(rows, field, frame):
-    """Where a bordered row has its first number; what follows its `width` numbers, and what precedes them, is set to 0."""
+    """Index of the first number of a bordered row; what precedes and what follows its `width` numbers is set to 0."""
     at = field * (frame.stride + 2 * BORDER)
     for i in range(BORDER):
         rows[at + i] = 0

@@ -21,11 +21,12 @@ import numpy as np
 
 from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.planes import TILE_ROWS, scratch
-from splat.backend.cpu.simd import broadcast, lanes, load, prefetch, select, store, store_sums
+from splat.backend.cpu.simd import broadcast, lanes, load, prefetch, store, store_sums
 from splat.raster.cpu.tile import (
+    BEHIND,
     PARAMS,
-    STOP,
-    T,
+    UNDO,
+    begin_undo_row,
     clear_sums,
     corner_of,
     dark,
@@ -35,23 +36,12 @@ from splat.raster.cpu.tile import (
     reached,
     row_v,
     store3,
+    undo_row,
 )
-from splat.raster.formulas import (
-    BENDS,
-    BLOCK_INDEX,
-    BLOCK_SUMS,
-    COLOUR,
-    CROSS,
-    DEGREE2,
-    SPLAT,
-    alpha_row,
-    cross_terms,
-    reciprocal,
-    step_block,
-)
+from splat.raster.formulas import BENDS, BLOCK_INDEX, BLOCK_SUMS, COLOUR, CROSS, DEGREE2, SPLAT, cross_terms, step_block
 
 AHEAD = 4  # intersections between a prefetch and its use
-BEHIND, GRAD, CURVATURE, BLOCK = 2, 5, 8, 11  # after T and STOP, in a row of pixels: R, v_image, h
+GRAD, CURVATURE, BLOCK = UNDO, UNDO + 3, UNDO + 6  # in a row of pixels: v_image, h
 
 
 @kernel
@@ -65,11 +55,7 @@ def block_moments(counter, params, lists, frame, pixels, v_planes, curvature, su
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
             b, p = BLOCK * L * y, corner + y * frame.stride
-            last = load(pixels.transmittance, p)
-            store(state, b + T * L, last)
-            store(state, b + STOP * L, load(pixels.stop, p))
-            for c in range(3):
-                store(state, b + (BEHIND + c) * L, last * frame.background[c])
+            begin_undo_row(state, b, L, frame, pixels, p)
             store3(state, b + GRAD * L, L, load3(v_planes, p, frame.size))
             store3(state, b + CURVATURE * L, L, load3(curvature, p, frame.size))
         first, count = reached(lists, tile, pixels, corner, frame.stride)
@@ -96,16 +82,9 @@ def block_of(params, lists, e, k, x0, y0, frame, state, shared, sums):
     for y in range(top, bottom):
         b = BLOCK * L * y
         v = row_v(frame, L, y, terms)
-        alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
-        r = reciprocal(1.0 - alpha)
-        before = load(state, b + T * L) * r
-        w, beta = alpha * before, alpha * r
-        free = w
-        if capped:
-            free, beta = select(uncapped <= frame.cap, w, 0.0), select(uncapped <= frame.cap, beta, 0.0)
+        w, free, beta = undo_row(state, b, L, frame, v, terms, index, capped)
         R, g, h = load3(state, b + BEHIND * L, L), load3(state, b + GRAD * L, L), load3(state, b + CURVATURE * L, L)
         D, after, weight = step_block(w, free, beta, R, g, h, colour)
-        store(state, b + T * L, before)
         store3(state, b + BEHIND * L, L, after)
         store(shared, 5 * L * y, w)
         store(shared, 5 * L * y + L, free)

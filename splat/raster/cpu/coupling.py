@@ -1,18 +1,19 @@
-"""What the coupling of pixels by SSIM adds to the diagonal block of every splat, exactly.
+"""The part of every splat's diagonal block that SSIM's coupling of pixels adds, exactly.
 
-The second derivative of SSIM couples pixels through its window g: with S'' at every window's centre (`losses/formulas.py`),
-r the residual, y the target and c = 1/2,
+The second derivative of SSIM couples the pixels of a window g.  With S'' at the window's centre (`losses/formulas.py`), r the
+residual, y the target and c = 1/2,
 
-    v . l'' v = sum over centres of M . S'' M + pixelwise terms,      M = blur(v), blur(2 r v), blur((y - c) v)
+    v . l'' v = sum over centres of M . S'' M + pixelwise terms,      M = (blur(v), blur(2 r v), blur((y - c) v))
 
-for each channel.  A splat moves its pixels by w along its own colour, and along the coefficients Q0, QU, ... of q' by
-D 1, D u, D v, D u^2, D u v, D v^2 (`footprints.py`): SLOPES fields, each blurred with three factors f.  As u does not depend on
-the row, the columns are blurred first, of D f, D f v, D f v^2 and w f; along the rows then, u(x + t) = u(x) + t `along`,
+for each channel.  v is the image's change with one of SLOPES numbers of a splat: w for its colour in the channel, and D, D u,
+D v, D u^2, D u v, D v^2 for the coefficients Q0, QU, ... of q' (w and D: `footprints.py`).  M takes three blurs of each, of the
+factors f = 1, 2 r and y - c times v.  The blur is separable, and u depends on the column alone: D f, D f v, D f v^2 and w f are
+blurred down the columns first, and then along the rows, with u(x + t) = u(x) + t `along`,
 
     blur(u F) = u B_0 + along B_1       blur(u^2 F) = u^2 B_0 + 2 u along B_1 + along^2 B_2       B_j = sum_t t^j g_t F(x + t)
 
-A splat's rows go through a ring, in columns that begin with the first window that reaches a pixel of the splat.  Sums leave
-single precision every FLUSH rows.
+A splat's rows go through a ring; its columns count from the first window that reaches one of its pixels.  Sums leave single
+precision every FLUSH rows.
 """
 
 import numpy as np
@@ -26,14 +27,14 @@ from splat.losses.reference import REACH, window
 from splat.raster.cpu.footprints import FOOTPRINT
 from splat.raster.cpu.tile import ALONG, PARAMS, alpha_terms, row_range
 
-FACTORS = 3  # 1, 2 r, y - c
-POWERS = 4  # fields of a factor that are blurred down: D, D v, D v^2, w
+FACTORS = 3  # f: 1, 2 r, y - c
+POWERS = 4  # fields of each factor that are blurred down the columns: D, D v, D v^2, w
 FIELDS = FACTORS * POWERS
-SLOPES = 7  # of a channel, in the order of `BLOCK`: six of geometry, one of its colour
+SLOPES = 7  # numbers of a splat that move a channel, in the order of its block: six of geometry, one of colour
 PAIRS = SLOPES * (SLOPES + 1) // 2
 RING = 16  # rows, at least the window's
 EDGE = 16  # floats at either side of a row: at least a vector, and the window's reach
-FLUSH = 16
+FLUSH = 16  # rows
 MIDDLE, *TAPS = (float(tap) for tap in window(torch.float64)[REACH:])
 TAPS = tuple(TAPS)
 FIRST, SECOND = (tuple((k + 1) ** power * tap for k, tap in enumerate(TAPS)) for power in (1, 2))
@@ -41,37 +42,39 @@ FIRST, SECOND = (tuple((k + 1) ** power * tap for k, tap in enumerate(TAPS)) for
 
 @kernel
 def coupled_blocks(counter, index, params, frame, size, footprints, begin, found, image, target, seconds, blocks):
-    """Add to blocks (m, 9, 9) of the splats at index; heaviest first.
+    """Add to the blocks (m, 9, 9) of the splats at index, which begins with the largest: threads then end at the same time.
 
-    size: height and width of the image.  footprints, found: as of `find_footprints`, from accumulator begin on.  image, target,
-    seconds: as of `Coupling`.
+    size: height and width of the image.  footprints, found: of `find_footprints`, from accumulator begin on.  image, target,
+    seconds: of `Coupling`.
     """
     L = lanes(params)
     widest = FIELDS * (frame.stride + 2 * EDGE)
     ring, rows = scratch(params, RING * widest), scratch(params, widest)
-    spans, own = np.empty((frame.size // frame.stride, 2), np.int64), scratch(params, L)
+    spans, weights = np.empty((frame.size // frame.stride, 2), np.int64), scratch(params, L)
     corners = np.empty((frame.size // (TILE_ROWS * L), 2), np.int64)
     moved, sums, total = scratch(params, FACTORS * SLOPES * L), scratch(params, PAIRS * L), np.empty(PAIRS)
     part = np.empty(PAIRS, params.dtype)
     turn = fetch_and_increment(counter)
     while turn < index.size:
         splat = index[turn]
-        y0, y1 = find_spans(params, splat, frame, size[1], footprints, begin, found, corners, spans, own)
+        y0, y1 = find_spans(params, splat, frame, size[1], footprints, begin, found, corners, spans, weights)
         if y0 <= y1:
             box = box_of_windows(spans, y0, y1, frame, size[1], L)
             for channel in range(3):
                 planes = (image, target, seconds, channel * frame.size)
                 work = (ring, rows, corners, spans, moved, sums)
-                couple(params, splat, channel, box, frame, size, footprints, begin, found, planes, work, part, total)
-                spread(total, channel, blocks[turn])
+                sum_windows(
+                    params, splat, channel, box, frame, size, footprints, begin, found, planes, work, part, total
+                )
+                add_to_block(total, channel, blocks[turn])
         turn = fetch_and_increment(counter)
 
 
 @formula
-def find_spans(params, splat, frame, width, footprints, begin, found, corners, spans, own):
-    """First and last column in which a splat has weight, for each of its rows; its first and last row that have one.
+def find_spans(params, splat, frame, width, footprints, begin, found, corners, spans, weights):
+    """First and last row in which a splat has weight; to spans the first and last column of each row.
 
-    corners: of the tiles of its intersections, row and column.
+    corners: filled with row and column of the first pixel of each of its intersections' tiles.
     """
     L = lanes(params)
     first, last = footprints.splat_start[splat], footprints.splat_start[splat + 1]
@@ -84,9 +87,9 @@ def find_spans(params, splat, frame, width, footprints, begin, found, corners, s
         done = row + TILE_ROWS
         top, bottom = row_range(footprints.rows[a])
         for y in range(top, bottom):
-            store(own, 0, load(found, (footprints.place[a] - footprints.place[begin] + y - top) * FOOTPRINT * L))
+            store(weights, 0, load(found, (footprints.place[a] - footprints.place[begin] + y - top) * FOOTPRINT * L))
             for x in range(min(L, width - column)):
-                if own[x] > 0:
+                if weights[x] > 0:
                     spans[row + y, 0], spans[row + y, 1] = min(spans[row + y, 0], column + x), column + x
                     y0, y1 = min(y0, row + y), max(y1, row + y)
     return y0, y1
@@ -94,7 +97,7 @@ def find_spans(params, splat, frame, width, footprints, begin, found, corners, s
 
 @formula
 def hull_of(spans, first, last):
-    """First and last column of some rows."""
+    """First and last column over the rows first .. last."""
     lo, hi = spans[first, 0], spans[first, 1]
     for y in range(first + 1, last + 1):
         lo, hi = min(lo, spans[y, 0]), max(hi, spans[y, 1])
@@ -103,7 +106,7 @@ def hull_of(spans, first, last):
 
 @formula
 def box_of_windows(spans, y0, y1, frame, width, L):
-    """First and last row of a splat, the first column of its windows, and how many vectors of them there are."""
+    """First and last row of a splat, first column of its windows, and the number of vectors that hold their columns."""
     lo, hi = hull_of(spans, y0, y1)
     left = max(lo - REACH, 0)
     vectors = (min(hi + REACH, width - 1) - left) // L + 1
@@ -111,8 +114,8 @@ def box_of_windows(spans, y0, y1, frame, width, L):
 
 
 @formula
-def spread(total, channel, block):
-    """Add a channel's sums to the entries of a block (9, 9)."""
+def add_to_block(total, channel, block):
+    """Add a channel's sums for pairs of slopes to a block (9, 9); the last slope is the channel's colour."""
     j = 0
     for a in range(SLOPES):
         for b in range(a + 1):
@@ -125,8 +128,8 @@ def spread(total, channel, block):
 
 
 @formula
-def couple(params, splat, channel, box, frame, size, footprints, begin, found, planes, work, part, total):
-    """The sums over all windows of a channel's M . S'' M, for every pair of slopes: total (PAIRS,)."""
+def sum_windows(params, splat, channel, box, frame, size, footprints, begin, found, planes, work, part, total):
+    """Sum a channel's M . S'' M over all windows, for every pair of slopes, into total (PAIRS,)."""
     ring, _rows, _corners, spans, _moved, sums = work
     y0, y1, left, vectors = box
     L = lanes(params)
@@ -138,7 +141,7 @@ def couple(params, splat, channel, box, frame, size, footprints, begin, found, p
     for ahead in range(y0, y1 + 2 * REACH + 1):
         clear_row(ring, ahead, vectors, pitch, L)
         if ahead <= y1:
-            a = feed_row(params, splat, channel, ahead, box, frame, size[1], footprints, a, begin, found, planes, work)
+            a = fill_row(params, splat, channel, ahead, box, frame, size[1], footprints, a, begin, found, planes, work)
         row = ahead - REACH
         if row < 0 or row >= size[0]:
             continue
@@ -165,8 +168,8 @@ def clear_row(ring, y, vectors, pitch, L):
 
 
 @formula
-def feed_row(params, splat, channel, y, box, frame, image_width, footprints, a, begin, found, planes, work):
-    """A row of the fields to the ring; a: an accumulator of the splat, at or before this row of tiles; where to begin next."""
+def fill_row(params, splat, channel, y, box, frame, image_width, footprints, a, begin, found, planes, work):
+    """Write row y of the fields to the ring; the next a.  a: an accumulator of the splat at or before this row of tiles."""
     ring, _rows, corners, spans, _moved, _sums = work
     _y0, _y1, left, vectors = box
     L = lanes(params)
@@ -181,25 +184,25 @@ def feed_row(params, splat, channel, y, box, frame, image_width, footprints, a, 
         inside, x = y - row, corners[at - first, 1]
         if top <= inside < bottom and x <= spans[y, 1] and x + L > spans[y, 0]:
             where = (footprints.place[at] - footprints.place[begin] + inside - top) * FOOTPRINT * L
-            feed(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, base + x, pitch)
+            fill_lanes(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, base + x, pitch)
         at += 1
     return a
 
 
 @formula
-def feed(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, to, pitch):
-    """The fields of the lanes at x."""
+def fill_lanes(params, splat, x, y, channel, frame, image_width, where, found, planes, ring, to, pitch):
+    """Write the fields of the vector of pixels at x."""
     L = lanes(params)
     image, target, _seconds, top = planes
     _u, terms = alpha_terms(params, splat * PARAMS, x, y)
     v = terms[0]
     inside = iota(params) < broadcast(params, image_width - x)
     w, D = select(inside, load(found, where), 0.0), select(inside, load(found, where + (1 + channel) * L), 0.0)
-    aim = load(target, top + y * frame.stride + x)
-    residual = load(image, top + y * frame.stride + x) - aim
+    photo = load(target, top + y * frame.stride + x)
+    residual = load(image, top + y * frame.stride + x) - photo
     put_powers(ring, to, pitch, w, D, v)
     put_powers(ring, to + POWERS * pitch, pitch, 2.0 * residual * w, 2.0 * residual * D, v)
-    put_powers(ring, to + 2 * POWERS * pitch, pitch, (aim - CENTRE) * w, (aim - CENTRE) * D, v)
+    put_powers(ring, to + 2 * POWERS * pitch, pitch, (photo - CENTRE) * w, (photo - CENTRE) * D, v)
 
 
 @formula
@@ -213,7 +216,7 @@ def put_powers(ring, to, width, w, D, v):
 
 @formula
 def slot(y):
-    """The place of a row in the ring."""
+    """Place of a row in the ring."""
     return y & (RING - 1)
 
 
@@ -246,7 +249,7 @@ def differences_around(array, at):
 
 @formula
 def sums_over_rows(ring, at, row, step):
-    """The rows at either side of a row, added, at a place of each."""
+    """For 1 to 5 rows' distance, the sum of the rows above and below."""
     return (
         load(ring, at + slot(row + 1) * step) + load(ring, at + slot(row - 1) * step),
         load(ring, at + slot(row + 2) * step) + load(ring, at + slot(row - 2) * step),
@@ -258,7 +261,7 @@ def sums_over_rows(ring, at, row, step):
 
 @formula
 def blur_columns(work, row, lo, hi, window, pitch, L):
-    """The window down the columns lo .. hi of every field; 0 in the other columns of the windows and beside them."""
+    """Blur every field down the columns lo .. hi; 0 in the other columns of the windows and beside them."""
     ring, rows, _corners, _spans, _moved, _sums = work
     step, (first, last) = FIELDS * pitch, window
     for at in range(EDGE, EDGE + step, pitch):
@@ -272,7 +275,7 @@ def blur_columns(work, row, lo, hi, window, pitch, L):
 
 @formula
 def add_windows(params, splat, row, left, window, frame, planes, pitch, work):
-    """Add a row's windows to the sums."""
+    """Add the windows centred in a row to the sums."""
     _image, _target, seconds, top = planes
     _ring, rows, _corners, _spans, moved, sums = work
     L = lanes(params)
@@ -291,7 +294,7 @@ def add_windows(params, splat, row, left, window, frame, planes, pitch, work):
 
 @formula
 def blur_row(rows, at, pitch, u, along, moved, to):
-    """The blurred slopes with one factor at the lanes at `at`, from the columns' fields."""
+    """Blur the slopes times one factor along a row, for the vector at `at`."""
     L = lanes(rows)
     F, s, d = load(rows, at), sums_around(rows, at, 1), differences_around(rows, at)
     B0, B1, B2 = F * MIDDLE + dot5(s, TAPS), along * dot5(d, FIRST), along * along * dot5(s, SECOND)
@@ -310,7 +313,7 @@ def blur_row(rows, at, pitch, u, along, moved, to):
 
 @formula
 def add_pairs(moved, second, sums, L):
-    """Add M . S'' M of every pair of slopes."""
+    """Add M . S'' M of every pair of slopes to the sums."""
     j = 0
     for a in range(SLOPES):
         n0, n1, n2 = ssim_second_dot(
@@ -324,7 +327,7 @@ def add_pairs(moved, second, sums, L):
 
 @formula
 def flush(sums, L, part, total):
-    """Empty the sums into total."""
+    """Move the sums to total."""
     for j in range(0, PAIRS, 4):
         at = j * L
         store_sums(part, j, (load(sums, at), load(sums, at + L), load(sums, at + 2 * L), load(sums, at + 3 * L)))

@@ -1,4 +1,4 @@
-"""What every splat does to the pixels under it: w = alpha T, and D_c = dI_c/dq of the three colours c, q = ln alpha.
+"""Effect of every splat on the pixels under it: w = alpha T, and D_c = dI_c/dq of the three colours c, q = ln alpha.
 
 They are found tile by tile, from back to front as in `blocks.py`, and laid out splat by splat for passes that look at a splat
 as a whole: four vectors (w, D) for each row of each intersection, an intersection's rows one after the other, the
@@ -15,9 +15,10 @@ from splat.backend.cpu.jit import formula, kernel
 from splat.backend.cpu.planes import TILE_ROWS, scratch
 from splat.backend.cpu.simd import broadcast, iota, lanes, load, maximum, select, store
 from splat.raster.cpu.tile import (
-    STOP,
+    BEHIND,
+    UNDO,
     Lists,
-    T,
+    begin_undo_row,
     corner_of,
     intersection,
     load3,
@@ -26,15 +27,15 @@ from splat.raster.cpu.tile import (
     row_range,
     row_v,
     store3,
+    undo_row,
 )
-from splat.raster.formulas import alpha_row, colour_slopes, plus, reciprocal
+from splat.raster.formulas import alpha_row, colour_slopes, plus
 
 FOOTPRINT = 4  # vectors of a row: w, D
-BEHIND, STATE = 2, 5  # after T and STOP, in a row of pixels: R
 
 
 class Footprints(NamedTuple):
-    """Where the rows of each splat lie.
+    """Places of the rows of each splat.
 
     tiles, rows: (accumulators,) tile of an intersection, and its rows as in `Lists`; place: (accumulators + 1,) which row is an
     intersection's first; splat_start: (n + 1,) the first accumulator of each splat.
@@ -59,7 +60,7 @@ def number_rows(lists, tiles, rows, place):
 
 
 def footprints_of(lists: Lists, splat_start: np.ndarray) -> Footprints:
-    """Of the intersections of lists that are numbered splat by splat."""
+    """Footprints of the intersections of lists, which are numbered splat by splat."""
     tiles, rows = np.empty((2, splat_start[-1]), np.int32)
     place = np.empty(splat_start[-1] + 1, np.int64)
     number_rows(lists, tiles, rows, place)
@@ -70,17 +71,12 @@ def footprints_of(lists: Lists, splat_start: np.ndarray) -> Footprints:
 def find_footprints(counter, params, lists, frame, pixels, footprints, begin, end, found):
     """w and D (rows, FOOTPRINT vectors) of the accumulators begin .. end - 1."""
     L = lanes(params)
-    state = scratch(params, STATE * L * TILE_ROWS)
+    state = scratch(params, UNDO * L * TILE_ROWS)
     tile = next_tile(counter, lists)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
         for y in range(TILE_ROWS):
-            b, p = STATE * L * y, corner + y * frame.stride
-            last = load(pixels.transmittance, p)
-            store(state, b + T * L, last)
-            store(state, b + STOP * L, load(pixels.stop, p))
-            for c in range(3):
-                store(state, b + (BEHIND + c) * L, last * frame.background[c])
+            begin_undo_row(state, UNDO * L * y, L, frame, pixels, corner + y * frame.stride)
         first, count = reached(lists, tile, pixels, corner, frame.stride)
         for k in range(count - 1, -1, -1):
             a = lists.accumulator[first + k]
@@ -97,17 +93,9 @@ def footprint_of(params, lists, e, k, x0, y0, frame, state, found, at):
     L = lanes(params)
     _splat, _u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
     for y in range(top, bottom):
-        b = STATE * L * y
-        v = row_v(frame, L, y, terms)
-        alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
-        r = reciprocal(1.0 - alpha)
-        before = load(state, b + T * L) * r
-        w, beta = alpha * before, alpha * r
-        free = w
-        if capped:
-            free, beta = select(uncapped <= frame.cap, w, 0.0), select(uncapped <= frame.cap, beta, 0.0)
+        b = UNDO * L * y
+        w, free, beta = undo_row(state, b, L, frame, row_v(frame, L, y, terms), terms, index, capped)
         R = load3(state, b + BEHIND * L, L)
-        store(state, b + T * L, before)
         store3(state, b + BEHIND * L, L, plus(R, w, colour))
         if at >= 0:
             to = at + (y - top) * FOOTPRINT * L
@@ -117,13 +105,10 @@ def footprint_of(params, lists, e, k, x0, y0, frame, state, found, at):
 
 @kernel
 def find_neighbours(counter, params, lists, frame, pixels, width, height, covered, before):
-    """Of every intersection: `covered`, in how many pixels of the image its splat has weight, and `before`, the splat next in
-    front of it among those of its tile that have weight in one of these pixels, or -1."""
+    """For every intersection fill `covered`, the number of pixels of the image in which its splat has weight, and `before`, the
+    splat next in front of it among those of its tile that have weight in one of these pixels, or -1."""
     L = lanes(params)
-    state, row = (
-        scratch(params, 2 * L * TILE_ROWS),
-        scratch(params, L),
-    )  # the stop, and the last intersection with weight
+    state, row = scratch(params, 2 * L * TILE_ROWS), scratch(params, L)  # state: stop, last intersection with weight
     tile = next_tile(counter, lists)
     while tile >= 0:
         x0, y0, corner = corner_of(tile, L, frame.columns, frame.stride)
@@ -142,7 +127,7 @@ def find_neighbours(counter, params, lists, frame, pixels, width, height, covere
 
 @formula
 def neighbours_of(params, lists, e, k, x0, y0, frame, state, row):
-    """In how many pixels intersection e has weight, and the nearest intersection in front of it in one of them, or -1."""
+    """Number of pixels in which intersection e has weight, and the nearest intersection in front in one of them, or -1."""
     L = lanes(params)
     _splat, _u, terms, _colour, index, _capped, top, bottom = intersection(params, lists, e, k, x0, y0)
     none, one = broadcast(params, 0.0), broadcast(params, 1.0)

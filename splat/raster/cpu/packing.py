@@ -1,4 +1,4 @@
-"""From splats to what the compositing kernels read, and from their sums back to splats, for the splats start..stop.
+"""Packing of splats start..stop for the compositing kernels, and reduction of their sums back to splats.
 
 Splats and the coordinates of their tangents and adjoints: `projection/whitening.py`.
 """

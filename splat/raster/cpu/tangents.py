@@ -1,7 +1,8 @@
 """The compositing kernels of second order: `tangent` (J u), front to back, and `backward_tangent`, back to front.
 
-K tangents share the primal quantities of a splat's rows (`raster/formulas.py`), which stay in the first-level cache between
-them.  `_single` is the code for K = 1, in one loop over the rows.
+Letters are those of `raster/formulas.py`: T, R, w, beta, r, tau, s, h; d.. marks a tangent, v_.. a cotangent.  K tangents share
+the primal quantities of a splat's rows, which stay in the first-level cache between them.  `.._single` is the code for K = 1,
+in one loop over the rows.
 """
 
 import numpy as np
@@ -51,8 +52,6 @@ from splat.raster.formulas import (
     step_tangent,
 )
 
-# --- tangent: J u -----------------------------------------------------------------------------------------------------
-
 
 @kernel
 def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittances):
@@ -89,7 +88,7 @@ def tangent(counter, params, tangents, lists, frame, pixels, planes, transmittan
 
 @formula
 def end_tangent_row(state, b, L, frame, planes, transmittances, i, p):
-    """Add the background's part to a row of tangent i, and write it."""
+    """Add the background's part to a row of tangent i, and write it to the planes."""
     dT = load(state, b + DT * L)
     store(transmittances, i * frame.size + p, dT)
     dimage = plus(load3(state, b + DIMAGE * L, L), dT, frame.background)
@@ -99,6 +98,7 @@ def end_tangent_row(state, b, L, frame, planes, transmittances, i, p):
 
 @formula
 def tangent_row(state, b, L, alpha, w, w_dq, colour, dcolour):
+    """Advance T' and image' of a row of pixels by one splat."""
     dT, dimage = step_tangent(load(state, b + DT * L), load3(state, b + DIMAGE * L, L), alpha, w, w_dq, colour, dcolour)
     store(state, b + DT * L, dT)
     store3(state, b + DIMAGE * L, L, dimage)
@@ -106,6 +106,7 @@ def tangent_row(state, b, L, alpha, w, w_dq, colour, dcolour):
 
 @formula
 def tangent_single(params, tangents, lists, e, k, x0, y0, frame, state):
+    """Advance the rows of a tile by intersection e, number k of the tile, for one tangent."""
     L = lanes(params)
     splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
     dterms, dcolour = tangent_terms(tangents, splat * SPLAT, u)
@@ -124,6 +125,7 @@ def tangent_single(params, tangents, lists, e, k, x0, y0, frame, state):
 
 @formula
 def tangent_block(params, tangents, K, lists, e, k, x0, y0, frame, state, shared):
+    """Advance the rows of a tile by intersection e, number k of the tile, for K tangents."""
     L = lanes(params)
     width = (2 + TANGENT * K) * L
     splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
@@ -143,14 +145,11 @@ def tangent_block(params, tangents, K, lists, e, k, x0, y0, frame, state, shared
             tangent_row(state, width * y + (2 + TANGENT * i) * L, L, alpha, w, free * dq, colour, dcolour)
 
 
-# --- the tangent of backward ------------------------------------------------------------------------------------------
-
-
 @kernel
 def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, transmittances, dv_planes, sums):
     """The nine sums of the tangent of `backward` for K tangents, (intersections, K, SPLAT).
 
-    v_planes: the cotangent, 4 planes; dv_planes: its tangents, (K, 4 planes); transmittances: as `tangent` left them.
+    v_planes: the cotangent, 4 planes; dv_planes: its tangents, (K, 4 planes); transmittances: those that `tangent` wrote.
     """
     L = lanes(params)
     K = transmittances.size // frame.size
@@ -187,6 +186,7 @@ def backward_tangent(counter, params, tangents, lists, frame, pixels, v_planes, 
 
 @formula
 def begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_planes, i, p):
+    """Start tau, R' and v_image' of tangent i behind all splats, for the row of pixels at p."""
     last, dT = load(pixels.transmittance, p), load(transmittances, i * frame.size + p)
     v_pixel = load_cotangent(v_planes, p, frame.size)
     dv_pixel = load_cotangent(dv_planes, 4 * i * frame.size + p, frame.size)
@@ -198,7 +198,7 @@ def begin_tangent_row(state, b, L, frame, pixels, v_planes, transmittances, dv_p
 
 @formula
 def backward_row(state, b, L, alpha, v_image, colour):
-    """Restore T and advance R; w, beta and r R of a row."""
+    """Undo a splat in T and R of a row; w, beta and r R."""
     R = load(state, b + REST * L)
     before, rest, w, beta, r, _we = step_back(alpha, load(state, b + T * L), R, v_image, colour)
     store(state, b + T * L, before)
@@ -208,7 +208,7 @@ def backward_row(state, b, L, alpha, v_image, colour):
 
 @formula
 def backward_tangent_row(state, b, L, w, beta, rR, dq, v_image, colour, dcolour):
-    """s' and h of a row, and the update of tau and R'."""
+    """Undo a splat in tau and R' of a row; s' where the cap does not hold, and h."""
     tau, dR, dv_image = load(state, b + TAU * L), load(state, b + DREST * L), load3(state, b + DGRAD * L, L)
     tau, dR, ds, h = step_backward_tangent(tau, dR, dv_image, w, beta, rR, dq, v_image, colour, dcolour)
     store(state, b + TAU * L, tau)
@@ -218,6 +218,7 @@ def backward_tangent_row(state, b, L, w, beta, rR, dq, v_image, colour, dcolour)
 
 @formula
 def backward_tangent_single(params, tangents, lists, e, k, x0, y0, frame, state, sums):
+    """Undo intersection e, number k of its tile, and write its sums, for one tangent."""
     L = lanes(params)
     splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)
     dterms, dcolour = tangent_terms(tangents, splat * SPLAT, u)
@@ -240,6 +241,7 @@ def backward_tangent_single(params, tangents, lists, e, k, x0, y0, frame, state,
 
 @formula
 def backward_tangent_block(params, tangents, K, lists, e, k, x0, y0, frame, state, shared, sums):
+    """Undo intersection e, number k of its tile, and write its sums, for K tangents."""
     L = lanes(params)
     width = (BACKWARD + BACKWARD_TANGENT * K) * L
     splat, u, terms, colour, index, capped, top, bottom = intersection(params, lists, e, k, x0, y0)

@@ -26,7 +26,7 @@ from splat.backend.cpu.simd import (
     store,
     store_sums,
 )
-from splat.raster.formulas import SPLAT, along_row, column_terms, row_terms
+from splat.raster.formulas import SPLAT, along_row, alpha_row, column_terms, reciprocal, row_terms
 
 NEVER = 1e30  # the stop index of a pixel that does not stop
 AHEAD = 6  # intersections between a prefetch and its use
@@ -39,12 +39,13 @@ CAPPED = 1 << 16  # in an intersection's rows: its splat's alpha can reach the c
 T, STOP = 0, 1  # transmittance, and the index of the intersection at which a pixel stops
 IMAGE, FORWARD = 2, 5
 REST, GRAD, BACKWARD = 2, 3, 6  # R and v_image
+BEHIND, UNDO = 2, 5  # the colour behind, of the passes in `blocks.py` and `footprints.py`
 DT, DIMAGE, TANGENT = 0, 1, 4  # after T and STOP, for each of K tangents
 TAU, DREST, DGRAD, BACKWARD_TANGENT = 0, 1, 2, 5  # after those of `backward`, for each of K tangents
 
 
 class Lists(NamedTuple):
-    """Which splats touch which tiles, in order of depth within a tile.
+    """Splats that touch each tile, in order of depth.
 
     start: (tiles + 1,) first intersection of each tile; splat: (intersections,); rows: (intersections,) first row |
     last row << 8 within the tile, and CAPPED; accumulator: (intersections,) where their sums go, splat by splat;
@@ -59,7 +60,7 @@ class Lists(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What all pixels share: tiles in a row, floats in a row of a plane, floats in a plane, cap, floor, background (3,).
+    """Constants of all pixels: tiles in a row, floats in a row of a plane, floats in a plane, cap, floor, background (3,).
 
     row_offsets: 0, ..., TILE_ROWS - 1, each `lanes` times: read as vectors, they cost the kernels less than a conversion.
     """
@@ -74,7 +75,7 @@ class Frame(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """What `forward` leaves in each pixel: planes (red, green, blue, alpha), the final T, and where it stopped."""
+    """Results of `forward` in each pixel: planes (red, green, blue, alpha), the final T, and where it stopped."""
 
     planes: np.ndarray
     transmittance: np.ndarray
@@ -134,6 +135,30 @@ def intersection(params, lists, e, k, x0, y0):
 def row_v(frame, L, y, terms):
     """v of a tile's row y."""
     return fma(load(frame.row_offsets, L * y), terms[1], terms[0])
+
+
+@formula
+def begin_undo_row(state, b, L, frame, pixels, p):
+    """Start a row behind all splats: T, STOP, and the background's colour times T."""
+    last = load(pixels.transmittance, p)
+    store(state, b + T * L, last)
+    store(state, b + STOP * L, load(pixels.stop, p))
+    for c in range(3):
+        store(state, b + (BEHIND + c) * L, last * frame.background[c])
+
+
+@formula
+def undo_row(state, b, L, frame, v, terms, index, capped):
+    """Undo a splat in T of a row; w, and w and beta where the cap does not hold."""
+    alpha, uncapped = alpha_row(v, terms, index < load(state, b + STOP * L), frame.cap)
+    r = reciprocal(1.0 - alpha)
+    before = load(state, b + T * L) * r
+    store(state, b + T * L, before)
+    w, beta = alpha * before, alpha * r
+    free = w
+    if capped:
+        free, beta = select(uncapped <= frame.cap, w, 0.0), select(uncapped <= frame.cap, beta, 0.0)
+    return w, free, beta
 
 
 @formula

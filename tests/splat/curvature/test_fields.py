@@ -111,7 +111,8 @@ def scene_of(rows: list[dict], centres: list[list[float]]) -> SceneObjective:
 
 def test_a_needle_is_the_one_of_largest_condition():
     needle = {"means": [0.6, 0.3, 4.0], "log_scales": [-1.5, -5.5, -5.5]}
-    found, _ = scene_fields(scene_of([{}, needle, {"means": [-0.6, 0.0, 4.0]}], [[0.0, 0.0, 0.0]]))
+    centres = [[0.0, 0.0, 0.0], [-4.0, 0.0, 4.0]]  # beside it, and behind its end
+    found, _ = scene_fields(scene_of([{}, needle, {"means": [-0.6, 0.0, 4.0]}], centres))
     focal, (long, thin) = 60.0 / 4, np.exp([-1.5, -5.5])
     slant = (0.6 / 4) * thin  # what the depth of its thin axis adds along the image
     kappa = ((focal * long) ** 2 + (focal * slant) ** 2 + 0.3) / ((focal * thin) ** 2 + 0.3)
