@@ -26,7 +26,7 @@ from landscape.probes import draw_probes
 from landscape.results import plain
 
 SCALE = 1 / 3  # not a power of two, so that the scaled vector rounds differently
-ROUND_OFFS = 4e3  # units of round-off in a sum of 1.6e7 rounded terms, whose errors add up like a random walk; 5e-4 in float32
+ROUND_OFFS = 4e3  # units of round-off in a sum of 1.6e7 rounded terms, whose errors add up like a random walk
 
 
 @dataclass(frozen=True)
