@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from analysis.measures.gradient_check import check_against_gradient
+from analysis.measures.gradient_check import ENOUGH, check_against_gradient
 from splat.curvature.hessian import SceneHessian
 from splat.curvature.linearize import LinearizedView
 from splat.curvature.objective import SceneObjective
@@ -69,3 +69,7 @@ def test_signs_that_only_double_tells_apart_are_round_off_and_no_error() -> None
     check = check_against_gradient(hessian, torch.Generator().manual_seed(0))
     assert check.rounding is not None and check.rounding > 0.01
     assert check.difference.error < 1e-3
+
+
+def test_single_precision_that_passes_is_closer_than_a_thousandth():
+    assert ENOUGH < 1e-3
