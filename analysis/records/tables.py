@@ -7,6 +7,7 @@ from typing import Any
 
 from msgspec import UNSET, UnsetType
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
 from analysis.records.findings import attribute_name, is_open, is_wide
@@ -57,7 +58,8 @@ def probe_table(data: ProbeRecord, width: int = 80) -> Table:
     table.add_column("", no_wrap=True)
     for row in rows:
         if row:
-            table.add_row(wrapped(row[0], name), row[1], wrapped(row[2], width - name - value - GAPS))
+            cells = wrapped(row[0], name), row[1], wrapped(row[2], width - name - value - GAPS)
+            table.add_row(*map(escape, cells))
         else:
             table.add_section()
     return table
@@ -208,7 +210,7 @@ def family_lines(data: ProbeRecord) -> list[Line]:
 
 def family_table(data: ProbeRecord) -> Table:
     """The indices of the lines, brackets beneath the values, within 80 columns: without saddle, which is -literal."""
-    title = f"Anisotropy by attribute ({data.families[0].unit})" if data.families else None
+    title = escape(f"Anisotropy by attribute ({data.families[0].unit})") if data.families else None
     look: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False, "show_edge": False}
     table = Table(title=title, caption=CAPTION, **look)
     table.add_column("", no_wrap=True)
@@ -222,7 +224,8 @@ def family_table(data: ProbeRecord) -> Table:
             table.add_row(operator := line.operator, style="bold")
         label = line.block if line.scene in ("", "trained") else f"  {line.scene}"
         cells = [line.indices[i] for i in shown]
-        table.add_row(label, *("\n".join(_folded(text) for text in (c.value, c.bracket) if text) for c in cells))
+        texts = ("\n".join(_folded(text) for text in (c.value, c.bracket) if text) for c in cells)
+        table.add_row(escape(label), *texts)
     return table
 
 

@@ -3,6 +3,7 @@ import math
 import re
 from html.parser import HTMLParser
 from io import StringIO
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +16,7 @@ from analysis.records import report
 from analysis.records.findings import findings
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
 from analysis.records.report import interactive_surface, numbers, write_report
-from analysis.records.tables import probe_table
+from analysis.records.tables import family_table, probe_table
 from tests.recorded import depth_section, probe_of, synthetic, written
 
 UNPACKS = 'new DecompressionStream("gzip")'  # plotly.js
@@ -441,6 +442,19 @@ def test_a_number_whose_bracket_is_tens_of_times_wide_is_none_and_only_a_caution
     assert "361" not in text
     data["anisotropy"]["mass_quantile"]["high"] = 149.0
     assert not any(line.text.startswith("Mass quantile") for line in findings(probe_of(data)))
+
+
+def test_names_and_notes_that_look_like_markup_are_printed_as_they_are():
+    data, _ = synthetic()
+    data["checks"]["[/x]"] = data["checks"].pop("symmetry")
+    data["anisotropy"]["literal"]["note"] = "[/note]"
+    old = json.loads((Path(__file__).parent / "old" / "probe.json").read_text())
+    data["families"] = [old["families"][0] | {"unit": "[/unit]", "block": "[/block]"}]
+    console = Console(width=140, file=StringIO())
+    record = probe_of(data)
+    console.print(probe_table(record, 140), family_table(record))
+    said = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+    assert [word for word in ("[/x]", "[/note]", "[/unit]", "[/block]") if word not in said] == []
 
 
 def test_the_page_of_the_splats_is_linked_where_it_is(tmp_path):
