@@ -20,6 +20,7 @@ from landscape.errors import InputError
 
 EXPANSION = 32  # times its size on disk that an archive may hold; what this program writes is not compressed
 SLACK = 2**20  # bytes that any archive may hold
+FOLDER = 0x10  # among the attributes of a member
 TAKEN = "expected {what}, got another at work, which holds {path}; wait until it ends, or choose another --out"
 
 
@@ -29,6 +30,20 @@ def require_modest(archive: zipfile.ZipFile) -> None:
     size, held = archive.fp.seek(0, os.SEEK_END), sum(member.file_size for member in archive.infolist())
     if held > EXPANSION * size + SLACK:
         raise InputError(f"it promises {held:,} bytes in a file of {size:,}")
+
+
+def require_whole(archive: zipfile.ZipFile) -> None:
+    """InputError where an archive that torch is to read is not modest, or a member is not there as it promises.
+
+    torch takes a member that is marked as a folder, or without bytes, as read: its numbers are what free memory held.
+    """
+    require_modest(archive)
+    for member in archive.infolist():
+        stored = member.compress_type == zipfile.ZIP_STORED
+        if member.external_attr & FOLDER or (stored and member.compress_size != member.file_size):
+            raise InputError(f"{member.filename!r} is marked as a folder, or promises other bytes than it has")
+    if wrong := archive.testzip():
+        raise InputError(f"the checksum of {wrong!r} is wrong")
 
 
 def require_held(file: BinaryIO, size: int) -> np.dtype:

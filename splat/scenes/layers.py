@@ -30,8 +30,9 @@ MASK_FOLDERS = ("mask", "masks")
 SIXTEEN_BITS = ("I;16", "I;16B", "I")
 # Pillow recognises a file by its content, whatever its name, and would start Ghostscript for PostScript
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-# raised by Pillow for damaged files
 MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
+STRIP = 256  # rows of a mask at a time: a large one would take a GB in all its copies
+# raised by Pillow for damaged files
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
 
 
@@ -88,11 +89,18 @@ def require_depths(views: Sequence[View], folder: Path) -> None:
 def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
     """1 inside, 0 outside."""
     with opened_image(path, "a mask") as file:
-        pixels = np.array(file if file.mode in ("1", "L", "RGB", "RGBA") else file.convert("RGB"))
-    lowest = pixels.reshape(*pixels.shape[:2], -1)[..., :3].min(axis=2)
+        file.load()
+        tops = range(0, file.height, STRIP)
+        lowest = np.concatenate([_lowest(file.crop((0, y, file.width, min(y + STRIP, file.height)))) for y in tops])
     if not lowest.any():
         raise InputError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
     return torch.from_numpy(lowest == lowest.max()).to(torch.float32)[None]
+
+
+def _lowest(image: Image.Image) -> np.ndarray:
+    """The smallest of each pixel's colour channels, (h, w)."""
+    pixels = np.array(image if image.mode in ("1", "L", "RGB", "RGBA") else image.convert("RGB"))
+    return pixels.reshape(*pixels.shape[:2], -1)[..., :3].min(axis=2)
 
 
 def read_depth(path: Path) -> Float[Tensor, "1 h w"]:

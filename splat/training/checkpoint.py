@@ -27,7 +27,7 @@ from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.settings import current_settings
 from splat.model.typed import MOST, Count, leaves, typed
-from splat.model.untrusted import require_modest
+from splat.model.untrusted import require_whole
 from splat.scenes.scene import Scene
 from splat.scenes.splits import spread_views
 from splat.training.densify import ScreenGradients
@@ -271,9 +271,7 @@ def _read(file: BinaryIO, path: Path) -> Any:
     """The content that torch saved, after its checksums were found to be right."""
     try:
         with zipfile.ZipFile(file) as archive:
-            require_modest(archive)
-            if wrong := archive.testzip():
-                raise zipfile.BadZipFile(f"the checksum of {wrong} is wrong")
+            require_whole(archive)
         file.seek(0)
         with warnings.catch_warnings(action="ignore"):  # torch warns of pickles of another kind before it refuses them
             return torch.load(file, map_location="cpu", weights_only=True)

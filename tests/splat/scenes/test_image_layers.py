@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from landscape.errors import InputError
-from splat.scenes.layers import dtu_number, find_layer, read_depth, read_mask
+from splat.scenes.layers import STRIP, dtu_number, find_layer, read_depth, read_mask
 from splat.scenes.scene import load_scene
 from splat.scenes.view import View
 from tests.splat.scenes import folders
@@ -111,6 +111,10 @@ def test_a_mask_of_colours_is_inside_where_every_channel_is_white(tmp_path: Path
     pixels[0, 1], pixels[1, 2] = 255, (255, 255, 254)
     Image.fromarray(pixels).save(tmp_path / "m.png")
     assert read_mask(tmp_path / "m.png").tolist() == [[[0, 1, 0], [0, 0, 0]]]
+    tall = np.zeros((2 * STRIP + 5, 3, 3), dtype=np.uint8)
+    tall[[0, STRIP, -1], 1] = 255
+    Image.fromarray(tall).save(tmp_path / "m.png")
+    assert read_mask(tmp_path / "m.png").nonzero().tolist() == [[0, 0, 1], [0, STRIP, 1], [0, 2 * STRIP + 4, 1]]
     (tmp_path / "m.png").write_text("no picture")
     with pytest.raises(ValueError, match=r"cannot read .*m\.png"):
         read_mask(tmp_path / "m.png")

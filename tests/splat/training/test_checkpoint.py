@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from landscape.errors import InputError
+from splat.model.files.tensor_files import load_tensors
 from splat.model.settings import RenderSettings
 from splat.training.checkpoint import LATER, load_checkpoint, save_checkpoint, write_atomically
 from splat.training.loop import train
@@ -171,6 +172,19 @@ def test_what_is_loaded_is_what_was_checked_though_the_file_is_replaced(path, tr
 
     monkeypatch.setattr(zipfile.ZipFile, "testzip", replaced)
     assert torch.equal(load_checkpoint(path).training.gaussians.flat, training.gaussians.flat)
+
+
+@pytest.mark.parametrize(("place", "value"), [(38, 0x10), (20, 0)], ids=["marked as a folder", "without bytes"])
+def test_a_member_that_torch_would_not_read_is_refused(path, place, value):
+    with zipfile.ZipFile(path) as archive:
+        (numbers,) = (each for each in archive.infolist() if each.filename.endswith("data/0"))
+    content = bytearray(path.read_bytes())
+    entry = content.rindex(b"PK\x01\x02", 0, content.rindex(numbers.filename.encode()))  # in the archive's index
+    content[entry + place : entry + place + 4] = value.to_bytes(4, "little")
+    path.write_bytes(content)
+    refused(path, "marked as a folder, or promises other bytes than it has")
+    with pytest.raises(InputError, match="marked as a folder"):
+        load_tensors(bytes(content))
 
 
 def test_an_archive_that_torch_stumbles_over_in_its_own_way_is_refused(path):
