@@ -58,24 +58,25 @@ STEPS = [0.2, 0.1, 0.05]
 
 
 MEAN = "the mean of back and forth (by its curvature alone:"
-REFUTED = "along e is not confirmed by renders: steps of 0.0500 to 0.200"
+REFUTED = "along e is not confirmed by renders: steps of 0.0500 to 0.200 stored units"
 
 
 @pytest.mark.parametrize(
     ("curvature", "factors", "said"),
     [
-        (4.0, [1.1, 1.0, 0.9], f"A step of 0.200 along e raises the loss by 4.40%, {MEAN} 4.00%)."),
+        (4.0, [1.1, 1.0, 0.9], f"A step of 0.200 stored units along e raises the loss by 4.40%, {MEAN} 4.00%)."),
         (
             4.0,
             [3.0, 0.9, 1.0],
-            f"A step of 0.100 along e raises the loss by 0.90%, {MEAN} 1.00%); over steps of 0.0500 to 0.200 by 0.900 to 3.00 "
-            "times what the curvature has.",
+            f"A step of 0.100 stored units along e raises the loss by 0.90%, {MEAN} 1.00%); "
+            "over steps of 0.0500 to 0.200 stored units by 0.900 to 3.00 times what the curvature has.",
         ),
-        (-4.0, [-1.0, 1.1, 1.0], "A step of 0.100 along e lowers the loss by 1.10%, "),
+        (-4.0, [-1.0, 1.1, 1.0], "A step of 0.100 stored units along e lowers the loss by 1.10%, "),
         (
             -4.0,
             [-1.0, 0.5, 0.6],
-            f"A step of 0.100 along e lowers the loss by 0.50%, {MEAN} 1.00%), 0.500 times as much as the curvature has it; ",
+            f"A step of 0.100 stored units along e lowers the loss by 0.50%, {MEAN} 1.00%), "
+            "0.500 times as much as the curvature has it; ",
         ),
         (
             -4.0,
@@ -124,7 +125,7 @@ def test_the_outline_is_the_splats(shown):
 
 @pytest.mark.parametrize(("x", "angle"), [(80.0, 0.4), (-90.0, 0.1), (150.0, 1.9)])
 def test_a_crop_has_all_of_an_outline_that_its_picture_has(x, angle):
-    left, top, right, bottom = crop_around([x, 60.0, 120.0, 2.0, angle], 160, 120)
+    left, top, right, bottom = crop_around([[x, 60.0, 120.0, 2.0, angle], [80.0, 60.0, 1.0, 1.0, 0.0]], 160, 120)
     along = np.linspace(-1, 1, 400) * 120
     points = np.stack([x + along * np.cos(angle), 60 + along * np.sin(angle)])
     points = points[:, ((points > 1) & (points < np.array([[159], [119]]))).all(axis=0)]
