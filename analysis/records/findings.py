@@ -389,7 +389,8 @@ def of_slice(plane: schema.Slice | None, made: Provenance) -> list[Line]:
         lines.append(Line(f"{text}; the bound for all: {100 * error:.2g}%)." if error is not None else f"{text})."))
     if plane.crossed_points:
         share = f"{plane.crossed_points:,} of the slice's {rendered:,} rendered points"
-        lines.append(Line(f"At {share} the order of the splats or the set of visible ones is not the checkpoint's."))
+        text = f"At {share} the order of the splats or the set of visible ones is not the checkpoint's"
+        lines.append(Line(f"{text}, which derivatives do not see.", "caution"))
     return lines
 
 

@@ -104,7 +104,8 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         data=record.data,
         counts=plain(record.data.counts),
         provenance=plain(record.data.provenance),
-        numbers=numbers(record.data),
+        subtitle=subtitle(record.data),
+        numbers=numbers(record.data, map_beside(record)[1]),
         headline=first,
         findings=findings(record.data),
         views=views,
@@ -154,16 +155,31 @@ def opening(record: Record[ProbeRecord]) -> list[Line]:
     if found is None or not found.steepest:
         return lines
     if any(end.curvature < 0 and end.is_refuted for end in found.steepest):
-        lines[0] = Line(f"{lines[0].text} Renders do not confirm its negative end, see below.", lines[0].level)
+        refuted = "Renders do not confirm its negative end: the loss rises along it at every length that was tried."
+        lines[0] = Line(f"{lines[0].text} {refuted}", lines[0].level)
     return [*lines[:2], Line(found.steepest[0].sentence)]
 
 
-def numbers(data: ProbeRecord) -> list[dict[str, str]]:
-    """The five numbers at the top: value with its error or bracket, and what it is."""
+def subtitle(data: ProbeRecord) -> str:
+    """Gaussians, the loss and its formula, the pictures' size, and the gradient, as far as they are known."""
+    loss, parts = data.objective, [f"{data.counts.gaussians:,} Gaussians"]
+    if loss.value is not None:
+        parts.append(f"loss {quantity(loss.value)}" + (f" = {loss.loss}" if loss.loss else ""))
+    if sizes := {tuple(size) for size in loss.sizes or []}:
+        parts.append("pictures of " + ", ".join(f"{width} x {height}" for width, height in sorted(sizes)[:3]) + " px")
+    if loss.gradient_norm is not None:
+        parts.append(f"gradient norm {quantity(loss.gradient_norm)}")
+    return ", ".join(parts) + "."
+
+
+def numbers(data: ProbeRecord, where: MapRecord | None = None) -> list[dict[str, str]]:
+    """The five numbers at the top: value with its error or bracket, and what it is; where: what renders say of the ends."""
     ends, found = data.eigenvalues, []
     lowest = "most negative" if (ends.min.value or 0.0) < 0 else "smallest"
+    seen = {each.curvature > 0: _by_renders(each) for each in (where.steepest if where else [])}
     for end, words in ((ends.max, "largest curvature, λ max"), (ends.min, f"{lowest} curvature, λ min")):
-        found.append({"value": measured(end.value, end.residual), "words": f"{words}, per stored unit²"})
+        said = seen.get((end.value or 0.0) > 0, "")
+        found.append({"value": measured(end.value, end.residual), "words": f"{words}, per stored unit²{said}"})
     found += _steepest_attribute(data)
     if index := data.anisotropy.literal:
         cell = bracketed(None if is_open(index) else index)
@@ -175,6 +191,15 @@ def numbers(data: ProbeRecord) -> list[dict[str, str]]:
         words = f"Gaussians carry the steepest direction, of {data.counts.visible_gaussians:,} in sight"
         found.append({"value": quantity(lives.participation), "words": words})
     return found
+
+
+def _by_renders(end: Steepest) -> str:
+    """What renders of several steps say of an end's curvature; empty in older maps."""
+    if end.is_refuted:
+        return "; not confirmed by renders"
+    if not end.factors:
+        return ""
+    return f"; by renders {quantity(min(end.factors))} to {quantity(max(end.factors))} times that, by the length of the step"
 
 
 def _steepest_attribute(data: ProbeRecord) -> list[dict[str, str]]:

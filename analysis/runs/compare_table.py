@@ -220,5 +220,5 @@ def compare_table(rows: Sequence[Row], labels: Sequence[str]) -> Table:
         name = f"depth / lateral {row.name}" if row.section == DEPTH else name
         name += ", training views" if row.section == "training views" else ""
         cells = ("\n".join(filter(None, (entry.cell.value, entry.cell.bracket))) for entry in row.entries)
-        table.add_row(name, *(escape(cell) for cell in cells))
+        table.add_row(*map(escape, [name, *cells]))
     return table

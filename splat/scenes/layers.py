@@ -32,7 +32,7 @@ SIXTEEN_BITS = ("I;16", "I;16B", "I")
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 # raised by Pillow for damaged files
 MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
-UNREADABLE = (OSError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError)
+UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
 
 
 @contextmanager
@@ -46,6 +46,8 @@ def opened_image(path: Path, kind: str = "an image") -> Iterator[Image.Image]:
                     "reduce it"
                 )
             yield file
+    except InputError:
+        raise
     except UNREADABLE as error:
         raise InputError(f"expected {kind}, cannot read {path}: {error}; replace the file") from error
 
@@ -86,8 +88,8 @@ def require_depths(views: Sequence[View], folder: Path) -> None:
 def read_mask(path: Path) -> Float[Tensor, "1 h w"]:
     """1 inside, 0 outside."""
     with opened_image(path, "a mask") as file:
-        pixels = np.array(file if file.mode in ("1", "L") else file.convert("RGB"))
-    lowest = pixels.reshape(*pixels.shape[:2], -1).min(axis=2)
+        pixels = np.array(file if file.mode in ("1", "L", "RGB", "RGBA") else file.convert("RGB"))
+    lowest = pixels.reshape(*pixels.shape[:2], -1)[..., :3].min(axis=2)
     if not lowest.any():
         raise InputError(f"expected a mask with something inside, got one that is black all over in {path}; remove it")
     return torch.from_numpy(lowest == lowest.max()).to(torch.float32)[None]

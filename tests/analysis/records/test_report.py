@@ -130,7 +130,13 @@ def test_the_map_beside_the_record_says_where(tmp_path, step):
     }
     carrier |= {"opacity": 0.7, "views": 1, "one_view": 1.0, "outline": [4.0, 3.0, 2.0, 1.0, 0.0]}
     end = {"name": "e₁", "curvature": 3.0, "participation": 1.5, "carriers": [carrier], "view": "a.png", "step": 0.1}
-    end |= {"crop": [0, 0, 4, 3], "losses": [1.1, 1.0, 1.2], "difference": shade, "file": "steepest-e1"}
+    end |= {
+        "crop": [0, 0, 4, 3],
+        "losses": [1.1, 1.0, 1.2],
+        "factors": [1.9, 0.5],
+        "difference": shade,
+        "file": "steepest-e1",
+    }
     found["steepest"] = [end | {"sentence": "80% of e₁ turns Gaussian 3,778.", "rendered": "Not confirmed by renders."}]
     found["steepest"].append(found["steepest"][0] | {"name": "e_min", "curvature": -1.0, "factors": [-0.2, -1.9]})
     found["steepest"][1] |= {"sentence": "97% of e_min.", "rendered": "", "file": "steepest-e_min"}
@@ -149,7 +155,8 @@ def test_the_map_beside_the_record_says_where(tmp_path, step):
     assert (
         "standard deviations 0.400, 0.0200, 0.0100 world units, opacity 0.70, 41 : 1 in the picture" in said
     ) == here
-    assert ("Renders do not confirm its negative end" in said) == here
+    assert ("Renders do not confirm its negative end" in said) == ("; not confirmed by renders" in said) == here
+    assert ("; by renders 0.500 to 1.90 times that, by the length of the step" in said) == here
     assert (said.count("Not confirmed by renders.") == 1) == here
     assert (said.count("80% of e₁ turns Gaussian 3,778.") == 1) == here == ("Position: half" in said)
     (headline,) = re.findall(r'<ul class="headline">(.*?)</ul>', text, re.DOTALL)
@@ -485,7 +492,9 @@ def test_the_title_and_the_checks_say_what_is_known(tmp_path):
 def test_the_first_view_is_that_of_the_steepest_direction(tmp_path, monkeypatch):
     path = with_views(tmp_path / "probe", ["a.png", "b.png", "c.png"])
     assert 'id="name">1 of 3: a.png<' in path.read_text(encoding="utf-8")
-    steepest = SimpleNamespace(view="b.png", sentence="most of e₁ in b.png", rendered="", curvature=1.0)
+    steepest = SimpleNamespace(
+        view="b.png", sentence="most of e₁ in b.png", curvature=1.0, is_refuted=False, factors=[]
+    )
     found = SimpleNamespace(steepest=[steepest], panels=[])
     monkeypatch.setattr(report, "map_beside", lambda record: (tmp_path, found))
     monkeypatch.setattr(report, "where", lambda *_: [])

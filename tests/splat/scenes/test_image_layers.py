@@ -2,12 +2,14 @@
 
 import json
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from landscape.errors import InputError
 from splat.scenes.layers import dtu_number, find_layer, read_depth, read_mask
 from splat.scenes.scene import load_scene
 from splat.scenes.view import View
@@ -184,3 +186,11 @@ def test_a_mask_or_depth_of_another_size_than_its_camera_is_refused(tmp_path: Pa
     for layer in ({"mask": torch.ones(3, 3, dtype=torch.bool)}, {"depth": torch.ones(HEIGHT, WIDTH + 1)}):
         with pytest.raises(ValueError, match="as its camera"):
             View(view.name, view.camera, view.image, **layer)
+
+
+def test_a_picture_whose_header_is_cut_is_refused_with_its_name(tmp_path):
+    header = b"IHDR" + bytes(12)  # a byte too few
+    path = tmp_path / "mask.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + (12).to_bytes(4, "big") + header + crc32(header).to_bytes(4, "big"))
+    with pytest.raises(InputError, match=r"expected a mask, cannot read .*mask\.png: Truncated IHDR"):
+        read_mask(path)
