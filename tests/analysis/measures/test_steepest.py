@@ -125,7 +125,7 @@ def test_the_outline_is_the_splats(shown):
 
 @pytest.mark.parametrize(("x", "angle"), [(80.0, 0.4), (-90.0, 0.1), (150.0, 1.9)])
 def test_a_crop_has_all_of_an_outline_that_its_picture_has(x, angle):
-    left, top, right, bottom = crop_around([[x, 60.0, 120.0, 2.0, angle], [80.0, 60.0, 1.0, 1.0, 0.0]], 160, 120)
+    left, top, right, bottom = crop_around([[x, 60.0, 120.0, 2.0, angle]], 160, 120)
     along = np.linspace(-1, 1, 400) * 120
     points = np.stack([x + along * np.cos(angle), 60 + along * np.sin(angle)])
     points = points[:, ((points > 1) & (points < np.array([[159], [119]]))).all(axis=0)]
@@ -136,10 +136,15 @@ def test_a_crop_has_all_of_an_outline_that_its_picture_has(x, angle):
 
 @pytest.mark.parametrize("x", [-50.0, 3.0, 80.0, 400.0])
 def test_a_crop_lies_in_its_picture(x):
-    left, top, right, bottom = crop_around([x, 60.0, 30.0, 1.0, 0.3], 160, 120)
+    left, top, right, bottom = crop_around([[x, 60.0, 30.0, 1.0, 0.3]], 160, 120)
     assert 0 <= left < right <= 160 and 0 <= top < bottom <= 120
     assert (right - left) / (bottom - top) == pytest.approx(4 / 3, rel=0.05)
 
 
 def test_an_outline_of_an_upright_splat_points_up():
     assert outline_of(torch.tensor([5.0, 6.0, 1.0, 0.0, 0.25, 0.0, 0.0, 0.0, 0.0]))[2:4] == [4.0, 2.0]
+
+
+def test_a_crop_has_the_outlines_of_all_carriers():
+    left, top, right, bottom = crop_around([[40.0, 30.0, 5.0, 2.0, 0.0], [90.0, 60.0, 5.0, 2.0, 0.0]], 160, 120)
+    assert left <= 35 and right >= 95 and top <= 28 and bottom >= 62

@@ -175,7 +175,7 @@ def test_every_picture_has_words_with_its_numbers(tmp_path):
     data, arrays = synthetic()
     text = page(tmp_path / "probe", data, arrays, picture="traces")
     (words,) = re.findall(r'<img src="data:[^"]*" alt="([^"]*)">', text)
-    assert words.startswith("Traces: position 3.99 × 10⁵, ")
+    assert words.startswith("Traces: position 3.99\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10⁵, ")
     assert re.findall(r"<h(\d)", text) == sorted(re.findall(r"<h(\d)", text)) and text.count("<h1") == 1
 
 
