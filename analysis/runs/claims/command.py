@@ -22,7 +22,7 @@ from analysis.records.json_files import json_text, plain
 from analysis.records.report import pictures_in, template_environment
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import LEAST, Judgement, effect_table, judgements
-from analysis.runs.claims.study import FILE, study
+from analysis.runs.claims.study import FILE, study, unended
 from analysis.runs.options import ClaimsOptions
 from splat.training.checkpoint import write_atomically
 
@@ -41,6 +41,7 @@ def run_claims(options: ClaimsOptions) -> int:
     for name, table in {FILE: rows, "claims.csv": effect_table(found), "predictors.csv": related}.items():
         write_atomically(out / name, table.to_csv(index=False).encode())
     write_atomically(out / "claims.json", json_text(plain([asdict(each) for each in found])).encode())
+    say(*(f"left out, as it has not ended: {run}" for run in unended(options.runs)), style="yellow", console=console)
     say(*draw("claims", out), style="yellow", console=console)
     write_atomically(out / "claims.html", render_page(rows, found, out).encode())
     _print(rows, found, console)

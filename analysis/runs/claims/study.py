@@ -40,9 +40,9 @@ from analysis.console.overrides import overridden
 from analysis.measures.units import step_lengths
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
-from analysis.records.run_files import CHECKPOINT, Made, MapRecord, read_map, read_scores
+from analysis.records.run_files import CHECKPOINT, METRICS, Made, MapRecord, read_map, read_scores
 from analysis.runs.claims.effects import STRETCHED
-from analysis.runs.sweep.sweep_results import PROBE, metrics_of, probe_of
+from analysis.runs.sweep.sweep_results import PROBE, REASONS, metrics_of, probe_of
 from landscape.errors import InputError
 from splat.model.typed import leaves
 from splat.training.checkpoint import load_checkpoint
@@ -52,7 +52,7 @@ from splat.training.state import LearningRates, TrainConfig
 
 FILE = "study.csv"
 KEYS = ("scene", "method", "seed", "steps", "views")
-TEXTS = ("scene", "method", "size", "date", "machine", "commit")  # of the columns; the others hold numbers
+TEXTS = ("scene", "method", "size", "date", "machine", "commit", *REASONS)  # of the columns; the others hold numbers
 SAMPLES = 10  # the paper's B
 
 
@@ -88,10 +88,23 @@ def _stored(path: Path) -> pd.DataFrame:
 
 
 def _runs(path: Path) -> Iterator[Path]:
-    found = sorted(checkpoint.parent for checkpoint in path.rglob(CHECKPOINT))
+    """Runs that have ended; InputError where there is none."""
+    found = [run for run in _trained(path) if (run / METRICS).is_file()]
     if not found:
-        raise InputError(f"expected a run, a folder of runs or the table {FILE} of a study, got {path} with none")
+        raise InputError(
+            f"expected a run that has ended, a folder of such or the table {FILE} of a study, got {path} with none"
+        )
     return iter(found)
+
+
+def unended(paths: Sequence[Path]) -> list[Path]:
+    """Runs without scores, which are in no row; not the checkpoints that a run has in folders of its own."""
+    found = [run for path in paths if path.is_dir() for run in _trained(path) if not (run / METRICS).is_file()]
+    return [run for run in found if not any((parent / CHECKPOINT).is_file() for parent in run.parents)]
+
+
+def _trained(path: Path) -> list[Path]:
+    return sorted(checkpoint.parent for checkpoint in path.rglob(CHECKPOINT))
 
 
 def row_of(run: Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from analysis.records.records import ProbeRecord, read_record
 from analysis.runs.claims.effects import Interval, gains, log_ratios
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, judgements
-from analysis.runs.claims.study import _more, method_name, study
+from analysis.runs.claims.study import _more, _runs, method_name, study, unended
 from analysis.runs.sweep.sweep_file import read_sweep
 from figures.paper import ONLY
 from splat.training.methods.methods import METHODS
@@ -202,6 +202,21 @@ def test_the_command_reads_a_table_and_draws(tmp_path, capsys):
     assert (out / "claims.html").read_text().count("<img ") == 9 + 1  # one for each, and the predictors
     again = study([out / "study.csv"])
     assert [each.verdict for each in judgements(again)] == ["holds"] * 9
+
+
+def test_the_stored_study_is_read_with_all_of_its_rows():
+    path = Path(__file__).parents[3] / "notebooks" / "results" / "study.csv"
+    rows = study([path])
+    assert len(rows) == len(path.read_text().splitlines()) - 1 and set(rows["lambda_max_reason"]) == {"tolerance"}
+
+
+def test_a_run_that_has_not_ended_is_left_out_and_said(tmp_path):
+    for name in ("ended", "ended/step-2", "under way", "under way/step-2"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "checkpoint.pt").write_bytes(b"")
+    (tmp_path / "ended" / "metrics.json").write_bytes(b"")
+    assert list(_runs(tmp_path)) == [tmp_path / "ended"]
+    assert unended([tmp_path, tmp_path / "study.csv"]) == [tmp_path / "under way"]
 
 
 def test_a_table_of_something_else_and_a_run_named_twice_are_refused(tmp_path, capsys):
