@@ -20,6 +20,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from analysis.records.findings import attribute_name
+from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import ProbeRecord, Record, read_record
 from analysis.records.run_files import COMPARISON, read_comparison
 from analysis.records.schema import Trace
@@ -32,13 +33,11 @@ from figures.style import (
     MISSING,
     RUNS,
     VERMILION,
-    exponent_of,
     folder_script,
     literal,
     new_figure,
     save,
     style,
-    unit_suffix,
 )
 from landscape.errors import InputError
 

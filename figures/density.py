@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from analysis.records.quantities import power_of_ten, quantity
+from analysis.records.quantities import exponent_of, power_of_ten, quantity, unit_suffix
 from analysis.records.records import ProbeRecord, Record
-from figures.style import BLUE, VERMILION, exponent_of, new_figure, script, style, unit_suffix
+from figures.style import BLUE, VERMILION, new_figure, script, style
 from landscape.errors import InputError
 
 BROADENING = 0.01

@@ -18,10 +18,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
+from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import ProbeRecord, Record, SliceRecord, read_record
 from analysis.records.run_files import CHECKPOINT
 from figures.plane import Plane, plane
-from figures.style import BLACK, FIELD_MAP, MISSING, exponent_of, literal, unit_suffix
+from figures.style import BLACK, FIELD_MAP, MISSING, literal
 from landscape.errors import InputError
 
 START = "start"

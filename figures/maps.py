@@ -26,9 +26,10 @@ from matplotlib.transforms import Affine2D, Bbox, TransformedBbox
 
 from analysis.records.quantities import BYTES, Shade, percent, quantity
 from analysis.records.run_files import Carrier, MapRecord, Panel, Steepest, Swaps, read_map
-from figures.style import BLACK, BLUE, VERMILION, folder_script, literal, save, style
+from figures.style import BLACK, BLUE, GREEN, VERMILION, folder_script, literal, save, style
 
 BOUNDS = {"error": (0,), "one_view": (0, BYTES)}  # ends of a scale, in bytes, beyond which nothing is
+SAME = 0.02  # greatest difference of curves that look alike, of their axis
 NEAR = 0.03  # of a scale's length, from its end
 WIDTH, TALLEST = 7.0, 9.0  # inches
 MARGIN, HEAD, LEGEND = 0.12, 0.22, 0.5  # inches: between pictures, above one, beneath one
@@ -155,9 +156,8 @@ def draw_fragility(maps: dict[str, np.ndarray], index: int, record: MapRecord) -
     with style():
         sheet = Sheet(2, 2, maps["error"].shape, (True, True), f"{view}: where it is fragile")
         for place, (name, title) in enumerate(titles.items()):
-            sheet.show_scaled(
-                place // 2, place % 2, maps[name], shades[name], title, f"{shades[name].title}; bright: fragile"
-            )
+            label = shades[name].title + ("" if name == "one_view" else "; bright: fragile")
+            sheet.show_scaled(place // 2, place % 2, maps[name], shades[name], title, label)
         _draw_swaps(sheet.plot(1, 1, "Position: neighbours that change order when one moves"), fragile.swaps, index)
     return sheet.figure
 
@@ -169,6 +169,8 @@ def _draw_swaps(axes: Axes, swaps: Swaps, index: int) -> None:
             swaps.lengths, shares, color=VERMILION if own else "0.75", linewidth=1.4 if own else 0.7, zorder=2 + own
         )
     words = [("this view", VERMILION)] + [("other views", "0.5")] * (len(swaps.share) > 1)
+    if len(swaps.share) > 1 and np.ptp(swaps.share, axis=0).max() < SAME:
+        words = [(f"all {len(swaps.share)} views coincide", VERMILION)]
     for line, (text, colour) in enumerate(words):
         axes.text(0.97, 0.13 - 0.08 * line, text, color=colour, ha="right", transform=axes.transAxes)
     axes.set(xlabel="distance along the ray, px", ylim=(0, 1))
@@ -194,24 +196,16 @@ def draw_steepest(maps: dict[str, np.ndarray], end: Steepest) -> Figure:
         parts = {
             "photograph": (0, 1, f"Gaussians with {share} of {end.name}"),
             "zero": (0, 2, f"Render: loss {quantity(end.losses[1])}"),
-            "minus": (1, 0, f"{step} back: loss {back}"),
-            "plus": (1, 1, f"{step} forth: loss {forth}"),
+            "minus": (1, 0, f"{step} stored units back: loss {back}"),
+            "plus": (1, 1, f"{step} stored units forth: loss {forth}"),
         }
-        ways = [("view", whole, (0, 0))]
-        ways += [
-            (name, sheet.show(row, column, maps[name], title), (left, top))
-            for name, (row, column, title) in parts.items()
-        ]
+        ways = {name: sheet.show(row, column, maps[name], title) for name, (row, column, title) in parts.items()} | {
+            "view": whole
+        }
         sheet.show_scaled(1, 2, maps["difference"], end.difference, "Forth less back", end.difference.unit)
-        ways.append(("difference", sheet.way(1, 2, maps["difference"]), (left, top)))
-        for name, way, shift in ways:
+        for name, shift in (("view", (0, 0)), ("photograph", (left, top))):
             for carrier in reversed(end.carriers):  # the first above the others
-                _inside(
-                    sheet,
-                    _outline(carrier, shift, _colour(carrier, end), 0.4 if name == "difference" else 0.8),
-                    way,
-                    maps[name],
-                )
+                _inside(sheet, _outline(carrier, shift, _colour(carrier, end)), ways[name], maps[name])
         x, y = sheet.corner(0, 1)
         for line, carrier in enumerate(end.carriers):
             sheet.text(
@@ -227,15 +221,14 @@ def _signed(share: float) -> str:
 
 
 def _colour(carrier: Carrier, end: Steepest) -> str:
-    return VERMILION if carrier is end.carriers[0] else BLUE
+    """Not of the colours of a difference."""
+    return BLUE if carrier is end.carriers[0] else GREEN
 
 
-def _outline(carrier: Carrier, shift: tuple[int, int], colour: str, width: float) -> Ellipse:
+def _outline(carrier: Carrier, shift: tuple[int, int], colour: str) -> Ellipse:
     x, y, long, short, angle = carrier.outline
     centre = (x - shift[0], y - shift[1])
-    return Ellipse(
-        centre, 2 * long, 2 * short, angle=math.degrees(angle), fill=False, edgecolor=colour, linewidth=width
-    )
+    return Ellipse(centre, 2 * long, 2 * short, angle=math.degrees(angle), fill=False, edgecolor=colour, linewidth=0.8)
 
 
 def _inside(sheet: Sheet, patch: Patch, way: Affine2D, image: np.ndarray) -> None:

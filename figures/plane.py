@@ -14,9 +14,9 @@ from msgspec import UNSET
 
 from analysis.records import schema
 from analysis.records.findings import unresolved
-from analysis.records.quantities import quantity
+from analysis.records.quantities import exponent_of, quantity, unit_suffix
 from analysis.records.records import Record
-from figures.style import exponent_of, literal, unit_suffix
+from figures.style import literal
 from landscape.errors import InputError
 
 TRUE_PROPORTIONS = 2.5  # ranges whose ratio is below this are drawn to the same scale
@@ -85,11 +85,6 @@ class Plane:
     def dots(self) -> np.ndarray:
         """Renders, which pictures mark where there are other points."""
         return self.evaluated & (not self.evaluated.all())
-
-    @property
-    def crossed_share(self) -> float | None:
-        """Share of the evaluated points."""
-        return None if self.crossed is None else float(self.crossed.sum() / self.evaluated.sum())
 
 
 def plane(record: Record) -> Plane:

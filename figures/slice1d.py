@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from analysis.records.findings import resolved
-from analysis.records.quantities import quantity
+from analysis.records.quantities import exponent_of, quantity, unit_suffix
 from analysis.records.records import Record
 from analysis.records.schema import FiniteProbe, Slice
 from figures.plane import Direction, direction
 from figures.slice2d import CROSSED, RENDERED
-from figures.style import BLACK, BLUE, VERMILION, exponent_of, new_figure, script, style, unit_suffix
+from figures.style import BLACK, BLUE, VERMILION, new_figure, script, style
 from landscape.errors import InputError
 
 DOT = {"markersize": 5}

@@ -39,7 +39,7 @@ def draw(record: Record) -> Figure:
             below = figure
             figure.suptitle(textwrap.fill(field.unresolved, WRAP), fontsize=6)
         else:
-            figure = new_figure(4.7)
+            figure = new_figure(5.0)
             above, below = figure.subfigures(2, 1, height_ratios=[1.35, 1], squeeze=False)[:, 0]
             axes = above.subplots()
             if (contours := _draw_plane(axes, field)) is not None:
@@ -93,8 +93,8 @@ def _finding(field: Plane) -> str:
     row, column = np.unravel_index(int(field.change.argmin()), field.change.shape)
     if (row, column) == (field.x.centre, field.y.centre):
         return f"{text}lowest at the checkpoint, the cross"
-    place = ", ".join(f"{each:.2g}".replace("-", "−") for each in (field.x.scaled[row], field.y.scaled[column]))
-    return f"{text}lowest, by {quantity(power * low)}, at ({place})"
+    place = ", ".join(quantity(float(each)) for each in (field.x.steps[row], field.y.steps[column]))
+    return f"{text}down by at most {quantity(-power * low)},\nat ({place})"
 
 
 def _levels(field: Plane) -> np.ndarray:
@@ -135,8 +135,8 @@ def _legend(field: Plane) -> list[Line2D]:
         label = f"loss; dots: rendered ({field.evaluated.mean():.0%}),\nline: interpolated (error {size})"
         label, marker = "loss, renders" if field.unresolved else label, "."
     handles = [Line2D([], [], color=BLACK, marker=marker, markersize=4, label=label)]
-    if field.crossed_share:
-        words = f"rendered, order changed ({field.crossed_share:.0%})"
+    if field.crossed is not None and field.crossed.any():
+        words = f"rendered, order changed:\n{field.crossed.sum():,} of {field.evaluated.sum():,}"
         handles.append(Line2D([], [], label=words, **{**CROSSED, "markersize": 6}))
     if field.model is not None:
         handles.append(Line2D([], [], color=VERMILION, linestyle="--", label="quadratic model"))

@@ -60,11 +60,11 @@ def _finding(nodes: np.ndarray, weights: np.ndarray) -> str:
     """How many directions are nearly flat, by the mean of the start vectors' quadratures.
 
     >>> _finding(np.array([[0.0, 10.0]]), np.array([[0.75, 0.25]]))
-    '75% of the directions have less than 1%\\nof the largest curvature (not broadened)'
+    '75% of the directions have less than 1%\\nof the largest curvature'
     """
     flat = float((weights * (np.abs(nodes) < FLAT * np.abs(nodes).max())).sum() / weights.sum())
     words = f"{100 * flat:.3g}%" if flat < 0.9995 else "Over 99.9%"
-    return f"{words} of the directions have less than {FLAT:.0%}\nof the largest curvature (not broadened)"
+    return f"{words} of the directions have less than {FLAT:.0%}\nof the largest curvature"
 
 
 def _draw_values(axes: Axes, values: np.ndarray, residuals: np.ndarray) -> None:

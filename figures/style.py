@@ -5,7 +5,6 @@ uniform map cividis.  Figures are made without pyplot, so drawing has no global 
 """
 
 import argparse
-import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,12 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from analysis.records.quantities import power_of_ten
 from analysis.records.records import ProbeRecord, read_record
 
 COLUMN = 3.3
@@ -93,28 +90,6 @@ def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:
             figure.savefig(temporary)
     temporary.replace(path)
     return path
-
-
-def exponent_of(*values: np.ndarray | float) -> int:
-    """The power of ten to take out of an axis: a multiple of three, 0 for numbers that read well as they are.
-
-    >>> exponent_of(4.2e-7), exponent_of(np.array([0.0, 30.0])), exponent_of(-8.1e9)
-    (-9, 0, 9)
-    """
-    finite = np.concatenate([np.abs(np.ravel(v)) for v in values])
-    largest = np.max(finite[np.isfinite(finite)], initial=0.0)
-    if largest == 0 or 0.05 <= largest < 5000:
-        return 0
-    return 3 * math.floor(math.log10(largest) / 3)
-
-
-def unit_suffix(exponent: int) -> str:
-    """Suffix of an axis label for a power that was taken out.
-
-    >>> unit_suffix(-6), unit_suffix(0)
-    (' (×10⁻⁶)', '')
-    """
-    return f" (×{power_of_ten(exponent)})" if exponent else ""
 
 
 def literal(text: str) -> str:

@@ -20,9 +20,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from analysis.records.findings import ATTRIBUTES, attribute_name
-from analysis.records.quantities import power_of_ten
+from analysis.records.quantities import exponent_of, power_of_ten, unit_suffix
 from analysis.records.run_files import ENDS, read_trajectory
-from figures.style import BLACK, RUNS, exponent_of, literal, new_figure, save, style, unit_suffix  # fmt: skip
+from figures.style import BLACK, RUNS, literal, new_figure, save, style
 from landscape.errors import InputError
 
 INDICES = {"literal": "|λmax / λmin|", "effective_rank": "effective rank"}

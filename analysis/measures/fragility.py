@@ -124,13 +124,16 @@ def fragility_sentences(found: Fragility) -> list[str]:
     if shares:
         spread = " to ".join(dict.fromkeys((percent(min(shares)), percent(max(shares)))))
         position = f"Position: 1 px along the ray changes the order of {spread} of the neighbouring pairs of a view"
-        position += f"; at a swap the loss jumps by {measured(moved.jump, moved.jump_error)}." if moved.sampled else "."
+        jump, clear = measured(moved.jump, moved.jump_error), (moved.jump or 0.0) >= 2 * (moved.jump_error or 0.0)
+        words = f"; at a swap the loss {'jumps by' if clear else 'has no clear jump:'} {jump}."
+        position += words if moved.sampled else "."
     if found.depth_gradient is not None:
         position += f" The gradient along the rays is {quantity(found.depth_gradient)} times that across them."
     rotation, scale = (percent(found.needles_steepest[name]) for name in ATTRIBUTES)
     conditioning = (
         f"Conditioning: {percent(found.needles)} of the Gaussians are needles (condition above {NEEDLE:.0f}, longer than "
-        f"{sqrt(NEEDLE):.0f} : 1); of the steepest {STEEPEST:.0%} in rotation {rotation} are, in scale {scale}."
+        f"{sqrt(NEEDLE):.0f} : 1); so are {rotation} of the "
+        f"{STEEPEST:.0%} that are steepest in rotation, and {scale} of those in scale."
     )
     opacity = f"Opacity: {percent(found.one_view)} of the Gaussians have over {ALONE:.0%} of their weight in one view"
     if found.one_view_trace is not None:

@@ -20,7 +20,7 @@ from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
 from analysis.measures.localization import mass_shares, masses, participation
-from analysis.records.quantities import Shade, percent, quantity
+from analysis.records.quantities import Shade, percent, quantity, ratio
 from analysis.records.run_files import Carrier, Steepest
 from landscape import curvature_reach
 from splat.backend.cpu.threads import single_threaded, thread_count
@@ -74,7 +74,7 @@ def steepest(
     index = int(torch.stack([sight.weight[chosen[0]] for sight in sights]).argmax())
     view = objective.views[index]
     carriers = [_carrier(objective, view, end, values, mass, i) for i in chosen]
-    crop = crop_around(carriers[0].outline, view.camera.width, view.camera.height)
+    crop = crop_around([each.outline for each in carriers], view.camera.width, view.camera.height)
     loss = objective.loss(objective.active.flat)
     steps = [curvature_reach(end.curvature, RISE * loss) / 2**k for k in range(STEPS)]
     pairs = _losses_at(objective, end.vector, steps)
@@ -124,7 +124,7 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
     """Sentence that compares renders with the curvature, at the step shown and over all steps, the longest first."""
     best = shown_step(factors)
     step, factor, alone = steps[best], factors[best], end.curvature * steps[best] ** 2 / 2 / loss
-    extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])}"
+    extent = f"steps of {quantity(steps[-1])} to {quantity(steps[0])} stored units"
     ways = ("lower", "raise") if end.curvature < 0 else ("raise", "lower")
     if not factor > 0:
         kind = "negative curvature" if end.curvature < 0 else "curvature"
@@ -132,7 +132,7 @@ def rendered_sentence(end: End, loss: float, steps: Sequence[float], factors: Se
             f"The {kind} along {end.name} is not confirmed by renders: {extent} {ways[1]} the loss, back and forth together, "
             f"where by the curvature they would {ways[0]} it."
         )
-    text = f"A step of {quantity(step)} along {end.name} {ways[0]}s the loss by {abs(factor * alone):.2%}"
+    text = f"A step of {quantity(step)} stored units along {end.name} {ways[0]}s the loss by {abs(factor * alone):.2%}"
     text += f", the mean of back and forth (by its curvature alone: {abs(alone):.2%})"
     if abs(factor - 1) > AGREES:
         text += f", {quantity(factor)} times as much as the curvature has it"
@@ -176,21 +176,21 @@ def outline_of(splat: Float64[Tensor, "9"]) -> list[float]:
     return [x, y, float(long), float(short), float(np.arctan2(axis[1], axis[0]))]
 
 
-def crop_around(outline: Sequence[float], width: int, height: int) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of a crop, with the picture's aspect ratio, around the part of an outline in the picture.
+def crop_around(outlines: Sequence[Sequence[float]], width: int, height: int) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of a crop, with the picture's aspect ratio, around the parts of outlines in the picture.
 
-    >>> crop_around([10.0, 90.0, 3.0, 1.0, 0.0], 160, 120)
+    >>> crop_around([[10.0, 90.0, 3.0, 1.0, 0.0]], 160, 120)
     (0, 82, 20, 97)
     """
-    x, y, long, short, angle = outline
     turn, radius = np.meshgrid(np.linspace(0, 2 * np.pi, 181), np.linspace(0, 1, 51))
+    x, y, long, short, angle = np.array(outlines).T[:, :, None, None]
     along, across = long * radius * np.cos(turn), short * radius * np.sin(turn)
     points = np.stack(
         [x + along * np.cos(angle) - across * np.sin(angle), y + along * np.sin(angle) + across * np.cos(angle)]
     )
-    size = np.array([width, height])[:, None, None]
+    size = np.array([width, height])[:, None, None, None]
     inside = points[:, ((points >= 0) & (points <= size)).all(axis=0)]
-    ends = inside if inside.size else np.array([[x], [y]])
+    ends = inside if inside.size else np.array(outlines)[:1, :2].T
     (left, top), (right, bottom) = ends.min(axis=1), ends.max(axis=1)
     share = min(max(ROOM * max((right - left) / width, (bottom - top) / height), 1 / SMALLEST), 1.0)
     x, y = (left + right) / 2, (top + bottom) / 2
@@ -232,11 +232,11 @@ def sentence(end: End, carriers: Sequence[Carrier], spread: float, view: View, c
     """
     first = carriers[0]
     name = max(first.attributes, key=first.attributes.__getitem__)
-    kind = f"a splat of {first.aspect:.1f} : 1"
+    kind = f"a splat of {ratio(first.aspect)}"
     if first.aspect**2 > NEEDLE:
         large, middle, small = first.sigmas
         flat = large * small < middle**2  # nearer to a disc than to a rod
-        kind = f"{'a plate seen edge-on' if flat else 'a needle'}, {first.aspect:.0f} : 1 in the picture,"
+        kind = f"{'a plate seen edge-on' if flat else 'a needle'}, {ratio(first.aspect)} in the picture,"
     x, y = first.outline[0] / view.camera.width, first.outline[1] / view.camera.height
     row, column = (min(max(int(3 * each), 0), 2) for each in (y, x))
     outside = "" if 0 <= x < 1 and 0 <= y < 1 else ", its centre outside of the picture"

@@ -77,6 +77,15 @@ def percent(share: float) -> str:
     return f"{share:.1%}" if 0 < share < 0.01 or 0.99 < share < 0.9995 else f"{share:.0%}"
 
 
+def ratio(aspect: float) -> str:
+    """How many times as long as wide.
+
+    >>> ratio(20.8), ratio(3.14)
+    ('21 : 1', '3.1 : 1')
+    """
+    return f"{aspect:.{0 if aspect > 10 else 1}f} : 1"
+
+
 def limits(low: float | None, high: float | None) -> tuple[str, str]:
     """Both ends of an interval, to three significant digits or to as many as tell them apart.
 
@@ -100,6 +109,28 @@ def power_of_ten(exponent: int) -> str:
     '10⁻¹²'
     """
     return f"10{str(exponent).translate(SUPERSCRIPTS)}"
+
+
+def exponent_of(*values: np.ndarray | float) -> int:
+    """The power of ten to take out of an axis: a multiple of three, 0 for numbers that read well as they are.
+
+    >>> exponent_of(4.2e-7), exponent_of(np.array([0.0, 30.0])), exponent_of(-8.1e9)
+    (-9, 0, 9)
+    """
+    finite = np.concatenate([np.abs(np.ravel(v)) for v in values])
+    largest = np.max(finite[np.isfinite(finite)], initial=0.0)
+    if largest == 0 or 0.05 <= largest < 5000:
+        return 0
+    return 3 * math.floor(math.log10(largest) / 3)
+
+
+def unit_suffix(exponent: int) -> str:
+    """Suffix of an axis label for a power that was taken out.
+
+    >>> unit_suffix(-6), unit_suffix(0)
+    (' (×10⁻⁶)', '')
+    """
+    return f" (×{power_of_ten(exponent)})" if exponent else ""
 
 
 def _plain(value: float, digits: int = 3) -> str:

@@ -8,6 +8,7 @@ import base64
 import gzip
 import io
 import math
+import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -20,9 +21,18 @@ import plotly.io
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from analysis.records.findings import Line, attribute_name, findings, headline, is_loose, is_open, largest_steps
+from analysis.records.findings import (
+    Line,
+    attribute_name,
+    findings,
+    headline,
+    is_loose,
+    is_open,
+    largest_steps,
+    shares_per_trace,
+)
 from analysis.records.json_files import plain
-from analysis.records.quantities import limits, measured, percent, quantity
+from analysis.records.quantities import exponent_of, limits, measured, percent, quantity, ratio, unit_suffix
 from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, read_record
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map
 from analysis.records.schema import INDICES
@@ -36,9 +46,17 @@ PICTURES = {
     "surface": "The same plane as a surface.",
     "spectrum": "The density of the spectrum, broadened; the share of all directions and of all curvature below a value; the "
     "eigenvalues that the search for the ends met, each with the residual within which a true one lies.",
-    "traces": "What a random step as long as the optimiser's first changes of the loss by each attribute's curvature, which "
-    "compares; beside the names their traces, each in its own unit.",
+    "traces": "The trace of each attribute's block of the Hessian, in units of its own: the rows do not compare.",
 }
+COMPARED = (  # of the traces, where the record has these steps
+    "What a random step as long as the optimiser's first changes of the loss by each attribute's curvature, which "
+    "compares; beside the names their traces, each in its own unit."
+)
+PIXEL = "1 px along the ray: a way as long as the one that moves a splat by a pixel where it is across the ray."
+POWER = "10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]"
+WITHIN_A_NUMBER = re.compile(
+    rf"(?<=[\d)]) (?=× {POWER}|± [\d?])|(?<=[\d)] ×) (?={POWER})|(?<=\d ±) (?=[\d?])"
+)  # spaces
 
 
 def write_report(folder: str | Path, surface: str | None = None) -> Path:
@@ -76,12 +94,13 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "measured": measured,
         "attribute": attribute_name,
         "cell": _cell,
+        "setting": _setting,
         "capitalise": lambda words: words[:1].upper() + words[1:],
         "loose": is_loose,
     }
     surface, views = embedded_surface(record) if surface is None else surface, views_in(record)
     first, start = opening(record), first_view(record, views)
-    return environment.get_template("report.html.jinja").render(
+    page = environment.get_template("report.html.jinja").render(
         data=record.data,
         counts=plain(record.data.counts),
         provenance=plain(record.data.provenance),
@@ -97,7 +116,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         start=start,
         title=title(record.data),
         checks=passed(record.data),
-        pictures=pictures_in(record.folder, PICTURES, shown_numbers(record)),
+        pictures=pictures_in(record.folder, captions(record.data), shown_numbers(record)),
         where=where(record, first[-1].text),
         splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
         families=family_lines(record.data),
@@ -105,6 +124,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         surface=surface,
         plotly_js=base64.b64encode(gzip.compress(get_plotlyjs().encode(), 6, mtime=0)).decode() if surface else "",
     )
+    return WITHIN_A_NUMBER.sub("\N{NO-BREAK SPACE}", page)
 
 
 def title(data: ProbeRecord) -> str:
@@ -249,7 +269,7 @@ def where(record: Record[ProbeRecord], said: str) -> list[dict[str, str]]:
         shown.append((end.file, text, end.sentence, carriers_in_words(end)))
     fragile, named = "\n".join(found.sentences[len(found.steepest) :]), {end.view for end in found.steepest[:1]}
     panel = next((panel for panel in found.panels if panel.name in named), found.panels[0] if found.panels else None)
-    words = f"{panel.name}: maps of its fragility in position, conditioning and opacity." if panel else ""
+    words = f"{panel.name}: maps of its fragility in position, conditioning and opacity. {PIXEL}" if panel else ""
     shown.append((panel.file.replace("view", "fragility") if panel else "", fragile, words, words))
     return [
         {"text": text, "caption": caption, "words": words, "uri": picture_uri(path) if path.is_file() else ""}
@@ -261,11 +281,14 @@ def carriers_in_words(end: Steepest) -> str:
     """The caption of the picture of an end of the spectrum."""
     carriers = "; ".join(
         f"Gaussian {each.gaussian:,} has {percent(each.share)} of it: standard deviations "
-        f"{', '.join(map(quantity, each.sigmas))} world units, opacity {each.opacity:.2f}, {each.aspect:.3g} : 1 in the picture"
+        f"{', '.join(map(quantity, each.sigmas))} world units, opacity {each.opacity:.2f}, {ratio(each.aspect)} in the picture"
         for each in end.carriers
     )
     place = f"{end.name} in {end.view.rpartition('/')[2]}"
-    return f"{place}: its carriers, outlined at two standard deviations, and renders a step back and forth. {carriers}."
+    first = end.carriers[0]
+    turn = 2 * math.degrees(math.atan(end.step * math.sqrt(first.attributes.get("quats", 0.0))))
+    turned = f" The step turns Gaussian {first.gaussian:,} by {quantity(turn)}°." if turn > 0 else ""
+    return f"{place}: its carriers, outlined at two standard deviations, and renders a step back and forth. {carriers}.{turned}"
 
 
 def picture_uri(picture: Path | Image.Image, quality: int = FINE) -> str:
@@ -286,30 +309,42 @@ def interactive_surface(record: Record[ProbeRecord]) -> go.Figure | None:
         return None
     arrays = record.arrays["slice"]
     layers = [("loss", "loss", "Cividis", 1.0), ("model", "quadratic model", "Greys", 0.45)]
+    loss = np.where(np.isfinite(arrays["loss"]), arrays["loss"], np.nan) - about.center_loss
+    low, high = float(np.nanmin(loss)), float(np.nanmax(loss))
+    exponent = exponent_of(loss)
+    low, high = low / 10.0**exponent, (high if high > low else low + 1) / 10.0**exponent
     figure = go.Figure()
     for name, label, colours, opacity in layers:
         if name in arrays:
             change = np.where(np.isfinite(arrays[name]), arrays[name], np.nan) - about.center_loss
             figure.add_surface(
-                x=arrays["x"], y=arrays["y"], z=change.T, name=label, colorscale=colours, opacity=opacity,
+                x=arrays["x"], y=arrays["y"], z=change.T / 10.0**exponent, name=label, colorscale=colours, opacity=opacity,
                 showscale=name == "loss", showlegend=True, visible=True if name == "loss" else "legendonly",
-                colorbar={"exponentformat": "power", "len": 0.8},
+                cmin=low, cmax=high, colorbar={"len": 0.8},
             )  # fmt: skip
     names = [_escaped(direction.name) for direction in about.directions]
     figure.update_layout(
         scene={
             "xaxis_title": f"step along {names[0]}",
             "yaxis_title": f"step along {names[1]}",
-            "zaxis_title": "change of loss",
+            "zaxis_title": f"change of loss{unit_suffix(exponent)}",
+            "zaxis_range": [low, high],
             "aspectmode": "cube",
-            "camera": {"eye": {"x": 1.2, "y": -1.9, "z": 1.0}, "center": {"x": 0, "y": 0, "z": -0.15}},
-            **{f"{axis}axis_exponentformat": "power" for axis in "xyz"},
+            "camera": {"eye": _eye(loss), "center": {"x": 0, "y": 0, "z": -0.15}},
+            **{f"{axis}axis_exponentformat": "power" for axis in "xy"},
         },
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         height=520,
         legend={"orientation": "h"},
     )
     return figure
+
+
+def _eye(loss: np.ndarray) -> dict[str, float]:
+    """A camera beyond the lowest corner of the plane, where nothing hides the middle."""
+    corners = [(float(np.nan_to_num(loss[x, y], nan=np.inf)), x, y) for x in (0, -1) for y in (0, -1)]
+    _, x, y = min(corners)
+    return {"x": -1.5 if x == 0 else 1.5, "y": -1.5 if y == 0 else 1.5, "z": 1.6}
 
 
 def embedded_surface(record: Record[ProbeRecord]) -> str:
@@ -325,6 +360,11 @@ def embedded_surface(record: Record[ProbeRecord]) -> str:
 def _escaped(text: str) -> str:
     """plotly reads some tags in its texts; a record's text has none to be read."""
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def captions(data: ProbeRecord) -> dict[str, str]:
+    """What each picture draws."""
+    return PICTURES | ({"traces": COMPARED} if shares_per_trace(data) else {})
 
 
 def pictures_in(
@@ -353,6 +393,14 @@ def shown_numbers(record: Record[ProbeRecord]) -> dict[str, str]:
         plane = f"over the plane of {names}: from {extent}, at the centre {quantity(data.slice.center_loss)}."
         found |= {"slice2d": f"Contours of the loss {plane}", "surface": f"Surface of the loss {plane}"}
     return found
+
+
+def _setting(value: Any, name: str) -> str:
+    """A value of the settings, with its unit."""
+    if name == "max_seconds" and value in ("Infinity", math.inf):
+        return "no limit"
+    unit = {"memory": " GiB", "max_seconds": " s"}.get(name, "")
+    return _cell(value) + (unit if isinstance(value, int | float) else "")
 
 
 def _cell(value: Any) -> str:

@@ -50,7 +50,7 @@ from splat.render.sight import Sight
 from splat.scenes.view import View
 from splat.training.checkpoint import Checkpoint
 
-ENDS = {"e1": "share of e₁", "e_min": "share of e_min"}
+ENDS = {"e1": "share of e₁", "e_min": "share of eₘᵢₙ"}
 AXES = ("order_gap", "condition", "one_view")  # of fragility
 PROBE = "probe"
 

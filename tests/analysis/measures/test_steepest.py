@@ -58,24 +58,25 @@ STEPS = [0.2, 0.1, 0.05]
 
 
 MEAN = "the mean of back and forth (by its curvature alone:"
-REFUTED = "along e is not confirmed by renders: steps of 0.0500 to 0.200"
+REFUTED = "along e is not confirmed by renders: steps of 0.0500 to 0.200 stored units"
 
 
 @pytest.mark.parametrize(
     ("curvature", "factors", "said"),
     [
-        (4.0, [1.1, 1.0, 0.9], f"A step of 0.200 along e raises the loss by 4.40%, {MEAN} 4.00%)."),
+        (4.0, [1.1, 1.0, 0.9], f"A step of 0.200 stored units along e raises the loss by 4.40%, {MEAN} 4.00%)."),
         (
             4.0,
             [3.0, 0.9, 1.0],
-            f"A step of 0.100 along e raises the loss by 0.90%, {MEAN} 1.00%); over steps of 0.0500 to 0.200 by 0.900 to 3.00 "
-            "times what the curvature has.",
+            f"A step of 0.100 stored units along e raises the loss by 0.90%, {MEAN} 1.00%); "
+            "over steps of 0.0500 to 0.200 stored units by 0.900 to 3.00 times what the curvature has.",
         ),
-        (-4.0, [-1.0, 1.1, 1.0], "A step of 0.100 along e lowers the loss by 1.10%, "),
+        (-4.0, [-1.0, 1.1, 1.0], "A step of 0.100 stored units along e lowers the loss by 1.10%, "),
         (
             -4.0,
             [-1.0, 0.5, 0.6],
-            f"A step of 0.100 along e lowers the loss by 0.50%, {MEAN} 1.00%), 0.500 times as much as the curvature has it; ",
+            f"A step of 0.100 stored units along e lowers the loss by 0.50%, {MEAN} 1.00%), "
+            "0.500 times as much as the curvature has it; ",
         ),
         (
             -4.0,
@@ -124,7 +125,7 @@ def test_the_outline_is_the_splats(shown):
 
 @pytest.mark.parametrize(("x", "angle"), [(80.0, 0.4), (-90.0, 0.1), (150.0, 1.9)])
 def test_a_crop_has_all_of_an_outline_that_its_picture_has(x, angle):
-    left, top, right, bottom = crop_around([x, 60.0, 120.0, 2.0, angle], 160, 120)
+    left, top, right, bottom = crop_around([[x, 60.0, 120.0, 2.0, angle]], 160, 120)
     along = np.linspace(-1, 1, 400) * 120
     points = np.stack([x + along * np.cos(angle), 60 + along * np.sin(angle)])
     points = points[:, ((points > 1) & (points < np.array([[159], [119]]))).all(axis=0)]
@@ -135,10 +136,15 @@ def test_a_crop_has_all_of_an_outline_that_its_picture_has(x, angle):
 
 @pytest.mark.parametrize("x", [-50.0, 3.0, 80.0, 400.0])
 def test_a_crop_lies_in_its_picture(x):
-    left, top, right, bottom = crop_around([x, 60.0, 30.0, 1.0, 0.3], 160, 120)
+    left, top, right, bottom = crop_around([[x, 60.0, 30.0, 1.0, 0.3]], 160, 120)
     assert 0 <= left < right <= 160 and 0 <= top < bottom <= 120
     assert (right - left) / (bottom - top) == pytest.approx(4 / 3, rel=0.05)
 
 
 def test_an_outline_of_an_upright_splat_points_up():
     assert outline_of(torch.tensor([5.0, 6.0, 1.0, 0.0, 0.25, 0.0, 0.0, 0.0, 0.0]))[2:4] == [4.0, 2.0]
+
+
+def test_a_crop_has_the_outlines_of_all_carriers():
+    left, top, right, bottom = crop_around([[40.0, 30.0, 5.0, 2.0, 0.0], [90.0, 60.0, 5.0, 2.0, 0.0]], 160, 120)
+    assert left <= 35 and right >= 95 and top <= 28 and bottom >= 62

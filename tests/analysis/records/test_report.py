@@ -14,6 +14,7 @@ from rich.console import Console
 
 from analysis.records import report
 from analysis.records.findings import findings
+from analysis.records.quantities import exponent_of
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
 from analysis.records.report import interactive_surface, numbers, write_report
 from analysis.records.tables import family_table, probe_table
@@ -174,7 +175,7 @@ def test_every_picture_has_words_with_its_numbers(tmp_path):
     data, arrays = synthetic()
     text = page(tmp_path / "probe", data, arrays, picture="traces")
     (words,) = re.findall(r'<img src="data:[^"]*" alt="([^"]*)">', text)
-    assert words.startswith("Traces: position 3.99 × 10⁵, ")
+    assert words.startswith("Traces: position 3.99\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10⁵, ")
     assert re.findall(r"<h(\d)", text) == sorted(re.findall(r"<h(\d)", text)) and text.count("<h1") == 1
 
 
@@ -265,7 +266,13 @@ def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
     assert "<" not in title and "&lt;a href" in title
     surfaces: Any = list(figure.select_traces())
     heights = np.asarray(surfaces[0].z)  # plotly's rows run along y
-    np.testing.assert_array_equal(heights.T, arrays["slice"]["loss"] - data["slice"]["center_loss"])
+    change = arrays["slice"]["loss"] - data["slice"]["center_loss"]
+    np.testing.assert_allclose(heights.T * 10.0 ** exponent_of(change), change, rtol=1e-12)
+    layout = figure.to_dict()["layout"]["scene"]
+    assert layout["zaxis"]["range"] == [heights.min(), heights.max()]
+    eye = layout["camera"]["eye"]
+    corners = {(x, y): change[x, y] for x in (0, -1) for y in (0, -1)}
+    assert change[0 if eye["x"] < 0 else -1, 0 if eye["y"] < 0 else -1] == min(corners.values())
 
 
 def test_text_of_the_record_cannot_become_markup(tmp_path):
