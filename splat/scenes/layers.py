@@ -31,6 +31,7 @@ SIXTEEN_BITS = ("I;16", "I;16B", "I")
 # Pillow recognises a file by its content, whatever its name, and would start Ghostscript for PostScript
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 MOST_PIXELS = 2**26  # of a picture: 67 million, a quarter of a GiB as read
+MOST_ROWS = 2**16  # more than JPEG has; Pillow keeps an address for each, which may be more than the pixels
 STRIP = 256  # rows of a mask at a time: a large one would take a GB in all its copies
 # raised by Pillow for damaged files
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
@@ -41,10 +42,10 @@ def opened_image(path: Path, kind: str = "an image") -> Iterator[Image.Image]:
     """An image file, open.  InputError that says which kind was expected, where it cannot be read or is too large."""
     try:
         with Image.open(path, formats=FORMATS) as file:
-            if file.width * file.height > MOST_PIXELS:
+            if file.width * file.height > MOST_PIXELS or max(file.size) > MOST_ROWS:
                 raise InputError(
-                    f"expected {kind} of at most {MOST_PIXELS:,} pixels, got {file.width} x {file.height} px in {path}; "
-                    "reduce it"
+                    f"expected {kind} of at most {MOST_PIXELS:,} pixels and {MOST_ROWS:,} a side, got {file.width} x "
+                    f"{file.height} px in {path}; reduce it"
                 )
             yield file
     except InputError:

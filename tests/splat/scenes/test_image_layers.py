@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from landscape.errors import InputError
-from splat.scenes.layers import STRIP, dtu_number, find_layer, read_depth, read_mask
+from splat.scenes.layers import MOST_ROWS, STRIP, dtu_number, find_layer, read_depth, read_mask
 from splat.scenes.scene import load_scene
 from splat.scenes.view import View
 from tests.splat.scenes import folders
@@ -118,6 +118,12 @@ def test_a_mask_of_colours_is_inside_where_every_channel_is_white(tmp_path: Path
     (tmp_path / "m.png").write_text("no picture")
     with pytest.raises(ValueError, match=r"cannot read .*m\.png"):
         read_mask(tmp_path / "m.png")
+
+
+def test_a_picture_of_more_rows_than_any_camera_makes_is_refused(tmp_path: Path) -> None:
+    Image.new("1", (1, MOST_ROWS + 1)).save(tmp_path / "tall.png")
+    with pytest.raises(ValueError, match=f"and 65,536 a side, got 1 x {MOST_ROWS + 1} px"):
+        read_mask(tmp_path / "tall.png")
 
 
 @pytest.mark.parametrize("option", ["masks", "depths"])
