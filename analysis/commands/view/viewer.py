@@ -97,7 +97,7 @@ class Viewer:
         self.mark = server.scene.add_frame("/picked", show_axes=False, visible=False)
         self._add_cameras()
         gui = server.gui
-        self.field = gui.add_dropdown("field", (APPEARANCE,), hint="what colours the splats")
+        self.field = gui.add_dropdown("field", (APPEARANCE,), hint="What colours the splats.")
         self.scale = gui.add_multi_slider("scale, percentiles", 0.0, 100.0, 0.5, (10.0, 98.0))
         self.shown = gui.add_multi_slider("show, percentiles", 0.0, 100.0, 0.5, (0.0, 100.0))
         self.legend = gui.add_html("")

@@ -85,7 +85,7 @@ def test_two_seeds_decide_nothing_about_a_difference_of_methods():
 
 
 def test_a_study_without_numbers_decides_nothing():
-    rows = pd.DataFrame(made_up(PAPER)[["scene", "method", "seed"]])
+    rows = pd.DataFrame(made_up(PAPER)[["scene", "method", "seed", "views"]])
     assert {each.verdict for each in judgements(rows)} == {"cannot be tested here"}
 
 
@@ -187,6 +187,13 @@ def test_needles_that_dominate_one_of_two_attributes_hold_in_part():
     assert third.verdict == "holds in part" and "curvature of log scale on needles: 0.02" in third.finding
     assert judgements(rows.assign(needles_log_scales=0.8))[2].verdict == "holds"
     assert judgements(rows.assign(needles_quats=0.03))[2].verdict == "does not hold"
+
+
+def test_the_gains_of_three_views_are_not_judged_on_runs_of_others():
+    rows = made_up(PAPER)
+    ninth = judgements(rows)[8]
+    assert ninth.verdict == "holds" and ninth.finding.startswith("With 3 views 3DGS scores ")
+    assert judgements(rows.assign(views=8))[8].verdict == "cannot be tested here"
 
 
 def test_the_command_reads_a_table_and_draws(tmp_path, capsys):
