@@ -223,7 +223,7 @@ def scores(rows: pd.DataFrame) -> Judgement:
         Effect(f"{name} over 3DGS", Interval.of(gains(rows, name)), 0.0, claim, "dB") for name, claim in claims.items()
     ]
     base = Interval.of(numbers(rows, SCORE, BASE)).text(" dB")
-    finding = f"With {CLAIMED_VIEWS} views 3DGS scores {base} on held-out views. Gains: " + "; ".join(
+    finding = f"3DGS scores {base} on held-out views. Gains: " + "; ".join(
         f"{effect.name.removesuffix(' over 3DGS')} {effect.interval.text(' dB')}" for effect in effects
     )
     return Judgement(

@@ -191,8 +191,7 @@ def test_needles_that_dominate_one_of_two_attributes_hold_in_part():
 
 def test_the_gains_of_three_views_are_not_judged_on_runs_of_others():
     rows = made_up(PAPER)
-    ninth = judgements(rows)[8]
-    assert ninth.verdict == "holds" and ninth.finding.startswith("With 3 views 3DGS scores ")
+    assert judgements(rows)[8].verdict == "holds"
     assert judgements(rows.assign(views=8))[8].verdict == "cannot be tested here"
 
 
