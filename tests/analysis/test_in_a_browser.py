@@ -105,6 +105,7 @@ def test_a_click_a_field_and_a_step_reach_the_viewer(browser, viewer):
 def test_the_page_of_the_splats_needs_no_network_and_switches_colours(browser, viewer, tmp_path):
     path = tmp_path / "view.html"
     path.write_text(offline_page(viewer, "condition"), encoding="utf-8")
+    browser.get("about:blank")  # the page of a test before may still look for its server
     requests_of(browser)
     errors_in(browser)
     browser.set_network_conditions(offline=True, latency=0, throughput=0)
