@@ -98,14 +98,15 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "capitalise": lambda words: words[:1].upper() + words[1:],
         "loose": is_loose,
     }
-    surface, views = embedded_surface(record) if surface is None else surface, views_in(record)
-    first, start = opening(record), first_view(record, views)
+    surface, found = embedded_surface(record) if surface is None else surface, map_beside(record)
+    views, first = views_in(record, found), opening(record.data, found)
+    start = first_view(found, views)
     page = environment.get_template("report.html.jinja").render(
         data=record.data,
         counts=plain(record.data.counts),
         provenance=plain(record.data.provenance),
         subtitle=subtitle(record.data),
-        numbers=numbers(record.data, map_beside(record)[1]),
+        numbers=numbers(record.data, found),
         headline=first,
         findings=findings(record.data),
         views=views,
@@ -117,7 +118,7 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         title=title(record.data),
         checks=passed(record.data),
         pictures=pictures_in(record.folder, captions(record.data), shown_numbers(record)),
-        where=where(record, first[-1].text),
+        where=where(record.folder.parent / MAP, found, first[-1].text),
         splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
         families=family_lines(record.data),
         indices=INDICES,
@@ -142,16 +143,15 @@ def passed(data: ProbeRecord) -> str:
     return text + (f", {missing} could not run" if (missing := results.count(None)) else "")
 
 
-def first_view(record: Record[ProbeRecord], views: list[dict[str, Any]]) -> int:
+def first_view(found: MapRecord | None, views: list[dict[str, Any]]) -> int:
     """The place of the view that the opening names, else of the first."""
-    found = map_beside(record)[1]
     named = found.steepest[0].view if found and found.steepest else None
     return next((i for i, view in enumerate(views) if view["name"] == named), 0)
 
 
-def opening(record: Record[ProbeRecord]) -> list[Line]:
+def opening(data: ProbeRecord, found: MapRecord | None) -> list[Line]:
     """The three sentences at the top: where a map knows which Gaussian carries the steepest direction, it has the last one."""
-    lines, found = headline(record.data), map_beside(record)[1]
+    lines = headline(data)
     if found is None or not found.steepest:
         return lines
     if any(end.curvature < 0 and end.is_refuted for end in found.steepest):
@@ -220,17 +220,17 @@ def _steepest_attribute(data: ProbeRecord) -> list[dict[str, str]]:
     return [{"value": measured(trace.value, trace.standard_error), "words": words}]
 
 
-def map_beside(record: Record[ProbeRecord]) -> tuple[Path, MapRecord | None]:
-    """The folder of the map beside the record, and the map if it was made of the same step of the training."""
+def map_beside(record: Record[ProbeRecord]) -> MapRecord | None:
+    """The map beside the record, if it was made of the same step of the training."""
     folder = record.folder.parent / MAP
     if not (folder / MapRecord.FILE).is_file():
-        return folder, None
+        return None
     found = read_map(folder)
     same = plain(found.provenance).get("iteration") == plain(record.data.provenance).get("iteration")
-    return folder, found if same else None
+    return found if same else None
 
 
-def views_in(record: Record[ProbeRecord]) -> list[dict[str, Any]]:
+def views_in(record: Record[ProbeRecord], found: MapRecord | None) -> list[dict[str, Any]]:
     """Photograph and render of the training views whose pictures lie in the folder, with the maps of those that were mapped.
 
     Each has its name and its pictures: what each is in words, a data URI, and the scale of its colours where it is a map.
@@ -238,7 +238,7 @@ def views_in(record: Record[ProbeRecord]) -> list[dict[str, Any]]:
     names, folder = record.data.provenance.views or [], record.folder
     pairs = [(folder / PHOTOGRAPH.format(i), folder / RENDER.format(i)) for i in range(len(names))]
     drawn = [i for i, pair in enumerate(pairs) if all(path.is_file() for path in pair)]
-    maps, found = map_beside(record)
+    maps = record.folder.parent / MAP
     panels = {panel.place: maps / f"{panel.file}.npz" for panel in (found.panels if found else [])}
     panels = {place: path for place, path in panels.items() if path.is_file() and place in drawn}
     views = []
@@ -258,9 +258,8 @@ def views_in(record: Record[ProbeRecord]) -> list[dict[str, Any]]:
     return views
 
 
-def where(record: Record[ProbeRecord], said: str) -> list[dict[str, str]]:
-    """Of the map beside the record, by picture: the sentence above it, and the caption beneath; said: what is told already."""
-    folder, found = map_beside(record)
+def where(folder: Path, found: MapRecord | None, said: str) -> list[dict[str, str]]:
+    """Of the map in a folder, by picture: the sentence above it, and the caption beneath; said: what is told already."""
     if found is None:
         return []
     shown = []

@@ -27,7 +27,7 @@ A number that a run does not have is empty.
 """
 
 import reprlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import log, nan, sqrt
 from pathlib import Path
@@ -87,14 +87,14 @@ def _stored(path: Path) -> pd.DataFrame:
     return table
 
 
-def _runs(path: Path) -> Iterator[Path]:
+def _runs(path: Path) -> list[Path]:
     """Runs that have ended; InputError where there is none."""
     found = [run for run in _trained(path) if (run / METRICS).is_file()]
     if not found:
         raise InputError(
             f"expected a run that has ended, a folder of such or the table {FILE} of a study, got {path} with none"
         )
-    return iter(found)
+    return found
 
 
 def unended(paths: Sequence[Path]) -> list[Path]:

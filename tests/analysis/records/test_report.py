@@ -496,7 +496,7 @@ def test_the_first_view_is_that_of_the_steepest_direction(tmp_path, monkeypatch)
         view="b.png", sentence="most of e₁ in b.png", curvature=1.0, is_refuted=False, factors=[]
     )
     found = SimpleNamespace(steepest=[steepest], panels=[])
-    monkeypatch.setattr(report, "map_beside", lambda record: (tmp_path, found))
+    monkeypatch.setattr(report, "map_beside", lambda record: found)
     monkeypatch.setattr(report, "where", lambda *_: [])
     text = write_report(path.parent).read_text(encoding="utf-8")
     assert 'id="name">2 of 3: b.png<' in text and 'value="1" aria-label' in text
