@@ -38,7 +38,7 @@ from splat.raster.dispatch import Adjoint, Raster, Tangent
 from splat.raster.formulas import BLOCK_SUMS
 from splat.render.forward import rasterize_view, touches
 
-LOSS_PLANES = 16  # planes that a linearised loss keeps: target, its moments, gradient, and a blurred one
+LOSS_PLANES = 19  # planes that a linearised loss keeps: target, its moments, gradient, a blurred one, a product
 DOUBLE_BLOCK = 8 * 9 * 9  # bytes of a 9 x 9 block in double precision
 VECTORS = 8  # of a product at a time: more would not fit into the second-level cache
 

@@ -8,6 +8,13 @@ of the range of intensities), and m, p, q the window's means of r, r^2 and (y - 
                           s = 1 - w / B2       w = p - m^2, the variance of r
                                                B2 = 2 (var + q - (mu - c) m) + w + C2
 
+A uniform tangent v0 leaves s and its slopes as they are, which m', p', q' below give as the difference of numbers that are
+1 / B2 times as large: a splat that fills the picture would lose three digits in float32.  So a tangent is taken less its mean
+v0, and v0 times the product of an image of ones is added.  Of the latter's terms those that cancel are left out; d, the
+window's weight beyond the edges of the image, is what remains of them:
+
+    m' = 1 - d     B2' = 2 d (mu + m)     w' = 2 d m
+
 The window's blur is its own adjoint.  So with S_m, S_p, S_q the partial derivatives of S,
 
     gradient of sum S      blur(S_m) + 2 r blur(S_p) + (y - c) blur(S_q)
@@ -80,6 +87,24 @@ def ssim_second_dot(second, dm, dp, dq):
     """S_m', S_p', S_q': the second derivatives applied to m', p', q'."""
     mm, mp, mq, pp, pq, qq = second
     return mm * dm + mp * dp + mq * dq, mp * dm + pp * dp + pq * dq, mq * dm + pq * dp + qq * dq
+
+
+@formula
+def ssim_uniform(m, p, q, mu, var, outside):
+    """S_m', S_p', S_q' for an image of ones, with S_m' less 2 l s / B2, which blurred is the term -2 blur(S_p).
+
+    outside: the window's weight beyond the image.
+    """
+    not_l, not_s, dl, sm, sp, sq, mean, centred, r1, r2 = similarity(m, p, q, mu, var)
+    l, s, inside = 1.0 - not_l, 1.0 - not_s, 1.0 - outside
+    ddl = -((2.0 * l + 4.0 * mean * dl) * r1)
+    widened, ds = 2.0 * outside * mean * r2, 2.0 * outside * (mean * not_s - m) * r2  # B2' / B2, s'
+    dsm = 2.0 * r2 * (centred * ds - outside * s) - sm * widened
+    return (
+        inside * (ddl * s + dl * sm) + dl * ds + l * dsm,
+        inside * dl * sp - l * (ds * r2 + sp * widened),
+        inside * dl * sq - l * (2.0 * ds * r2 + sq * widened),
+    )
 
 
 @formula

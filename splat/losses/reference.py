@@ -16,7 +16,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from landscape.errors import InputError
@@ -76,6 +76,12 @@ def window(dtype: torch.dtype) -> Float[Tensor, "11"]:
     offset = torch.arange(WINDOW, dtype=torch.float64) - REACH
     weight = torch.exp(-(offset**2) / (2 * SIGMA**2))
     return (weight / weight.sum()).to(dtype)
+
+
+def beyond(length: int) -> Float64[Tensor, " length"]:
+    """The weight of the 1-D window outside of a line of so many pixels, round each of them; exactly 0 in the middle."""
+    place = torch.arange(length)[:, None] + torch.arange(WINDOW) - REACH
+    return ((place < 0) | (place >= length)).double() @ window(torch.float64)
 
 
 def blur(fields: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:

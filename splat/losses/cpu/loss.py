@@ -16,10 +16,10 @@ from splat.backend.cpu.planes import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
 from splat.losses.cpu.seconds import Coupling, second_rows
-from splat.losses.cpu.sweeps import PRODUCT_FIELDS, Loss, diagonal_rows, gradient_rows, product_rows
+from splat.losses.cpu.sweeps import PRODUCT_FIELDS, Loss, diagonal_rows, gradient_rows, product_rows, uniform_rows
 from splat.losses.cpu.window import RING, Frame, moments_rows
 from splat.losses.formulas import KINDS, SECONDS
-from splat.losses.reference import LossSettings, window
+from splat.losses.reference import LossSettings, beyond, window
 
 RINGS = 5 << 18  # bytes of rings in a sweep: with more, another vector costs more cache than it shares
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
@@ -115,7 +115,8 @@ class CpuLinearLoss:
         found = loss.planes(min(self._together, len(vectors)))
         for first in range(0, len(vectors), self._together):
             some, results = (each[first : first + self._together] for each in (vectors, products))
-            self._products(some, found.reshape(len(found), -1)[: len(some)], None, None)
+            planes = found.reshape(len(found), -1)[: len(some)]
+            self._products(some, self._means(some), self._uniform, planes, None, None)
             results[:, :3, :height] = found[: len(some), :, :height]
             results[:, :, height:] = 0
             results[:, 3] = 0
@@ -129,14 +130,33 @@ class CpuLinearLoss:
 
     def curvatures(self, tangents: Float[Tensor, "k p H W"]) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
         forms = np.empty((2, len(tangents), 3 * self.loss.frame.height))
-        self._products(tangents.numpy(), None, self.diagonal.numpy().reshape(-1), forms)
+        none = np.zeros((len(tangents), 3), self.loss.dtype)
+        self._products(tangents.numpy(), none, self._blurred, None, self.diagonal.numpy().reshape(-1), forms)
         full, pixelwise = torch.from_numpy(forms.sum(axis=2))
         return full, pixelwise
 
-    def _products(self, tangents: np.ndarray, *results: np.ndarray | None) -> None:
-        """`product_rows`.  results: products, diagonal and forms."""
+    def _products(self, tangents: np.ndarray, *arguments: np.ndarray | None) -> None:
+        """`product_rows`.  arguments: means, uniform, products, diagonal and forms."""
         V = np.ascontiguousarray(tangents, self.loss.dtype).reshape(len(tangents), -1)
-        self._sweep(product_rows, V, *results)
+        self._sweep(product_rows, V, *arguments)
+
+    def _means(self, tangents: np.ndarray) -> np.ndarray:
+        """Of each tangent's channels, (k, 3), where SSIM is to have what differs from them."""
+        if not self.loss.structural:
+            return np.zeros((len(tangents), 3), self.loss.dtype)
+        return tangents[:, :3, : self.loss.frame.height, : self.loss.frame.width].mean(axis=(2, 3))
+
+    @cached_property
+    def _uniform(self) -> np.ndarray:
+        """l'' times an image of ones, with SSIM."""
+        loss, frame = self.loss, self.loss.frame
+        if not loss.structural:
+            return self._blurred
+        columns = np.zeros(frame.stride, loss.dtype)
+        columns[: frame.width] = beyond(frame.width).numpy()
+        uniform = loss.planes(1).reshape(-1)
+        self._sweep(uniform_rows, columns, beyond(frame.height).numpy().astype(loss.dtype), uniform)
+        return uniform
 
     def _sweep(self, kernel: Callable, *arguments: np.ndarray | tuple | None) -> None:
         loss = self.loss
@@ -146,7 +166,7 @@ class CpuLinearLoss:
     @property
     def bytes(self) -> int:
         target = self.loss.target.nbytes + self.loss._target_moments.nbytes
-        return target + self.gradient.nbytes + self._blurred.nbytes
+        return target + self.gradient.nbytes + 2 * self._blurred.nbytes
 
     def workspace(self, vectors: int) -> int:
         """Bytes that `hvp` of so many tangents takes beside its result and a few rows a thread."""

@@ -48,6 +48,7 @@ from splat.losses.formulas import (
     ssim_second_dot,
     ssim_seconds,
     ssim_slopes,
+    ssim_uniform,
 )
 
 PRODUCT_FIELDS = 6  # rings of rows that a sweep of products keeps for a vector
@@ -68,10 +69,10 @@ class Loss(NamedTuple):
 
 
 @formula
-def feed(v, x, y, top, row, frame, rows, ring, field):
+def feed(v, less, x, y, top, row, frame, rows, ring, field):
     """Stage one: row `row` of v, r v and (y - c) v, blurred along itself, to three fields of the ring.
 
-    v: a flat plane set, r if None.  top: where the channel begins.
+    v: a flat plane set, taken less a number, or r if None.  top: where the channel begins.
     """
     if row < 0 or row >= frame.height:
         clear(ring, field, 3, row, frame)
@@ -83,7 +84,7 @@ def feed(v, x, y, top, row, frame, rows, ring, field):
         if v is None:
             value = residual
         else:
-            value = load(v, at + i)
+            value = load(v, at + i) - less
         put(rows, i, frame, (value, value * residual, value * (target - CENTRE)))
     blur_along(rows, 3, frame, ring, field, row)
 
@@ -206,7 +207,7 @@ def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, pixel
                 if target is None:
                     feed_pair(x, y, top, ahead, frame, rows, ring)
                 else:
-                    feed(None, x, y, top, ahead, frame, rows, ring, 0)
+                    feed(None, 0, x, y, top, ahead, frame, rows, ring, 0)
                 row = ahead - REACH
                 if first - reach <= row < last + reach:
                     if target is None:
@@ -259,16 +260,17 @@ def curve(second, ring, field, row, frame, rows, slopes):
 
 
 @formula
-def finish_product(v, x, y, at, row, field, frame, slopes, loss, blurred_sp, product):
+def finish_product(v, mean, x, y, at, row, field, frame, slopes, loss, blurred_sp, uniform, product):
     """Stage three of a vector's product."""
     for i in range(0, frame.stride, lanes(x)):
-        aim, tangent = load(y, at + i), load(v, at + i)
+        aim, tangent = load(y, at + i), load(v, at + i) - mean
         residual = load(x, at + i) - aim
         total = pixel_curvature(residual, loss.kind, loss.eps, broadcast(x, loss.pixel)) * tangent
         if loss.structural != 0:
             bm, bp, bq = blur_down_three(slopes, field, row, i, frame)
             turned = 2.0 * tangent * load(blurred_sp, at + i)
             total -= loss.structural * (ssim_adjoint(residual, aim - CENTRE, bm, bp, bq) + turned)
+            total += mean * load(uniform, at + i)
         store(product, at + i, total)
     for i in range(frame.width, frame.stride):
         product[at + i] = 0
@@ -291,8 +293,10 @@ def finish_forms(v, x, y, at, row, field, frame, ring, second, loss, blurred_sp,
 
 
 @kernel
-def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, products, diagonal, forms):
+def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, means, uniform, products, diagonal, forms):
     """Multiply every v in V (k, plane sets) by l'', the Hessian of the loss; products and forms may be None.
+
+    means: of v, (k, 3), or any other numbers; 0 for forms.  uniform: l'' times an image of ones, a plane set, with SSIM.
 
     products: l'' v, (k, plane sets); not V itself, which another range may still read.  forms: sums over each row of v . l'' v
     and of v . D v, D the diagonal of l'', (2, k, 3 height).
@@ -307,12 +311,12 @@ def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, products
         for ahead in rows_ahead:
             row = ahead - REACH
             if loss.structural != 0:
-                feed(None, x, y, top, ahead, frame, rows, own, 0)
+                feed(None, 0, x, y, top, ahead, frame, rows, own, 0)
                 inside = first - reach <= row < last + reach and 0 <= row < frame.height
                 if inside:
                     seconds_row(own, row, top, frame, loss.margin, target, second)
                 for k in range(K):
-                    feed(V[k], x, y, top, ahead, frame, rows, ring, 3 * k)
+                    feed(V[k], means[k, channel], x, y, top, ahead, frame, rows, ring, 3 * k)
                     if products is not None and inside:
                         curve(second, ring, 3 * k, row, frame, rows, slopes)
                     elif products is not None:
@@ -323,12 +327,61 @@ def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, products
             at = top + row * frame.stride
             for k in range(K):
                 if products is not None:
-                    finish_product(V[k], x, y, at, row, 3 * k, frame, slopes, loss, blurred_sp, products[k])
+                    finish_product(
+                        V[k],
+                        means[k, channel],
+                        x,
+                        y,
+                        at,
+                        row,
+                        3 * k,
+                        frame,
+                        slopes,
+                        loss,
+                        blurred_sp,
+                        uniform,
+                        products[k],
+                    )
                 if forms is not None:
                     place = channel * frame.height + row
                     forms[0, k, place], forms[1, k, place] = finish_forms(
                         V[k], x, y, at, row, 3 * k, frame, ring, second, loss, blurred_sp, diagonal, values, rows
                     )
+
+
+@kernel
+def uniform_rows(start, stop, frame, loss, x, y, target, blurred_sp, columns, lines, uniform):
+    """The Hessian of a loss with SSIM times an image of ones.
+
+    columns, lines: the weights of the window beyond the image's left and right edges, (stride,), and beyond the others.
+    """
+    rows, own, slopes = bordered_rows(x, 3, frame), ring_buffer(x, 3, frame), ring_buffer(x, 3, frame)
+    for channel in range(3):
+        top, first, _last, rows_ahead = part_of(start, stop, channel, 2 * REACH, frame)
+        for ahead in rows_ahead:
+            feed(None, 0, x, y, top, ahead, frame, rows, own, 0)
+            row = ahead - REACH
+            if counts(row, loss.margin, frame) and row >= first - REACH:
+                for i in range(0, frame.stride, lanes(x)):
+                    m, p, q, mu, var = window_at(own, row, i, top + row * frame.stride, frame, target)
+                    aside = load(columns, i)
+                    put(rows, i, frame, ssim_uniform(m, p, q, mu, var, aside + lines[row] * (1.0 - aside)))
+                leave_margin(rows, 3, loss.margin, frame)
+                blur_along(rows, 3, frame, slopes, 0, row)
+            else:
+                clear(slopes, 0, 3, row, frame)
+            row = ahead - 2 * REACH
+            if row < first:
+                continue
+            at = top + row * frame.stride
+            for i in range(0, frame.stride, lanes(x)):
+                aim = load(y, at + i)
+                residual = load(x, at + i) - aim
+                total = pixel_curvature(residual, loss.kind, loss.eps, broadcast(x, loss.pixel))
+                bm, bp, bq = blur_down_three(slopes, 0, row, i, frame)
+                store(uniform, at + i, total - loss.structural * ssim_adjoint(residual, aim - CENTRE, bm, bp, bq))
+            for i in range(frame.width, frame.stride):
+                uniform[at + i] = 0
 
 
 @kernel
@@ -341,7 +394,7 @@ def diagonal_rows(start, stop, frame, loss, x, y, target, blurred_sp, squared, d
         top, first, _last, rows_ahead = part_of(start, stop, channel, lead, frame)
         for ahead in rows_ahead:
             if loss.structural != 0:
-                feed(None, x, y, top, ahead, frame, rows, own, 0)
+                feed(None, 0, x, y, top, ahead, frame, rows, own, 0)
                 row = ahead - REACH
                 if 0 <= row < frame.height and row >= first - REACH:
                     seconds_row(own, row, top, frame, loss.margin, target, second)

@@ -26,6 +26,7 @@ SECONDS = tl.constexpr(formulas.SECONDS)
 ssim_slopes, ssim_seconds = triton_formula(formulas.ssim_slopes), triton_formula(formulas.ssim_seconds)
 ssim_adjoint, ssim_second_dot = triton_formula(formulas.ssim_adjoint), triton_formula(formulas.ssim_second_dot)
 ssim_quadratic_form = triton_formula(formulas.ssim_quadratic_form)
+ssim_uniform = triton_formula(formulas.ssim_uniform)
 ssim_diag_hessian = triton_formula(formulas.ssim_diag_hessian)
 pixel_slope, pixel_curvature = triton_formula(formulas.pixel_slope), triton_formula(formulas.pixel_curvature)
 pair_slopes, pair_adjoint = triton_formula(formulas.pair_slopes), triton_formula(formulas.pair_adjoint)
@@ -188,6 +189,19 @@ def differentiate(
     if SECOND:
         found = counted(ssim_seconds(m, p, q, mu, var), x, y, height, width, MARGIN)
         store_all(second, at, size, found, here, SECONDS)
+
+
+@jit
+def differentiate_uniform(
+    fed, target_moments, columns, lines, out, constants, height, width, MARGIN: tl.constexpr, BLOCK: tl.constexpr
+):
+    """S_m', S_p', S_q' for an image of ones; columns, lines: the window's weight beyond the edges (`losses/cpu/sweeps.py`)."""
+    at, x, y, here, size = pixels(height, width, BLOCK)
+    m, p, q = windowed_down(fed, at, y, height, width, constants, here, 3)
+    mu, var = load_all(target_moments, at, size, here, 2)
+    aside = tl.load(columns + x)
+    found = ssim_uniform(m, p, q, mu, var, aside + tl.load(lines + y) * (1.0 - aside))
+    store_all(out, at, size, counted(found, x, y, height, width, MARGIN), here, 3)
 
 
 @jit

@@ -13,7 +13,7 @@ from triton import cdiv
 from splat.backend.gpu.compile import launch
 from splat.losses.cuda import kernels
 from splat.losses.formulas import KINDS, SECONDS
-from splat.losses.reference import LossSettings, window
+from splat.losses.reference import LossSettings, beyond, window
 
 BLOCK = 256
 
@@ -148,15 +148,35 @@ class CudaLinearLoss:
         return self.total.to(like.dtype)
 
     def hvp(self, tangents: Float[Tensor, "k p h w"], out: Tensor | None = None) -> Float[Tensor, "k 4 h w"]:
+        if not self.loss.ssim:
+            return self._finish(tangents.contiguous(), self.loss.like, self._blurred, out)
+        loss, K, means = self.loss, len(tangents), tangents[:, :3].mean(dim=(2, 3), keepdim=True)
+        tangents = tangents[:, :3] - means
+        fed, bends = loss.fed(tangents, self._residual, loss.target, 3), loss.fields(K, 3)
+        loss.run(kernels.curve, fed, self._second, bends, loss.constants, vectors=K)
+        products = self._finish(tangents, bends, self._blurred, out)
+        products[:, :3].addcmul_(means, self._uniform)
+        return products
+
+    @cached_property
+    def _uniform(self) -> Float[Tensor, "3 h w"]:
+        """The product of an image of ones, with SSIM."""
+        loss, bends = self.loss, self.loss.fields(1, 3)
+        edges = (beyond(length).to(loss.constants, non_blocking=True) for length in reversed(loss.shape))
+        fed = loss.fed(self._residual[None], self._residual, loss.target, 3)
+        loss.run(kernels.differentiate_uniform, fed, loss.moments, *edges, bends, loss.constants, **loss.margin)
+        ones = torch.ones_like(self._residual)[None]
+        return self._finish(ones, bends, torch.zeros_like(self._blurred), None)[0, :3].contiguous()
+
+    def _finish(
+        self, tangents: Tensor, bends: Tensor, blurred_sp: Tensor, out: Tensor | None
+    ) -> Float[Tensor, "k 4 h w"]:
+        """The products, from S_m', S_p', S_q' of every tangent."""
         loss, K = self.loss, len(tangents)
-        tangents, blurred = tangents.contiguous(), loss.like
-        if loss.ssim:
-            fed, bends = loss.fed(tangents, self._residual, loss.target, 3), loss.fields(K, 3)
-            loss.run(kernels.curve, fed, self._second, bends, loss.constants, vectors=K)
-            blurred = loss.blurred(bends.flatten(0, 1), loss.constants)
+        blurred = loss.blurred(bends.flatten(0, 1), loss.constants) if loss.ssim else loss.like
         products = self.gradient.new_empty(K, *self.gradient.shape) if out is None else out
         loss.run(
-            kernels.finish_product, tangents, tangents.stride(0), blurred, self._residual, loss.target, self._blurred,
+            kernels.finish_product, tangents, tangents.stride(0), blurred, self._residual, loss.target, blurred_sp,
             products, products.stride(0), loss.constants, vectors=K, **loss.which,
         )  # fmt: skip
         products[:, 3] = 0
@@ -175,12 +195,13 @@ class CudaLinearLoss:
 
     @property
     def bytes(self) -> int:
-        kept = (self.gradient, self._residual, self._second, self._blurred, self.loss.target, self.loss.moments)
+        kept = self.gradient, self._residual, self._second, *2 * [self._blurred], self.loss.target, self.loss.moments
         return sum(tensor.nbytes for tensor in kept)
 
     def workspace(self, vectors: int) -> int:
-        """Bytes that `hvp` of so many tangents takes beside its result: twice nine blurred planes each."""
-        return vectors * 18 * self.gradient[0].nbytes
+        """Bytes that `hvp` of so many tangents takes beside its result: twice nine blurred planes each, and three of it less
+        its mean."""
+        return vectors * 21 * self.gradient[0].nbytes
 
     @cached_property
     def diagonal(self) -> Float[Tensor, "3 h w"]:

@@ -186,6 +186,22 @@ def test_near_a_fit_of_a_smooth_picture_ssim_keeps_its_digits_in_float32():
     assert [relative_error(single, double) < bound for single, double in zip(*found, strict=True)] == [True] * 4
 
 
+@each_size
+@pytest.mark.parametrize("border", ["padded", "valid"])
+def test_products_of_nearly_uniform_tangents_keep_their_digits_in_float32(size, border):
+    """As of a splat that fills the picture: beside its mean such a tangent has nothing that SSIM's structure would see."""
+    image, target = (each.float() for each in image_and_target(size if min(size) >= WINDOW else (WINDOW, 60)))
+    generator = torch.Generator().manual_seed(0)
+    image, target = 0.6 + 0.001 * image, 0.5 + 0.02 * target  # of low contrast
+    v = 1 + 1e-4 * torch.randn(image.shape, generator=generator)
+    found = []
+    for dtype in DTYPES:
+        loss = CpuViewLoss(target, LossSettings(ssim_weight=1.0, border=border), dtype)
+        held = loss.linearize(loss.padded(image.to(dtype)))
+        found.append(loss.cropped(held.hvp(loss.padded(v.to(dtype))[None])[0]))
+    assert relative_error(*found) < 2 * WINDOW * torch.finfo(torch.float32).eps
+
+
 @each_dtype
 @each_loss
 def test_padding_and_alpha_have_no_derivative(settings, dtype):

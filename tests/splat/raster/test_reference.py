@@ -39,7 +39,7 @@ def by_hand(
     sigmas = np.inf if settings.contour_sigma is None else settings.contour_sigma
     return composited_picture(
         splats, 1 / (1 + np.exp(-logits)), BACKGROUND.numpy(), (camera.width, camera.height),
-        near=settings.near, cap=settings.alpha_max, cut=settings.alpha_min, floor=settings.transmittance_min, sigmas=sigmas,
+        near=settings.near, cap=settings.alpha_max, cut=settings.alpha_min, floor=settings.floor, sigmas=sigmas,
     )  # fmt: skip
 
 
@@ -86,3 +86,15 @@ def test_every_threshold_shows_in_the_picture(changed):
     plain = by_reference(gaussians, camera, RenderSettings()).image
     moved = by_reference(gaussians, camera, replace(RenderSettings(), **changed)).image
     assert (plain - moved).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("backend", ["reference", "kernels"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_second_splat_at_the_cap_stops_a_pixel_in_every_precision(dtype, backend):
+    """The two would leave (1 - 0.99)^2, which is transmittance_min but for round-off."""
+    camera, gaussians = random_camera(5, 5, focal=5.0), random_gaussians(2, 0).to(dtype)
+    depths = torch.tensor([[2.0], [3.0]], dtype=dtype)
+    gaussians.means[:] = camera.centre.to(dtype) + depths * camera.rotation[2].to(dtype)
+    gaussians.log_scales[:], gaussians.opacity_logits[:] = 4.0, 20.0
+    alpha = render(gaussians, camera, torch.zeros(3, dtype=dtype), backend=backend).alpha
+    assert float((alpha - 0.99).abs().max()) < 1e-6
