@@ -27,20 +27,28 @@ from tests.hostile.programs import forked, program
 
 CHANGING = ("second", "provenance", "timing", "created", "skipped")  # in the names of what no two runs have alike
 TRAINED = 6  # steps of the run that others read
+SHOWN = 50  # trials after which the counts are printed
 COMPARED = (TABLE, COMPARISON, PAGE)
 Numbers = dict[str, str]  # what was found, in words, by its name
 
 
 def attempts(name: str, trials: Iterable[tuple[str, Callable[[], str]]]) -> list[str]:
     """Try each, which says what became of it, and print how many went which way; what went wrong, by the words of the trial."""
-    outcomes, failures = Counter[str](), list[str]()
-    for words, trial in trials:
+    outcomes, failures, start = Counter[str](), list[str](), time.monotonic()
+
+    def show() -> None:
+        done = f"{outcomes.total() + len(failures)} in {time.monotonic() - start:,.0f} s"
+        print(f"{name}: {done}: {dict(outcomes)}, {len(failures)} failures", flush=True)
+
+    for number, (words, trial) in enumerate(trials, 1):
         try:
             outcomes[trial()] += 1
         except Exception as error:  # whatever it is, it is what is looked for
             failures.append(f"{name}, {words}: {type(error).__name__} {error}")
             print(failures[-1], flush=True)
-    print(f"{name}: {dict(outcomes)}, {len(failures)} failures", flush=True)
+        if number % SHOWN == 0:
+            show()
+    show()
     return failures
 
 

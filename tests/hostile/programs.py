@@ -5,17 +5,24 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import matplotlib.figure
+import pandas
+import scipy.sparse.csgraph
+import torch.fx.experimental.symbolic_shapes  # noqa: F401
+
 import splat.raster.cpu.raster  # noqa: F401
-from analysis.commands.map import command as _map  # noqa: F401
-from analysis.commands.uses import prune as _prune  # noqa: F401
+from analysis.commands import cli
 from analysis.console import drawing, recording
 from analysis.console.interruption import ignored, raising
 from analysis.runs import compare
 
 ROOT = Path(__file__).parents[2]
+for _each in cli.COMMANDS.values():
+    import_module(_each.runs.split(":")[0])
 
 
 @contextmanager
