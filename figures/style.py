@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from analysis.records.records import ProbeRecord, read_record
+from splat.model.untrusted import replacing
 
 COLUMN = 3.3
 FIELD_MAP = "cividis"
@@ -82,13 +83,11 @@ def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
-    with style():
+    with style(), replacing(path) as partial:
         if path.suffix == ".png":  # the same bytes as savefig's, which draws twice: once for the layout alone
-            FigureCanvasAgg(figure).print_png(temporary, pil_kwargs={"compress_level": compression})
+            FigureCanvasAgg(figure).print_png(partial, pil_kwargs={"compress_level": compression})
         else:
-            figure.savefig(temporary)
-    temporary.replace(path)
+            figure.savefig(partial, format=path.suffix[1:])
     return path
 
 

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.ticker import MaxNLocator
 
+from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
 from figures import render_surface
@@ -173,4 +174,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from threading import Event, Timer, current_thread, main_thread
 from types import FrameType
 from typing import Any
@@ -20,6 +20,9 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, number: int) -> None:
         super().__init__(number)
         self.number = number
+
+    def __str__(self) -> str:
+        return f"interrupted by {signal.Signals(self.number).name}"
 
     @property
     def exit_code(self) -> int:
@@ -74,11 +77,26 @@ def _send_again(number: int) -> None:
     again.start()
 
 
-@contextmanager
-def ignored() -> Iterator[None]:
-    """Signals change nothing any more."""
-    with _handled(lambda *_: None):
-        yield
+def end_at_once() -> None:
+    """A signal ends the process from now on, in a line: while libraries are loaded there is nothing to leave in order."""
+
+    def end(number: int, _: FrameType | None) -> None:
+        with suppress(OSError):
+            os.write(2, f"landscape: {Interrupted(number)}\n".encode())
+        os._exit(Interrupted(number).exit_code)
+
+    _for_good(end)
+
+
+def ignore() -> None:
+    """Signals change nothing from now on: the work is done."""
+    _for_good(signal.SIG_IGN)
+
+
+def _for_good(handler: "Callable[[int, FrameType | None], None] | signal.Handlers") -> None:
+    for each in SIGNALS:
+        if signal.getsignal(each) is not signal.SIG_IGN:
+            signal.signal(each, handler)
 
 
 @contextmanager

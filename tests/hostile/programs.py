@@ -9,20 +9,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import matplotlib.figure
-import pandas
-import scipy.sparse.csgraph
-import torch.fx.experimental.symbolic_shapes  # noqa: F401
-
 import splat.raster.cpu.raster  # noqa: F401
 from analysis.commands import cli
 from analysis.console import drawing, recording
-from analysis.console.interruption import ignored, raising
+from analysis.console.interruption import ignore, raising
 from analysis.runs import compare
 
 ROOT = Path(__file__).parents[2]
-for _each in cli.COMMANDS.values():
-    import_module(_each.runs.split(":")[0])
+LATE = ("matplotlib.figure", "pandas", "scipy.sparse.csgraph", "torch.fx.experimental.symbolic_shapes")
+for _name in (*LATE, *(each.runs.split(":")[0] for each in cli.COMMANDS.values())):
+    import_module(_name)
 
 
 @contextmanager
@@ -48,8 +44,7 @@ class forked:
                 with raising():
                     os.write(begun, b".")
                     code = run()
-                    with ignored():
-                        os._exit(code)
+                    ignore()
             finally:
                 os._exit(code)
         os.close(begun)

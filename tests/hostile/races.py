@@ -32,7 +32,9 @@ def race(command: Ended, chance: random.Random, files: Path) -> str:
     said = [files / "first", files / "second"]
     words = command.words()
     first = forked(lambda: main(words), said[0])
-    time.sleep(chance.choice((0, 0.01, 0.1, chance.random() * command.seconds, chance.uniform(0.9, 1.1) * command.seconds)))
+    time.sleep(
+        chance.choice((0, 0.01, 0.1, chance.random() * command.seconds, chance.uniform(0.9, 1.1) * command.seconds))
+    )
     second = forked(lambda: main(words), said[1])
     both, codes = [first, second], dict[int, int]()
     while len(codes) < 2:
