@@ -11,6 +11,7 @@ from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 DEAF = "_raw_object_cache"  # how the functions of llvmlite begin that LLVM calls, and which must not fail
+IMPORTING = "<frozen importlib._bootstrap>"  # the file of Python's own code that loads modules
 AGAIN = 0.05  # seconds until a signal that came where nothing can be raised is sent again
 
 
@@ -40,14 +41,14 @@ class Interruption(Event):
 def raising() -> Iterator[None]:
     """Signals raise `Interrupted` wherever the main thread is, so that what it has begun is cleaned up.
 
-    Where Python drops what is raised, in finalizers and what C calls, the signal is sent again until it is heard.  An error
-    after it stands for it: a library that is interrupted as it is loaded says that it cannot be.
+    Where Python drops what is raised, in finalizers and what C calls, and while a library is loaded, whose C may end the
+    process for it, the signal is sent again until it is heard.  An error after it stands for it.
     """
     raised: list[Interrupted] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         while frame is not None:
-            if frame.f_code.co_name.startswith(DEAF):
+            if frame.f_code.co_name.startswith(DEAF) or frame.f_code.co_filename == IMPORTING:
                 return _send_again(number)
             frame = frame.f_back
         raised.append(Interrupted(number))

@@ -14,11 +14,14 @@ from typing import Any, ClassVar
 
 import torch
 
-from analysis.commands.cli import main
+from analysis.commands import cli
+from analysis.commands.uses.next_view import RECORD as NEXT
 from analysis.commands.uses.prune import RECORD
+from analysis.commands.uses.uncertainty import RECORD as UNCERTAINTY
 from analysis.records.records import ProbeRecord, SliceRecord, read_record
 from analysis.records.run_files import COMPARISON, MapRecord
 from analysis.runs.compare import PAGE, TABLE
+from figures import paper
 from splat.model.files.read import read_splats
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
@@ -28,7 +31,6 @@ from tests.hostile.programs import forked, program
 CHANGING = ("second", "provenance", "timing", "created", "skipped")  # in the names of what no two runs have alike
 TRAINED = 6  # steps of the run that others read
 SHOWN = 50  # trials after which the counts are printed
-COMPARED = (TABLE, COMPARISON, PAGE)
 Numbers = dict[str, str]  # what was found, in words, by its name
 
 
@@ -56,6 +58,7 @@ class Ended:
     """A command on a tiny scene in `root`, and what it comes to when nobody ends it."""
 
     name: ClassVar[str]
+    module = cli  # whose `main` it is
     apart = 0.2  # share of the rounds that run a program of its own
     goes_on = False  # from files in `out`, which are replaced one by one
 
@@ -74,7 +77,7 @@ class Ended:
         settings = SyntheticSettings(gaussians=60, views=5, width=24, height=18)
         assert forked(lambda: write_transforms_scene(synthetic_scene(settings).scene, self.scene) or 0).wait() == 0
         train = ["train", str(self.scene), "--out", str(self.checkpoint.parent), "--iterations", str(TRAINED)]
-        assert forked(lambda: main(train)).wait() == 0
+        assert forked(lambda: cli.main(train)).wait() == 0
 
     def words(self) -> list[str]:
         raise NotImplementedError
@@ -88,7 +91,7 @@ class Ended:
             raise AssertionError(f"the same command again ends with {code}")
 
     def begun(self) -> "forked":
-        return forked(lambda: main(self.words()))
+        return forked(lambda: self.module.main(self.words()))
 
     def clean(self) -> None:
         shutil.rmtree(self.out.parent)
@@ -103,7 +106,7 @@ class Ended:
         """End the command once and go on; what became of it."""
         self.prepare(chance)
         before, apart = self.out.exists(), chance.random() < self.apart
-        process = program(self.words()) if apart else self.begun()
+        process = program(self.words(), self.module.__name__) if apart else self.begun()
         time.sleep(chance.random() * (self.seconds + 3 * apart))
         process.send(number)
         code = process.wait()
@@ -186,8 +189,8 @@ class Map(Ended):
         return ["map", str(self.checkpoint), "--out", str(self.out)]
 
     def numbers(self) -> Numbers:
-        found = {name: digest((self.out / name).read_bytes()) for name in ("fields.ply", "largest.ply", "top.csv")}
-        return found | leaves(json.loads((self.out / MapRecord.FILE).read_text()))
+        told = leaves(json.loads((self.out / MapRecord.FILE).read_text()))
+        return told | bytes_of(self.out, "fields.ply", "largest.ply", "top.csv")
 
 
 class Convert(Ended):
@@ -253,16 +256,64 @@ class Prune(Ended):
 
     def numbers(self) -> Numbers:
         json.loads((self.out / RECORD).read_text())
-        tables = {
-            name: digest((self.out / name).read_bytes()) for name in ("scores.csv", "correlations.csv", "pruned.ply")
-        }
-        return tables | trained(self.out)
+        return bytes_of(self.out, "scores.csv", "correlations.csv", "pruned.ply") | trained(self.out)
 
 
-class Compare(Ended):
-    """Replaces each file whole, not the folder."""
+class NextView(Ended):
+    name = "next-view"
 
-    name = "compare"
+    def words(self) -> list[str]:
+        return ["next-view", str(self.checkpoint), "--out", str(self.out)]
+
+    def numbers(self) -> Numbers:
+        return leaves(json.loads((self.out / NEXT).read_text())) | bytes_of(self.out, "gains.csv")
+
+
+class Uncertainty(Ended):
+    name = "uncertainty"
+
+    def words(self) -> list[str]:
+        return ["uncertainty", str(self.checkpoint), "--out", str(self.out)]
+
+    def numbers(self) -> Numbers:
+        told = leaves(json.loads((self.out / UNCERTAINTY).read_text()))
+        return told | bytes_of(self.out, "agreement.csv", "view-000.npz")
+
+
+class Files(Ended):
+    """Replaces each file whole, not the folder.  files: some of them, which have the same bytes each time."""
+
+    files: tuple[str, ...]
+
+    def numbers(self) -> Numbers:
+        found = bytes_of(self.out, *(name for name in self.files if (self.out / name).exists()))
+        assert all(
+            (self.out / name).read_text().rstrip().endswith("</html>") for name in found if name.endswith("html")
+        )
+        return found
+
+    def check(self) -> None:
+        found = self.numbers()
+        changed = [name for name in found if found[name] != self.expected[name]]
+        assert not changed, f"other content of {changed} as it was left"
+
+
+class NextStudy(Files):
+    """Goes on from the cells that there are."""
+
+    name, files = "next-view-study", ("study.csv", "cells/tiny-d-0.json", "cells/tiny-random-0.json")
+
+    def words(self) -> list[str]:
+        file = self.scene.with_name("study.toml")
+        file.write_text(
+            'out = "work/out"\nrules = ["d", "random"]\nseeds = [0]\nrounds = 1\nfirst_steps = 4\nsteps = 2\n'
+            f'[scenes.tiny]\npath = "{self.scene}"\n'
+        )
+        return ["next-view", str(file)]
+
+
+class Compare(Files):
+    name, files = "compare", (TABLE, COMPARISON, PAGE)
 
     def __init__(self, root: Path) -> None:
         self.runs = [root / "run", root / "other"]
@@ -271,29 +322,70 @@ class Compare(Ended):
     def made_before(self) -> None:
         super().made_before()
         train = ["train", str(self.scene), "--out", str(self.runs[1]), "--iterations", str(TRAINED), "--seed", "1"]
-        assert forked(lambda: main(train)).wait() == 0
+        assert forked(lambda: cli.main(train)).wait() == 0
         for run in self.runs:
             probe = ["probe", str(run), "--quick", "--slice-points", "5", "--out", str(run / "probe")]
-            assert forked(lambda words=probe: main(words)).wait() == 0
+            assert forked(lambda words=probe: cli.main(words)).wait() == 0
 
     def words(self) -> list[str]:
         return ["compare", *map(str, self.runs), "--out", str(self.out)]
 
-    def numbers(self) -> Numbers:
-        whole = {name: (self.out / name).read_bytes() for name in COMPARED if (self.out / name).exists()}
-        if PAGE in whole:
-            assert whole.pop(PAGE).rstrip().endswith(b"</html>"), "a page that was cut"
-        return {name: digest(content) for name, content in whole.items()}
 
-    def check(self) -> None:
-        found = self.numbers()
-        changed = [name for name in found if found[name] != self.expected[name]]
-        assert not changed, f"other content of {changed} as it was left"
+class Trajectory(Files):
+    name, files = "trajectory", ("trajectories.csv",)
+
+    def made_before(self) -> None:
+        super().made_before()
+        out, steps = ["--out", str(self.checkpoint.parent)], ["--iterations", "4", "--probe-every", "2"]
+        shutil.rmtree(self.checkpoint.parent)
+        train = ["train", str(self.scene), *out, *steps, "--probe-share", "inf"]
+        assert forked(lambda: cli.main(train)).wait() == 0
+
+    def words(self) -> list[str]:
+        return ["trajectory", str(self.checkpoint.parent), "--out", str(self.out)]
 
 
-COMMANDS: dict[str, type[Ended]] = {
-    each.name: each for each in (Train, Probe, Slice, Map, Convert, Sweep, Prune, Compare)
-}
+class Claims(Files):
+    name, files = "claims", ("study.csv", "claims.csv", "predictors.csv", "claims.json")
+
+    def words(self) -> list[str]:
+        return ["claims", str(paper.RESULTS / "study.csv"), "--out", str(self.out)]
+
+
+class Paper(Files):
+    """`python -m figures.paper`; its PDFs hold the time."""
+
+    name, module, files = (
+        "figures.paper",
+        paper,
+        ("claims.png", "predictors.png", "budget.png", "axes.png", "captions.md"),
+    )
+
+    def words(self) -> list[str]:
+        return ["--out", str(self.out)]
+
+
+KINDS = (
+    Train,
+    Probe,
+    Slice,
+    Map,
+    Convert,
+    Sweep,
+    Prune,
+    NextView,
+    NextStudy,
+    Uncertainty,
+    Compare,
+    Trajectory,
+    Claims,
+    Paper,
+)
+COMMANDS: dict[str, type[Ended]] = {each.name: each for each in KINDS}
+
+
+def bytes_of(folder: Path, *names: str) -> Numbers:
+    return {name: digest((folder / name).read_bytes()) for name in names}
 
 
 def digest(content: bytes) -> str:

@@ -7,13 +7,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import splat.raster.cpu.raster  # noqa: F401
 from analysis.commands import cli
-from analysis.console import drawing, recording
+from analysis.console import drawing
 from analysis.console.interruption import ignore, raising
-from analysis.runs import compare
 
 ROOT = Path(__file__).parents[2]
 LATE = ("matplotlib.figure", "pandas", "scipy.sparse.csgraph", "torch.fx.experimental.symbolic_shapes")
@@ -22,8 +20,8 @@ for _name in (*LATE, *(each.runs.split(":")[0] for each in cli.COMMANDS.values()
 
 
 @contextmanager
-def nothing_drawn(*_: Any) -> Iterator[Callable[[Path], list[str]]]:
-    yield lambda _: []
+def nothing_begun(_: list[str]) -> Iterator[None]:
+    yield
 
 
 class forked:
@@ -34,8 +32,7 @@ class forked:
         ready, begun = os.pipe()
         self.process = os.fork()
         if self.process == 0:
-            drawing.drawing = nothing_drawn
-            recording.draw = compare.draw = lambda *_: []
+            drawing._group, drawing._said = nothing_begun, lambda *_: []
             quiet = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(quiet, 1)
             os.dup2(quiet, 2)
@@ -64,10 +61,10 @@ class forked:
 
 
 class program:
-    """The command as a program of its own."""
+    """The command as a program of its own; module: whose."""
 
-    def __init__(self, words: list[str]) -> None:
-        command = [sys.executable, "-m", "analysis.commands.cli", *words]
+    def __init__(self, words: list[str], module: str = cli.__name__) -> None:
+        command = [sys.executable, "-m", module, *words]
         self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def send(self, number: int) -> None:
