@@ -14,7 +14,8 @@ import time
 from functools import partial
 from pathlib import Path
 
-from tests.hostile.ended import COMMANDS, Ended, attempts
+from tests.hostile.commands import COMMANDS
+from tests.hostile.ended import Ended, attempts
 from tests.hostile.programs import forked
 
 BAD_INPUT = 2
