@@ -42,40 +42,47 @@ def raising() -> Iterator[None]:
     """Signals raise `Interrupted` wherever the main thread is, so that what it has begun is cleaned up.
 
     Where Python drops what is raised, in finalizers and what C calls, and while a library is loaded, whose C may end the
-    process for it, the signal is sent again until it is heard.  An error after it stands for it.
+    process for it, the signal is sent again until it is heard, or the block ends.  An error after it stands for it.
     """
-    raised: list[Interrupted] = []
+    raised, waiting = list[Interrupted](), list[tuple[Timer, int]]()
+
+    def send_again(number: int) -> None:
+        timer = Timer(AGAIN, os.kill, (os.getpid(), number))
+        waiting.append((timer, number))
+        timer.daemon = True
+        timer.start()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         while frame is not None:
             if frame.f_code.co_name.startswith(DEAF) or frame.f_code.co_filename == IMPORTING:
-                return _send_again(number)
+                return send_again(number)
             frame = frame.f_back
         raised.append(Interrupted(number))
         raise raised[-1]
 
     def dropped(found: Any) -> None:
         if isinstance(found.exc_value, Interrupted):
-            _send_again(found.exc_value.number)
+            send_again(found.exc_value.number)
         else:
             before(found)
 
     before, sys.unraisablehook = sys.unraisablehook, dropped
     try:
         with _handled(interrupt):
-            yield
+            try:
+                yield
+            finally:
+                late = [number for timer, number in waiting if timer.is_alive()]
+                for timer, _ in waiting:
+                    timer.cancel()
+            if late:
+                raise Interrupted(late[-1])
     except Exception as error:
         if raised:
             raise raised[-1] from error
         raise
     finally:
         sys.unraisablehook = before
-
-
-def _send_again(number: int) -> None:
-    again = Timer(AGAIN, os.kill, (os.getpid(), number))
-    again.daemon = True
-    again.start()
 
 
 def end_at_once() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from analysis.console.failures import program
-from analysis.console.interruption import SIGNALS, Interrupted, raising
+from analysis.console.interruption import AGAIN, SIGNALS, Interrupted, raising
 
 ROOT = Path(__file__).parents[3]
 
@@ -58,6 +58,16 @@ def test_a_signal_while_a_library_is_loaded_is_heard_once_it_is(tmp_path, monkey
     with pytest.raises(Interrupted) as raised, raising():
         waits_after(lambda: import_module("interrupted"))
     assert sys.modules.pop("interrupted").loaded and raised.value.exit_code == 143
+
+
+def test_a_signal_while_the_last_library_is_loaded_is_heard_at_the_end(tmp_path, monkeypatch):
+    (tmp_path / "interrupted.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(Interrupted) as raised, raising():
+        import_module("interrupted")
+    del sys.modules["interrupted"]
+    time.sleep(4 * AGAIN)  # in which none comes any more
+    assert raised.value.exit_code == 143
 
 
 @pytest.mark.parametrize("began", ["landscape", "-m"])
