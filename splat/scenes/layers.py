@@ -8,6 +8,8 @@ A file is found by the photograph's name, with its suffix replaced or followed b
 scene (`train/r_3` in `train/r_3.npy` or `r_3.npy`); the masks of DTU by the number of the view.
 """
 
+import io
+import os
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -37,11 +39,26 @@ STRIP = 256  # rows of a mask at a time: a large one would take a GB in all its 
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
 
 
+class _File(io.BufferedReader):
+    """A file, of which no more bytes are asked for than there are: a chunk of a PNG may announce 2 GiB."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self.size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1) -> bytes:
+        left = max(self.size - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+    def __repr__(self) -> str:  # in Pillow's messages
+        return repr(self.name)
+
+
 @contextmanager
 def opened_image(path: Path, kind: str = "an image") -> Iterator[Image.Image]:
     """An image file, open.  InputError that says which kind was expected, where it cannot be read or is too large."""
     try:
-        with Image.open(path, formats=FORMATS) as file:
+        with _File(path) as content, Image.open(content, formats=FORMATS) as file:
             if file.width * file.height > MOST_PIXELS or max(file.size) > MOST_ROWS:
                 raise InputError(
                     f"expected {kind} of at most {MOST_PIXELS:,} pixels and {MOST_ROWS:,} a side, got {file.width} x "

@@ -45,10 +45,14 @@ class Format:
         name = chance.choice(list(self.files))
         self.chance, self.changed, self.by_bytes = chance, name, False
         try:
-            (self.root / name).write_bytes(self.mutated(chance, name, self.files[name]))
+            self._put(name, self.mutated(chance, name, self.files[name]))
             self.use()
         finally:
-            (self.root / name).write_bytes(self.files[name])
+            self._put(name, self.files[name])
+
+    def _put(self, name: str, content: bytes) -> None:
+        (self.root / name).unlink()  # some file systems wait for the disk when a file is written over
+        (self.root / name).write_bytes(content)
 
     def mutated(self, chance: Random, name: str, content: bytes) -> bytes:
         if Path(name).suffix in (".txt", ".csv", ".toml", ".json") and chance.random() < 0.6:

@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.special import stdtrit
 
 from analysis.records.quantities import quantity
 
@@ -51,7 +51,7 @@ class Interval:
         n = len(known)
         if n < 2:
             return cls(float(known.mean()) if n else np.nan, -np.inf, np.inf, n)
-        half = float(stats.t.ppf((1 + CONFIDENCE) / 2, n - 1) * known.std(ddof=1) / np.sqrt(n))
+        half = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * known.std(ddof=1) / np.sqrt(n))
         return cls(float(known.mean()), float(known.mean()) - half, float(known.mean()) + half, n)
 
     def exp(self) -> "Interval":
@@ -107,9 +107,14 @@ def numbers(rows: pd.DataFrame, name: str, method: str | None = None, keys: Sequ
     """A quantity by keys: of every run, or the means of one method's runs with the same keys; empty where no run has it."""
     part = rows if method is None else rows[rows["method"] == method]
     values = np.asarray(part[name], float) if name in part else np.full(len(part), np.nan)
-    found = pd.Series(values, pd.MultiIndex.from_frame(pd.DataFrame(part[list(keys)])))
-    found = pd.Series(found[np.isfinite(values)])
-    return found if method is None else pd.Series(found.groupby(level=list(keys)).mean())
+    known = np.isfinite(values)
+    found = pd.Series(values[known], pd.MultiIndex.from_arrays([part[key][known] for key in keys]))
+    return found if method is None else _means(found, keys)
+
+
+def _means(values: pd.Series, keys: Sequence[str]) -> pd.Series:
+    """Of those with the same keys."""
+    return values if values.index.is_unique else pd.Series(values.groupby(level=list(keys)).mean())
 
 
 def gains(rows: pd.DataFrame, method: str) -> pd.Series:
@@ -121,7 +126,7 @@ def log_ratios(rows: pd.DataFrame, name: str, method: str = STABLE) -> pd.Series
     """ln |quantity / that of 3DGS| by scene and seed; times are compared only within the same surroundings."""
     keys = [*PAIR, *(key for key in SURROUNDINGS if key in rows and name.endswith("_seconds"))]
     found = (numbers(rows, name, method, keys) / numbers(rows, name, BASE, keys)).dropna().abs()
-    return pd.Series(pd.Series(np.log(found[found > 0])).groupby(level=list(PAIR)).mean())
+    return _means(pd.Series(np.log(found[found > 0])).droplevel(keys[len(PAIR) :]), PAIR)
 
 
 def ratio_effect(name: str, logarithms: pd.Series, claimed: float | None) -> Effect:

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Literal
 
 import pycolmap
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
 from landscape.errors import InputError
 from splat.scenes.images import IMAGE_SUFFIXES, image_files, image_header, image_pixels
-from splat.scenes.layers import FORMATS
+from splat.scenes.layers import opened_image
 from splat.scenes.scene import load_scene
 from splat.scenes.sfm.triangulation import SEED, matching, quiet, verification
 from splat.scenes.write import finished_folder
@@ -135,7 +135,7 @@ def _by_camera(files: Sequence[Path]) -> list[list[int]]:
     """The indices of photographs that may share a camera, in groups."""
     groups: dict[tuple, list[int]] = {}
     for i, path in enumerate(files):
-        with Image.open(path, formats=FORMATS) as file:
+        with opened_image(path) as file:
             exif = file.getexif()
             focal = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
             key = file.size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), focal

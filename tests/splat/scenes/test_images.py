@@ -2,6 +2,7 @@
 
 import shutil
 import struct
+import tracemalloc
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch
 from PIL import Image
 
 from splat.model.camera import Camera
-from splat.scenes.images import resize_by_area
+from splat.scenes.images import image_pixels, resize_by_area
 from splat.scenes.scene import load_scene
 from tests.oracles import distorted_picture, opencv_distortion
 from tests.splat.scenes import folders
@@ -310,6 +311,20 @@ def test_grey_and_palette_pictures_become_colour(tmp_path: Path, mode: str) -> N
     image.save(tmp_path / "images/a.png")
     wanted = np.array(image.convert("RGB")) / 255
     np.testing.assert_allclose(load_scene(tmp_path).load()[0].image.permute(1, 2, 0).numpy(), wanted, atol=1e-7)
+
+
+def test_a_chunk_takes_no_more_memory_than_the_file_has_bytes(tmp_path: Path) -> None:
+    folders.write_transforms(tmp_path)
+    path = tmp_path / "images/a.png"
+    content = bytearray(path.read_bytes())
+    content[content.index(b"IDAT") - 4] = 0x40  # a length of 1 GiB
+    path.write_bytes(content)
+    tracemalloc.start()
+    try:
+        image_pixels(path)
+        assert tracemalloc.get_traced_memory()[1] < 2**24
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_picture_cut_short_is_refused_when_it_is_read(tmp_path: Path) -> None:
