@@ -12,7 +12,7 @@ from typing import Any
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 DEAF = "_raw_object_cache"  # how the functions of llvmlite begin that LLVM calls, and which must not fail
 IMPORTING = "<frozen importlib._bootstrap>"  # the file of Python's own code that loads modules
-AGAIN = 0.05  # seconds until a signal that came where nothing can be raised is sent again
+AGAIN = 0.01  # seconds until a signal that came where nothing can be raised is sent again
 
 
 class Interrupted(KeyboardInterrupt):
