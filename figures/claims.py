@@ -5,6 +5,7 @@ OUT/predictors.png from OUT/predictors.csv, as `landscape claims` wrote them.
 """
 
 import textwrap
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from analysis.console.failures import program
 from analysis.records.findings import attribute_name
 from figures.style import BLUE, UNDETERMINED, VERMILION, folder_script, new_figure, save, style
 
@@ -130,4 +132,4 @@ def draw(folder: Path, suffix: str) -> list[Path]:
 
 
 if __name__ == "__main__":
-    folder_script(draw, "the effects behind the verdicts", "claims")
+    program(partial(folder_script, draw, "the effects behind the verdicts", "claims"))

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.ticker import MaxNLocator
 
+from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
 from analysis.records.report import eye_over
@@ -194,4 +195,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

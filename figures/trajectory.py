@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from analysis.console.failures import program
 from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.quantities import exponent_of, power_of_ten, unit_suffix
 from analysis.records.run_files import ENDS, read_trajectory
@@ -185,4 +186,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)
