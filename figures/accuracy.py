@@ -13,6 +13,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from analysis.console.failures import program
 from figures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, literal, new_figure, save, style
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, "0.45", BLACK)
@@ -91,4 +92,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from analysis.console.failures import program
 from figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, new_figure, save, style
 
 LABELS = {"gaussians": "Gaussians", "pixels": "pixels", "views": "views", "threads": "threads"}
@@ -88,4 +89,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

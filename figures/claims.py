@@ -5,6 +5,7 @@ OUT/predictors.png from OUT/predictors.csv, as `landscape claims` wrote them.
 """
 
 import textwrap
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from analysis.console.failures import program
 from analysis.records.findings import attribute_name
 from figures.style import BLUE, UNDETERMINED, VERMILION, folder_script, new_figure, save, style
 
 UNITS = {"×": "ratio (×)", "dB": "PSNR gained (dB)", "": "share or correlation"}
 KINDS = {"all": "all runs", "between": "means of methods", "within": "seeds of a method"}
 VERDICTS = {"holds": BLUE, "holds in part": BLUE, "does not hold": VERMILION, "cannot be tested here": UNDETERMINED}
-ROW, PANEL, WRAP = 0.17, 0.8, 76  # inches; characters
+ROW, PANEL, WRAP = 0.17, 1.05, 76  # inches; characters
 SMALL = 150  # dots per inch of a statement's own picture
 CROWDED = 1e3  # from the least ratio to the largest: powers of ten alone are labelled
 FAR = 1e4  # a ratio beyond this, or below its inverse, ends at the edge
@@ -130,4 +132,4 @@ def draw(folder: Path, suffix: str) -> list[Path]:
 
 
 if __name__ == "__main__":
-    folder_script(draw, "the effects behind the verdicts", "claims")
+    program(partial(folder_script, draw, "the effects behind the verdicts", "claims"))

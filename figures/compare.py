@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from analysis.console.failures import program
 from analysis.records.findings import attribute_name
 from analysis.records.quantities import exponent_of, unit_suffix
 from analysis.records.records import ProbeRecord, Record, read_record
@@ -255,4 +256,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

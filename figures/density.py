@@ -6,6 +6,7 @@ sigma = BROADENING of the range; a peak narrower than sigma is not resolved.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from analysis.console.failures import program
 from analysis.records.quantities import exponent_of, power_of_ten, quantity, unit_suffix
 from analysis.records.records import ProbeRecord, Record
 from figures.style import BLUE, VERMILION, new_figure, script, style
@@ -105,4 +107,4 @@ class _OfRecord:
 
 
 if __name__ == "__main__":
-    script(draw, "density", ProbeRecord)
+    program(partial(script, draw, "density", ProbeRecord))

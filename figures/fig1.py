@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
 
+from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.run_files import METRICS, read_scores
 from figures.fig7 import command_line, names_of, read_all
@@ -114,4 +115,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

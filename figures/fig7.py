@@ -17,6 +17,7 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
+from analysis.console.failures import program
 from analysis.records.run_files import RECORDS, read_trajectory
 from figures.manifold import Scale, landscape_of, require_same_function, section, start_of, surface
 from figures.style import BLUE, RUNS, literal, new_figure, save, style
@@ -123,4 +124,4 @@ def command_line(figure, name: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

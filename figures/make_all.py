@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from analysis.console.failures import program
 from analysis.records.records import ProbeRecord, Record, read_record
 from figures import slice1d, slice2d, spectrum, surface, traces
 from figures.style import folder_script, save
@@ -60,4 +61,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

@@ -24,6 +24,7 @@ from matplotlib.patches import Ellipse, Patch, Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.transforms import Affine2D, Bbox, TransformedBbox
 
+from analysis.console.failures import program
 from analysis.records.quantities import BYTES, Shade, percent, quantity
 from analysis.records.run_files import Carrier, MapRecord, Panel, Steepest, Swaps, read_map
 from figures.style import BLACK, BLUE, GREEN, VERMILION, folder_script, literal, save, style
@@ -268,4 +269,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

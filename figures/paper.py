@@ -23,12 +23,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from analysis.console.failures import program
 from analysis.records.run_files import read_trajectory
 from analysis.runs.claims.effects import BASE, LEAST, SCORE, STABLE, Interval, gains, log_ratios, numbers
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, effect_table, judgements
 from figures.claims import draw_claims, draw_predictors, words_of
 from figures.style import BLUE, RUNS, UNDETERMINED, VERMILION, literal, new_figure, save, style
+from splat.model.untrusted import replacing
 
 RESULTS = Path(__file__).parents[1] / "notebooks" / "results"
 LETTER, ROW = 4.4, 8.5  # points: as wide as a letter of a name on the average, and as high
@@ -71,7 +73,8 @@ def make(results: Path, out: Path) -> Iterator[Path]:
     for name, figure in drawn.items():
         for suffix in ("png", "pdf"):
             yield save(figure, out / f"{name}.{suffix}")
-    (out / "captions.md").write_text(captions(rows, list(drawn)), encoding="utf-8")
+    with replacing(out / "captions.md") as partial:
+        partial.write_text(captions(rows, list(drawn)), encoding="utf-8")
     yield out / "captions.md"
 
 
@@ -291,4 +294,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program(main)

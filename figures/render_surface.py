@@ -2,35 +2,39 @@
 
 A program of its own: where a machine has no usable OpenGL, VTK may end the process that renders.  FIELD.npz holds
 `height` [nx, ny] in [0, 1], nan where there is none, `dots` [nx, ny], the points to mark, `colour` [256, 3] as bytes, and
-`levels`, the heights of the contour lines.  The scene is the box of `Box`, seen from `Box.EYE` in parallel projection.
+`levels`, the heights of the contour lines.  The scene is a `Box`, seen from `eye` in parallel projection.
 """
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 
+@dataclass(frozen=True, eq=False)
 class Box:
     """x, y in [-1, 1], z in [0, TOP], and the camera, whose image is EXTENT wide and high."""
 
+    eye: np.ndarray
+
     TOP = 1.0
-    EYE = np.array([1.0, -1.55, 1.35])
     TARGET = np.array([0.0, 0.0, 0.4])
     EXTENT = 3.2
     PIXELS = 900
 
-    @classmethod
-    def project(cls, points: np.ndarray) -> np.ndarray:
+    def project(self, points: np.ndarray) -> np.ndarray:
         """Points [..., 3] of the scene to [..., 2] of the image, (0, 0) its lower left corner, (1, 1) the opposite."""
-        forward = -cls.EYE / np.linalg.norm(cls.EYE)
+        forward = -self.eye / np.linalg.norm(self.eye)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         up = np.cross(right, forward)
-        return 0.5 + (np.asarray(points) - cls.TARGET) @ np.stack([right, up], axis=1) / cls.EXTENT
+        return 0.5 + (np.asarray(points) - self.TARGET) @ np.stack([right, up], axis=1) / self.EXTENT
 
 
-def render(height: np.ndarray, dots: np.ndarray, colour: np.ndarray, levels: np.ndarray, out: Path) -> None:
+def render(
+    height: np.ndarray, dots: np.ndarray, colour: np.ndarray, levels: np.ndarray, eye: np.ndarray, out: Path
+) -> None:
     """Write the picture of the surface with its contour lines, and the lines once more on the floor, on white."""
     import pyvista as pv
     from matplotlib.colors import ListedColormap
@@ -57,7 +61,7 @@ def render(height: np.ndarray, dots: np.ndarray, colour: np.ndarray, levels: np.
         places = np.stack([x[marked], y[marked], height[marked] * Box.TOP + 0.006], axis=1)
         plotter.add_mesh(pv.PolyData(places), color="black", point_size=8, render_points_as_spheres=True)
     plotter.camera.parallel_projection = True
-    plotter.camera.position = tuple(Box.TARGET + 10 * Box.EYE)
+    plotter.camera.position = tuple(Box.TARGET + 10 * eye)
     plotter.camera.focal_point = tuple(Box.TARGET)
     plotter.camera.up = (0, 0, 1)
     plotter.camera.parallel_scale = Box.EXTENT / 2
@@ -71,4 +75,4 @@ if __name__ == "__main__":
         print("expected FIELD.npz OUT.png; to draw a record: python -m figures.surface RUN/probe", file=sys.stderr)
         sys.exit(2)
     with np.load(sys.argv[1], allow_pickle=False) as field:
-        render(field["height"], field["dots"], field["colour"], field["levels"], Path(sys.argv[2]))
+        render(field["height"], field["dots"], field["colour"], field["levels"], field["eye"], Path(sys.argv[2]))

@@ -4,11 +4,13 @@
 RUNS/SCENE.png.  Lines: means over the seeds that have ended, at equal steps; bands: from the lowest seed to the highest.
 """
 
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
 from matplotlib.figure import Figure
 
+from analysis.console.failures import program
 from figures.style import RUNS, folder_script, literal, new_figure, save, style
 from landscape.errors import InputError
 
@@ -56,4 +58,4 @@ def draw(runs: Path, suffix: str) -> list[Path]:
 
 
 if __name__ == "__main__":
-    folder_script(draw, "loss and scores along trainings", "sweep")
+    program(partial(folder_script, draw, "loss and scores along trainings", "sweep"))

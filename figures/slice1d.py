@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from analysis.console.failures import program
 from analysis.records.findings import resolved
 from analysis.records.quantities import exponent_of, quantity, unit_suffix
 from analysis.records.records import Record
@@ -126,4 +127,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
 from figures.plane import Direction, Plane, curvature_text, plane, same_scale
@@ -153,4 +154,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 
+from analysis.console.failures import program
 from analysis.records.quantities import measured, power_of_ten
 from analysis.records.records import ProbeRecord, Record
 from figures.density import draw_on
@@ -153,4 +154,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from PIL import Image
 
 from analysis.records.records import ProbeRecord, read_record
+from splat.model.untrusted import replacing
 
 COLUMN = 3.3
 FIELD_MAP = "cividis"
@@ -82,13 +85,16 @@ def save(figure: Figure, path: str | Path, compression: int = 6) -> Path:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
-    with style():
-        if path.suffix == ".png":  # the same bytes as savefig's, which draws twice: once for the layout alone
-            FigureCanvasAgg(figure).print_png(temporary, pil_kwargs={"compress_level": compression})
+    with style(), replacing(path) as partial:
+        if (
+            path.suffix == ".png"
+        ):  # savefig draws twice, once for the layout alone, and keeps that nothing shines through
+            canvas = FigureCanvasAgg(figure)
+            canvas.draw()
+            picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+            picture.save(partial, "png", compress_level=compression, dpi=(figure.dpi, figure.dpi))
         else:
-            figure.savefig(temporary)
-    temporary.replace(path)
+            figure.savefig(partial, format=path.suffix[1:])
     return path
 
 

@@ -22,8 +22,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.ticker import MaxNLocator
 
+from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
+from analysis.records.report import eye_over
 from figures import render_surface
 from figures.plane import Direction, Plane, plane
 from figures.render_surface import Box
@@ -34,7 +36,8 @@ RENDERER = [sys.executable, str(Path(render_surface.__file__))]
 TIME_LIMIT = 120  # seconds for one picture
 LEVELS = 10
 SAME = 0.005  # relative difference of two scales that look alike
-CORNER = 0.06  # of half an axis, from its start on, without a tick: another axis has one there
+CORNER = 0.06  # of half an axis, to its far end, without a tick: another axis has one there
+NAMES = 0.13  # of the picture's width, for labels under the floor
 
 
 class RendererMissing(UserWarning):
@@ -50,21 +53,22 @@ def draw(record: Record) -> Figure:
     span = high - low if high > low else 1.0
     ticks = np.asarray(MaxNLocator(5).tick_values(low, low + span))
     ticks = ticks[(ticks >= low) & (ticks <= low + span)]
+    box = Box(np.array(eye_over(_heights(field)[0], Box.TOP)))
     with style():
         figure = new_figure(2.6)
         try:
-            image = _rendered(*_heights(field), field.dots)
+            image = _rendered(box, *_heights(field), field.dots)
         except RuntimeError as error:
             warnings.warn(
                 f"matplotlib drew the surface, because the off-screen renderer failed: {error}", RendererMissing, 2
             )
-            image = _drawn_by_matplotlib(_heights(field)[0], field.dots)
+            image = _drawn_by_matplotlib(box, _heights(field)[0], field.dots)
             figure.supxlabel("drawn without the off-screen renderer (not available)", fontsize=6, color=VERMILION)
         axes = figure.subplots()
         axes.imshow(image, extent=(0, 1, 0, 1), interpolation="antialiased")
-        axes.set(xlim=(0.0, 1.0), ylim=(0.11, 0.92), aspect="equal")
+        axes.set(xlim=(0.0, 1.0), ylim=_extent(box, _heights(field)[0]), aspect="equal")
         axes.axis("off")
-        _draw_box(axes, field, ticks, (ticks - low) / span * Box.TOP)
+        _draw_box(axes, box, field, ticks, (ticks - low) / span * Box.TOP)
         colours = ScalarMappable(Normalize(low, low + span), FIELD_MAP)
         figure.colorbar(colours, ax=axes, label=field.label, shrink=0.75, pad=0.0, aspect=20)
         curvatures = ", ".join(f"{d.name} {quantity(d.curvature)}" for d in (field.x, field.y))
@@ -90,12 +94,13 @@ def _heights(field: Plane) -> tuple[np.ndarray, np.ndarray]:
     return ((field.change - low) / span).filled(np.nan), levels
 
 
-def _rendered(heights: np.ndarray, levels: np.ndarray, dots: np.ndarray) -> np.ndarray:
+def _rendered(box: Box, heights: np.ndarray, levels: np.ndarray, dots: np.ndarray) -> np.ndarray:
     """The renderer's picture.  RuntimeError says what it said when it failed."""
     colour = (mpl.colormaps[FIELD_MAP](np.arange(256))[:, :3] * 255).astype(np.uint8)
     with tempfile.TemporaryDirectory() as folder:
         field, out = Path(folder, "field.npz"), Path(folder, "surface.png")
-        np.savez(field, height=heights, colour=colour, levels=levels[(levels > 0) & (levels < 1)], dots=dots)
+        levels = levels[(levels > 0) & (levels < 1)]
+        np.savez(field, height=heights, colour=colour, levels=levels, dots=dots, eye=box.eye)
         try:
             done = subprocess.run(
                 [*RENDERER, str(field), str(out)], capture_output=True, text=True, timeout=TIME_LIMIT, check=False
@@ -108,18 +113,18 @@ def _rendered(heights: np.ndarray, levels: np.ndarray, dots: np.ndarray) -> np.n
         return imread(out)
 
 
-def _drawn_by_matplotlib(heights: np.ndarray, dots: np.ndarray) -> np.ndarray:
+def _drawn_by_matplotlib(box: Box, heights: np.ndarray, dots: np.ndarray) -> np.ndarray:
     """Surface in the renderer's box and view, painted back to front."""
     figure = Figure(figsize=(3, 3), dpi=300)
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(0, 1), ylim=(0, 1))
     axes.axis("off")
     x, y = np.meshgrid(*(np.linspace(-1, 1, n) for n in heights.shape), indexing="ij")
-    corners = Box.project(np.stack([x, y, heights * Box.TOP], axis=-1))
+    corners = box.project(np.stack([x, y, heights * Box.TOP], axis=-1))
     middles = (heights[1:, 1:] + heights[:-1, 1:] + heights[1:, :-1] + heights[:-1, :-1]) / 4
     colours = mpl.colormaps[FIELD_MAP](middles)
     cells = [(i, j) for i, j in np.ndindex(*middles.shape) if np.isfinite(middles[i, j])]
-    for i, j in sorted(cells, key=lambda cell: float(x[cell] * Box.EYE[0] + y[cell] * Box.EYE[1])):
+    for i, j in sorted(cells, key=lambda cell: float(x[cell] * box.eye[0] + y[cell] * box.eye[1])):
         ring = corners[[i, i + 1, i + 1, i], [j, j, j + 1, j + 1]]
         axes.fill(ring[:, 0], ring[:, 1], color=colours[i, j], linewidth=0.1)
     axes.plot(*corners[dots & np.isfinite(heights)].T, ".", color=BLACK, markersize=1.2)
@@ -128,42 +133,59 @@ def _drawn_by_matplotlib(heights: np.ndarray, dots: np.ndarray) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())
 
 
-def _draw_box(axes: Axes, field: Plane, heights: np.ndarray, levels: np.ndarray) -> None:
-    """The edges that carry the axes, their ticks and names: x in front, y at the right, z at the left."""
-    _edge(axes, (-1, -1, 0), (1, -1, 0))
-    _edge(axes, (1, -1, 0), (1, 1, 0))
-    _edge(axes, (-1, -1, 0), (-1, -1, Box.TOP))
-    _floor_axis(axes, field.x, lambda t: (t, -1.0, 0.0), np.array([0.0, -1.0, 0.0]))
-    _floor_axis(axes, field.y, lambda t: (1.0, t, 0.0), np.array([1.0, 0.0, 0.0]))
+def _extent(box: Box, heights: np.ndarray) -> tuple[float, float]:
+    """The lower and the upper end of the picture: room for the labels under the floor, and for the highest point."""
+    x, y = np.meshgrid(*(np.linspace(-1, 1, n) for n in heights.shape), indexing="ij")
+    floor, top = (box.project(np.stack([x, y, z], axis=-1))[..., 1] for z in (0 * x, np.nan_to_num(heights) * Box.TOP))
+    return float(floor.min()) - NAMES, float(top.max()) + 0.02
+
+
+def _draw_box(axes: Axes, box: Box, field: Plane, heights: np.ndarray, levels: np.ndarray) -> None:
+    """The edges that carry the axes, their ticks and names: x and y in front, z at the left, where one of them ends."""
+    x, y = np.sign(box.eye[:2])
+    ends = np.array([[-x, y, 0.0], [x, -y, 0.0]])
+    left = ends[box.project(ends)[:, 0].argmin()]
+    for end in (*ends, left + [0, 0, Box.TOP]):
+        _edge(axes, box, left if end[2] else (x, y, 0.0), end)
+    far = [each if (left[:2] == corner[:2]).all() else 0.0 for each, corner in zip((-x, -y), ends, strict=True)]
+    _floor_axis(axes, box, field.x, lambda t: (t, y, 0.0), np.array([0.0, y, 0.0]), far[0])
+    _floor_axis(axes, box, field.y, lambda t: (x, t, 0.0), np.array([x, 0.0, 0.0]), far[1])
     for value, level in zip(heights, levels, strict=True):
-        _tick(axes, np.array([-1.0, -1.0, level]), np.array([-0.7, -0.7, 0.0]), f"{value:g}".replace("-", "−"), "right")
+        _tick(axes, box, left + [0.0, 0.0, level], 0.7 * left, f"{value:g}".replace("-", "−"))
 
 
 def _floor_axis(
-    axes: Axes, direction: Direction, place: Callable[[float], Sequence[float]], outwards: np.ndarray
+    axes: Axes,
+    box: Box,
+    direction: Direction,
+    place: Callable[[float], Sequence[float]],
+    outwards: np.ndarray,
+    far: float,
 ) -> None:
+    """Ticks and name of an axis along an edge; far: its end where z has ticks, -1 or 1; else 0."""
     steps = direction.scaled
     middle, half = (steps[-1] + steps[0]) / 2, (steps[-1] - steps[0]) / 2
-    align = "right" if outwards[0] == 0 else "left"
     for value in MaxNLocator(4).tick_values(steps[0], steps[-1]):
-        if steps[0] + CORNER * half < value <= steps[-1]:
-            text = f"{value:g}".replace("-", "−")
-            _tick(axes, np.array(place((value - middle) / half)), outwards, text, align)
-    ends = Box.project(np.array([place(-1.0), place(1.0)]))
+        along = (value - middle) / half
+        if abs(along) <= 1 and far * along < 1 - CORNER:
+            _tick(axes, box, np.array(place(along)), outwards, f"{value:g}".replace("-", "−"))
+    ends = box.project(
+        np.array(sorted((place(-1.0), place(1.0)), key=lambda end: float(box.project(np.array(end))[0])))
+    )
     angle = np.degrees(np.arctan2(*(ends[1] - ends[0])[::-1]))
-    at = Box.project(np.array(place(0.0)) + 0.55 * outwards)
+    at = box.project(np.array(place(0.0)) + 0.55 * outwards)
     axes.text(at[0], at[1], direction.short_label, rotation=angle, rotation_mode="anchor", ha="center", va="center")
 
 
-def _tick(axes: Axes, foot: np.ndarray, outwards: np.ndarray, text: str, align: str) -> None:
-    ends = Box.project(np.stack([foot, foot + 0.06 * outwards]))
+def _tick(axes: Axes, box: Box, foot: np.ndarray, outwards: np.ndarray, text: str) -> None:
+    ends = box.project(np.stack([foot, foot + 0.06 * outwards]))
     axes.plot(ends[:, 0], ends[:, 1], color=BLACK, linewidth=0.5)
-    at = Box.project(foot + 0.1 * outwards)
+    at, align = box.project(foot + 0.1 * outwards), "left" if ends[1, 0] > ends[0, 0] else "right"
     axes.text(at[0], at[1], text, ha=align, va="center_baseline", fontsize=6)
 
 
-def _edge(axes: Axes, start: tuple[float, float, float], end: tuple[float, float, float]) -> None:
-    points = Box.project(np.array([start, end]))
+def _edge(axes: Axes, box: Box, start: Sequence[float], end: Sequence[float]) -> None:
+    points = box.project(np.array([start, end]))
     axes.plot(points[:, 0], points[:, 1], color=BLACK, linewidth=0.6)
 
 
@@ -173,4 +195,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

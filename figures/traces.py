@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 from msgspec import structs
 
+from analysis.console.failures import program
 from analysis.records.findings import attribute_name, largest_steps, shares_per_trace
 from analysis.records.quantities import measured, power_of_ten
 from analysis.records.records import ProbeRecord, Record
@@ -143,4 +144,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

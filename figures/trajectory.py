@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from analysis.console.failures import program
 from analysis.records.findings import ATTRIBUTES, attribute_name
 from analysis.records.quantities import exponent_of, power_of_ten, unit_suffix
 from analysis.records.run_files import ENDS, read_trajectory
@@ -76,9 +77,11 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
     """An index of every run over the steps, its magnitude on a logarithmic axis, with its bracket.  runs: name -> colour.
 
     Hollow where it is negative.  Of one that has only a lower bound, the bound is drawn, as a triangle; without one, nothing.
+    The first run is drawn broad, below the others, so that it is seen where another one coincides with it.
     """
     axes.set_yscale("log")
-    for run, colour in runs.items():
+    for place, (run, colour) in enumerate(runs.items()):
+        broad = 1.0 if place or len(runs) == 1 else 2.2
         part = pd.DataFrame(measured[(measured["run"] == run) & measured[name].notna()])
         steps, values = part["step"].to_numpy(float), part[name].to_numpy(float)
         magnitudes = np.abs(values)
@@ -89,12 +92,12 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
         shown[shown == 0] = np.nan  # of which a logarithmic axis has no place
         high = np.where(unbounded, shown, np.fmax(ends.max(axis=0), magnitudes))
         axes.fill_between(steps, np.where(shown > 0, low, np.nan), high, color=colour, alpha=0.25, linewidth=0)
-        axes.plot(steps, shown, color=colour, linewidth=1.0)
+        axes.plot(steps, shown, color=colour, linewidth=1.1 * broad)
         for kind, marker in ((~unbounded, "o"), (unbounded, "^")):
             for sign, face in ((values >= 0, colour), (values < 0, "white")):
                 chosen = kind & sign
                 axes.plot(
-                    steps[chosen], shown[chosen], marker, color=colour, markerfacecolor=face, markersize=3,
+                    steps[chosen], shown[chosen], marker, color=colour, markerfacecolor=face, markersize=3 * broad,
                     linestyle="none",
                 )  # fmt: skip
     _few_decades(axes)
@@ -183,4 +186,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(main)

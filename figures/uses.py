@@ -1,5 +1,6 @@
 """Pictures of `landscape prune`, `next-view` and `uncertainty`: `python -m figures.uses RUN/prune`"""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from figures.style import (
     BLACK,
@@ -154,4 +156,4 @@ def draw(folder: Path, suffix: str = "png") -> list[Path]:
 
 
 if __name__ == "__main__":
-    folder_script(draw, "what curvature is good for", "prune")
+    program(partial(folder_script, draw, "what curvature is good for", "prune"))

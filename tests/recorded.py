@@ -8,10 +8,16 @@ import numpy as np
 
 from analysis.records.json_files import fitted, plain
 from analysis.records.provenance import provenance
+from analysis.records.quantities import HARD
 from analysis.records.records import ProbeRecord, Record, SliceRecord, read_record, record_folder, write_record
 from analysis.records.tables import NEEDS_DENSITY
 
 ATTRIBUTES = ("means", "log_scales", "quats", "opacity_logits", "sh")
+
+
+def soft(text: str) -> str:
+    """Text with spaces within its numbers that are as those between words."""
+    return text.replace(HARD, " ")
 
 
 def probe_of(data: dict[str, Any]) -> ProbeRecord:

@@ -40,6 +40,7 @@ from analysis.bench.speed.meters import Meter, meter_of
 from analysis.bench.speed.timing import interleaved
 from analysis.bench.tables import rich_table
 from analysis.bench.workloads import Size, Workload, synthetic_checkpoint, synthetic_workload, workload_of
+from analysis.console.failures import program
 from analysis.console.options import DeviceName
 from analysis.probe.command import run_probe
 from analysis.probe.options import ProbeOptions
@@ -266,4 +267,4 @@ def _found(name: str, command: list[str], limit: float) -> list[Check]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program(main)

@@ -23,7 +23,7 @@ from analysis.bench.options import BenchOptions
 from analysis.commands.options import ConvertOptions, DemoOptions, MapOptions, SfmOptions, ViewOptions
 from analysis.commands.uses.options import NextViewOptions, PruneOptions, UncertaintyOptions
 from analysis.console.failures import report
-from analysis.console.interruption import ignored, raising
+from analysis.console.interruption import ignore, raising
 from analysis.console.options import REGISTRY
 from analysis.probe.options import ProbeOptions
 from analysis.runs.options import ClaimsOptions, CompareOptions, SweepOptions, TrajectoryOptions
@@ -79,14 +79,16 @@ def command() -> NoReturn:
     gc.set_threshold(100_000)
     _open_streams()
     Console.on_broken_pipe = _say_no_more  # pyright: ignore[reportAttributeAccessIssue]
-    code = main()
-    with ignored():  # the work is done
-        try:
-            sys.stdout.flush()
-        except BrokenPipeError:
-            _drop(sys.stdout)
-        gc.freeze()
-        sys.exit(code)
+    try:
+        code = main()
+    finally:  # after the help too
+        ignore()
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _drop(sys.stdout)
+    gc.freeze()
+    sys.exit(code)
 
 
 def _open_streams() -> None:

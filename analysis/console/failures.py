@@ -14,12 +14,12 @@ Numbers as in `sysexits.h`, and 128 + the number of the signal.
 """
 
 import shlex
-import signal
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NoReturn
 
-from analysis.console.interruption import Interrupted
+from analysis.console.interruption import Interrupted, ignore, raising
 from landscape.errors import InputError, TooLittleMemory, lacks_memory, lacks_space
 
 LONGEST = 4000  # characters of a sentence; the list of all settings, the longest of our own, takes a third
@@ -42,7 +42,7 @@ def describe(error: BaseException) -> tuple[int, str]:
     if len(text) > LONGEST:  # a damaged file's own words may be megabytes
         text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 4 :]}"
     if isinstance(error, Interrupted):
-        return error.exit_code, f"interrupted by {signal.Signals(error.number).name}"
+        return error.exit_code, str(error)
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED, "interrupted"
     if isinstance(error, BrokenPipeError):
@@ -72,3 +72,15 @@ def report(error: BaseException, command: Sequence[str], debug: bool = False) ->
     if sentence:
         print(f"landscape: {sentence}", file=sys.stderr)
     return code
+
+
+def program(main: Callable[[], int | None]) -> NoReturn:
+    """The main function of a module that is run as a program: ends the process with its exit code, or that of its error."""
+    try:
+        with raising():
+            code = main() or 0
+    except (Exception, KeyboardInterrupt) as error:
+        code = report(error, sys.orig_argv)
+    finally:
+        ignore()
+    sys.exit(code)

@@ -4,14 +4,15 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from threading import Event, Timer, current_thread, main_thread
 from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 DEAF = "_raw_object_cache"  # how the functions of llvmlite begin that LLVM calls, and which must not fail
-AGAIN = 0.05  # seconds until a signal that came where nothing can be raised is sent again
+IMPORTING = "<frozen importlib._bootstrap>"  # the file of Python's own code that loads modules
+AGAIN = 0.01  # seconds until a signal that came where nothing can be raised is sent again
 
 
 class Interrupted(KeyboardInterrupt):
@@ -20,6 +21,9 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, number: int) -> None:
         super().__init__(number)
         self.number = number
+
+    def __str__(self) -> str:
+        return f"interrupted by {signal.Signals(self.number).name}"
 
     @property
     def exit_code(self) -> int:
@@ -37,29 +41,42 @@ class Interruption(Event):
 def raising() -> Iterator[None]:
     """Signals raise `Interrupted` wherever the main thread is, so that what it has begun is cleaned up.
 
-    Where Python drops what is raised, in finalizers and what C calls, the signal is sent again until it is heard.  An error
-    after it stands for it: a library that is interrupted as it is loaded says that it cannot be.
+    Where Python drops what is raised, in finalizers and what C calls, and while a library is loaded, whose C may end the
+    process for it, the signal is sent again until it is heard, or the block ends.  An error after it stands for it.
     """
-    raised: list[Interrupted] = []
+    raised, waiting = list[Interrupted](), list[tuple[Timer, int]]()
+
+    def send_again(number: int) -> None:
+        timer = Timer(AGAIN, os.kill, (os.getpid(), number))
+        waiting.append((timer, number))
+        timer.daemon = True
+        timer.start()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         while frame is not None:
-            if frame.f_code.co_name.startswith(DEAF):
-                return _send_again(number)
+            if frame.f_code.co_name.startswith(DEAF) or frame.f_code.co_filename == IMPORTING:
+                return send_again(number)
             frame = frame.f_back
         raised.append(Interrupted(number))
         raise raised[-1]
 
     def dropped(found: Any) -> None:
         if isinstance(found.exc_value, Interrupted):
-            _send_again(found.exc_value.number)
+            send_again(found.exc_value.number)
         else:
             before(found)
 
     before, sys.unraisablehook = sys.unraisablehook, dropped
     try:
         with _handled(interrupt):
-            yield
+            try:
+                yield
+            finally:
+                late = [number for timer, number in waiting if timer.is_alive()]
+                for timer, _ in waiting:
+                    timer.cancel()
+            if late:
+                raise Interrupted(late[-1])
     except Exception as error:
         if raised:
             raise raised[-1] from error
@@ -68,17 +85,26 @@ def raising() -> Iterator[None]:
         sys.unraisablehook = before
 
 
-def _send_again(number: int) -> None:
-    again = Timer(AGAIN, os.kill, (os.getpid(), number))
-    again.daemon = True
-    again.start()
+def end_at_once() -> None:
+    """A signal ends the process from now on, in a line: while libraries are loaded there is nothing to leave in order."""
+
+    def end(number: int, _: FrameType | None) -> None:
+        with suppress(OSError):
+            os.write(2, f"landscape: {Interrupted(number)}\n".encode())
+        os._exit(Interrupted(number).exit_code)
+
+    _for_good(end)
 
 
-@contextmanager
-def ignored() -> Iterator[None]:
-    """Signals change nothing any more."""
-    with _handled(lambda *_: None):
-        yield
+def ignore() -> None:
+    """Signals change nothing from now on: the work is done."""
+    _for_good(signal.SIG_IGN)
+
+
+def _for_good(handler: "Callable[[int, FrameType | None], None] | signal.Handlers") -> None:
+    for each in SIGNALS:
+        if signal.getsignal(each) is not signal.SIG_IGN:
+            signal.signal(each, handler)
 
 
 @contextmanager

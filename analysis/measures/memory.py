@@ -9,7 +9,7 @@ import torch
 
 from landscape import EigenSettings
 from landscape.errors import InputError, TooLittleMemory, lacks_memory
-from splat.backend.memory import RESERVE, SLACK, free_memory, is_told, require_room, resident_memory
+from splat.backend.memory import RESERVE, SLACK, free_memory, is_told, memory_left, require_room, resident_memory
 from splat.curvature.linearize import VECTORS, KeptViews
 from splat.curvature.objective import SceneObjective
 from splat.model.gaussians import Gaussians
@@ -50,14 +50,18 @@ def require_pictures(frames: Sequence[Frame], gaussians: Gaussians) -> None:
     """TooLittleMemory that says what would fit, where pictures and Gaussians alone take more than is free."""
     require_room(RESERVE)
     each = [PICTURES * 4 * frame.camera.width * frame.camera.height for frame in frames]
-    fixed, free = COPIES * gaussians.flat.nbytes, max(free_memory(torch.device("cpu")), 0)
-    if fixed + sum(each) <= free:
+    fixed, left = COPIES * gaussians.flat.nbytes, memory_left(torch.device("cpu"))
+    if fixed + sum(each) <= left:
         return
-    some = (free - fixed) // max(each)
+    some = (left - fixed) // max(each)
     raise TooLittleMemory(
         f"expected {_gb(fixed + sum(each))} of memory beside what is taken, for {len(frames)} pictures and "
-        f"{len(gaussians):,} Gaussians, got {_gb(free)}; "
-        + (f"--max-views {some} would fit" if some > 0 else "allow or free more, or take fewer Gaussians")
+        f"{len(gaussians):,} Gaussians, got {_gb(max(left, 0))}; "
+        + (
+            f"--max-views {some} would fit"
+            if some > 0
+            else f"allow or free at least {_gb(fixed + sum(each) - left)} more"
+        )
     )
 
 
@@ -66,10 +70,10 @@ def expected_peak(objective: SceneObjective) -> int:
     free."""
     require_room(RESERVE)
     needs, device = objective.needs, objective.active.flat.device
-    free, used = max(free_memory(device), 0), resident_memory() if device.type == "cpu" else 0
+    free, used = memory_left(device), resident_memory() if device.type == "cpu" else 0
     least, camera = needs.view + needs.beside, objective.views[0].camera
     if least > free:
-        fit = int(len(objective.active) * free / least)
+        fit = int(len(objective.active) * max(free, 0) / least)
         enough = (
             f"--memory {ceil((used + least) / (1 - SLACK) / 1e7) / 100:g}GB"
             if is_told()
@@ -77,7 +81,7 @@ def expected_peak(objective: SceneObjective) -> int:
         )
         raise TooLittleMemory(
             f"expected at least {_gb(used + least)} of memory for {len(objective.active):,} Gaussians in sight of views of "
-            f"{camera.width} x {camera.height} px, got {_gb(used + free)}, of which {_gb(used)} are taken; "
+            f"{camera.width} x {camera.height} px, got {_gb(used + max(free, 0))}, of which {_gb(used)} are taken; "
             f"{enough} would fit{f', or about {fit:,} such Gaussians' if fit else ''}"
         )
     return used + min(free, len(objective.views) * needs.view + needs.beside)

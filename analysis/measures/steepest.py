@@ -30,7 +30,7 @@ from splat.projection.dispatch import projected
 from splat.projection.formulas import lens_of
 from splat.projection.reference import NEEDLE
 from splat.render.render import render
-from splat.render.sight import Sight
+from splat.render.sight import Sight, sight
 from splat.scenes.view import View
 
 LEAST, MOST = 0.05, 5  # share of the mass that makes a carrier; most carriers
@@ -71,8 +71,7 @@ def steepest(
     mass = mass / mass.sum()
     order = mass.argsort(descending=True, stable=True)[:MOST].tolist()
     chosen = [i for i in order if mass[i] >= LEAST] or order[:1]
-    index = int(torch.stack([sight.weight[chosen[0]] for sight in sights]).argmax())
-    view = objective.views[index]
+    view = objective.views[_view_with_most(sights, chosen[0])]
     carriers = [_carrier(objective, view, end, values, mass, i) for i in chosen]
     crop = crop_around([each.outline for each in carriers], view.camera.width, view.camera.height)
     loss = objective.loss(objective.active.flat)
@@ -94,6 +93,16 @@ def steepest(
         sentence=sentence(end, carriers, participation(mass), view, len(objective.views)),
     )  # fmt: skip
     return found, pictures
+
+
+def heaviest_view(objective: SceneObjective, vector: Float[Tensor, " p"]) -> int:
+    """Place of the training view in which the Gaussian with most mass in a vector has most weight."""
+    sights = [sight(objective.active, view.camera, objective.settings) for view in objective.views]
+    return _view_with_most(sights, int(masses(vector, objective.active).argmax()))
+
+
+def _view_with_most(sights: Sequence[Sight], gaussian: int) -> int:
+    return int(torch.stack([each.weight[gaussian] for each in sights]).argmax())
 
 
 def _losses_at(

@@ -7,7 +7,6 @@ stages found is kept in `.NAME.unfinished` beside the record, from which the sam
 import shlex
 import shutil
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
 from hashlib import file_digest
@@ -35,7 +34,7 @@ from analysis.probe.settings import ProbeSettings
 from analysis.probe.summary import remarks, summary
 from analysis.probe.views import write_views
 from analysis.records.provenance import require_seed, versions
-from analysis.records.records import Arrays, ProbeRecord, Record, record_folder, require_replaceable
+from analysis.records.records import Arrays, ProbeRecord, record_folder, require_replaceable
 from analysis.records.tables import family_table, probe_table
 from analysis.train.source import of_trainer
 from landscape.errors import InputError
@@ -161,13 +160,11 @@ def _write(
     drawn: Draw | None,
 ) -> None:
     """The record, its pictures and its page, into the folder."""
-    with ThreadPoolExecutor(1) as pool:
-        write_views(folder, objective)
-        surface = pool.submit(_embedded_surface, Record(folder, data, arrays))  # while the pictures are drawn
-        write_with_pictures(folder, data, arrays, stages, start, drawn)
-        from analysis.records.report import write_report
+    write_views(folder, objective)
+    write_with_pictures(folder, data, arrays, stages, start, drawn)
+    from analysis.records.report import write_report
 
-        write_report(folder, surface.result())
+    write_report(folder)
 
 
 def opened(path: Path, folder: Path | None, ask: ForeignOptions, out: Path) -> tuple[Checkpoint, Scene]:
@@ -250,12 +247,6 @@ def _expected(objective: SceneObjective, settings: ProbeSettings, after: Expecte
     objective.loss(objective.active.flat)  # for the first render the kernels may compile
     seconds = expected_seconds(settings, seconds_of_render(objective), after)
     return f"about {seconds:,.0f} s, roughly, and {peak / 1e9:.1f} GB of memory"
-
-
-def _embedded_surface(record: Record[ProbeRecord]) -> str:
-    from analysis.records.report import embedded_surface  # a quarter of a second of imports
-
-    return embedded_surface(record)
 
 
 def _conclude(data: ProbeRecord, out: Path, verbose: bool) -> None:

@@ -2,6 +2,7 @@
 
 The error is rounded to two significant digits and the value to the same place; without an error a number keeps three
 significant digits.  None, *not determined* in a record, is an en dash.
+The spaces within a number are HARD: it stays in one line.
 
 `Shade` is how numbers of many sizes are written in colours.
 """
@@ -17,6 +18,8 @@ from msgspec import UNSET, Struct, UnsetType
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNDETERMINED = "–"
+HARD = "\N{NO-BREAK SPACE}"
+PLUS_MINUS, TIMES = f"{HARD}±{HARD}", f"{HARD}×{HARD}"
 FINEST = 10  # significant digits
 BYTES, NOTHING = 254, 255  # of a scale in bytes: its end, and what has no value
 GREY = 128  # in bytes, of what has no value
@@ -27,30 +30,32 @@ PLACES = {"psnr": 2, "ssim": 4, "lpips": 4}
 def quantity(value: float | None, error: float | None = None) -> str:
     """`value ± error` as text.
 
-    >>> quantity(123456.0, 4321.0), quantity(-0.0123), quantity(3e-12, 1e-11), quantity(None)
-    ('(1.235 ± 0.043) × 10⁵', '−0.0123', '(0.3 ± 1.0) × 10⁻¹¹', '–')
+    >>> texts = quantity(123456.0, 4321.0), quantity(-0.0123), quantity(3e-12, 1e-11), quantity(None)
+    >>> [text.replace(HARD, " ") for text in texts]
+    ['(1.235 ± 0.043) × 10⁵', '−0.0123', '(0.3 ± 1.0) × 10⁻¹¹', '–']
     """
     if value is None:
         return UNDETERMINED
     if not math.isfinite(value):
         return "not a number" if math.isnan(value) else "−∞" if value < 0 else "∞"
     if error is None or not math.isfinite(error) or error <= 0:
-        return _plain(value) if error is None or error == 0 else f"{_plain(value)} ± ?"
+        return _plain(value) if error is None or error == 0 else f"{_plain(value)}{PLUS_MINUS}?"
     if error < 1e-9 * abs(value):
-        return f"{_plain(value, FINEST)} ± {_plain(error, 2)}"
+        return f"{_plain(value, FINEST)}{PLUS_MINUS}{_plain(error, 2)}"
     exponent = _exponent(max(abs(value), error))
     places = 1 - _exponent(error)
     if -3 <= exponent <= 3:
-        return f"{_fixed(value, 0, places)} ± {_fixed(error, 0, places)}"
+        return f"{_fixed(value, 0, places)}{PLUS_MINUS}{_fixed(error, 0, places)}"
     places += exponent
-    return f"({_fixed(value, exponent, places)} ± {_fixed(error, exponent, places)}) × {power_of_ten(exponent)}"
+    digits = f"{_fixed(value, exponent, places)}{PLUS_MINUS}{_fixed(error, exponent, places)}"
+    return f"({digits}){TIMES}{power_of_ten(exponent)}"
 
 
 def measured(value: float | None, error: float | None) -> str:
     """`quantity` for a number that comes with an error: where that is not determined, it says so.
 
-    >>> measured(5.0, None), measured(5.0, 0.0), measured(None, None)
-    ('5.00 ± ?', '5.00', '–')
+    >>> [text.replace(HARD, " ") for text in (measured(5.0, None), measured(5.0, 0.0), measured(None, None))]
+    ['5.00 ± ?', '5.00', '–']
     """
     return quantity(value, math.inf if error is None else error)
 
@@ -140,7 +145,7 @@ def _plain(value: float, digits: int = 3) -> str:
         return "0"
     if -3 <= exponent <= 3:
         return _fixed(value, 0, digits - 1 - exponent)
-    return f"{_fixed(value, exponent, digits - 1)} × {power_of_ten(exponent)}"
+    return f"{_fixed(value, exponent, digits - 1)}{TIMES}{power_of_ten(exponent)}"
 
 
 def _fixed(value: float, exponent: int, places: int) -> str:

@@ -7,19 +7,18 @@ to a network.  Text from the record is escaped.
 import base64
 import gzip
 import io
+import itertools
 import math
-import re
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
-import plotly.graph_objects as go
-import plotly.io
 from PIL import Image
-from plotly.offline import get_plotlyjs
 
 from analysis.records.findings import (
     Line,
@@ -53,22 +52,24 @@ COMPARED = (  # of the traces, where the record has these steps
     "compares; beside the names their traces, each in its own unit."
 )
 PIXEL = "1 px along the ray: a way as long as the one that moves a splat by a pixel where it is across the ray."
-POWER = "10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]"
-WITHIN_A_NUMBER = re.compile(
-    rf"(?<=[\d)]) (?=× {POWER}|± [\d?])|(?<=[\d)] ×) (?={POWER})|(?<=\d ±) (?=[\d?])"
-)  # spaces
+ASIDE = 0.65  # of a surface's eye: its way along x for one along y
+RISES, CLEAR, SAME = (
+    (0.75, 1.0, 1.4, 2.0),
+    0.97,
+    0.01,
+)  # of a surface's eye: heights over ways; share seen; of no account
+PACKED = 4  # level of gzip of plotly.js: at the usual 6 it takes twice as long for 4% fewer bytes
 
 
-def write_report(folder: str | Path, surface: str | None = None) -> Path:
+def write_report(folder: str | Path) -> Path:
     """Write report.html about the record in `folder`, with the pictures that lie beside it; returns its path.
 
-    surface: `embedded_surface` of the record, where it is known already.  The page replaces an older one at once.  Raises
-    FileNotFoundError or ValueError as `read_record` does.
+    The page replaces an older one at once.  Raises FileNotFoundError or ValueError as `read_record` does.
     """
     record = read_record(folder, ProbeRecord)
     path = record.folder / FILE
     temporary = path.with_suffix(".html.tmp")
-    temporary.write_text(render_report(record, surface), encoding="utf-8")
+    temporary.write_text(render_report(record), encoding="utf-8")
     temporary.replace(path)
     return path
 
@@ -76,18 +77,13 @@ def write_report(folder: str | Path, surface: str | None = None) -> Path:
 @cache
 def template_environment(folder: Path = Path(__file__).parent) -> jinja2.Environment:
     """Of the pages whose templates lie in a folder, by default beside this file; each is compiled once."""
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(folder),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-
-
-def render_report(record: Record[ProbeRecord], surface: str | None = None) -> str:
-    """The page as text; surface: as for `write_report`."""
-    environment = template_environment()
     environment.filters |= {
         "quantity": quantity,
         "limits": limits,
@@ -98,34 +94,47 @@ def render_report(record: Record[ProbeRecord], surface: str | None = None) -> st
         "capitalise": lambda words: words[:1].upper() + words[1:],
         "loose": is_loose,
     }
-    surface, found = embedded_surface(record) if surface is None else surface, map_beside(record)
-    views, first = views_in(record, found), opening(record.data, found)
+    return environment
+
+
+def render_report(record: Record[ProbeRecord]) -> str:
+    """The page as text; its parts are packed at once, in parallel."""
+    surface, found = interactive_surface(record), map_beside(record)
+    first, drawn = opening(record.data, found), (captions(record.data), shown_numbers(record))
+    with ThreadPoolExecutor() as pool:
+        packed = pool.submit(_packed_plotly) if surface else None
+        pictures = pool.submit(pictures_in, record.folder, *drawn)
+        places = pool.submit(where, record.folder.parent / MAP, found, first[-1].text)
+        views = views_in(record, found)
     start = first_view(found, views)
-    page = environment.get_template("report.html.jinja").render(
-        data=record.data,
-        counts=plain(record.data.counts),
-        provenance=plain(record.data.provenance),
-        subtitle=subtitle(record.data),
-        numbers=numbers(record.data, found),
-        headline=first,
-        findings=findings(record.data),
-        views=views,
-        listed_views=[
-            {**view, "pictures": [{**each, "uri": ""} for each in view["pictures"]]} if i == start else view
-            for i, view in enumerate(views)
-        ],
-        start=start,
-        title=title(record.data),
-        checks=passed(record.data),
-        pictures=pictures_in(record.folder, captions(record.data), shown_numbers(record)),
-        where=where(record.folder.parent / MAP, found, first[-1].text),
-        splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
-        families=family_lines(record.data),
-        indices=INDICES,
-        surface=surface,
-        plotly_js=base64.b64encode(gzip.compress(get_plotlyjs().encode(), 6, mtime=0)).decode() if surface else "",
+    return (
+        template_environment()
+        .get_template("report.html.jinja")
+        .render(
+            data=record.data,
+            counts=plain(record.data.counts),
+            provenance=plain(record.data.provenance),
+            subtitle=subtitle(record.data),
+            numbers=numbers(record.data, found),
+            headline=first,
+            findings=findings(record.data),
+            views=views,
+            listed_views=[
+                {**view, "pictures": [{**each, "uri": ""} for each in view["pictures"]]} if i == start else view
+                for i, view in enumerate(views)
+            ],
+            start=start,
+            title=title(record.data),
+            checks=passed(record.data),
+            pictures=pictures.result(),
+            where=places.result(),
+            splats=f"../{SPLATS}" if (record.folder.parent / SPLATS).is_file() else "",
+            families=family_lines(record.data),
+            indices=INDICES,
+            surface=surface,
+            plotly_js=packed.result() if packed else "",
+        )
     )
-    return WITHIN_A_NUMBER.sub("\N{NO-BREAK SPACE}", page)
 
 
 def title(data: ProbeRecord) -> str:
@@ -301,59 +310,90 @@ def data_uri(content: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def interactive_surface(record: Record[ProbeRecord]) -> go.Figure | None:
-    """The recorded slice as a surface to turn and zoom, with the quadratic model where known; None without one."""
+def interactive_surface(record: Record[ProbeRecord]) -> dict[str, Any] | None:
+    """The recorded slice as a surface to turn and zoom, with the quadratic model where known: what plotly.js draws, in JSON.
+
+    None without a slice.  The Python half of plotly would take half a second to say the same.
+    """
     about = record.data.slice
     if about is None or "slice" not in record.arrays or not about.is_resolved:
         return None
     arrays = record.arrays["slice"]
-    layers = [("loss", "loss", "Cividis", 1.0), ("model", "quadratic model", "Greys", 0.45)]
     loss = np.where(np.isfinite(arrays["loss"]), arrays["loss"], np.nan) - about.center_loss
     low, high = float(np.nanmin(loss)), float(np.nanmax(loss))
     exponent = exponent_of(loss)
     low, high = low / 10.0**exponent, (high if high > low else low + 1) / 10.0**exponent
-    figure = go.Figure()
-    for name, label, colours, opacity in layers:
-        if name in arrays:
-            change = np.where(np.isfinite(arrays[name]), arrays[name], np.nan) - about.center_loss
-            figure.add_surface(
-                x=arrays["x"], y=arrays["y"], z=change.T / 10.0**exponent, name=label, colorscale=colours, opacity=opacity,
-                showscale=name == "loss", showlegend=True, visible=True if name == "loss" else "legendonly",
-                cmin=low, cmax=high, colorbar={"len": 0.8},
-            )  # fmt: skip
-    names = [_escaped(direction.name) for direction in about.directions]
-    figure.update_layout(
-        scene={
-            "xaxis_title": f"step along {names[0]}",
-            "yaxis_title": f"step along {names[1]}",
-            "zaxis_title": f"change of loss{unit_suffix(exponent)}",
-            "zaxis_range": [low, high],
-            "aspectmode": "cube",
-            "camera": {"eye": _eye(loss), "center": {"x": 0, "y": 0, "z": -0.15}},
-            **{f"{axis}axis_exponentformat": "power" for axis in "xy"},
-        },
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        height=520,
-        legend={"orientation": "h"},
-    )
-    return figure
+    layers = [("loss", "loss", "Cividis", 1.0), ("model", "quadratic model", "Greys", 0.45)]
+    surfaces = [
+        {
+            "type": "surface", "x": _listed(arrays["x"]), "y": _listed(arrays["y"]), "name": label, "colorscale": colours,
+            "z": _listed((arrays[name] - about.center_loss).T / 10.0**exponent), "opacity": opacity, "showlegend": True,
+            "showscale": name == "loss", "visible": True if name == "loss" else "legendonly", "cmin": low, "cmax": high,
+            "colorbar": {"len": 0.8},
+        }
+        for name, label, colours, opacity in layers if name in arrays
+    ]  # fmt: skip
+    steps = [
+        {"title": {"text": f"step along {_escaped(each.name)}"}, "exponentformat": "power"} for each in about.directions
+    ]
+    change = {"title": {"text": f"change of loss{unit_suffix(exponent)}"}, "range": [low, high]}
+    eye = eye_over((loss / 10.0**exponent - low) / (high - low), 1.0)
+    camera = {"eye": dict(zip("xyz", eye, strict=True)), "center": {"x": 0, "y": 0, "z": -0.1}}
+    box = {"aspectmode": "manual", "aspectratio": {"x": 1, "y": 1, "z": 0.5}}  # as high as half its width
+    scene = {"xaxis": steps[0], "yaxis": steps[1], "zaxis": change, "camera": camera, **box}
+    layout = {"scene": scene, "margin": dict.fromkeys("lrtb", 0), "height": 520, "legend": {"orientation": "h"}}
+    return {"data": surfaces, "layout": layout}
 
 
-def _eye(loss: np.ndarray) -> dict[str, float]:
-    """A camera beyond the lowest corner of the plane, where nothing hides the middle."""
-    corners = [(float(np.nan_to_num(loss[x, y], nan=np.inf)), x, y) for x in (0, -1) for y in (0, -1)]
-    _, x, y = min(corners)
-    return {"x": -1.5 if x == 0 else 1.5, "y": -1.5 if y == 0 else 1.5, "z": 1.6}
+def _listed(values: np.ndarray) -> list[Any]:
+    """Numbers for JSON, to as many digits as a picture shows; None for what is not finite."""
+    if values.ndim > 1:
+        return [_listed(row) for row in values]
+    return [float(f"{value:.7g}") if math.isfinite(value) else None for value in values.tolist()]
 
 
-def embedded_surface(record: Record[ProbeRecord]) -> str:
-    """`interactive_surface` as a part of a page, empty without a slice."""
-    figure = interactive_surface(record)
-    if figure is None:
-        return ""
-    buttons = ["toImage", "zoom3d", "pan3d", "orbitRotation", "resetCameraDefault3d"]
-    settings = {"displaylogo": False, "responsive": True, "plotlyServerURL": "", "modeBarButtons": [buttons]}
-    return plotly.io.to_html(figure, full_html=False, include_plotlyjs=False, div_id="surface", config=settings)
+def _packed_plotly() -> str:
+    content = files("plotly").joinpath("package_data/plotly.min.js").read_bytes()
+    return base64.b64encode(gzip.compress(content, PACKED, mtime=0)).decode()
+
+
+def eye_over(heights: np.ndarray, tall: float) -> tuple[float, float, float]:
+    """Where a surface over [-1, 1]^2 is seen from: beyond one of its corners, as low as shows the valley, at a distance of 2.
+
+    heights: from 0 to 1, nan where there is none; drawn `tall` high.  Every point counts by its depth below the highest.
+    """
+    known = np.isfinite(heights)
+    heights, weight = np.where(known, heights, 0.0), np.where(known, 1.0 - heights, 0.0)
+    best, eye = -1.0, (0.0, 0.0, 0.0)
+    for rise in RISES:
+        for x, y in itertools.product((1, -1), (-1, 1)):
+            across = np.array([ASIDE * x, y]) / math.hypot(ASIDE, 1)
+            seen = ~_hidden(heights, across, rise / tall)
+            share = float((weight * seen).sum() / (weight.sum() or 1.0)) - (
+                not seen[np.unravel_index(weight.argmax(), seen.shape)]
+            )
+            if share > best + SAME:
+                place = 2 * np.array([*across, rise]) / math.hypot(1, rise)
+                best, eye = share, (float(place[0]), float(place[1]), float(place[2]))
+        if best > CLEAR:
+            break
+    return eye
+
+
+def _hidden(heights: np.ndarray, across: np.ndarray, rise: float) -> np.ndarray:
+    """Which points of a surface others hide from an eye far away, which is seen under this rise of a way across."""
+    size = np.array(heights.shape) - 1
+    places, hidden = np.indices(heights.shape).astype(float), np.zeros(heights.shape, bool)
+    step = 2 / size.max()
+    for k in range(1, int(3 / step)):
+        i, j = (
+            np.round(place + k * step * part * n / 2).astype(int)
+            for place, part, n in zip(places, across, size, strict=True)
+        )
+        inside = (i >= 0) & (i <= size[0]) & (j >= 0) & (j <= size[1])
+        nearer = heights[np.clip(i, 0, size[0]), np.clip(j, 0, size[1])]
+        hidden |= inside & (nearer > heights + k * step * rise + SAME)
+    return hidden
 
 
 def _escaped(text: str) -> str:

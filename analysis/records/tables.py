@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from analysis.records.findings import attribute_name, is_open, is_wide
-from analysis.records.quantities import UNDETERMINED, apart, limits, measured, quantity
+from analysis.records.quantities import HARD, PLUS_MINUS, UNDETERMINED, apart, limits, measured, quantity
 from analysis.records.records import Check, Counts, ProbeRecord
 from analysis.records.schema import INDICES, BlockShare, Depth, Effect, End, Family, Index, Number
 
@@ -26,7 +26,6 @@ NEEDS_DENSITY = "needs the spectral density, which was left out"  # said of an i
 OPERATOR_NAMES = {"hessian": "Hessian", "gauss-newton": "Gauss-Newton"}
 ERRORS = "± of a trace: its standard error; of an eigenvalue: within it lies a true one, not necessarily the end."
 CAPTION = "≥: λ min was not reached, or cannot be told from 0"
-HARD_SPACE = "\u00a0"
 GAPS, NUMBER, REMARK = 8, 27, 22  # of the probe's table: between columns, widest number in a line, least room for words
 WIDTH = 15  # of a column of the families' table, with which it fits into 80
 NARROW = 0.1  # of the value: a bracket that is written as an error
@@ -69,15 +68,14 @@ Row = tuple[str, str, str]
 
 
 def wrapped(text: str, width: int) -> str:
-    """Text in lines of this width at most; a number with its error stays in one.
+    """Text in lines of this width at most; a number, with its error and pixels, stays in one.
 
-    >>> print(wrapped("(8.6 ± 0.6) × 10⁻⁶ over (1.37 ± 0.10) × 10⁻⁴", 22).replace("\u00a0", " "))
-    (8.6 ± 0.6) × 10⁻⁶
+    >>> print(wrapped(f"{quantity(8.6e-6, 6e-7)} over {quantity(1.37e-4, 1e-5)}", 22).replace(HARD, " "))
+    (8.60 ± 0.60) × 10⁻⁶
     over
     (1.37 ± 0.10) × 10⁻⁴
     """
-    for sign in " ± ", " × ", " px":
-        text = text.replace(sign, sign.replace(" ", HARD_SPACE))
+    text = text.replace(" px", f"{HARD}px")
     return textwrap.fill(text, max(width, 12), break_long_words=False, break_on_hyphens=False)
 
 
@@ -235,7 +233,7 @@ def _folded(text: str, width: int = WIDTH) -> str:
     >>> _folded("7.45 × 10⁻⁴ … 1.02 × 10⁴"), _folded("34.1 … 120")
     ('7.45 × 10⁻⁴ …\\n1.02 × 10⁴', '34.1 … 120')
     """
-    return text if len(text) <= width else text.replace(" ± ", "\n± ").replace(" … ", " …\n")
+    return text if len(text) <= width else text.replace(PLUS_MINUS, f"\n±{HARD}").replace(" … ", " …\n")
 
 
 def bracketed(index: Index | Effect | None) -> Cell:
@@ -243,8 +241,8 @@ def bracketed(index: Index | Effect | None) -> Cell:
 
     >>> bracketed(Index(value=7.0, low=34.2, high=None, note="lambda_min is not resolved")).value
     '≥ 34.2'
-    >>> bracketed(Index(value=2.0, low=1.95, high=2.04, note="")).value
-    '2.000 ± 0.050'
+    >>> print(bracketed(Index(value=2.0, low=1.95, high=2.04, note="")).value.replace(HARD, " "))
+    2.000 ± 0.050
     >>> bracketed(Index(value=2.0, low=1.0, high=30.0, note=""))
     Cell(value='–', bracket='1.00 … 30.0', note='')
     """

@@ -15,7 +15,6 @@ method takes to METHOD's last loss (on a straight line of ln loss between checkp
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ import pandas as pd
 from rich.console import Console
 from rich.progress import track
 
+from analysis.console.failures import program
 from analysis.console.plain import say
 from analysis.records.run_files import CHECKPOINT
 from landscape.errors import InputError
@@ -147,4 +147,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program(main)

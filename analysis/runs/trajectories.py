@@ -25,6 +25,7 @@ from analysis.records.schema import Index
 from analysis.records.tables import bracketed
 from analysis.runs.options import TrajectoryOptions
 from landscape.errors import InputError
+from splat.model.untrusted import replacing
 
 TABLE, PICTURE = "trajectories.csv", "trajectories.png"
 VALUES = {f"trace_{name}": f"trace of {attribute_name(name)}" for name in ATTRIBUTES} | ENDS
@@ -38,9 +39,8 @@ def run_trajectory(options: TrajectoryOptions) -> int:
     out = options.out or common / "trajectory"
     out.mkdir(parents=True, exist_ok=True)
     path, console = out / TABLE, Console()
-    temporary = path.with_suffix(".csv.partial")
-    table.to_csv(temporary, index=False, errors="backslashreplace")
-    temporary.replace(path)
+    with replacing(path) as partial:
+        table.to_csv(partial, index=False, errors="backslashreplace")
     console.print(first_and_last(table))
     (out / PICTURE).unlink(missing_ok=True)
     say(*draw("trajectory", path), style="yellow", console=console)

@@ -2,6 +2,7 @@
 
 Limits of addresses and of data (`ulimit -v`, `ulimit -d`) are kept well away from.  Beyond them a tensor raises, but compiled
 code and libraries end the process, and the start of a thread waits for ever: these are asked for only where a reserve is left.
+Beyond the limit of a control group the system kills.
 """
 
 import ctypes
@@ -28,6 +29,7 @@ LIMITED = {  # what the process may be told to stay within, and the option of ul
     resource.RLIMIT_DATA: ("data (ulimit -d)", 2**29),
 }
 RESERVE = 2**29  # bytes of these that no plan counts on: for threads, compiled code and libraries that are loaded late
+OF_GROUP = RESERVE // 2  # bytes of a group's memory that no plan counts on: for the same, and processes that draw
 LEAST = RESERVE // 4  # of which is left where something goes on
 
 SLACK = 0.05  # of a limit that is asked for: what allocators and libraries hold beside what is counted
@@ -68,12 +70,17 @@ def give_back_freed() -> None:
 
 def free_memory(device: "torch.device") -> int:
     """Free bytes on a device; on a GPU with those that torch keeps for future tensors."""
+    return max(0, memory_left(device))
+
+
+def memory_left(device: "torch.device") -> int:
+    """The same; below zero where something is taken of what no plan counts on."""
     if device.type == "cuda":
         import torch
 
         cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + cached
-    return max(0, min([psutil.virtual_memory().available, *_of_process(), *_of_groups()]))
+    return min([psutil.virtual_memory().available, *_of_process(), *(left - OF_GROUP for left in _of_groups())])
 
 
 def _of_process() -> Iterator[int]:

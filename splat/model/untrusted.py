@@ -5,6 +5,7 @@ of it is read.
 """
 
 import fcntl
+import glob
 import os
 import zipfile
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import psutil
 
 from landscape.errors import InputError
 
@@ -113,6 +115,31 @@ def locked(path: Path, what: str) -> Iterator[int]:
             finally:
                 path.unlink(missing_ok=True)
             return
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Where to write what becomes `path` when the block ends: a reader or a crash sees what was there before or all of it."""
+    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")  # another program may write there too
+    try:
+        yield partial
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+        _drop_abandoned(path)
+    except BaseException as error:
+        partial.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno and error.filename is None:
+            error.filename = str(path)  # a full disk's error has none
+        raise
+
+
+def _drop_abandoned(path: Path) -> None:
+    """Remove what killed processes left of the same file."""
+    for partial in path.parent.glob(f".{glob.escape(path.name)}.partial-*"):
+        process = partial.name.rpartition("-")[2]
+        if process.isdigit() and not psutil.pid_exists(int(process)):
+            partial.unlink(missing_ok=True)
 
 
 def beside(folder: Path) -> Path:

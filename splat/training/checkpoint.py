@@ -6,9 +6,7 @@ Its keys are the fields of `_File` and of `_Training`, side by side.
 """
 
 import errno
-import glob
 import io
-import os
 import sys
 import warnings
 import zipfile
@@ -17,7 +15,6 @@ from math import inf
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import psutil
 import torch
 from torch import Tensor
 
@@ -27,7 +24,7 @@ from splat.model.files.read import is_foreign
 from splat.model.gaussians import Gaussians
 from splat.model.settings import current_settings
 from splat.model.typed import MOST, Count, leaves, typed
-from splat.model.untrusted import require_whole
+from splat.model.untrusted import replacing, require_whole
 from splat.scenes.scene import Scene
 from splat.scenes.splits import spread_views
 from splat.training.densify import ScreenGradients
@@ -190,28 +187,9 @@ def _interned(content: Any) -> Any:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Put content at path, so that a reader or a crash sees either what was there before or all of it."""
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")  # another program may write there too
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-        _drop_abandoned(path)
-    except BaseException as error:
-        partial.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno and error.filename is None:
-            error.filename = str(path)  # a full disk's error has none
-        raise
-
-
-def _drop_abandoned(path: Path) -> None:
-    """Remove what killed processes left of the same file."""
-    for partial in path.parent.glob(f".{glob.escape(path.name)}.partial-*"):
-        process = partial.name.rpartition("-")[2]
-        if process.isdigit() and not psutil.pid_exists(int(process)):
-            partial.unlink(missing_ok=True)
+    """Put content at path, whole or not at all (`replacing`)."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
 
 
 def open_checkpoint(path: Path, ask: Foreign, picture: Path) -> Checkpoint:

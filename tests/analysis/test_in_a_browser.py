@@ -68,7 +68,7 @@ def viewer() -> Iterator[view.Viewer]:
     made = synthetic_scene(SyntheticSettings(gaussians=150, views=2, width=32, height=24))
     objective = SceneObjective(made.truth, made.scene.load())
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    found = view.Viewer(server, objective)
+    found = view.Viewer(server, objective, 1)
     found.add_fields(measured_fields(objective, Path("nowhere"), [], lambda *_: None), "largest")
     direction = torch.zeros_like(objective.active.flat)
     direction[objective.blocks["sh"]] = 1.0
@@ -82,6 +82,9 @@ def test_a_click_a_field_and_a_step_reach_the_viewer(browser, viewer):
 
     browser.get(f"http://127.0.0.1:{viewer.server.get_port()}")
     until(browser, "document.body.innerText.includes('training view')")
+    until(browser, "/splats, from [^ ]+ .* to /.test(document.body.innerText)")
+    camera, own = next(iter(viewer.server.get_clients().values())).camera, viewer.objective.views[1].camera
+    assert np.allclose(camera.position, viewer.frame.place(own.centre), atol=1e-3)
     canvas = browser.find_element("tag name", "canvas")
     ActionChains(browser).move_to_element_with_offset(canvas, -130, 0).click().perform()
     until(browser, "/Gaussian \\d+, \\d+% of this pixel/.test(document.body.innerText)")
@@ -98,7 +101,7 @@ def test_a_click_a_field_and_a_step_reach_the_viewer(browser, viewer):
     (direction, reach), active = viewer.steps["e₁"], viewer.objective.active
     there = active.with_flat(active.flat + reach * direction)
     until(browser, f"document.body.innerText.includes('loss {view.quantity(viewer.objective.loss(there.flat))}')")
-    image = view.in_bytes(rendered(viewer.objective, 0, there))
+    image = view.in_bytes(rendered(viewer.objective, 1, there))
     assert (viewer.render.image == image.transpose(1, 2, 0)).all()
 
 

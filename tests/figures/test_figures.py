@@ -20,6 +20,7 @@ from figures.style import BLACK, COLUMN, SKY, save, style
 from tests.recorded import synthetic, written
 
 POINT = 1 / 72  # inches
+BOX = Box(np.array([1.0, -1.55, 1.35]))
 
 
 def test_a_png_is_what_matplotlib_saves_and_takes_one_drawing(tmp_path, monkeypatch):
@@ -29,7 +30,10 @@ def test_a_png_is_what_matplotlib_saves_and_takes_one_drawing(tmp_path, monkeypa
     figure, drawings = traces.draw(record), []
     draw = figure.draw
     monkeypatch.setattr(figure, "draw", lambda renderer: drawings.append(renderer) or draw(renderer))
-    assert save(figure, tmp_path / "traces.png").read_bytes() == (tmp_path / "saved.png").read_bytes()
+    drawn, saved = (Image.open(path) for path in (save(figure, tmp_path / "traces.png"), tmp_path / "saved.png"))
+    assert (
+        np.array_equal(np.asarray(drawn), np.asarray(saved.convert("RGB"))) and drawn.info["dpi"] == saved.info["dpi"]
+    )
     assert len(drawings) == 1
 
 
@@ -276,32 +280,32 @@ def test_pyvista_marks_the_renders(tmp_path):
     heights, dots = np.zeros((9, 9)), np.zeros((9, 9), bool)
     dots[2, 6] = True
     try:
-        marked = surface._rendered(heights, np.array([]), dots)
+        marked = surface._rendered(BOX, heights, np.array([]), dots)
     except RuntimeError as error:
         pytest.skip(f"no off-screen renderer on this machine: {error}")
-    changed = np.abs(marked - surface._rendered(heights, np.array([]), dots & False)).sum(axis=-1) > 0.05
+    changed = np.abs(marked - surface._rendered(BOX, heights, np.array([]), dots & False)).sum(axis=-1) > 0.05
     rows, columns = np.nonzero(changed)
     place = np.array([columns.mean(), len(changed) - 1 - rows.mean()]) / len(changed)
-    assert place == pytest.approx(Box.project(np.array([-0.5, 0.5, 0.006])), abs=0.005)
+    assert place == pytest.approx(BOX.project(np.array([-0.5, 0.5, 0.006])), abs=0.005)
 
 
 def test_pyvista_renders_the_field_where_the_labels_are_put(tmp_path):
     heights = np.zeros((9, 9))
     heights[-1, :] = 1.0  # high at the right end of x
     try:
-        image = surface._rendered(heights, np.array([]), np.zeros((9, 9), bool))
+        image = surface._rendered(BOX, heights, np.array([]), np.zeros((9, 9), bool))
     except RuntimeError as error:
         pytest.skip(f"no off-screen renderer on this machine: {error}")
     size = image.shape[0]
     assert image.shape[:2] == (Box.PIXELS, Box.PIXELS)
 
     def pixel(point):
-        column, row = Box.project(np.array(point)) * size
+        column, row = BOX.project(np.array(point)) * size
         return image[size - 1 - int(row), int(column), :3]
 
     ink = np.argwhere(image[..., :3].min(axis=-1) < 0.95)
     x, y = np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9), indexing="ij")
-    corners = Box.project(np.stack([x, y, heights * Box.TOP], axis=-1).reshape(-1, 3)) * size
+    corners = BOX.project(np.stack([x, y, heights * Box.TOP], axis=-1).reshape(-1, 3)) * size
     assert ink[:, 1].min() == pytest.approx(corners[:, 0].min(), abs=2)
     assert ink[:, 1].max() == pytest.approx(corners[:, 0].max(), abs=2)
     assert size - 1 - ink[:, 0].min() == pytest.approx(corners[:, 1].max(), abs=2)

@@ -14,12 +14,8 @@ from typing import Any, ClassVar
 
 import torch
 
-from analysis.commands.cli import main
-from analysis.commands.uses.prune import RECORD
-from analysis.records.records import ProbeRecord, SliceRecord, read_record
-from analysis.records.run_files import COMPARISON, MapRecord
-from analysis.runs.compare import PAGE, TABLE
-from splat.model.files.read import read_splats
+from analysis.commands import cli
+from analysis.records.records import read_record
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
 from splat.scenes.write import write_transforms_scene
 from splat.training.checkpoint import load_checkpoint, training_state
@@ -27,20 +23,27 @@ from tests.hostile.programs import forked, program
 
 CHANGING = ("second", "provenance", "timing", "created", "skipped")  # in the names of what no two runs have alike
 TRAINED = 6  # steps of the run that others read
-COMPARED = (TABLE, COMPARISON, PAGE)
+SHOWN = 50  # trials after which the counts are printed
 Numbers = dict[str, str]  # what was found, in words, by its name
 
 
 def attempts(name: str, trials: Iterable[tuple[str, Callable[[], str]]]) -> list[str]:
     """Try each, which says what became of it, and print how many went which way; what went wrong, by the words of the trial."""
-    outcomes, failures = Counter[str](), list[str]()
-    for words, trial in trials:
+    outcomes, failures, start = Counter[str](), list[str](), time.monotonic()
+
+    def show() -> None:
+        done = f"{outcomes.total() + len(failures)} in {time.monotonic() - start:,.0f} s"
+        print(f"{name}: {done}: {dict(outcomes)}, {len(failures)} failures", flush=True)
+
+    for number, (words, trial) in enumerate(trials, 1):
         try:
             outcomes[trial()] += 1
         except Exception as error:  # whatever it is, it is what is looked for
             failures.append(f"{name}, {words}: {type(error).__name__} {error}")
             print(failures[-1], flush=True)
-    print(f"{name}: {dict(outcomes)}, {len(failures)} failures", flush=True)
+        if number % SHOWN == 0:
+            show()
+    show()
     return failures
 
 
@@ -48,6 +51,7 @@ class Ended:
     """A command on a tiny scene in `root`, and what it comes to when nobody ends it."""
 
     name: ClassVar[str]
+    module = cli  # whose `main` it is
     apart = 0.2  # share of the rounds that run a program of its own
     goes_on = False  # from files in `out`, which are replaced one by one
 
@@ -66,7 +70,7 @@ class Ended:
         settings = SyntheticSettings(gaussians=60, views=5, width=24, height=18)
         assert forked(lambda: write_transforms_scene(synthetic_scene(settings).scene, self.scene) or 0).wait() == 0
         train = ["train", str(self.scene), "--out", str(self.checkpoint.parent), "--iterations", str(TRAINED)]
-        assert forked(lambda: main(train)).wait() == 0
+        assert forked(lambda: cli.main(train)).wait() == 0
 
     def words(self) -> list[str]:
         raise NotImplementedError
@@ -80,7 +84,7 @@ class Ended:
             raise AssertionError(f"the same command again ends with {code}")
 
     def begun(self) -> "forked":
-        return forked(lambda: main(self.words()))
+        return forked(lambda: self.module.main(self.words()))
 
     def clean(self) -> None:
         shutil.rmtree(self.out.parent)
@@ -95,7 +99,7 @@ class Ended:
         """End the command once and go on; what became of it."""
         self.prepare(chance)
         before, apart = self.out.exists(), chance.random() < self.apart
-        process = program(self.words()) if apart else self.begun()
+        process = program(self.words(), self.module.__name__) if apart else self.begun()
         time.sleep(chance.random() * (self.seconds + 3 * apart))
         process.send(number)
         code = process.wait()
@@ -123,169 +127,8 @@ class Ended:
         assert not changed, f"{len(changed)} other numbers {when}: {', '.join(shown)}"
 
 
-class Train(Ended):
-    name, goes_on = "train", True
-
-    def words(self) -> list[str]:
-        more = ["--resume"] if self.out.exists() else []
-        return [
-            "train",
-            str(self.scene),
-            "--iterations",
-            "20",
-            "--checkpoint-every",
-            "2",
-            "--out",
-            str(self.out),
-            *more,
-        ]
-
-    def numbers(self) -> Numbers:
-        return trained(self.out)
-
-    def prepare(self, chance: random.Random) -> None:
-        self.clean()
-
-    def check(self) -> None:
-        load_checkpoint(self.out / "checkpoint.pt")
-
-
-class Probe(Ended):
-    name = "probe"
-
-    def words(self) -> list[str]:
-        return ["probe", str(self.checkpoint), "--quick", "--slice-points", "5", "--out", str(self.out)]
-
-    def numbers(self) -> Numbers:
-        return recorded(self.out, ProbeRecord)
-
-
-class Slice(Ended):
-    name = "slice"
-
-    def words(self) -> list[str]:
-        return ["slice", str(self.checkpoint), "--points", "9", "--all-points", "--out", str(self.out)]
-
-    def numbers(self) -> Numbers:
-        found = recorded(self.out, SliceRecord)
-        return {name: value for name, value in found.items() if name != ".counts.products"}  # of the last run alone
-
-
-class Map(Ended):
-    name = "map"
-
-    def words(self) -> list[str]:
-        return ["map", str(self.checkpoint), "--out", str(self.out)]
-
-    def numbers(self) -> Numbers:
-        found = {name: digest((self.out / name).read_bytes()) for name in ("fields.ply", "largest.ply", "top.csv")}
-        return found | leaves(json.loads((self.out / MapRecord.FILE).read_text()))
-
-
-class Convert(Ended):
-    name = "convert"
-
-    def words(self) -> list[str]:
-        return ["convert", str(self.checkpoint), str(self.out), "--to", "graphdeco"]
-
-    def __init__(self, root: Path) -> None:
-        super().__init__(root)
-        self.seconds = max(self.seconds, 0.05)
-
-    def numbers(self) -> Numbers:
-        return {"file": digest(self.out.read_bytes()), "n": str(len(read_splats(self.out).gaussians))}
-
-    def prepare(self, chance: random.Random) -> None:
-        self.clean()
-
-    def run_to_its_end(self) -> None:
-        if not self.out.exists():  # which it refuses
-            super().run_to_its_end()
-
-
-class Sweep(Ended):
-    """Its commands are programs of their own, which a kill leaves at work."""
-
-    name = "sweep"
-
-    def words(self) -> list[str]:
-        file = self.scene.with_name("sweep.toml")
-        file.write_text(
-            f'out = "work/out"\nseeds = [0]\niterations = {TRAINED}\n[probe]\nquick = true\nslice_points = 5\n'
-            f'[scenes.tiny]\npath = "{self.scene}"\n[methods.3dgs]\n'
-        )
-        return ["sweep", str(file)]
-
-    def numbers(self) -> Numbers:
-        run = self.out / "tiny/3dgs/0"
-        return trained(run) | recorded(run / "probe", ProbeRecord)
-
-    def prepare(self, chance: random.Random) -> None:
-        self.clean()
-
-    def run_to_its_end(self) -> None:
-        end = time.monotonic() + 600
-        while (code := self.begun().wait()) == 2 and time.monotonic() < end:  # another is at work
-            time.sleep(1)
-        assert code == 0, f"the same command again ends with {code}"
-
-    def check(self) -> None:
-        for checkpoint in self.out.rglob("checkpoint.pt"):
-            load_checkpoint(checkpoint)
-        for record in self.out.rglob(ProbeRecord.FILE):
-            if not record.parent.name.startswith("."):
-                read_record(record.parent, ProbeRecord)
-
-
-class Prune(Ended):
-    name = "prune"
-
-    def words(self) -> list[str]:
-        return ["prune", str(self.checkpoint), "--sample", "10", "--out", str(self.out)]
-
-    def numbers(self) -> Numbers:
-        json.loads((self.out / RECORD).read_text())
-        tables = {
-            name: digest((self.out / name).read_bytes()) for name in ("scores.csv", "correlations.csv", "pruned.ply")
-        }
-        return tables | trained(self.out)
-
-
-class Compare(Ended):
-    """Replaces each file whole, not the folder."""
-
-    name = "compare"
-
-    def __init__(self, root: Path) -> None:
-        self.runs = [root / "run", root / "other"]
-        super().__init__(root)
-
-    def made_before(self) -> None:
-        super().made_before()
-        train = ["train", str(self.scene), "--out", str(self.runs[1]), "--iterations", str(TRAINED), "--seed", "1"]
-        assert forked(lambda: main(train)).wait() == 0
-        for run in self.runs:
-            probe = ["probe", str(run), "--quick", "--slice-points", "5", "--out", str(run / "probe")]
-            assert forked(lambda words=probe: main(words)).wait() == 0
-
-    def words(self) -> list[str]:
-        return ["compare", *map(str, self.runs), "--out", str(self.out)]
-
-    def numbers(self) -> Numbers:
-        whole = {name: (self.out / name).read_bytes() for name in COMPARED if (self.out / name).exists()}
-        if PAGE in whole:
-            assert whole.pop(PAGE).rstrip().endswith(b"</html>"), "a page that was cut"
-        return {name: digest(content) for name, content in whole.items()}
-
-    def check(self) -> None:
-        found = self.numbers()
-        changed = [name for name in found if found[name] != self.expected[name]]
-        assert not changed, f"other content of {changed} as it was left"
-
-
-COMMANDS: dict[str, type[Ended]] = {
-    each.name: each for each in (Train, Probe, Slice, Map, Convert, Sweep, Prune, Compare)
-}
+def bytes_of(folder: Path, *names: str) -> Numbers:
+    return {name: digest((folder / name).read_bytes()) for name in names}
 
 
 def digest(content: bytes) -> str:

@@ -18,7 +18,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from tests.hostile.ended import COMMANDS, Ended, attempts
+from tests.hostile.commands import COMMANDS
+from tests.hostile.ended import Ended, attempts
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 

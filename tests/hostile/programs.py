@@ -5,22 +5,23 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import splat.raster.cpu.raster  # noqa: F401
-from analysis.commands.map import command as _map  # noqa: F401
-from analysis.commands.uses import prune as _prune  # noqa: F401
-from analysis.console import drawing, recording
-from analysis.console.interruption import ignored, raising
-from analysis.runs import compare
+from analysis.commands import cli
+from analysis.console import drawing
+from analysis.console.interruption import ignore, raising
 
 ROOT = Path(__file__).parents[2]
+LATE = ("matplotlib.figure", "pandas", "scipy.sparse.csgraph", "torch.fx.experimental.symbolic_shapes")
+for _name in (*LATE, *(each.runs.split(":")[0] for each in cli.COMMANDS.values())):
+    import_module(_name)
 
 
 @contextmanager
-def nothing_drawn(*_: Any) -> Iterator[Callable[[Path], list[str]]]:
-    yield lambda _: []
+def nothing_begun(_: list[str]) -> Iterator[None]:
+    yield
 
 
 class forked:
@@ -31,8 +32,7 @@ class forked:
         ready, begun = os.pipe()
         self.process = os.fork()
         if self.process == 0:
-            drawing.drawing = nothing_drawn
-            recording.draw = compare.draw = lambda *_: []
+            drawing._group, drawing._said = nothing_begun, lambda *_: []
             quiet = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(quiet, 1)
             os.dup2(quiet, 2)
@@ -41,8 +41,7 @@ class forked:
                 with raising():
                     os.write(begun, b".")
                     code = run()
-                    with ignored():
-                        os._exit(code)
+                    ignore()
             finally:
                 os._exit(code)
         os.close(begun)
@@ -62,10 +61,10 @@ class forked:
 
 
 class program:
-    """The command as a program of its own."""
+    """The command as a program of its own; module: whose."""
 
-    def __init__(self, words: list[str]) -> None:
-        command = [sys.executable, "-m", "analysis.commands.cli", *words]
+    def __init__(self, words: list[str], module: str = cli.__name__) -> None:
+        command = [sys.executable, "-m", module, *words]
         self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def send(self, number: int) -> None:

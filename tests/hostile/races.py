@@ -14,8 +14,8 @@ import time
 from functools import partial
 from pathlib import Path
 
-from analysis.commands.cli import main
-from tests.hostile.ended import COMMANDS, Ended, attempts
+from tests.hostile.commands import COMMANDS
+from tests.hostile.ended import Ended, attempts
 from tests.hostile.programs import forked
 
 BAD_INPUT = 2
@@ -31,9 +31,11 @@ def race(command: Ended, chance: random.Random, files: Path) -> str:
         before.wait()
     said = [files / "first", files / "second"]
     words = command.words()
-    first = forked(lambda: main(words), said[0])
-    time.sleep(chance.choice((0, 0, 0.01, 0.1, chance.random() * command.seconds)))
-    second = forked(lambda: main(words), said[1])
+    first = forked(lambda: command.module.main(words), said[0])
+    time.sleep(
+        chance.choice((0, 0.01, 0.1, chance.random() * command.seconds, chance.uniform(0.9, 1.1) * command.seconds))
+    )
+    second = forked(lambda: command.module.main(words), said[1])
     both, codes = [first, second], dict[int, int]()
     while len(codes) < 2:
         for i, process in enumerate(both):

@@ -111,8 +111,8 @@ def test_a_signal_while_pycolmap_loads_is_heard_once_it_has(tmp_path):
         "import os, signal, sys\nfrom analysis.console.interruption import Interrupted, raising\n"
         "class Signals:\n    def find_spec(self, name, *_):\n        if name == 'pycolmap._core':\n"
         "            os.kill(os.getpid(), signal.SIGHUP)\nsys.meta_path.insert(0, Signals())\n"
-        "with raising():\n    try:\n        import splat.scenes\n    except Interrupted as error:\n"
-        "        print(error.exit_code, 'pycolmap' in sys.modules)"
+        "try:\n    with raising():\n        import splat.scenes\nexcept Interrupted as error:\n"
+        "    print(error.exit_code, 'pycolmap' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("129 True\n", "")

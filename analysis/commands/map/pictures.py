@@ -47,18 +47,22 @@ def view_maps(
     squared = float(difference.double().square().mean())
     found = {name: in_bytes(part).transpose(1, 2, 0) for name, part in (("photograph", view.image), ("render", image))}
     found["error"] = error_scale.bytes(difference.abs().mean(dim=0).numpy())
-    for name, share in shares.items():
-        found[name] = share_in_bytes(composited(objective, view.camera, share))
+    fields = composited(objective, view.camera, torch.stack([*shares.values()], dim=1))
+    found |= {name: share_in_bytes(field) for name, field in zip(shares, fields, strict=True)}
     return found, -10 * log10(squared) if squared else inf
 
 
-def composited(objective: SceneObjective, camera: Camera, share: Float64[Tensor, " n"]) -> Float64[np.ndarray, "h w"]:
-    """The mean of the Gaussians' numbers by their weights in every pixel; nan where those that have one weigh nothing."""
-    known = share.isfinite()
-    layers = torch.stack([share.nan_to_num(), known.double(), torch.zeros_like(share)], dim=1)
-    planes, _ = render_layers(objective.active, camera, layers.to(objective.active.flat), objective.settings)
-    total, weight, _ = planes.double().numpy()
-    return np.where(weight > LEAST, total / np.maximum(weight, LEAST), np.nan)
+def composited(
+    objective: SceneObjective, camera: Camera, shares: Float64[Tensor, "n k"]
+) -> Float64[np.ndarray, "k h w"]:
+    """The means of the Gaussians' numbers by their weights in every pixel; nan where those that have one weigh nothing."""
+    known, which = shares.isfinite().unique(dim=1, return_inverse=True)
+    columns = torch.cat([shares.nan_to_num(), known.double()], dim=1).to(objective.active.flat)
+    layers = torch.nn.functional.pad(columns, (0, -columns.shape[1] % 3)).split(3, dim=1)
+    planes = [render_layers(objective.active, camera, each, objective.settings)[0] for each in layers]
+    sums = torch.cat(planes).double().numpy()
+    totals, weights = sums[: len(which)], sums[len(which) :][which]
+    return np.where(weights > LEAST, totals / np.maximum(weights, LEAST), np.nan)
 
 
 def write_maps(path: Path, maps: Mapping[str, np.ndarray]) -> None:

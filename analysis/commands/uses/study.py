@@ -97,7 +97,7 @@ def run_study(file: Path) -> int:
         last = f"{found[-1]['psnr']:.2f} dB on {found[-1]['views']} views"
         say(f"{done + 1} of {len(cells)}: {name}, {rule}, seed {seed}: {last}", console=console)
     table = pd.DataFrame(rows)
-    table.to_csv(out / "study.csv", index=False)
+    write_atomically(out / "study.csv", table.to_csv(index=False).encode())
     notes = draw_or_say("uses", out)
     last = table[table["round"] == study.rounds].groupby(["scene", "rule"])["psnr"].agg(["mean", "std", "count"])
     say(*notes, style="yellow", console=console)

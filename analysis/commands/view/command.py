@@ -15,6 +15,7 @@ from analysis.commands.view.page import offline_page
 from analysis.commands.view.viewer import APPEARANCE, Viewer
 from analysis.console.plain import say
 from analysis.console.stages import Stages
+from analysis.measures.steepest import heaviest_view
 from analysis.probe.command import opened, scene_objective
 from analysis.slice.directions import RISE, UNITS, recorded_probe
 from landscape import curvature_reach
@@ -22,6 +23,8 @@ from landscape.errors import InputError, did_you_mean
 from splat.curvature.fields import FIELDS
 from splat.curvature.objective import SceneObjective
 from splat.training.checkpoint import write_atomically
+
+STEEPEST = "e₁"
 
 
 def run_view(options: ViewOptions) -> int:
@@ -37,12 +40,14 @@ def run_view(options: ViewOptions) -> int:
         folder = options.checkpoint.parent
         checkpoint, scene = opened(options.checkpoint, options.scene, options.foreign, folder / "view")
         objective = scene_objective(checkpoint, scene)
+        directions = steepest_directions(objective, folder / PROBE)
+        start = heaviest_view(objective, directions[STEEPEST][0]) if STEEPEST in directions else 0
     try:
         server = viser.ViserServer(host=options.host, port=options.port, label="splat-landscape", verbose=False)
     except OSError as error:
         raise InputError(f"expected a free --port, got {options.port} ({error}); choose another") from error
     try:
-        viewer = Viewer(server, objective)
+        viewer = Viewer(server, objective, start)
         if options.html is None:
             console.print(f"open http://{options.host}:{server.get_port()}; Ctrl-C ends it", highlight=False)
         notes: list[str] = []
@@ -60,7 +65,7 @@ def run_view(options: ViewOptions) -> int:
             ):
                 report.write_report(folder / PROBE)  # its page has a link to this one
             return 0
-        viewer.add_steps(steepest_directions(objective, folder / PROBE))
+        viewer.add_steps(directions)
         Event().wait()
     except KeyboardInterrupt:
         console.print("ended", highlight=False)
@@ -84,7 +89,7 @@ def steepest_directions(objective: SceneObjective, probe: Path) -> dict[str, tup
     if recorded is None:
         return {}
     ends, vectors = recorded.data.eigenvalues, recorded.arrays["eigenvectors"]["largest"]
-    values = {"e₁": ends.max.value, "e₂": ends.second.value if ends.second else None}
+    values = {STEEPEST: ends.max.value, "e₂": ends.second.value if ends.second else None}
     rise = RISE * objective.loss(objective.active.flat)
     return {
         name: (torch.from_numpy(vectors[:, i]), curvature_reach(value, rise, UNITS))

@@ -22,7 +22,7 @@ def offline_page(viewer: Viewer, shown: str) -> str:
         if name != APPEARANCE:
             shade = fields.shade(name)
             words, colours = fields.kinds[name].words, shade.colours_of(fields.values[name].numpy())
-            legend = f"{shade.unit}{shade.legend}"
+            legend = f"{shade.unit}{shade.legend}10th to 98th percentile, by weight"
         scene.add_gaussian_splats(
             f"/{words}", **viewer.frame.splats(viewer.objective.active), rgbs=colours, opacities=viewer.opacities,
             visible=name == shown,

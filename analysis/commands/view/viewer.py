@@ -10,6 +10,7 @@ of the constant band.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from threading import Lock
 from typing import Any
 
@@ -24,6 +25,7 @@ from analysis.measures.steepest import in_bytes
 from analysis.records.quantities import Shade, percent, quantity
 from analysis.slice.directions import UNITS
 from landscape.errors import InputError
+from splat.curvature.fields import Field
 from splat.curvature.objective import SceneObjective
 from splat.model.camera import Camera, look_at
 from splat.model.gaussians import Gaussians
@@ -80,7 +82,8 @@ class Frame:
 class Viewer:
     """The page of one scene."""
 
-    def __init__(self, server: Any, objective: SceneObjective) -> None:
+    def __init__(self, server: Any, objective: SceneObjective, start: int = 0) -> None:
+        """start: place of the training view from which the page is seen at first."""
         self.server, self.objective, self.frame = server, objective, Frame(objective.active)
         self.fields: Fields | None = None
         self.names = {APPEARANCE: APPEARANCE}  # of the fields, by what they are in words
@@ -95,25 +98,28 @@ class Viewer:
             "/splats", **self.frame.splats(active), rgbs=self.plain, opacities=self.opacities
         )
         self.mark = server.scene.add_frame("/picked", show_axes=False, visible=False)
-        self._add_cameras()
+        self._add_cameras(start)
         gui = server.gui
         self.field = gui.add_dropdown("field", (APPEARANCE,), hint="What colours the splats.")
-        self.scale = gui.add_multi_slider("scale, percentiles", 0.0, 100.0, 0.5, (10.0, 98.0))
-        self.shown = gui.add_multi_slider("show, percentiles", 0.0, 100.0, 0.5, (0.0, 100.0))
         self.legend = gui.add_html("")
+        self.scale = gui.add_multi_slider("scale, percentiles", 0.0, 100.0, 0.5, (10.0, 98.0))
+        self.ends = gui.add_html("")  # of the scale, as values
+        self.shown = gui.add_multi_slider("show, percentiles", 0.0, 100.0, 0.5, (0.0, 100.0))
+        self.between = gui.add_html("")  # which values are shown
         for control in (self.field, self.scale, self.shown):
             control.on_update(lambda _: self.recolour())
         self.numbers = gui.add_markdown("Click a splat for its numbers.")
-        self.view = gui.add_dropdown("training view", tuple(view.name for view in objective.views))
+        names = tuple(view.name for view in objective.views)
+        self.view = gui.add_dropdown("training view", names, initial_value=names[start])
         self.render = gui.add_image(self._image(active), label="render")
         self.loss = gui.add_markdown(f"loss {quantity(objective.loss(active.flat))}")
         self.view.on_update(lambda _: self.step())
         server.scene.on_click()(lambda event: self.click(event.ray_origin, event.ray_direction))
 
-    def _add_cameras(self) -> None:
-        """The training views, and where the page's own camera starts: behind them."""
+    def _add_cameras(self, start: int) -> None:
+        """The training views; the page's own camera stands in one of them, whose photograph would hide the scene."""
         cameras, scene = [view.camera for view in self.objective.views], self.server.scene
-        down, forward = (torch.stack([camera.rotation[i] for camera in cameras]).mean(dim=0).numpy() for i in (1, 2))
+        down = torch.stack([camera.rotation[1] for camera in cameras]).mean(dim=0)
         scene.set_up_direction(tuple((-down).tolist()))
         places = np.stack([self.frame.place(camera.centre) for camera in cameras])
         apart = np.linalg.norm(places - places.mean(axis=0), axis=1).max() or RADIUS / 10
@@ -122,13 +128,17 @@ class Viewer:
             step = -(-max(camera.width, camera.height) // 256)  # small photographs load at once
             scene.add_camera_frustum(
                 f"/cameras/{view.name}", fov=2 * float(np.arctan(camera.height / 2 / camera.fy)),
-                aspect=camera.width / camera.height, scale=apart / 5,
+                aspect=camera.width / camera.height, scale=apart / 10,
                 image=in_bytes(view.image).transpose(1, 2, 0)[::step, ::step],
-                wxyz=turn, position=place, thickness=1.0, thickness_units="screen",
+                wxyz=turn, position=place, thickness=1.0, thickness_units="screen", visible=camera is not cameras[start],
             )  # fmt: skip
-        start = self.server.initial_camera
-        start.position = tuple((places.mean(axis=0) - 2 * apart * forward).tolist())
-        start.look_at = tuple((places.mean(axis=0) + RADIUS * forward).tolist())
+        own, first = cameras[start], self.server.initial_camera
+        first.position, first.up = tuple(places[start].tolist()), tuple((-own.rotation[1]).tolist())
+        depth = float(((self.objective.active.means.double() - own.centre) @ own.forward).median())
+        first.look_at = tuple(
+            self.frame.place(own.centre + max(depth, 0.0) * own.forward).tolist()
+        )  # which it turns about
+        first.fov = 2 * float(np.arctan(own.height / 2 / own.fy))
 
     def add_fields(self, fields: Fields, shown: str) -> None:
         """The drop-down's further entries, once they are measured."""
@@ -155,7 +165,8 @@ class Viewer:
         self._tell()
         name = self.names[self.field.value]
         if self.fields is None or name == APPEARANCE:
-            self.splats.rgbs, self.splats.opacities, self.legend.content = self.plain, self.opacities, ""
+            self.splats.rgbs, self.splats.opacities = self.plain, self.opacities
+            self.legend.content = self.ends.content = self.between.content = ""
             return
         kind, values = self.fields.kinds[name], self.fields.values[name].numpy()
         ends = (float(self.scale.value[0]), float(self.scale.value[1]))
@@ -166,7 +177,10 @@ class Viewer:
         inside = np.ones(len(values), bool) if everything else (values >= low) & (values <= high)
         self.splats.rgbs = shade.colours_of(values)
         self.splats.opacities = self.opacities * inside[:, None]
-        self.legend.content = f'<div style="padding:0 1em;font-size:.85em">{shade.title}{shade.legend}</div>'
+        self.legend.content = _small(f"{shade.title}{shade.legend}")
+        self.ends.content = _small(f"colours {_range(kind, shade.value(shade.low), shade.value(shade.high))}")
+        some = "all" if everything else f"{inside.sum():,} of {len(values):,}"
+        self.between.content = _small(f"{some} splats, {_range(kind, float(low), float(high))}")
 
     def step(self) -> None:
         """The splats, the render of the chosen view and the loss where the sliders are."""
@@ -237,6 +251,14 @@ class Viewer:
         lines += ["", "| | Hessian | Gauss-Newton |", "| --- | --- | --- |"]
         lines += [f"| {kinds[a].words} | {numbers[a]} | {numbers[b]} |" for a, b in pairs.items()]
         return "\n".join(lines)
+
+
+def _range(kind: Field, low: float, high: float) -> str:
+    return f"from {in_words(replace(kind, unit=''), low)} to {in_words(kind, high)}"
+
+
+def _small(text: str) -> str:
+    return f'<div style="padding:0 1em;font-size:.85em">{text}</div>'
 
 
 def heaviest_on_ray(objective: SceneObjective, origin: Tensor, direction: Tensor) -> tuple[int, float] | None:

@@ -22,7 +22,7 @@ from rich import box
 from rich.table import Table
 
 from analysis.records.findings import attribute_name, of_budgets
-from analysis.records.quantities import PLACES, SCORES, quantity
+from analysis.records.quantities import PLACES, PLUS_MINUS, SCORES, quantity
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import Clock, ViewScores, read_scores
 from analysis.records.schema import INDICES, Effect, Index
@@ -206,5 +206,5 @@ def _cell(row: Mapping[Any, Any], name: str, most: int) -> str:
     if not n:
         return quantity(None)
     parts = [mean] if n < 2 or math.isnan(deviation) else [mean, deviation]
-    text = " ± ".join(f"{part:.{DECIMALS[name]}f}" for part in parts) if name in DECIMALS else quantity(*parts)
+    text = PLUS_MINUS.join(f"{part:.{DECIMALS[name]}f}" for part in parts) if name in DECIMALS else quantity(*parts)
     return text if n == most else f"{text} (n = {n})"

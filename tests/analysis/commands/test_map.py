@@ -102,15 +102,17 @@ def test_a_run_folder_is_mapped_like_the_file_it_was_made_of(folder):
 def test_a_field_is_composited_with_the_weights_of_the_splats():
     gaussians = random_gaussians(30, seed=2, logit=0.0, spread=0.6)
     objective = SceneObjective(gaussians, two_views())
-    share = torch.linspace(0, 1, len(objective.active), dtype=torch.float64)
-    share[::5] = torch.nan
+    shares = torch.linspace(0, 1, 5 * len(objective.active), dtype=torch.float64).view(5, -1)
+    shares[0, ::5], shares[3, 1::2] = torch.nan, torch.nan
     camera = objective.views[0].camera
     w, _ = weights(objective.active, camera, objective.settings)
-    w = w[share.isfinite()]
-    mean = (w * share[share.isfinite(), None, None]).sum(dim=0) / w.sum(dim=0)
-    found = torch.from_numpy(composited(objective, camera, share))
-    assert torch.equal(found.isnan(), w.sum(dim=0) <= 0.02) and not found.isnan().all()
-    assert torch.allclose(found[~found.isnan()], mean[~found.isnan()], atol=1e-10)
+    fields = torch.from_numpy(composited(objective, camera, shares.T))
+    for share, found in zip(shares, fields, strict=True):
+        known = share.isfinite()
+        total = w[known].sum(dim=0)
+        mean = (w[known] * share[known, None, None]).sum(dim=0) / total
+        assert torch.equal(found.isnan(), total <= 0.02) and not found.isnan().all()
+        assert torch.allclose(found[~found.isnan()], mean[~found.isnan()], atol=1e-10)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from analysis.commands.map.command import measured_fields
 from analysis.commands.map.pictures import rendered
 from analysis.commands.view import command, page
 from analysis.commands.view import viewer as view
+from analysis.measures.steepest import heaviest_view
 from splat.curvature.objective import SceneObjective
 from splat.projection.reference import rotation_matrices
 from splat.scenes.synthetic import SyntheticSettings, synthetic_scene
@@ -77,6 +78,15 @@ def test_the_controls_colour_hide_and_step(viewer, objective):
     assert "largest curvature" in viewer.legend.content
     viewer.shown.value = (90.0, 100.0)
     viewer.recolour()
+    kind, (low, high) = fields.kinds["largest"], np.percentile(values, (90, 100))
+    between = f"from {view.quantity(low)} to {view.in_words(kind, high)}"
+    assert between in viewer.between.content and "per stored unit²" in between
+    shade = fields.shade("largest")  # whose ends are the slider's at first
+    colours = f"from {view.quantity(shade.value(shade.low))} to {view.in_words(kind, shade.value(shade.high))}"
+    assert colours in viewer.ends.content
+    viewer.scale.value = (50.0, 60.0)
+    viewer.recolour()
+    assert "colours from" in viewer.ends.content and colours not in viewer.ends.content
     assert (viewer.splats.opacities[:, 0] > 0).mean() == pytest.approx(0.1, abs=0.02)
     assert values[viewer.splats.opacities[:, 0] > 0].min() >= np.percentile(values, 90)
     direction = torch.zeros_like(objective.active.flat)
@@ -90,6 +100,34 @@ def test_the_controls_colour_hide_and_step(viewer, objective):
     assert f"{view.quantity(objective.loss(there.flat))}" in viewer.loss.content
     viewer.click(*_ray(viewer, objective))
     assert "Gaussian" in viewer.numbers.content and "largest curvature" in viewer.numbers.content
+
+
+@pytest.mark.parametrize("start", [0, 1])
+def test_the_page_opens_in_the_training_view_that_it_is_told(objective, start):
+    viser = pytest.importorskip("viser", reason="needs viser; pip install -e '.[view]'")
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        found, camera = view.Viewer(server, objective, start), objective.views[start].camera
+        first, frame = server.initial_camera, found.frame
+        assert np.allclose(first.position, frame.place(camera.centre)) and np.allclose(first.up, -camera.rotation[1])
+        ahead = first.look_at - first.position
+        assert np.allclose(ahead / np.linalg.norm(ahead), camera.forward, atol=1e-6)
+        assert first.fov == pytest.approx(2 * np.arctan(camera.height / 2 / camera.fy))
+        assert found.view.value == objective.views[start].name
+        assert np.array_equal(found.render.image, view.in_bytes(rendered(objective, start)).transpose(1, 2, 0))
+    finally:
+        server.stop()
+
+
+def test_the_view_of_a_direction_is_that_where_its_heaviest_gaussian_weighs_most(objective):
+    for index in (3, 60):
+        vector = torch.zeros_like(objective.active.flat)
+        objective.active.with_flat(vector).means[index] = 1.0
+        heavy = [
+            float(weights(objective.active, each.camera, objective.settings)[0][index].sum())
+            for each in objective.views
+        ]
+        assert heaviest_view(objective, vector) == int(np.argmax(heavy))
 
 
 def test_a_pick_is_outlined_and_lists_the_field_shown_first(viewer, objective):

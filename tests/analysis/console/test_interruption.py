@@ -3,12 +3,19 @@
 import ctypes
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 
-from analysis.console.interruption import Interrupted, raising
+from analysis.console.failures import program
+from analysis.console.interruption import AGAIN, SIGNALS, Interrupted, raising
+
+ROOT = Path(__file__).parents[3]
 
 
 def waits_after(signalled: Callable[[], object]) -> None:
@@ -42,6 +49,49 @@ def test_a_signal_in_what_llvm_calls_lets_it_do_its_work_first():
     with pytest.raises(Interrupted) as raised, raising():
         waits_after(_raw_object_cache_notify)
     assert done and raised.value.exit_code == 130
+
+
+def test_a_signal_while_a_library_is_loaded_is_heard_once_it_is(tmp_path, monkeypatch):
+    lines = "import os, signal, time\nos.kill(os.getpid(), signal.SIGTERM)\ntime.sleep(0.2)\nloaded = True\n"
+    (tmp_path / "interrupted.py").write_text(lines)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(Interrupted) as raised, raising():
+        waits_after(lambda: import_module("interrupted"))
+    assert sys.modules.pop("interrupted").loaded and raised.value.exit_code == 143
+
+
+def test_a_signal_while_the_last_library_is_loaded_is_heard_at_the_end(tmp_path, monkeypatch):
+    (tmp_path / "interrupted.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(Interrupted) as raised, raising():
+        import_module("interrupted")
+    del sys.modules["interrupted"]
+    time.sleep(4 * AGAIN)  # in which none comes any more
+    assert raised.value.exit_code == 143
+
+
+@pytest.mark.parametrize("began", ["landscape", "-m"])
+def test_a_signal_while_a_program_loads_libraries_ends_it_in_a_line(began):
+    program = f"import sys; sys.argv[0] = {began!r}\nimport analysis, os, signal, time\n"
+    program += "os.kill(os.getpid(), signal.SIGINT)\ntime.sleep(10)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "landscape: interrupted by SIGINT\n")
+
+
+def test_a_script_of_figures_answers_a_signal_as_commands_do():
+    def interrupted() -> int:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(10)
+        return 0
+
+    handlers = {each: signal.getsignal(each) for each in SIGNALS}
+    try:
+        with pytest.raises(SystemExit) as ended:
+            program(interrupted)
+        assert ended.value.code == 143 and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
 
 
 def test_what_a_library_makes_of_a_signal_is_that_signal():

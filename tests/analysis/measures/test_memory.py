@@ -24,7 +24,8 @@ def objective() -> SceneObjective:
 
 
 def free(monkeypatch, amount: float) -> None:
-    monkeypatch.setattr(memory, "free_memory", lambda _: int(amount))
+    for name in ("free_memory", "memory_left"):
+        monkeypatch.setattr(memory, name, lambda _: int(amount))
 
 
 def test_vectors_are_those_of_the_budget_and_of_half_of_what_is_free(objective, monkeypatch):
@@ -71,6 +72,11 @@ def test_less_memory_keeps_fewer_views_and_too_little_is_refused(objective, monk
     free(monkeypatch, needs.view)
     with pytest.raises(TooLittleMemory, match=r"expected at least \d+\.\d\d GB .* got .*; \d\.\d\d GB more would fit"):
         expected_peak(objective)
+    monkeypatch.setattr(memory, "memory_left", lambda _: -int(2e9))  # of what no plan counts on
+    with pytest.raises(TooLittleMemory, match=r"; 2\.\d\d GB more would fit$"):
+        expected_peak(objective)
+    with pytest.raises(TooLittleMemory, match=r", got 0\.00 GB; allow or free at least 2\.\d\d GB more$"):
+        require_pictures(MADE.scene.frames, objective.active)
     with staying_within(1), pytest.raises(TooLittleMemory, match=r"; --memory [\d.]+GB would fit"):
         expected_peak(objective)
     free(monkeypatch, 1e6)

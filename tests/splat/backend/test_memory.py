@@ -52,10 +52,10 @@ def test_little_room_in_limits_is_refused_before_what_cannot_say_that_it_lacks_i
 
 
 def group(folder: Path, limit: str, usage: int, version: int, cached: int = 0) -> None:
-    """Of the files that the system gives of a control group, those that are read."""
+    """Of the files that the system gives of a control group, those that are read.  limit: beside what no plan counts on."""
     _, most, used = memory.VERSIONS[version]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / most).write_text(f"{limit}\n")
+    (folder / most).write_text(f"{int(limit) + memory.OF_GROUP if limit.isdigit() else limit}\n")
     (folder / used).write_text(f"{usage}\n")
     word = "total_inactive_file" if version == 1 else "inactive_file"
     (folder / "memory.stat").write_text(f"anon 1\n{word} {cached}\n")
@@ -78,7 +78,7 @@ def test_the_tightest_group_decides_and_what_caches_files_can_be_had(version, tm
     group(top / "job", str(60 * MIB), 55 * MIB, version, cached=10 * MIB)
     assert free_memory(CPU) == 15 * MIB
     group(top, str(50 * MIB), 70 * MIB, version)
-    assert free_memory(CPU) == 0
+    assert free_memory(CPU) == 0 and memory.memory_left(CPU) == -20 * MIB
 
 
 def test_what_cannot_be_read_of_a_group_limits_nothing(version, tmp_path):

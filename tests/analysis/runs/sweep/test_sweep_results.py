@@ -10,6 +10,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from analysis.records.quantities import PLUS_MINUS
 from analysis.runs.sweep.sweep_file import Cell
 from analysis.runs.sweep.sweep_results import (
     REASONS,
@@ -23,7 +24,7 @@ from analysis.runs.sweep.sweep_results import (
 from analysis.train.options import TrainOptions
 from analysis.train.training_time import TrainingTime
 from splat.training.loop import StepResult
-from tests.recorded import synthetic, written
+from tests.recorded import soft, synthetic, written
 
 
 def test_an_index_of_which_only_a_bound_is_known_is_not_averaged(tmp_path):
@@ -75,7 +76,7 @@ def test_mean_deviation_and_ratio_are_taken_over_the_seeds_of_a_method():
         and summary["psnr_std"].isna().tolist()[1:] == [True] * 2
     )
     (table,) = tables(summary)
-    assert [list(column.cells) for column in table.columns][3] == ["11.50 ± 2.12", "20.00", "7.00"]
+    assert [list(column.cells) for column in table.columns][3] == [f"11.50{PLUS_MINUS}2.12", "20.00", "7.00"]
 
 
 def test_times_by_the_clock_are_compared_only_at_as_many_threads():
@@ -127,7 +128,7 @@ def test_no_cell_of_the_tables_is_wrapped_or_cut_in_80_columns():
     printed = io.StringIO()
     for table in tables(summary):
         Console(width=80, file=printed).print(table)
-    text = printed.getvalue()
+    text = soft(printed.getvalue())
     assert max(map(len, text.splitlines())) <= 80 and "…" not in text
     lines = [line for line in text.splitlines() if "garden" in line]
     assert sum(line.count(" ± ") for line in lines) == len(names) == text.count(" ± ") - text.count("mean ± standard")
