@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -138,9 +139,9 @@ class Records(Format):
     def use(self) -> None:
         from rich.console import Console
 
+        from analysis.records import report
         from analysis.records.findings import findings
         from analysis.records.records import ProbeRecord, read_record
-        from analysis.records.report import render_report
         from analysis.records.tables import family_table, probe_table
         from analysis.runs.compare import cautions, render_page
         from analysis.runs.compare_table import Run, compare_table, comparison, frame
@@ -160,7 +161,11 @@ class Records(Format):
             frame(rows, ["a", "b"]).to_csv(index=False)
             console.print(compare_table(rows, ["a", "b"]))
         render_page(runs, ["a", "b"], rows, [], cautions(runs), self.root)
-        render_report(record, None if self.chance.random() < 5 * DRAWN else "")
+        if self.chance.random() < 5 * DRAWN:
+            report.render_report(record)
+        else:  # without the surface, whose program takes the longest to pack
+            with patch.object(report, "interactive_surface", return_value=None):
+                report.render_report(record)
         if self.chance.random() < DRAWN:
             self.draw(record)
 
