@@ -21,7 +21,7 @@ from figures.style import BLUE, UNDETERMINED, VERMILION, folder_script, new_figu
 UNITS = {"×": "ratio (×)", "dB": "PSNR gained (dB)", "": "share or correlation"}
 KINDS = {"all": "all runs", "between": "means of methods", "within": "seeds of a method"}
 VERDICTS = {"holds": BLUE, "holds in part": BLUE, "does not hold": VERMILION, "cannot be tested here": UNDETERMINED}
-ROW, PANEL, WRAP = 0.17, 0.8, 76  # inches; characters
+ROW, PANEL, WRAP = 0.17, 1.05, 76  # inches; characters
 SMALL = 150  # dots per inch of a statement's own picture
 CROWDED = 1e3  # from the least ratio to the largest: powers of ten alone are labelled
 FAR = 1e4  # a ratio beyond this, or below its inverse, ends at the edge

@@ -77,9 +77,11 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
     """An index of every run over the steps, its magnitude on a logarithmic axis, with its bracket.  runs: name -> colour.
 
     Hollow where it is negative.  Of one that has only a lower bound, the bound is drawn, as a triangle; without one, nothing.
+    The first run is drawn broad, below the others, so that it is seen where another one coincides with it.
     """
     axes.set_yscale("log")
-    for run, colour in runs.items():
+    for place, (run, colour) in enumerate(runs.items()):
+        broad = 1.0 if place or len(runs) == 1 else 2.2
         part = pd.DataFrame(measured[(measured["run"] == run) & measured[name].notna()])
         steps, values = part["step"].to_numpy(float), part[name].to_numpy(float)
         magnitudes = np.abs(values)
@@ -90,12 +92,12 @@ def index_over_steps(axes: Axes, measured: pd.DataFrame, runs: dict[str, str], n
         shown[shown == 0] = np.nan  # of which a logarithmic axis has no place
         high = np.where(unbounded, shown, np.fmax(ends.max(axis=0), magnitudes))
         axes.fill_between(steps, np.where(shown > 0, low, np.nan), high, color=colour, alpha=0.25, linewidth=0)
-        axes.plot(steps, shown, color=colour, linewidth=1.0)
+        axes.plot(steps, shown, color=colour, linewidth=1.1 * broad)
         for kind, marker in ((~unbounded, "o"), (unbounded, "^")):
             for sign, face in ((values >= 0, colour), (values < 0, "white")):
                 chosen = kind & sign
                 axes.plot(
-                    steps[chosen], shown[chosen], marker, color=colour, markerfacecolor=face, markersize=3,
+                    steps[chosen], shown[chosen], marker, color=colour, markerfacecolor=face, markersize=3 * broad,
                     linestyle="none",
                 )  # fmt: skip
     _few_decades(axes)

@@ -10,6 +10,7 @@ of the constant band.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from threading import Lock
 from typing import Any
 
@@ -24,6 +25,7 @@ from analysis.measures.steepest import in_bytes
 from analysis.records.quantities import Shade, percent, quantity
 from analysis.slice.directions import UNITS
 from landscape.errors import InputError
+from splat.curvature.fields import Field
 from splat.curvature.objective import SceneObjective
 from splat.model.camera import Camera, look_at
 from splat.model.gaussians import Gaussians
@@ -176,13 +178,9 @@ class Viewer:
         self.splats.rgbs = shade.colours_of(values)
         self.splats.opacities = self.opacities * inside[:, None]
         self.legend.content = _small(f"{shade.title}{shade.legend}")
-        self.ends.content = _small(
-            f"colours from {in_words(kind, shade.value(shade.low))} to {in_words(kind, shade.value(shade.high))}"
-        )
+        self.ends.content = _small(f"colours {_range(kind, shade.value(shade.low), shade.value(shade.high))}")
         some = "all" if everything else f"{inside.sum():,} of {len(values):,}"
-        self.between.content = _small(
-            f"{some} splats, from {in_words(kind, float(low))} to {in_words(kind, float(high))}"
-        )
+        self.between.content = _small(f"{some} splats, {_range(kind, float(low), float(high))}")
 
     def step(self) -> None:
         """The splats, the render of the chosen view and the loss where the sliders are."""
@@ -253,6 +251,10 @@ class Viewer:
         lines += ["", "| | Hessian | Gauss-Newton |", "| --- | --- | --- |"]
         lines += [f"| {kinds[a].words} | {numbers[a]} | {numbers[b]} |" for a, b in pairs.items()]
         return "\n".join(lines)
+
+
+def _range(kind: Field, low: float, high: float) -> str:
+    return f"from {in_words(replace(kind, unit=''), low)} to {in_words(kind, high)}"
 
 
 def _small(text: str) -> str:

@@ -218,9 +218,13 @@ def _within(time: Interval) -> bool | None:
 
 def scores(rows: pd.DataFrame) -> Judgement:
     rows = pd.DataFrame(rows[rows["views"] == CLAIMED_VIEWS])
-    claims = {STABLE: 4.73, ATTRIBUTES_ALONE: 2.92, VIEWPOINTS_ALONE: 2.29}
+    claims = (
+        (STABLE, "StableGS", 4.73),
+        (ATTRIBUTES_ALONE, "probed attributes alone", 2.92),
+        (VIEWPOINTS_ALONE, "probed viewpoints alone", 2.29),
+    )
     effects = [
-        Effect(f"{name} over 3DGS", Interval.of(gains(rows, name)), 0.0, claim, "dB") for name, claim in claims.items()
+        Effect(f"{words} over 3DGS", Interval.of(gains(rows, name)), 0.0, claim, "dB") for name, words, claim in claims
     ]
     base = Interval.of(numbers(rows, SCORE, BASE)).text(" dB")
     finding = f"3DGS scores {base} on held-out views. Gains: " + "; ".join(

@@ -79,10 +79,10 @@ def test_the_controls_colour_hide_and_step(viewer, objective):
     viewer.shown.value = (90.0, 100.0)
     viewer.recolour()
     kind, (low, high) = fields.kinds["largest"], np.percentile(values, (90, 100))
-    between = f"from {view.in_words(kind, low)} to {view.in_words(kind, high)}"
+    between = f"from {view.quantity(low)} to {view.in_words(kind, high)}"
     assert between in viewer.between.content and "per stored unit²" in between
     shade = fields.shade("largest")  # whose ends are the slider's at first
-    colours = f"from {view.in_words(kind, shade.value(shade.low))} to {view.in_words(kind, shade.value(shade.high))}"
+    colours = f"from {view.quantity(shade.value(shade.low))} to {view.in_words(kind, shade.value(shade.high))}"
     assert colours in viewer.ends.content
     viewer.scale.value = (50.0, 60.0)
     viewer.recolour()
