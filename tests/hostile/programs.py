@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import splat.raster.cpu.raster  # noqa: F401
 from analysis.commands import cli
 from analysis.console import drawing
-from analysis.console.interruption import ignore, raising
+from analysis.console.failures import program as run_program
 
 ROOT = Path(__file__).parents[2]
 LATE = ("matplotlib.figure", "pandas", "scipy.sparse.csgraph", "torch.fx.experimental.symbolic_shapes")
@@ -36,12 +37,16 @@ class forked:
             quiet = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(quiet, 1)
             os.dup2(quiet, 2)
-            code = 70
+            code: Any = 70
+
+            def begin() -> int:
+                os.write(begun, b".")
+                return run()
+
             try:
-                with raising():
-                    os.write(begun, b".")
-                    code = run()
-                    ignore()
+                run_program(begin)
+            except SystemExit as ended:
+                code = ended.code
             finally:
                 os._exit(code)
         os.close(begun)
