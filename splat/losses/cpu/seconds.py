@@ -31,7 +31,7 @@ def second_rows(start, stop, frame, loss, x, y, target, blurred_sp, seconds, unc
     for channel in range(3):
         top, first, _last, rows_ahead = part_of(start, stop, channel, REACH, frame)
         for ahead in rows_ahead:
-            feed(None, x, y, top, ahead, frame, rows, own, 0)
+            feed(None, 0, x, y, top, ahead, frame, rows, own, 0)
             row = ahead - REACH
             if row < first:
                 continue
