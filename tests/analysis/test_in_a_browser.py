@@ -82,7 +82,7 @@ def test_a_click_a_field_and_a_step_reach_the_viewer(browser, viewer):
 
     browser.get(f"http://127.0.0.1:{viewer.server.get_port()}")
     until(browser, "document.body.innerText.includes('training view')")
-    until(browser, "/splats, from [^ ]+ .* to /.test(document.body.innerText)")
+    until(browser, "/splats, from .+ to /.test(document.body.innerText)")
     camera, own = next(iter(viewer.server.get_clients().values())).camera, viewer.objective.views[1].camera
     assert np.allclose(camera.position, viewer.frame.place(own.centre), atol=1e-3)
     canvas = browser.find_element("tag name", "canvas")
