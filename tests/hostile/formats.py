@@ -9,8 +9,8 @@ from tests.hostile.work_formats import KeptPoints, KeptStages, SliceFiles, Study
 FORMATS: dict[str, type[Format]] = {
     each.name: each
     for each in (
-        CheckpointFile, ProbeJson, ProbeArrays, TrajectoryCsv, RunFiles, SweepToml, ColmapBinary, ColmapText, Llff, Transforms,
-        Ply, PlyText, Pictures, PointCloud, TextPly, DotSplat, Graphdeco, Gsplat, Splatfacto, *QUANTISED,
-        Blender, Dtu, SliceFiles, StudyCsv, KeptStages, KeptPoints,
+        StudyCsv, CheckpointFile, ProbeJson, ProbeArrays, TrajectoryCsv, RunFiles, SweepToml, ColmapBinary, ColmapText, Llff,
+        Transforms, Ply, PlyText, Pictures, PointCloud, TextPly, DotSplat, Graphdeco, Gsplat, Splatfacto, *QUANTISED,
+        Blender, Dtu, SliceFiles, KeptStages, KeptPoints,
     )
 }  # fmt: skip

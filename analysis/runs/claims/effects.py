@@ -105,10 +105,11 @@ def decide(effect: Effect) -> Verdict:
 
 def numbers(rows: pd.DataFrame, name: str, method: str | None = None, keys: Sequence[str] = PAIR) -> pd.Series:
     """A quantity by keys: of every run, or the means of one method's runs with the same keys; empty where no run has it."""
-    part = rows if method is None else rows[rows["method"] == method]
-    values = np.asarray(part[name], float) if name in part else np.full(len(part), np.nan)
+    values = np.asarray(rows[name], float) if name in rows else np.full(len(rows), np.nan)
     known = np.isfinite(values)
-    found = pd.Series(values[known], pd.MultiIndex.from_arrays([part[key][known] for key in keys]))
+    if method is not None:
+        known &= np.asarray(rows["method"] == method)
+    found = pd.Series(values[known], pd.MultiIndex.from_arrays([rows[key].array[known] for key in keys], names=keys))
     return found if method is None else _means(found, keys)
 
 
