@@ -12,11 +12,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from analysis.console.failures import program
 from figures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, literal, new_figure, save, style
 
-COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, "0.45", BLACK)
+COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, "0.45", BLACK, "saddlebrown", "olive")
 LINES = {"own": ("-", "o"), "peer": ("--", "^")}
 PANEL = 1.5  # inches of height
 LEGEND_LINE = 0.14
@@ -54,6 +55,7 @@ def draw(table: pd.DataFrame, quantity: str) -> Figure:
 def _panel(axes: Axes, part: pd.DataFrame, looks: dict[tuple[str, str], tuple[str, str, str]]) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(True)
     for (origin, method), (colour, line, marker) in looks.items():
         points = part[(part["origin"] == origin) & (part["method"] == method) & np.isfinite(part["true_error"])]
