@@ -25,12 +25,12 @@ from matplotlib.ticker import MaxNLocator
 from analysis.console.failures import program
 from analysis.records.quantities import quantity
 from analysis.records.records import Record
-from analysis.records.report import eye_over
 from figures import render_surface
 from figures.plane import Direction, Plane, plane
 from figures.render_surface import Box
 from figures.style import BLACK, FIELD_MAP, VERMILION, new_figure, script, style
 from landscape.errors import InputError
+from landscape.slices.eye import eye_over
 
 RENDERER = [sys.executable, str(Path(render_surface.__file__))]
 TIME_LIMIT = 120  # seconds for one picture

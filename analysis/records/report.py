@@ -7,7 +7,6 @@ to a network.  Text from the record is escaped.
 import base64
 import gzip
 import io
-import itertools
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +35,8 @@ from analysis.records.records import PHOTOGRAPH, RENDER, ProbeRecord, Record, re
 from analysis.records.run_files import MAP, MapRecord, Steepest, read_map
 from analysis.records.schema import INDICES
 from analysis.records.tables import bracketed, family_lines
+from landscape.slices.eye import eye_over
+from splat.model.untrusted import replacing
 
 FILE, SPLATS = "report.html", "view.html"  # in the record's folder, and beside it: the page of `landscape view --html`
 FINE, COARSE, QUICK = 82, 60, 2  # quality of WebP: of drawings, and of maps, which are noisy; effort, of 6
@@ -52,12 +53,6 @@ COMPARED = (  # of the traces, where the record has these steps
     "compares; beside the names their traces, each in its own unit."
 )
 PIXEL = "1 px along the ray: a way as long as the one that moves a splat by a pixel where it is across the ray."
-ASIDE = 0.65  # of a surface's eye: its way along x for one along y
-RISES, CLEAR, SAME = (
-    (0.75, 1.0, 1.4, 2.0),
-    0.97,
-    0.01,
-)  # of a surface's eye: heights over ways; share seen; of no account
 PACKED = 4  # level of gzip of plotly.js: at the usual 6 it takes twice as long for 4% fewer bytes
 
 
@@ -68,9 +63,8 @@ def write_report(folder: str | Path) -> Path:
     """
     record = read_record(folder, ProbeRecord)
     path = record.folder / FILE
-    temporary = path.with_suffix(".html.tmp")
-    temporary.write_text(render_report(record), encoding="utf-8")
-    temporary.replace(path)
+    with replacing(path) as partial:
+        partial.write_text(render_report(record), encoding="utf-8")
     return path
 
 
@@ -355,45 +349,6 @@ def _listed(values: np.ndarray) -> list[Any]:
 def _packed_plotly() -> str:
     content = files("plotly").joinpath("package_data/plotly.min.js").read_bytes()
     return base64.b64encode(gzip.compress(content, PACKED, mtime=0)).decode()
-
-
-def eye_over(heights: np.ndarray, tall: float) -> tuple[float, float, float]:
-    """Where a surface over [-1, 1]^2 is seen from: beyond one of its corners, as low as shows the valley, at a distance of 2.
-
-    heights: from 0 to 1, nan where there is none; drawn `tall` high.  Every point counts by its depth below the highest.
-    """
-    known = np.isfinite(heights)
-    heights, weight = np.where(known, heights, 0.0), np.where(known, 1.0 - heights, 0.0)
-    best, eye = -1.0, (0.0, 0.0, 0.0)
-    for rise in RISES:
-        for x, y in itertools.product((1, -1), (-1, 1)):
-            across = np.array([ASIDE * x, y]) / math.hypot(ASIDE, 1)
-            seen = ~_hidden(heights, across, rise / tall)
-            share = float((weight * seen).sum() / (weight.sum() or 1.0)) - (
-                not seen[np.unravel_index(weight.argmax(), seen.shape)]
-            )
-            if share > best + SAME:
-                place = 2 * np.array([*across, rise]) / math.hypot(1, rise)
-                best, eye = share, (float(place[0]), float(place[1]), float(place[2]))
-        if best > CLEAR:
-            break
-    return eye
-
-
-def _hidden(heights: np.ndarray, across: np.ndarray, rise: float) -> np.ndarray:
-    """Which points of a surface others hide from an eye far away, which is seen under this rise of a way across."""
-    size = np.array(heights.shape) - 1
-    places, hidden = np.indices(heights.shape).astype(float), np.zeros(heights.shape, bool)
-    step = 2 / size.max()
-    for k in range(1, int(3 / step)):
-        i, j = (
-            np.round(place + k * step * part * n / 2).astype(int)
-            for place, part, n in zip(places, across, size, strict=True)
-        )
-        inside = (i >= 0) & (i <= size[0]) & (j >= 0) & (j <= size[1])
-        nearer = heights[np.clip(i, 0, size[0]), np.clip(j, 0, size[1])]
-        hidden |= inside & (nearer > heights + k * step * rise + SAME)
-    return hidden
 
 
 def _escaped(text: str) -> str:

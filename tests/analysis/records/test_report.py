@@ -15,8 +15,9 @@ from analysis.records import report
 from analysis.records.findings import findings
 from analysis.records.quantities import exponent_of
 from analysis.records.records import PHOTOGRAPH, RENDER, record_folder, write_record
-from analysis.records.report import RISES, _hidden, eye_over, interactive_surface, numbers, write_report
+from analysis.records.report import interactive_surface, numbers, write_report
 from analysis.records.tables import family_table, probe_table
+from landscape.slices.eye import eye_over
 from tests.recorded import depth_section, probe_of, soft, synthetic, written
 
 UNPACKS = 'new DecompressionStream("gzip")'  # plotly.js
@@ -262,22 +263,6 @@ def test_a_direction_named_with_markup_is_shown_as_it_is(tmp_path):
     np.testing.assert_allclose(layout["zaxis"]["range"], [heights.min(), heights.max()], rtol=1e-6)
     span = np.ptp(heights)
     assert (*layout["camera"]["eye"].values(),) == eye_over((heights.T - heights.min()) / span, 1.0)
-
-
-def test_a_surface_is_seen_from_where_its_valley_is_not_hidden():
-    x, y = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), indexing="ij")
-    for toward in ((1, -1), (1, 1), (-1, -1), (-1, 1)):  # a quarter alone is low, behind walls
-        wall = np.where((x * toward[0] > 0) & (y * toward[1] > 0), 0.0, 1.0)
-        assert (*np.sign(eye_over(wall, 1.0)[:2]),) == toward
-    pit = np.where(np.hypot(x, y) < 0.3, 0.0, 1.0)  # steep all around, and deeper than wide: from above alone
-    flat, deep = eye_over(np.zeros((5, 7)), 1.0), eye_over(pit, 1.0)
-    rises = [eye[2] / np.hypot(*eye[:2]) for eye in (flat, deep)]
-    assert rises == pytest.approx([RISES[0], RISES[-1]])
-    assert not _hidden(np.zeros((5, 7)), np.array([0.6, 0.8]), 0.1).any()
-    ridge = np.zeros((21, 3))
-    ridge[15] = 1.0  # hides what is behind it, as far as its height over the rise
-    hidden = _hidden(ridge, np.array([1.0, 0.0]), 2.0)[:, 1]
-    assert hidden.tolist() == [10 < i < 15 for i in range(21)]
 
 
 def test_text_of_the_record_cannot_become_markup(tmp_path):
