@@ -26,7 +26,7 @@ from analysis.records.json_files import decoded, encoded, fitted, json_text, pla
 from analysis.records.provenance import Provenance
 from analysis.records.schema import Count, Maybe, Number
 from landscape.errors import InputError
-from splat.model.untrusted import beside, locked, require_held, require_modest
+from splat.model.untrusted import beside, locked, replacing, require_held, require_modest
 
 ARRAYS = {
     "spectrum": {"ritz_values": "k", "residuals": "k", "nodes": "starts steps?", "weights": "starts steps?"},
@@ -227,9 +227,8 @@ def write_data(folder: str | Path, data: ProbeRecord | SliceRecord) -> Path:
     content = encoded(plain(data))
     fitted(decoded(content), type(data), "a record that cannot be read again", "")
     path = Path(folder) / data.FILE
-    temporary = path.with_suffix(".json.tmp")
-    temporary.write_text(json_text(content), encoding="utf-8")
-    temporary.replace(path)
+    with replacing(path) as partial:
+        partial.write_text(json_text(content), encoding="utf-8")
     return path
 
 
