@@ -297,7 +297,6 @@ def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, means, u
     """Multiply every v in V (k, plane sets) by l'', the Hessian of the loss; products and forms may be None.
 
     means: of v, (k, 3), or any other numbers; 0 for forms.  uniform: l'' times an image of ones, a plane set, with SSIM.
-
     products: l'' v, (k, plane sets); not V itself, which another range may still read.  forms: sums over each row of v . l'' v
     and of v . D v, D the diagonal of l'', (2, k, 3 height).
     """
@@ -328,20 +327,8 @@ def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, means, u
             for k in range(K):
                 if products is not None:
                     finish_product(
-                        V[k],
-                        means[k, channel],
-                        x,
-                        y,
-                        at,
-                        row,
-                        3 * k,
-                        frame,
-                        slopes,
-                        loss,
-                        blurred_sp,
-                        uniform,
-                        products[k],
-                    )
+                        V[k], means[k, channel], x, y, at, row, 3 * k, frame, slopes, loss, blurred_sp, uniform, products[k]
+                    )  # fmt: skip
                 if forms is not None:
                     place = channel * frame.height + row
                     forms[0, k, place], forms[1, k, place] = finish_forms(
