@@ -7,17 +7,20 @@ that a study can measure their effect on the landscape.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from landscape.errors import InputError
 from splat.model.typed import NonNegative, Positive, Settings
+
+if TYPE_CHECKING:
+    import torch
 
 Accumulation = Literal["deterministic", "atomic"]
 Antialias = Literal["none", "mip", "mip-plain", "mip-splatting"]
 
 
-# relative, above float32's round-off.  Two splats at the cap leave (1 - 0.99)^2, the floor itself.  In float32 they stop the
-# pixel, here and in the CUDA renderers, because 1 - 0.99 rounds down; so they must in float64.
+# relative, of float64 alone.  Two splats at the cap leave (1 - 0.99)^2, the floor itself.  In float32 they stop the pixel, here
+# and in the CUDA renderers, because 1 - 0.99 rounds down by more than round-off adds; so they must in float64.
 TIE = 1e-5
 
 
@@ -33,8 +36,7 @@ class RenderSettings(Settings):
     near: Gaussians whose centre is nearer than this to the camera plane (world units) are not drawn.
     alpha_max: cap of a Gaussian's alpha in a pixel, below 1 (at 1 the transmittance behind it would be 0).
     alpha_min: a Gaussian is skipped in the pixels where its alpha is below this; 0 draws it in every pixel.
-    transmittance_min: a pixel stops before its transmittance would fall to this, or to so little above it that round-off
-        decides (TIE); 0 never stops.
+    transmittance_min: a pixel stops before its transmittance would fall below this; 0 never stops.
     contour_sigma: an additional cut at this Mahalanobis distance (the original cuts at 3); None keeps alpha_min's contour.
     gradient_through_cap: pass derivatives in ln alpha through the cap, instead of the true 0; the original CUDA code passes
         those in alpha through, which is the same within 1%.
@@ -69,10 +71,9 @@ class RenderSettings(Settings):
         if not 0 <= self.transmittance_min < 1:
             raise InputError(f"expected 0 <= transmittance_min < 1, got {self.transmittance_min}")
 
-    @property
-    def floor(self) -> float:
-        """The transmittance beneath which a pixel stops."""
-        return self.transmittance_min * (1 + TIE)
+    def floor(self, dtype: "torch.dtype") -> float:
+        """The transmittance beneath which a pixel of dtype stops: in float64 TIE above transmittance_min."""
+        return self.transmittance_min * (1 + TIE if dtype.itemsize == 8 else 1)
 
 
 SMOOTH = replace(RenderSettings(), alpha_min=0.0, transmittance_min=0.0, fov_clamp=1e6)

@@ -70,7 +70,7 @@ def thresholds_of(settings: RenderSettings, dtype: torch.dtype) -> Thresholds:
     least = max(log2(settings.alpha_min) if settings.alpha_min else -inf, LEAST_LOG2_ALPHA[dtype])
     contour = inf if settings.contour_sigma is None else settings.contour_sigma
     free = inf if settings.gradient_through_cap else settings.alpha_max
-    floor = max(settings.floor, LEAST_TRANSMITTANCE[dtype])
+    floor = max(settings.floor(dtype), LEAST_TRANSMITTANCE[dtype])
     return Thresholds(settings.alpha_min, contour, least, settings.alpha_max, free, floor)
 
 

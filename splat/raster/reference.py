@@ -4,7 +4,7 @@ Works in any float type and differentiates any number of times, at the price of 
 order of depth, d = p - mean:
 
     alpha = min(alpha_max, opacity exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2)), 0 where that is below alpha_min
-    w     = alpha T,  T <- T - w;  the pixel stops before T would fall to transmittance_min
+    w     = alpha T,  T <- T - w;  the pixel stops before T would fall below transmittance_min
     colour = sum w colour_i + T background,  alpha of the pixel = 1 - T,  expected depth = sum w z_i
 
 The order, the alpha_min cut and the stop are constants under differentiation: they are piecewise constant.
@@ -88,7 +88,7 @@ def _composite(
     alpha = _alphas(splats, index, xs, ys, settings)
     before, after = _transmittances(alpha)
     # the first splat that would pass the floor ends it
-    running = (after >= settings.floor).cumprod(0).bool()
+    running = (after >= settings.floor(after.dtype)).cumprod(0).bool()
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     before, after = _transmittances(alpha)
     weight = alpha * before

@@ -174,5 +174,5 @@ def undecided(splats: Tensor, depths: Tensor, drawn: Tensor, case: Case) -> Tens
     alpha = torch.where(active, torch.exp2(level).clamp_max(settings.alpha_max), 0.0)
     after = torch.log2(1 - alpha).cumsum(0)
     if settings.transmittance_min:  # round-off of T grows with the number of factors and with 1 / (1 - alpha) <= 100
-        near |= ((after - np.log2(settings.floor)).abs() < 100 * UNDECIDED).any(dim=0)
+        near |= ((after - np.log2(settings.transmittance_min)).abs() < 100 * UNDECIDED).any(dim=0)
     return near

@@ -39,7 +39,7 @@ def by_hand(
     sigmas = np.inf if settings.contour_sigma is None else settings.contour_sigma
     return composited_picture(
         splats, 1 / (1 + np.exp(-logits)), BACKGROUND.numpy(), (camera.width, camera.height),
-        near=settings.near, cap=settings.alpha_max, cut=settings.alpha_min, floor=settings.floor, sigmas=sigmas,
+        near=settings.near, cap=settings.alpha_max, cut=settings.alpha_min, floor=settings.floor(torch.float64), sigmas=sigmas,
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ def weights(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> t
         a, b, c = splats.conics[i]
         alpha = splats.opacities[i] * torch.exp(-(a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2)
         alpha = torch.where(alpha >= settings.alpha_min, alpha.clamp_max(settings.alpha_max), 0)
-        running &= T * (1 - alpha) >= settings.floor
+        running &= T * (1 - alpha) >= settings.floor(torch.float64)
         found[i] = torch.where(running, alpha * T, 0)
         T = torch.where(running, T * (1 - alpha), T)
     return found, order
