@@ -1,6 +1,7 @@
 """The thresholds of the renderer."""
 
 import pytest
+import torch
 
 from splat.model.settings import SMOOTH, RenderSettings
 
@@ -9,6 +10,11 @@ def test_defaults_are_those_of_the_original_rasterizer():
     settings = RenderSettings()
     assert (settings.blur, settings.fov_clamp, settings.near) == (0.3, 1.3, 0.2)
     assert (settings.alpha_max, settings.alpha_min, settings.transmittance_min) == (0.99, 1 / 255, 1e-4)
+
+
+def test_a_pixel_in_float32_stops_at_the_threshold_itself():
+    """What a training comes to depends on every bit of it."""
+    assert RenderSettings().floor(torch.float32) == 1e-4 < RenderSettings().floor(torch.float64)
 
 
 def test_smooth_switches_off_every_threshold_that_can_be():
