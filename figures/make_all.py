@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Collection
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ from analysis.console.failures import program
 from analysis.records.records import ProbeRecord, Record, read_record
 from figures import slice1d, slice2d, spectrum, surface, traces
 from figures.style import folder_script, save
+from landscape.errors import TooLittleMemory
 
 FIGURES = {
     "traces": traces.draw,
@@ -36,7 +38,8 @@ def draw_probe(
     """Draw every figure that the record in `folder` has the numbers for into it, but for some; returns the files.
 
     processes: that draw at a time.  Warns with `figures.surface.RendererMissing` where the surface had to be drawn without the
-    off-screen renderer.  Raises FileNotFoundError or ValueError for a folder that holds no readable record.
+    off-screen renderer.  Raises FileNotFoundError or ValueError for a folder that holds no readable record,
+    TooLittleMemory where the system ends one of the processes.
     """
     record = read_record(folder)
     names = [name for name in recorded_figures(record) if name not in without]
@@ -46,7 +49,10 @@ def draw_probe(
     if min(processes, len(names)) <= 1:
         return [draw(name) for name in names]
     with ProcessPoolExecutor(min(processes, len(names))) as pool:
-        return list(pool.map(draw, reversed(names)))[::-1]  # the slow ones first
+        try:
+            return list(pool.map(draw, reversed(names)))[::-1]  # the slow ones first
+        except BrokenProcessPool as error:
+            raise TooLittleMemory("a process that draws was ended, as Linux does where memory runs out") from error
 
 
 def _draw(record: Record, suffix: str, name: str) -> Path:

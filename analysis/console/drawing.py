@@ -1,7 +1,8 @@
 """Pictures of a record: the figures' own commands, each run in a process of its own.
 
 `figures/` reads what this package wrote and is not imported here, so that the arrow between them points one way; a
-renderer that ends its process (VTK does, where OpenGL is missing) cannot take a probe along.
+renderer that ends its process (VTK does, where OpenGL is missing) cannot take a probe along.  Where memory runs out, Linux
+ends a process that draws before any that measures.
 """
 
 import os
@@ -9,10 +10,11 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+FIRST_TO_END = "1000"  # of /proc/PID/oom_score_adj
 Draw = Callable[[Path], list[str]]
 """Draws into a folder; returns what it warned of, or why it failed: the numbers stand without pictures."""
 
@@ -53,6 +55,7 @@ def _group(command: list[str]) -> Iterator[subprocess.Popen[str]]:
         start_new_session=True,
     )
     try:
+        _end_first(process.pid)
         yield process
     finally:
         if process.poll() is None:
@@ -60,9 +63,18 @@ def _group(command: list[str]) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
+def _end_first(process: int) -> None:
+    """Make Linux end this process, and those that it will start, before others where memory runs out."""
+    with suppress(OSError):  # another system, or the process has ended
+        Path(f"/proc/{process}/oom_score_adj").write_text(FIRST_TO_END)
+
+
 def _said(process: subprocess.Popen[str], told: str = "") -> list[str]:
     """Warnings of the process, once it is told this and has ended."""
     lines = [line for line in process.communicate(told)[1].splitlines() if line.strip()]
+    if process.returncode < 0:
+        name = signal.Signals(-process.returncode).name
+        return [f"drawing failed: ended by {name}" + ", as Linux does where memory runs out" * (name == "SIGKILL")]
     if process.returncode:
         return ["drawing failed: " + " ".join(" ".join(lines).split())]
     return [line.split("Warning: ", 1)[1] for line in lines if "Warning: " in line]

@@ -160,6 +160,7 @@ def _write(
     drawn: Draw | None,
 ) -> None:
     """The record, its pictures and its page, into the folder."""
+    objective.release()  # processes that draw take memory too
     write_views(folder, objective)
     write_with_pictures(folder, data, arrays, stages, start, drawn)
     from analysis.records.report import write_report

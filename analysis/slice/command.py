@@ -100,6 +100,7 @@ def _run(options: SliceOptions, command: Sequence[str]) -> int:
         made = provenance_of(options.seed, options.checkpoint, command, settings, checkpoint, scene)
         made.other = ", ".join(map(str, options.others)) or None
         data = slice_record(found, objective, notes + checkpoint.assumptions, made)
+        objective.release()  # processes that draw take memory too
         write_with_pictures(folder, data, slice_arrays(found), stages, start)
     shutil.rmtree(unfinished, ignore_errors=True)
     _conclude(data, out)

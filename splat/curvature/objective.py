@@ -28,7 +28,7 @@ from torch import Tensor
 from landscape.errors import InputError
 from landscape.operators.distributed import ALONE, Ranks
 from landscape.results import Progress
-from splat.backend.memory import free_memory
+from splat.backend.memory import free_memory, give_back_freed
 from splat.curvature.gaussian_blocks import PerGaussianBlocks
 from splat.curvature.linearize import KeptViews, LinearizedView
 from splat.losses.autograd import loss_against
@@ -258,6 +258,11 @@ class SceneObjective:
     def linearized(self) -> KeptViews:
         """This rank's views, linearized at the active Gaussians; made on first use."""
         return KeptViews(self.linearizer(self.active), len(self.views), self._memory)
+
+    def release(self) -> None:
+        """Free the linearized views, also for other processes; they are made anew on their next use."""
+        vars(self).pop("linearized", None)
+        give_back_freed()
 
     def linearizer(self, gaussians: Gaussians) -> Callable[[int], LinearizedView]:
         """Function that linearizes the view of an index, at the active Gaussians or, for comparison, at others.

@@ -1,4 +1,6 @@
 import math
+import os
+import signal
 import subprocess
 import sys
 import warnings
@@ -17,6 +19,7 @@ from figures import make_all, slice2d, spectrum, surface, traces
 from figures.plane import plane
 from figures.render_surface import Box
 from figures.style import BLACK, COLUMN, SKY, save, style
+from landscape.errors import TooLittleMemory
 from tests.recorded import synthetic, written
 
 POINT = 1 / 72  # inches
@@ -274,6 +277,13 @@ def test_the_command_draws_the_folder_named_on_its_standard_input(tmp_path):
     by_processes = {path.name: path.read_bytes() for path in folder.glob("*.png")}
     alone = make_all.draw_probe(folder, without=["surface", "slice2d"])  # by this process
     assert {path.name: path.read_bytes() for path in alone} == by_processes
+
+
+def test_the_end_of_a_process_that_draws_is_said(tmp_path, monkeypatch):
+    folder = written(tmp_path / "probe", *synthetic()).folder
+    monkeypatch.setitem(make_all.FIGURES, "traces", lambda record: os.kill(os.getpid(), signal.SIGKILL))
+    with pytest.raises(TooLittleMemory, match="a process that draws was ended"):
+        make_all.draw_probe(folder, without=["surface"], processes=2)
 
 
 def test_pyvista_marks_the_renders(tmp_path):

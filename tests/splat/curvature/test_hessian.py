@@ -268,3 +268,12 @@ def test_what_was_linearized_is_freed_with_its_objective():
         assert [left() for left in used()] == [None, None, None]
     finally:
         gc.enable()
+
+
+def test_released_views_are_made_anew():
+    objective = SceneObjective(random_gaussians(30), two_views(16, 12))
+    hessian, V = SceneHessian(objective), torch.randn(len(objective.active.flat), 2)
+    before, view = hessian.apply(V), ref(objective.linearized.first)
+    objective.release()
+    assert view() is None
+    assert torch.equal(hessian.apply(V), before)
