@@ -209,6 +209,8 @@ def _write(runs: Sequence[Run], groups: Sequence[Group], same: Sequence[str], ou
     write_atomically(out / TABLE, frame(rows, labels).to_csv(index=False).encode(errors="backslashreplace"))
     index = Comparison(runs={label: str(probe_folder(folder).resolve()) for folder, label in shown_runs.items()})
     write_atomically(out / COMPARISON, json_text(plain(index)).encode())
+    for name in PICTURES:  # of an earlier comparison, which may show what this one has no numbers for
+        (out / f"{name}.png").unlink(missing_ok=True)
     notes += draw("compare", out)
     names = [group.label for group in groups]
     write_atomically(out / PAGE, render_page(runs, names, shown, says, notes, out).encode(errors="backslashreplace"))

@@ -2,6 +2,7 @@
 
 import json
 import random
+import re
 import shutil
 import time
 from pathlib import Path
@@ -212,6 +213,16 @@ class Compare(Files):
         for run in self.runs:
             probe = ["probe", str(run), "--quick", "--slice-points", "5", "--out", str(run / "probe")]
             assert forked(lambda words=probe: cli.main(words)).wait() == 0
+
+    def numbers(self) -> Numbers:
+        """The page's without its pictures, which only programs draw."""
+        found = super().numbers()
+        if PAGE in found:
+            page = (self.out / PAGE).read_text()
+            found[PAGE] = digest(
+                re.sub("<figure>.*?</figure>|<p>No pictures were drawn.</p>", "", page, flags=re.DOTALL).encode()
+            )
+        return found
 
     def words(self) -> list[str]:
         return ["compare", *map(str, self.runs), "--out", str(self.out)]

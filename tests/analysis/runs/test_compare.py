@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from PIL import Image
 
 from analysis.commands.cli import main
 from analysis.probe.command import opened
@@ -192,6 +193,13 @@ def test_pictures_are_drawn_from_the_records_and_lie_in_the_page(trained, tmp_pa
     drawn = sorted(path.stem for path in tmp_path.glob("*.png"))
     assert drawn == ["compare_densities", "compare_sections", "compare_slices", "compare_traces"]
     assert (tmp_path / "compare.html").read_text().count("data:image/webp;base64,") == 4
+
+
+def test_pictures_of_an_earlier_comparison_do_not_stay(runs, tmp_path, no_pictures):
+    old = tmp_path / "compare_slices.png"
+    Image.new("RGB", (8, 8)).save(old)
+    assert main(["compare", *map(str, runs), "--out", str(tmp_path)]) == 0
+    assert not old.exists() and "data:image" not in (tmp_path / "compare.html").read_text()
 
 
 def test_other_functions_are_not_compared(runs, capsys):
