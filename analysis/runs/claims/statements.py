@@ -144,29 +144,34 @@ def opacity(rows: pd.DataFrame) -> Judgement:
 
 
 def samples(rows: pd.DataFrame) -> Judgement:
+    """Ten samples suffice where the largest error that a trace can have is small, not where only the least is."""
+    words, columns = ("least", "largest"), ("hutchinson_{}", "hutchinson_{}_most")
     effects = [
         Effect(
-            f"{attribute_name(each)}, least relative error of the trace",
-            Interval.of(numbers(rows, name)),
+            f"{attribute_name(each)}, {word} relative error of the trace",
+            Interval.of(pd.Series(np.log(numbers(rows, name)))).exp(),
             SUFFICIENT,
             0.0,
         )
+        for word, column in zip(words, columns)
         for each in ATTRIBUTES
-        if (name := f"hutchinson_{each}") in rows
+        if (name := column.format(each)) in rows
     ]
-    effects.sort(key=lambda effect: -effect.interval.value)
-    if not effects:
-        return Judgement(
-            6, "Ten random probes suffice for the traces.", "Eq. (6)", "cannot be tested here",
-            "No run has the anisotropy of its attributes; probe with --families.",
-            (Effect("least relative error of a trace", Interval.of([]), SUFFICIENT, 0.0),),
-        )  # fmt: skip
-    worst = effects[0]
-    verdict: Verdict = "holds" if worst.interval.high <= SUFFICIENT else "does not hold"
-    if worst.interval.n < LEAST or worst.interval.low <= SUFFICIENT < worst.interval.high:
-        verdict = "cannot be tested here"
-    finding = f"With ten Gaussian samples the relative standard error of a trace is at least {worst.interval.text()} "
-    finding += f"({worst.name.split(',')[0]}); {SUFFICIENT:.0%} counts as sufficient."
+    least, most = ([effect for effect in effects if f", {word} " in effect.name] for word in words)
+    enough = len(most) == len(ATTRIBUTES) and all(effect.interval.n >= LEAST for effect in least + most)
+    verdict: Verdict = "cannot be tested here"
+    if enough and all(effect.interval.high <= SUFFICIENT for effect in most):
+        verdict = "holds"
+    if any(effect.interval.n >= LEAST and effect.interval.low > SUFFICIENT for effect in least):
+        verdict = "does not hold"
+    finding = "No run has the anisotropy of its attributes; probe with --families."
+    if least:
+        bounds = [max(part, key=lambda effect: effect.interval.value) for part in (least, most) if part]
+        finding = "With ten Gaussian samples the relative standard error of the trace is at least " + ", at most ".join(
+            f"{bound.interval.text()} ({bound.name.split(',')[0]})" for bound in bounds
+        )
+        finding += f"; {SUFFICIENT:.0%} counts as sufficient."
+    effects = effects or [Effect("largest relative error of a trace", Interval.of([]), SUFFICIENT, 0.0)]
     return Judgement(6, "Ten random probes suffice for the traces.", "Eq. (6)", verdict, finding, tuple(effects))
 
 

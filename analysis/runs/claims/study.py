@@ -20,8 +20,8 @@
                                 mean of the squared learning rates of its attributes, weighted with its mass
     opacity_one_view            rank correlation of a Gaussian's curvature in opacity with the share of its weight that one view
                                 sees; where `landscape map` has been run
-    hutchinson_ATTRIBUTE        the least relative standard error that ten Gaussian samples of the block's trace can have,
-                                sqrt(2 / (10 r)), r the upper end of the block's effective rank; where families were measured
+    hutchinson_ATTRIBUTE, hutchinson_ATTRIBUTE_most   the least and the largest relative standard error that ten Gaussian
+                                samples of the block's trace can have (`_hutchinson`); where families were measured
 
 A number that a run does not have is empty.
 """
@@ -38,7 +38,6 @@ from msgspec import structs
 
 from analysis.console.overrides import overridden
 from analysis.measures.units import step_lengths
-from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
 from analysis.records.run_files import CHECKPOINT, METRICS, Made, MapRecord, read_map, read_scores
 from analysis.runs.claims.effects import STRETCHED
@@ -200,14 +199,26 @@ def _finite(data: ProbeRecord, shares: Mapping[str, float], rates: LearningRates
 
 
 def _hutchinson(data: ProbeRecord) -> dict[str, float]:
-    """Relative variance of the mean of B samples: 2 |H|_F^2 / (B tr^2) >= 2 / (B r), r = (sum |lambda|)^2 / sum lambda^2."""
-    blocks = {
-        row.block: row.indices.effective_rank
-        for row in data.families or ()
-        if row.operator == "hessian" and not row.split
-    }
-    ranks: Mapping[str, float] = {name: index.high for name, index in blocks.items() if index and index.high}
-    return {f"hutchinson_{name}": sqrt(2 / (SAMPLES * ranks[name])) for name in ATTRIBUTES if name in ranks}
+    """The least and the largest relative standard error of the mean of B samples v . H v.
+
+    Its variance is 2 |H|_F^2 / (B tr^2) = (2 / (B r)) (S / tr)^2 with S = sum |lambda| >= |tr| and r = S^2 / sum lambda^2.
+    """
+    found = {}
+    for row in data.families or ():
+        rank, share, trace = row.indices.effective_rank, row.indices.share, data.traces.get(row.block)
+        if row.operator != "hessian" or row.split or row.metric != "parameters" or not (rank and share and trace):
+            continue
+        if rank.high:
+            found[f"hutchinson_{row.block}"] = sqrt(2 / (SAMPLES * rank.high))
+        top, residual, error = (
+            _number(x) for x in (row.lambda_max.value, row.lambda_max.residual, trace.standard_error)
+        )
+        least = abs(_number(trace.value)) - 2 * error
+        if rank.low and share.low and least > 0:
+            found[f"hutchinson_{row.block}_most"] = (
+                sqrt(2 / (SAMPLES * rank.low)) * (top + residual) / share.low / least
+            )
+    return found
 
 
 def _number(value: Any) -> float:

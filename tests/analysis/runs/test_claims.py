@@ -2,6 +2,8 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -12,10 +14,11 @@ from analysis.commands.cli import main
 from analysis.console.overrides import assignments, overridden
 from analysis.records.findings import ATTRIBUTES
 from analysis.records.records import ProbeRecord, read_record
+from analysis.records.schema import Anisotropy, End, Family, Index
 from analysis.runs.claims.effects import Interval, gains, log_ratios
 from analysis.runs.claims.predictors import predictors
 from analysis.runs.claims.statements import ATTRIBUTES_ALONE, AXIS, VIEWPOINTS_ALONE, judgements
-from analysis.runs.claims.study import _more, _runs, method_name, study, unended
+from analysis.runs.claims.study import _hutchinson, _more, _runs, method_name, study, unended
 from analysis.runs.sweep.sweep_file import read_sweep
 from figures.paper import ONLY
 from splat.training.methods.methods import METHODS
@@ -65,6 +68,7 @@ def made_up(world: dict, seeds: int = 3, spread: float = 0.02) -> pd.DataFrame:
                 }
                 | {"lambda_max": top, "lambda_second": top / (5 * (world["elongation"] if stable else 1) * noise())}
                 | {f"hutchinson_{name}": (0.2 / world["ranks"]) ** 0.5 * noise() for name in ATTRIBUTES}
+                | {f"hutchinson_{name}_most": 2 * (0.2 / world["ranks"]) ** 0.5 * noise() for name in ATTRIBUTES}
             )
     return pd.DataFrame(rows)
 
@@ -179,6 +183,31 @@ def test_a_map_of_a_run_adds_what_one_view_sees(tmp_path, monkeypatch):
     assert row == {
         "opacity_one_view": 0.25, "needle_count": 0.1, "needles_quats": 0.6, "needles_log_scales": 0.5,
     }  # fmt: skip
+
+
+def test_ten_samples_suffice_where_the_largest_error_is_small():
+    rows = made_up(PAPER)
+    large = {f"hutchinson_{name}_most": 0.3 for name in ATTRIBUTES}
+    assert judgements(rows.assign(**large))[5].verdict == "cannot be tested here"
+    assert judgements(rows.drop(columns="hutchinson_sh_most"))[5].verdict == "cannot be tested here"
+    assert judgements(rows.assign(hutchinson_quats=0.3, **large))[5].verdict == "does not hold"
+
+
+@pytest.mark.parametrize("least", [0.5, -0.5])
+def test_bounds_of_ten_samples_enclose_the_error_of_a_known_spectrum(least):
+    spectrum = np.linspace(least, 4.0, 20)
+    size, true = np.abs(spectrum).sum(), np.sqrt(2 * (spectrum**2).sum() / 10) / spectrum.sum()
+    index = {name: Index(value=x, low=x, high=x, note="") for name, x in
+             {"effective_rank": size**2 / (spectrum**2).sum(), "share": spectrum.max() / size}.items()}  # fmt: skip
+    end = End(value=spectrum.max(), residual=0.0)
+    family = Family(metric="parameters", unit="", operator="hessian", block="quats", split=False, gaussians=5, dim=20, rank=20,
+                    lambda_max=end, lambda_min=end, indices=Anisotropy(**index))  # fmt: skip
+    data = SimpleNamespace(
+        families=[family], traces={"quats": SimpleNamespace(value=spectrum.sum(), standard_error=0.0)}
+    )
+    found = _hutchinson(cast(ProbeRecord, data))
+    assert found["hutchinson_quats_most"] == pytest.approx(true)
+    assert found["hutchinson_quats"] <= true * (1 + 1e-12)
 
 
 def test_needles_that_dominate_one_of_two_attributes_hold_in_part():
