@@ -10,7 +10,10 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-DEAF = "_raw_object_cache"  # how the functions of llvmlite begin that LLVM calls, and which must not fail
+DEAF = (
+    "_raw_object_cache",
+    "_unheard",
+)  # how functions begin that must not fail: llvmlite's that LLVM calls, and our own
 IMPORTING = "<frozen importlib._bootstrap>"  # the file of Python's own code that loads modules
 AGAIN = 0.01  # seconds until a signal that came where nothing can be raised is sent again
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from io import BytesIO
 from math import prod
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 import numpy as np
 import psutil
@@ -100,21 +100,27 @@ def locked(path: Path, what: str) -> Iterator[int]:
     The system lets go of it when the last process that has it ends, however that comes.  A file system without locks holds
     nothing.  what: which is expected to be alone.  InputError where another process holds it.
     """
+    with _unheard_lock(path, what) as file:
+        try:
+            yield file.fileno()
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _unheard_lock(path: Path, what: str) -> IO[str]:
+    """The file of `locked`, held.  While a function of this name runs no signal is raised, which would leave the file."""
     while True:
-        with path.open("a") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError(TAKEN.format(what=what, path=path)) from None
-            except OSError:  # such as Lustre, mounted without them
-                pass
-            if not _is_at(file.fileno(), path):  # the one who held it has just removed it
-                continue
-            try:
-                yield file.fileno()
-            finally:
-                path.unlink(missing_ok=True)
-            return
+        file = path.open("a")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            raise InputError(TAKEN.format(what=what, path=path)) from None
+        except OSError:  # such as Lustre, mounted without them
+            pass
+        if _is_at(file.fileno(), path):
+            return file
+        file.close()  # the one who held it has just removed it
 
 
 @contextmanager

@@ -1,5 +1,8 @@
 """Arrays that promise more than their files hold are refused before memory is asked for."""
 
+import os
+import signal
+import time
 import tracemalloc
 import zipfile
 from io import BytesIO
@@ -8,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.console.interruption import Interrupted, raising
 from analysis.records.records import _archive
 from landscape.errors import InputError
-from splat.model.untrusted import inside, read_array
+from splat.model.untrusted import inside, locked, read_array
 
 
 def with_header(length: bytes, header: bytes, version: int) -> bytes:
@@ -58,3 +62,13 @@ def test_names_that_lead_out_are_refused_and_others_are_not(tmp_path, monkeypatc
         inside(tmp_path, name)
     monkeypatch.chdir(tmp_path)
     assert inside(Path("."), "a/../b") == Path("a/../b") and inside(Path("."), str(tmp_path / "b")) == tmp_path / "b"
+
+
+def test_a_signal_while_a_lock_is_taken_leaves_no_file(tmp_path, monkeypatch):
+    def flock(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr("splat.model.untrusted.fcntl.flock", flock)
+    with pytest.raises(Interrupted), raising(), locked(tmp_path / ".lock", "a run"):
+        time.sleep(5)
+    assert list(tmp_path.iterdir()) == []
