@@ -187,8 +187,8 @@ def record_folder(folder: str | Path, mark: str = ProbeRecord.FILE) -> Iterator[
     with locked(beside(folder), f"no other command that writes {folder}"):
         _clean_up_after_kills(folder, previous)
         partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
-        partial.mkdir()
         try:
+            partial.mkdir()  # in here: a signal may come as it returns
             yield partial
             for file in (path for path in partial.rglob("*") if path.is_file()):
                 with file.open("rb") as stream:
