@@ -10,11 +10,12 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-DEAF = (
-    "_raw_object_cache",
-    "_unheard",
-)  # how functions begin that must not fail: llvmlite's that LLVM calls, and our own
-IMPORTING = "<frozen importlib._bootstrap>"  # the file of Python's own code that loads modules
+DEAF = "_unheard"  # how the names of our functions begin in which nothing may be raised
+DEAF_FILES = (
+    "<frozen importlib._bootstrap>",  # Python's own code that loads modules
+    os.path.join("llvmlite", "binding", "ffi.py"),  # LLVM's lock, and what LLVM calls while it compiles
+)
+LOCKING = ("__enter__", "__exit__", "acquire", "release")  # where a lock is held and nobody knows it yet, or any more
 AGAIN = 0.01  # seconds until a signal that came where nothing can be raised is sent again
 
 
@@ -44,8 +45,9 @@ class Interruption(Event):
 def raising() -> Iterator[None]:
     """Signals raise `Interrupted` wherever the main thread is, so that what it has begun is cleaned up.
 
-    Where Python drops what is raised, in finalizers and what C calls, and while a library is loaded, whose C may end the
-    process for it, the signal is sent again until it is heard, or the block ends.  An error after it stands for it.
+    Where Python drops what is raised, in finalizers and what C calls, while a library is loaded, whose C may end the
+    process for it, and as a lock is taken, which another thread would wait for without end, the signal is sent again
+    until it is heard, or the block ends.  An error after it stands for it.
     """
     raised, waiting = list[Interrupted](), list[tuple[Timer, int]]()
 
@@ -56,10 +58,8 @@ def raising() -> Iterator[None]:
         timer.start()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        while frame is not None:
-            if frame.f_code.co_name.startswith(DEAF) or frame.f_code.co_filename == IMPORTING:
-                return send_again(number)
-            frame = frame.f_back
+        if _is_deaf(frame):
+            return send_again(number)
         raised.append(Interrupted(number))
         raise raised[-1]
 
@@ -86,6 +86,17 @@ def raising() -> Iterator[None]:
         raise
     finally:
         sys.unraisablehook = before
+
+
+def _is_deaf(frame: FrameType | None) -> bool:
+    """Whether nothing may be raised in what the frame runs, or what called it."""
+    if frame is not None and frame.f_code.co_name in LOCKING:
+        return True
+    while frame is not None:
+        if frame.f_code.co_name.startswith(DEAF) or frame.f_code.co_filename.endswith(DEAF_FILES):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def end_at_once() -> None:

@@ -7,10 +7,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+from llvmlite.binding import ffi
 
 from analysis.console.failures import program
 from analysis.console.interruption import AGAIN, SIGNALS, Interrupted, raising
@@ -41,14 +43,38 @@ def test_a_signal_in_what_llvm_calls_lets_it_do_its_work_first():
     done = []
 
     @ctypes.CFUNCTYPE(None)
-    def _raw_object_cache_notify() -> None:
+    def called() -> None:
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(0)
         done.append(True)
 
     with pytest.raises(Interrupted) as raised, raising():
-        waits_after(_raw_object_cache_notify)
+        waits_after(ffi._lib_fn_wrapper(ffi._LLVMLock(), called))
     assert done and raised.value.exit_code == 130
+
+
+def test_a_signal_as_a_lock_is_taken_or_given_back_leaves_it_free():
+    class Locked:
+        held = False
+
+        def __enter__(self) -> None:
+            self.held = True
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        def __exit__(self, *_: object) -> None:
+            os.kill(os.getpid(), signal.SIGHUP)
+            self.held = False
+
+    def waits_in(lock: AbstractContextManager[object]) -> None:
+        with lock:
+            waits_after(lambda: None)
+
+    for lock, held in ((Locked(), lambda lock: lock.held), (ffi._LLVMLock(), lambda lock: lock._lock._is_owned())):
+        if isinstance(lock, ffi._LLVMLock):
+            lock.register(lambda: os.kill(os.getpid(), signal.SIGTERM), lambda: os.kill(os.getpid(), signal.SIGHUP))
+        with pytest.raises(Interrupted), raising():
+            waits_in(lock)
+        assert not held(lock)
 
 
 def test_a_signal_while_a_library_is_loaded_is_heard_once_it_is(tmp_path, monkeypatch):
