@@ -6,6 +6,7 @@
     70   a fault of the program: its traceback, and how to report it
     71   memory ran out, or would
     74   the disk is full, or a limit on the size of files is reached
+    75   another sweep is at a cell of this one; the same command later finds it done
     130  interrupted by Ctrl-C; 143 by SIGTERM, 129 by a terminal that closed
     141  nobody reads the help any more, as after `| head -1`
 

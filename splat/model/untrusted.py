@@ -80,6 +80,10 @@ def read_array(file: BinaryIO) -> np.ndarray:
         raise InputError(f"no array of numbers ({error})") from error
 
 
+class Taken(InputError):
+    """A file that another process holds."""
+
+
 def inside(folder: Path, name: str) -> Path:
     """The file of this name in a folder.  InputError where a name of someone else's file leads out of it."""
     path = folder / name
@@ -98,7 +102,7 @@ def locked(path: Path, what: str) -> Iterator[int]:
     """Hold the file at `path`, made for this and removed in the end; gives its descriptor, with which a child holds it too.
 
     The system lets go of it when the last process that has it ends, however that comes.  A file system without locks holds
-    nothing.  what: which is expected to be alone.  InputError where another process holds it.
+    nothing.  what: which is expected to be alone.  Taken where another process holds it.
     """
     with _unheard_lock(path, what) as file:
         try:
@@ -115,7 +119,7 @@ def _unheard_lock(path: Path, what: str) -> IO[str]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.close()
-            raise InputError(TAKEN.format(what=what, path=path)) from None
+            raise Taken(TAKEN.format(what=what, path=path)) from None
         except OSError:  # such as Lustre, mounted without them
             pass
         if _is_at(file.fileno(), path):

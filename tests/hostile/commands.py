@@ -14,6 +14,7 @@ from analysis.commands.uses.uncertainty import RECORD as UNCERTAINTY
 from analysis.records.records import ProbeRecord, SliceRecord, read_record
 from analysis.records.run_files import COMPARISON, MapRecord
 from analysis.runs.compare import PAGE, TABLE
+from analysis.runs.sweep.sweep import CELLS_ELSEWHERE
 from figures import paper
 from splat.model.files.read import read_splats
 from splat.training.checkpoint import load_checkpoint
@@ -123,7 +124,7 @@ class Sweep(Ended):
 
     def run_to_its_end(self) -> None:
         end = time.monotonic() + 600
-        while (code := self.begun().wait()) == 2 and time.monotonic() < end:  # another is at work
+        while (code := self.begun().wait()) == CELLS_ELSEWHERE and time.monotonic() < end:  # another is at work
             time.sleep(1)
         assert code == 0, f"the same command again ends with {code}"
 

@@ -48,7 +48,7 @@ def started(words: list[str], **settings) -> subprocess.Popen[str]:
 def waits_for(process: subprocess.Popen[str], ready: Callable[[], bool]) -> None:
     deadline = time.monotonic() + 300
     while not ready():
-        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate(timeout=300)
         time.sleep(0.01)
 
 
@@ -63,7 +63,7 @@ def test_a_training_that_a_signal_ends_saves_and_says_how_to_continue(scene, tmp
     waits_for(process, (out / "checkpoint.pt").exists)
     time.sleep(1)
     process.send_signal(kind)
-    said = process.communicate()[1]
+    said = process.communicate(timeout=300)[1]
     assert process.returncode == 128 + kind, said
     assert f"'{out}'" in said and "Aborted at" not in said and "Traceback" not in said
     assert load_checkpoint(out / "checkpoint.pt").training.step > 0 and hidden(tmp_path) == hidden(out) == []
@@ -76,12 +76,12 @@ def test_what_a_signal_ends_keeps_what_it_found_and_goes_on_from_there(run, tmp_
     process = started(command)
     waits_for(process, lambda: any((tmp_path / ".record.unfinished").glob("[!.]*.[mn]*")))
     process.terminate()
-    said = process.communicate()[1]
+    said = process.communicate(timeout=300)[1]
     assert process.returncode == 143 and said.endswith("landscape: interrupted by SIGTERM\n"), said
     assert "Aborted at" not in said and "Traceback" not in said and shlex.join(command) in said
     assert [path.name for path in tmp_path.iterdir()] == [".record.unfinished"]
     again = started(command)
-    said = again.communicate()[1]
+    said = again.communicate(timeout=300)[1]
     assert again.returncode == 0 and (words[0] == "slice" or "kept from before" in said), said
     assert [path.name for path in tmp_path.iterdir()] == ["record"]
 
@@ -91,7 +91,7 @@ def test_a_probe_that_a_signal_ends_as_it_begins_leaves_nothing(run, tmp_path):
     process = started(["probe", str(run / "checkpoint.pt"), "--out", str(out)])
     waits_for(process, beside(out).exists)
     process.terminate()
-    said = process.communicate()[1]
+    said = process.communicate(timeout=300)[1]
     assert process.returncode == 143 and said.endswith("landscape: interrupted by SIGTERM\n"), said
     assert "Aborted at" not in said and list(tmp_path.iterdir()) == []
 
@@ -160,10 +160,10 @@ def test_of_two_trainings_in_one_folder_one_is_refused_in_a_sentence(scene, tmp_
     first = started(["train", str(scene), "--out", str(out), *LONG])
     waits_for(first, (out / "checkpoint.pt").exists)
     second = started(["train", str(scene), "--out", str(out), *LONG, "--resume"])
-    said = second.communicate()[1]
+    said = second.communicate(timeout=300)[1]
     assert second.returncode == 2 and "no other training" in said and said.count("landscape:") == 1
     first.terminate()
-    first.communicate()
+    first.communicate(timeout=300)
     assert first.returncode == 143 and load_checkpoint(out / "checkpoint.pt").training.step > 0
 
 
@@ -184,12 +184,12 @@ def limited(size: int) -> Callable[[], None]:
 
 def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_path):
     done = started(["train", str(scene), "--out", str(tmp_path / "new")], preexec_fn=limited(4096))
-    said = done.communicate()[1]
+    said = done.communicate(timeout=300)[1]
     assert done.returncode == 74 and str(tmp_path) in said and "Traceback" not in said, said
     quick = ["probe", str(run / "checkpoint.pt"), "--quick", "--out"]
     assert main([*quick, str(run / "first")]) == 0  # compiles what is not yet
     done = started([*quick, str(tmp_path / "probe")], preexec_fn=limited(8192))
-    said = done.communicate()[1]
+    said = done.communicate(timeout=300)[1]
     assert done.returncode == 74 and str(tmp_path / ".probe.unfinished/") in said and "Traceback" not in said, said
     assert [path.name for path in tmp_path.iterdir()] == [".probe.unfinished"]  # from where it goes on
 
@@ -197,7 +197,7 @@ def test_a_full_disk_leaves_what_was_there_and_names_the_file(scene, run, tmp_pa
 def test_a_command_with_too_few_addresses_says_so_before_it_begins(tmp_path):
     few = 2**30
     done = started(["probe", str(tmp_path)], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (few, few)))
-    said = done.communicate()[1]
+    said = done.communicate(timeout=300)[1]
     assert done.returncode == 71 and said.startswith("landscape: expected at least 2,147 MB of addresses"), said
 
 
@@ -229,14 +229,14 @@ def test_two_compile_a_kernel_at_once_and_a_cut_file_is_compiled_anew(tmp_path):
         pipe = subprocess.PIPE
         return subprocess.Popen(words, cwd=ROOT, env=environment, stdout=pipe, stderr=pipe, text=True, **settings)
 
-    said = begun(preexec_fn=limited(100)).communicate()[1]
+    said = begun(preexec_fn=limited(100)).communicate(timeout=300)[1]
     assert "File too large" in said and str(tmp_path / "cache") in said.splitlines()[-1]
     cold = [begun(), begun()]
-    assert [process.communicate() for process in cold] == [("8.0\n", "")] * 2
+    assert [process.communicate(timeout=300) for process in cold] == [("8.0\n", "")] * 2
     for suffix in ("nbi", "nbc"):
         for file in (tmp_path / "cache").rglob(f"small.twice-*.{suffix}"):
             file.write_bytes(file.read_bytes()[:40])
-        assert begun().communicate() == ("8.0\n", "")
+        assert begun().communicate(timeout=300) == ("8.0\n", "")
 
 
 @pytest.mark.parametrize("words", [["train", "--help"], ["train", "nowhere"]])

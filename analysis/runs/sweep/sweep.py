@@ -6,8 +6,9 @@ OUT/results.csv, OUT/summary.csv    see `analysis/runs/sweep/sweep_results.py`; 
 
 Every cell runs as the commands that a user would type, in processes of their own: one that crashes, or is killed for its
 memory, does not end the sweep, several run at once each on its share of the processors, and any can be repeated by hand.
-What is there already is not done again: the next start continues where the last one ended.  The results do not depend on the
-number of threads, only the seconds do.
+What is there already is not done again: the next start continues where the last one ended.  Several sweeps may work in one
+folder, also on machines that share it: each takes cells that no other has.  The results do not depend on the number of
+threads, only the seconds do.
 """
 
 import os
@@ -39,10 +40,10 @@ from analysis.runs.sweep.sweep_results import PROBE, of_other_threads, summarize
 from analysis.train.command import planned, resumed
 from landscape.errors import InputError
 from splat.losses.reference import LossSettings
-from splat.model.untrusted import locked
+from splat.model.untrusted import Taken, locked
 
 CELL_FAILED = 1
-LOCK = ".lock"
+CELLS_ELSEWHERE = 75  # sysexits.h's EX_TEMPFAIL: the same command later finds them done
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 POLL = 0.5  # seconds
 
@@ -55,10 +56,8 @@ def run_sweep(options: SweepOptions) -> int:
     sweep = only(whole, options.only)
     to_do = {cell.name: missing(cell, sweep) for cell in sweep.cells}
     sweep.out.mkdir(parents=True, exist_ok=True)
-    # its commands inherit the lock: one that was killed alone leaves them at work
-    alone = f"no other sweep in {sweep.out}, nor a command that one left behind"
-    with locked(sweep.out / LOCK, alone) as lock, interruption() as interrupted:
-        cells = _Cells(sweep, to_do, options.jobs, interrupted, lock, whole)
+    with interruption() as interrupted:
+        cells = _Cells(sweep, to_do, options.jobs, interrupted, whole)
         cells.run()
     return _conclude(cells, interrupted.exit_code)
 
@@ -100,20 +99,17 @@ def _probed(cell: Cell, options: ProbeOptions, loss: LossSettings) -> bool:
 
 
 class _Cells:
-    """The cells under way.  to_do: by a cell's name; whole: also those not asked for; failed: words by cell."""
+    """The cells under way.
+
+    to_do: stages by a cell's name; whole: also those not asked for; failed: words by cell; elsewhere: cells of other sweeps.
+    """
 
     def __init__(
-        self,
-        sweep: Sweep,
-        to_do: dict[str, list[Stage]],
-        jobs: int,
-        interrupted: Event,
-        lock: int,
-        whole: Sweep | None = None,
+        self, sweep: Sweep, to_do: dict[str, list[Stage]], jobs: int, interrupted: Event, whole: Sweep
     ) -> None:
-        self.whole = whole or sweep
-        self.sweep, self.to_do, self.jobs, self.interrupted, self.lock = sweep, to_do, jobs, interrupted, lock
+        self.sweep, self.to_do, self.jobs, self.interrupted, self.whole = sweep, to_do, jobs, interrupted, whole
         self.failed: dict[str, str] = {}
+        self.elsewhere: list[Cell] = []
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self.progress = SweepProgress(sweep, to_do, jobs)
 
@@ -163,29 +159,40 @@ class _Cells:
                 process.terminate()
 
     def _cell(self, cell: Cell) -> Cell:
-        """Do what is missing; what fails is noted."""
+        """Do what is missing, unless another sweep is at it; what fails is noted."""
+        if not self.interrupted.is_set():
+            cell.out.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                with locked(lock_of(cell), f"no other sweep at {cell.name}") as lock:
+                    self.to_do[cell.name] = missing(cell, self.sweep)  # another may have been here since the start
+                    self._stages(cell, lock)
+            except Taken:
+                self.elsewhere.append(cell)
+        return cell
+
+    def _stages(self, cell: Cell, lock: int) -> None:
         while self.to_do[cell.name] and not self.interrupted.is_set():
             stage, start = self.to_do[cell.name][0], monotonic()
             self.progress.started(cell, stage)
-            code = self._command(cell, stage)
+            code = self._command(cell, stage, lock)
             if code == 0:
                 self.to_do[cell.name].pop(0)
                 self.progress.took(stage, monotonic() - start)
             elif not self.interrupted.is_set():
                 self.failed[cell.name] = f"{cell.name}: {stage} ended with exit code {code}; see {log_of(cell)}"
                 break
-        return cell
 
-    def _command(self, cell: Cell, stage: Stage) -> int:
-        """Run `landscape train` or `landscape probe`; returns its exit code, negative where a signal killed it."""
+    def _command(self, cell: Cell, stage: Stage, lock: int) -> int:
+        """Run `landscape train` or `landscape probe`; returns its exit code, negative where a signal killed it.
+
+        It inherits the lock: a sweep that is killed alone leaves it at work.
+        """
         words = (
             arguments("train", replace(cell.training, resume=cell.out.exists()))
             if stage == "train"
             else probe_arguments(cell, self.sweep)
         )
-        path = log_of(cell)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("ab", buffering=0) as log:
+        with log_of(cell).open("ab", buffering=0) as log:
             log.write(f"$ {shlex.join(['landscape', *words])}\n".encode())
             process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "analysis.commands.cli", *words],
@@ -193,7 +200,7 @@ class _Cells:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=_environment(self.jobs),
-                pass_fds=(self.lock,),
+                pass_fds=(lock,),
                 start_new_session=True,  # the terminal's Ctrl-C comes here alone, and is passed on once
             )
             self.running[cell.name] = process
@@ -211,6 +218,10 @@ def log_of(cell: Cell) -> Path:
     return cell.out.with_name(f"{cell.out.name}.log")
 
 
+def lock_of(cell: Cell) -> Path:
+    return cell.out.with_name(f".{cell.out.name}.cell")
+
+
 def _environment(jobs: int) -> dict[str, str]:
     """Environment of a command: its share of the processors, or of the threads that this process was given."""
     environment = module_environment()
@@ -224,13 +235,16 @@ def _environment(jobs: int) -> dict[str, str]:
 def _conclude(cells: _Cells, stopped: int) -> int:
     """The tables, and what did not go well; returns the exit code."""
     sweep, console = cells.sweep, Console()
+    cells.to_do |= {cell.name: missing(cell, sweep) for cell in cells.elsewhere}
+    elsewhere = [cell.name for cell in cells.elsewhere if cells.to_do[cell.name]]
     rows = cells.write()
     for table in tables(summarize(rows)):
         console.print(table)
     say(*unfinished(rows), *of_other_threads(rows), style="yellow", console=console)
     say(*cells.failed.values(), style="red", console=console)
+    say(*(f"{name}: another sweep is at it" for name in elsewhere), style="yellow", console=console)
     done = sum(not cells.to_do[cell.name] for cell in sweep.cells)
     say(f"{done} of {len(sweep.cells)} cells done; tables: {sweep.out}", console=console)
     if done < len(sweep.cells):
         say("the same command continues", console=console)
-    return stopped or (CELL_FAILED if cells.failed else 0)
+    return stopped or (CELL_FAILED if cells.failed else CELLS_ELSEWHERE if elsewhere else 0)

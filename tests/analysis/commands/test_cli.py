@@ -150,10 +150,10 @@ def test_a_run_killed_at_any_moment_and_resumed_is_the_run_that_was_not(original
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 100
     while not (out / "checkpoint.pt").exists() or load_checkpoint(out / "checkpoint.pt").training.step < 3:
-        assert process.poll() is None and time.monotonic() < deadline, process.communicate()[1]
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate(timeout=300)[1]
         time.sleep(0.002)
     process.kill()
-    process.communicate()
+    process.communicate(timeout=300)
     assert process.returncode == -signal.SIGKILL
     assert 3 <= load_checkpoint(out / "checkpoint.pt").training.step < 60
     assert main(arguments(original, out, *longer, "--resume")) == main(arguments(original, whole, *longer)) == 0

@@ -6,6 +6,8 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -19,7 +21,7 @@ import tyro
 from analysis.commands.cli import main
 from analysis.probe.record import loss_name
 from analysis.records.provenance import usable_cores
-from analysis.runs.sweep.sweep import LOCK, _Cells, missing, only, probe_arguments
+from analysis.runs.sweep.sweep import CELLS_ELSEWHERE, _Cells, lock_of, missing, only, probe_arguments
 from analysis.runs.sweep.sweep_file import Cell, Sweep, arguments, read_sweep
 from analysis.runs.sweep.sweep_progress import Stage, SweepProgress
 from analysis.runs.sweep.sweep_results import results
@@ -34,6 +36,7 @@ from splat.training.checkpoint import load_checkpoint
 from tests import recorded
 from tests.recorded import synthetic
 
+ROOT = Path(__file__).parents[4]
 FILE = """
 out = "out"
 iterations = 6
@@ -111,7 +114,7 @@ def no_commands(monkeypatch):
     """A list of the stages that would run, each a success, instead of running them."""
     ran: list[tuple[str, str]] = []
 
-    def command(self, cell, stage) -> int:
+    def command(self, cell, stage, lock) -> int:
         ran.append((cell.name, stage))
         return 0
 
@@ -251,7 +254,7 @@ def test_what_is_done_with_other_settings_is_refused_by_name(finished, folder, n
 
 
 def test_a_cell_that_fails_does_not_end_the_sweep(finished, folder, tmp_path, monkeypatch, capsys):
-    def command(self, cell, stage) -> int:
+    def command(self, cell, stage, lock) -> int:
         ran.append((cell.name, stage))
         if cell.method == "3dgs":
             return -9
@@ -279,10 +282,32 @@ def test_damaged_scores_end_a_sweep_before_it_starts(finished, folder, tmp_path,
     assert f"in {path}, got a damaged file" in " ".join(capsys.readouterr().err.split()) and no_commands == []
 
 
-def test_two_sweeps_do_not_work_in_one_folder(folder, tmp_path, no_commands, capsys):
-    with locked(tmp_path / LOCK, "no other sweep"):
-        assert main(["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path)]) == 2
-    assert "expected no other sweep in" in " ".join(capsys.readouterr().err.split()) and no_commands == []
+def test_a_cell_of_another_sweep_is_left_to_it(folder, tmp_path, no_commands, capsys):
+    words = ["sweep", str(folder / "sweep.toml"), "--out", str(tmp_path)]
+    taken = read_sweep(folder / "sweep.toml", tmp_path).cells[0]
+    lock_of(taken).parent.mkdir(parents=True)
+    with locked(lock_of(taken), "this alone"):
+        assert main([*words, "--only", taken.name]) == CELLS_ELSEWHERE
+    assert "still/3dgs/1: another sweep is at it 0 of 1 cells done" in " ".join(capsys.readouterr().out.split())
+    assert no_commands == [] and not list(tmp_path.rglob(".*"))
+
+
+def test_two_sweeps_share_the_cells_and_the_last_writes_all(folder, tmp_path, capsys):
+    """The second begins while the first is at a cell, and both list all as missing."""
+    words = ["sweep", str(written(folder, "iterations = 12", "iterations = 40")), "--out", str(tmp_path)]
+    first = subprocess.Popen(
+        [sys.executable, "-m", "analysis.commands.cli", *words], cwd=ROOT, stdout=subprocess.DEVNULL
+    )
+    lock = lock_of(read_sweep(folder / "changed.toml", tmp_path).cells[0])
+    deadline = time.monotonic() + 120
+    while not lock.exists() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    codes = {main(words), first.wait(timeout=300)}
+    assert codes <= {0, CELLS_ELSEWHERE} and 0 in codes
+    rows = pd.read_csv(tmp_path / "results.csv")
+    assert list(rows["status"]) == ["done"] * 4 and rows["psnr"].notna().all()
+    logs = [path.read_text() for path in tmp_path.rglob("*.log")]
+    assert [log.count("$ landscape train") for log in logs] == [1] * 4
 
 
 def test_a_cell_is_probed_once_and_again_where_the_control_is_new(finished, folder):
