@@ -292,17 +292,21 @@ def test_a_cell_of_another_sweep_is_left_to_it(folder, tmp_path, no_commands, ca
     assert no_commands == [] and not list(tmp_path.rglob(".*"))
 
 
-def test_two_sweeps_share_the_cells_and_the_last_writes_all(folder, tmp_path, capsys):
-    """The second begins while the first is at a cell, and both list all as missing."""
+def test_two_sweeps_share_the_cells_and_the_last_writes_all(folder, tmp_path, monkeypatch):
+    """The second lists all as missing, and begins when the first has made one."""
     words = ["sweep", str(written(folder, "iterations = 12", "iterations = 40")), "--out", str(tmp_path)]
-    first = subprocess.Popen(
-        [sys.executable, "-m", "analysis.commands.cli", *words], cwd=ROOT, stdout=subprocess.DEVNULL
-    )
-    lock = lock_of(read_sweep(folder / "changed.toml", tmp_path).cells[0])
-    deadline = time.monotonic() + 120
-    while not lock.exists() and time.monotonic() < deadline:
-        time.sleep(0.005)
-    codes = {main(words), first.wait(timeout=300)}
+    cell, run = read_sweep(folder / "changed.toml", tmp_path).cells[0], _Cells.run
+
+    def waits(cells: _Cells) -> None:
+        deadline = time.monotonic() + 120
+        while not ((cell.out / "metrics.json").exists() and not lock_of(cell).exists()) and time.monotonic() < deadline:
+            time.sleep(0.005)
+        run(cells)
+
+    monkeypatch.setattr(_Cells, "run", waits)
+    command = [sys.executable, "-m", "analysis.commands.cli", *words]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as first:
+        codes = {main(words), first.wait(timeout=300)}
     assert codes <= {0, CELLS_ELSEWHERE} and 0 in codes
     rows = pd.read_csv(tmp_path / "results.csv")
     assert list(rows["status"]) == ["done"] * 4 and rows["psnr"].notna().all()
