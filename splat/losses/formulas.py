@@ -40,7 +40,7 @@ from splat.losses.reference import C1, C2, PixelLoss
 L1, CHARBONNIER, L2 = range(3)
 KINDS: dict[PixelLoss, int] = {"l1": L1, "charbonnier": CHARBONNIER, "l2": L2}
 CENTRE = 0.5
-SECONDS = 6  # S_mm, S_mp, S_mq, S_pp, S_pq, S_qq
+SECONDS = 5  # S_mm, S_mp, S_mq, S_pp, S_qq; S_pq is S_pp + S_qq / 4
 
 
 @formula
@@ -77,7 +77,6 @@ def ssim_seconds(m, p, q, mu, var):
         dl * sp + l * smp,
         dl * sq + l * smq,
         -2.0 * l * sp * r2,
-        -(l * (sq + 2.0 * sp) * r2),
         -4.0 * l * sq * r2,
     )
 
@@ -85,7 +84,8 @@ def ssim_seconds(m, p, q, mu, var):
 @formula
 def ssim_second_dot(second, dm, dp, dq):
     """S_m', S_p', S_q': the second derivatives applied to m', p', q'."""
-    mm, mp, mq, pp, pq, qq = second
+    mm, mp, mq, pp, qq = second
+    pq = pp + 0.25 * qq
     return mm * dm + mp * dp + mq * dq, mp * dm + pp * dp + pq * dq, mq * dm + pq * dp + qq * dq
 
 
@@ -123,8 +123,8 @@ def ssim_adjoint(residual, aim, bm, bp, bq):
 @formula
 def ssim_diag_hessian(second, blurred_sp, residual, aim):
     """The diagonal of the Hessian of sum S, from its second derivatives blurred by the squared window."""
-    mm, mp, mq, pp, pq, qq = second
-    coupled = mm + 4.0 * residual * (mp + residual * pp + aim * pq) + aim * (2.0 * mq + aim * qq)
+    mm, mp, mq, pp, qq = second
+    coupled = mm + 4.0 * residual * (mp + residual * pp + aim * (pp + 0.25 * qq)) + aim * (2.0 * mq + aim * qq)
     return coupled + 2.0 * blurred_sp
 
 

@@ -6,6 +6,7 @@ Planes are padded as in `raster/cpu/raster.py`; only the first three are read, a
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,14 +16,34 @@ from torch import Tensor
 from splat.backend.cpu.planes import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range
-from splat.losses.cpu.seconds import Coupling, second_rows
-from splat.losses.cpu.sweeps import PRODUCT_FIELDS, Loss, diagonal_rows, gradient_rows, product_rows, uniform_rows
+from splat.losses.cpu.sweeps import (
+    PRODUCT_FIELDS,
+    Loss,
+    diagonal_rows,
+    gradient_rows,
+    product_rows,
+    uncoupled_rows,
+    uniform_rows,
+)
 from splat.losses.cpu.window import RING, Frame, moments_rows
 from splat.losses.formulas import KINDS, SECONDS
 from splat.losses.reference import LossSettings, beyond, window
 
 RINGS = 5 << 18  # bytes of rings in a sweep: with more, another vector costs more cache than it shares
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
+
+
+class Coupling(NamedTuple):
+    """l'' = weight * sum over windows of M . seconds M, M a window's means of v, 2 r v and (y - c) v, plus uncoupled v^2.
+
+    image, target, uncoupled: three flat planes; seconds: see `sweeps.py`.
+    """
+
+    image: np.ndarray
+    target: np.ndarray
+    seconds: np.ndarray
+    weight: float
+    uncoupled: np.ndarray
 
 
 class CpuImageLoss:
@@ -58,7 +79,7 @@ class CpuImageLoss:
         return planes[:3, : self.frame.height, : self.frame.width].contiguous()
 
     def _sweep(self, *images: np.ndarray | None) -> float:
-        """The loss by `gradient_rows`.  images: x, y and target, and where the two results go."""
+        """The loss by `gradient_rows`.  images: x, y and target, and where the three results go."""
         pixels, distances = np.zeros((2, 3 * self.frame.height))
         over_range(len(pixels), gradient_rows, self.frame, self.loss, *images, pixels, distances)
         return float(self.pixel * pixels.sum() + self.structural * distances.sum())
@@ -67,7 +88,8 @@ class CpuImageLoss:
         self, x: Float[Tensor, "3 H W"], y: Float[Tensor, "3 H W"]
     ) -> tuple[Float[Tensor, ""], Float[Tensor, "2 3 H W"]]:
         gradients = self.planes(2)
-        value = self._sweep(x.numpy().reshape(-1), y.numpy().reshape(-1), None, *gradients.reshape(2, -1))
+        flat = *gradients.reshape(2, -1), np.empty(0, self.dtype)
+        value = self._sweep(x.numpy().reshape(-1), y.numpy().reshape(-1), None, *flat)
         return x.new_tensor(value), torch.from_numpy(gradients)
 
 
@@ -89,22 +111,36 @@ class CpuViewLoss(CpuImageLoss):
 
     def value(self, image: Float[Tensor, "k H W"]) -> float:
         """The loss at padded planes: two blurs instead of the gradient's four."""
-        return self._sweep(*self._against(image), None, np.empty(0, self.dtype))
+        none = np.empty(0, self.dtype)
+        return self._sweep(*self._against(image), None, none, none)
 
     def linearize(self, image: Float[Tensor, "k H W"], second_order: bool = True) -> "CpuLinearLoss":
         gradient = aligned((4, self.frame.plane_rows, self.frame.stride), self.dtype)
-        blurred = self.planes(1).reshape(-1) if second_order and self.structural else np.empty(0, self.dtype)
+        wanted = second_order and self.structural
+        blurred, seconds = (self.planes(sets if wanted else 0) for sets in (1, SECONDS))
         gradient[:, self.frame.height :] = 0
         gradient[3] = 0
-        value = self._sweep(*self._against(image), gradient.reshape(-1), blurred)
-        return CpuLinearLoss(self, value, torch.from_numpy(gradient), image, blurred)
+        value = self._sweep(*self._against(image), gradient.reshape(-1), blurred.reshape(-1), seconds.reshape(-1))
+        self._leave_margin(seconds)
+        return CpuLinearLoss(self, value, torch.from_numpy(gradient), image, blurred.reshape(-1), seconds.reshape(-1))
+
+    def _leave_margin(self, planes: np.ndarray) -> None:
+        """Set planes to 0 where no window counts, and in their padding."""
+        frame, margin = self.frame, self.loss.margin
+        for edge in (slice(margin), slice(frame.height - margin, None)):
+            planes[:, :, edge] = 0
+        for edge in (slice(margin), slice(frame.width - margin, None)):
+            planes[..., edge] = 0
 
 
 class CpuLinearLoss:
     """`losses.protocols.LinearLoss`: value, gradient (4 padded planes; that of alpha is 0) and Hessian-vector products."""
 
-    def __init__(self, loss: CpuViewLoss, value: float, gradient: Tensor, image: Tensor, blurred: np.ndarray):
-        self.loss, self.value, self.gradient, self._image, self._blurred = loss, value, gradient, image, blurred
+    def __init__(
+        self, loss: CpuViewLoss, value: float, gradient: Tensor, image: Tensor, blurred: np.ndarray, seconds: np.ndarray
+    ):
+        self.loss, self.value, self.gradient, self._image = loss, value, gradient, image
+        self._blurred, self._seconds = blurred, seconds
 
     def scalar(self, like: Tensor) -> Float[Tensor, ""]:
         return like.new_tensor(self.value)
@@ -154,19 +190,19 @@ class CpuLinearLoss:
             return self._blurred
         columns = np.zeros(frame.stride, loss.dtype)
         columns[: frame.width] = beyond(frame.width).numpy()
-        uniform = loss.planes(1).reshape(-1)
-        self._sweep(uniform_rows, columns, beyond(frame.height).numpy().astype(loss.dtype), uniform)
+        lines, uniform = beyond(frame.height).numpy().astype(loss.dtype), loss.planes(1).reshape(-1)
+        images = loss._against(self._image)
+        over_range(3 * frame.height, uniform_rows, frame, loss.loss, *images, columns, lines, uniform)
         return uniform
 
     def _sweep(self, kernel: Callable, *arguments: np.ndarray | tuple | None) -> None:
-        loss = self.loss
-        kept = *loss._against(self._image), self._blurred
-        over_range(3 * loss.frame.height, kernel, loss.frame, loss.loss, *kept, *arguments)
+        loss, (x, y, _) = self.loss, self.loss._against(self._image)
+        over_range(3 * loss.frame.height, kernel, loss.frame, loss.loss, x, y, self._blurred, self._seconds, *arguments)
 
     @property
     def bytes(self) -> int:
         target = self.loss.target.nbytes + self.loss._target_moments.nbytes
-        return target + self.gradient.nbytes + 2 * self._blurred.nbytes
+        return target + self.gradient.nbytes + 2 * self._blurred.nbytes + self._seconds.nbytes
 
     def workspace(self, vectors: int) -> int:
         """Bytes that `hvp` of so many tangents takes beside its result and a few rows a thread."""
@@ -174,13 +210,11 @@ class CpuLinearLoss:
 
     def coupling(self) -> Coupling:
         """l'' of a loss with SSIM: the part that couples pixels, and the pixelwise rest."""
-        loss = self.loss
+        loss, uncoupled = self.loss, self.loss.planes(1)
         image, target, _ = loss._against(self._image)
-        found = loss.planes(SECONDS + 1)
-        found[:, :, loss.frame.height :] = 0
-        seconds, uncoupled = found[:SECONDS].reshape(-1), found[SECONDS].reshape(-1)
-        self._sweep(second_rows, seconds, uncoupled)
-        return Coupling(image, target, seconds, uncoupled)
+        uncoupled[:, :, loss.frame.height :] = 0
+        self._sweep(uncoupled_rows, uncoupled.reshape(-1))
+        return Coupling(image, target, self._seconds, -loss.structural, uncoupled.reshape(-1))
 
     @cached_property
     def diagonal(self) -> Float[Tensor, "3 H W"]:

@@ -6,12 +6,13 @@ A sweep is one pass down the rows with up to three stages, each REACH rows behin
     differentiate   those blurred down, and from them partial derivatives at a row (`formulas.py`), blurred along it
     finish          those blurred down, and the result at a row
 
-So the only arrays of the size of the image that a sweep writes are its results.  Products need blur(S_p), which the gradient's
-sweep leaves, and the two images; S's second derivatives are worked out again, once for all vectors of a sweep.  A quadratic
-form has no third stage, as the window is its own adjoint.  Two images that both depend on the parameters (a pair) take four
-blurs in and four out, where a loss against each as the other's target takes sixteen.
+So the only arrays of the size of the image that a sweep writes are its results.  Products need the two images, and what the
+gradient's sweep leaves: blur(S_p) and S's second derivatives.  A quadratic form has no third stage, as the window is its own
+adjoint.  Two images that both depend on the parameters (a pair) take four blurs in and four out, where a loss against each as
+the other's target takes sixteen.
 
-The kernels' arguments: x, y image and target, or a pair; target: mu and var of y (2 plane sets); loss: see `Loss`.
+The kernels' arguments: x, y image and target, or a pair; target: mu and var of y (2 plane sets); loss: see `Loss`; seconds:
+S's second derivatives at every window's centre (SECONDS plane sets), 0 where no window counts and in the padding.
 """
 
 from typing import NamedTuple
@@ -97,8 +98,11 @@ def window_at(own, row, i, at, frame, target):
 
 
 @formula
-def differentiate(own, row, top, frame, margin, target, rows, values, slopes, gradient):
-    """Stage two of the gradient, if any: S_m, S_p, S_q of a row, blurred along it, to `slopes`; the sum of 1 - S."""
+def differentiate(own, row, top, frame, margin, target, rows, values, slopes, gradient, seconds, keep):
+    """Stage two of the gradient, if any: S_m, S_p, S_q of a row, blurred along it, to `slopes`; the sum of 1 - S.
+
+    keep: whether to write `seconds`, also where no window counts beside those that do.
+    """
     if not counts(row, margin, frame):
         clear(slopes, 0, 3, row, frame)
         return 0.0
@@ -108,6 +112,10 @@ def differentiate(own, row, top, frame, margin, target, rows, values, slopes, gr
         store(values, BORDER + i, distance)
         if gradient is not None:
             put(rows, i, frame, (sm, sp, sq))
+            if keep:
+                found = ssim_seconds(m, p, q, mu, var)
+                for j in range(SECONDS):
+                    store(seconds, (3 * j * frame.plane_rows + row) * frame.stride + top + i, found[j])
     leave_margin(values, 1, margin, frame)
     if gradient is not None:
         leave_margin(rows, 3, margin, frame)
@@ -190,11 +198,11 @@ def finish_pair(x, y, at, row, frame, slopes, loss, in_x, in_y, values):
 
 
 @kernel
-def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, pixels, distances):
+def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, seconds, pixels, distances):
     """The gradient in x, unless None, of a loss against a target; or, where target is None, the gradients in both of a pair.
 
-    other: where the gradient in y goes or, against a target, blur(S_p), unless empty.  pixels, distances: sums over each row
-    of the pixel loss and of 1 - S.
+    other: where the gradient in y goes or, against a target, blur(S_p), unless empty, as `seconds` may be.  pixels, distances:
+    sums over each row of the pixel loss and of 1 - S.
     """
     rows, values = bordered_rows(x, PAIR_FIELDS, frame), bordered_rows(x, 1, frame)
     ring, slopes = ring_buffer(x, PAIR_FIELDS, frame), ring_buffer(x, PAIR_FIELDS, frame)
@@ -213,8 +221,9 @@ def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, pixel
                     if target is None:
                         distance = differentiate_pair(ring, row, frame, loss.margin, rows, values, slopes)
                     else:
+                        keep = seconds.size > 0 and first <= row < last
                         distance = differentiate(
-                            ring, row, top, frame, loss.margin, target, rows, values, slopes, gradient
+                            ring, row, top, frame, loss.margin, target, rows, values, slopes, gradient, seconds, keep
                         )
                     if first <= row < last:
                         distances[channel * frame.height + row] = distance
@@ -230,32 +239,19 @@ def gradient_rows(start, stop, frame, loss, x, y, target, gradient, other, pixel
 
 
 @formula
-def seconds_row(own, row, top, frame, margin, target, second):
-    """S's second derivatives at a row of the image, to SECONDS bordered rows."""
-    if not counts(row, margin, frame):
-        for i in range(SECONDS * (frame.stride + 2 * BORDER)):
-            second[i] = 0
-        return
-    for i in range(0, frame.stride, lanes(own)):
-        m, p, q, mu, var = window_at(own, row, i, top + row * frame.stride, frame, target)
-        put(second, i, frame, ssim_seconds(m, p, q, mu, var))
-    leave_margin(second, SECONDS, margin, frame)
+def seconds_at(seconds, at, frame):
+    """The second derivatives at the lanes at `at` of a plane set."""
+    size = 3 * frame.plane_rows * frame.stride
+    mm, mp, mq = load(seconds, at), load(seconds, at + size), load(seconds, at + 2 * size)
+    return mm, mp, mq, load(seconds, at + 3 * size), load(seconds, at + 4 * size)
 
 
 @formula
-def seconds_at(second, i, frame):
-    """The second derivatives at the lanes at i."""
-    at, pitch = BORDER + i, frame.stride + 2 * BORDER
-    mm, mp, mq = load(second, at), load(second, at + pitch), load(second, at + 2 * pitch)
-    return mm, mp, mq, load(second, at + 3 * pitch), load(second, at + 4 * pitch), load(second, at + 5 * pitch)
-
-
-@formula
-def curve(second, ring, field, row, frame, rows, slopes):
+def curve(seconds, at, ring, field, row, frame, rows, slopes):
     """Stage two of a vector's product: S_m', S_p', S_q' at a row of the image, blurred along it, to three of `slopes`."""
     for i in range(0, frame.stride, lanes(ring)):
         dm, dp, dq = blur_down_three(ring, field, row, i, frame)
-        put(rows, i, frame, ssim_second_dot(seconds_at(second, i, frame), dm, 2.0 * dp, dq))
+        put(rows, i, frame, ssim_second_dot(seconds_at(seconds, at + i, frame), dm, 2.0 * dp, dq))
     blur_along(rows, 3, frame, slopes, field, row)
 
 
@@ -277,7 +273,7 @@ def finish_product(v, mean, x, y, at, row, field, frame, slopes, loss, blurred_s
 
 
 @formula
-def finish_forms(v, x, y, at, row, field, frame, ring, second, loss, blurred_sp, diagonal, values, rows):
+def finish_forms(v, x, y, at, row, field, frame, ring, seconds, loss, blurred_sp, diagonal, values, rows):
     """A row's sums of v . l'' v and v . D v."""
     for i in range(0, frame.stride, lanes(x)):
         squared = load(v, at + i) * load(v, at + i)
@@ -285,7 +281,7 @@ def finish_forms(v, x, y, at, row, field, frame, ring, second, loss, blurred_sp,
         total = pixel_curvature(residual, loss.kind, loss.eps, broadcast(x, loss.pixel)) * squared
         if loss.structural != 0:
             dm, dp, dq = blur_down_three(ring, field, row, i, frame)
-            bends, bp = seconds_at(second, i, frame), load(blurred_sp, at + i)
+            bends, bp = seconds_at(seconds, at + i, frame), load(blurred_sp, at + i)
             total -= loss.structural * ssim_quadratic_form(bends, dm, 2.0 * dp, dq, squared, bp)
         store(values, BORDER + i, total)
         store(rows, BORDER + i, load(diagonal, at + i) * squared)
@@ -293,16 +289,15 @@ def finish_forms(v, x, y, at, row, field, frame, ring, second, loss, blurred_sp,
 
 
 @kernel
-def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, means, uniform, products, diagonal, forms):
+def product_rows(start, stop, frame, loss, x, y, blurred_sp, seconds, V, means, uniform, products, diagonal, forms):
     """Multiply every v in V (k, plane sets) by l'', the Hessian of the loss; products and forms may be None.
 
     means: of v, (k, 3), or any other numbers; 0 for forms.  uniform: l'' times an image of ones, a plane set, with SSIM.
     products: l'' v, (k, plane sets); not V itself, which another range may still read.  forms: sums over each row of v . l'' v
     and of v . D v, D the diagonal of l'', (2, k, 3 height).
     """
-    K, rows, second = len(V), bordered_rows(x, 3, frame), bordered_rows(x, SECONDS, frame)
-    own, ring, slopes = ring_buffer(x, 3, frame), ring_buffer(x, 3 * K, frame), ring_buffer(x, 3 * K, frame)
-    values = bordered_rows(x, 1, frame)
+    K, rows, values = len(V), bordered_rows(x, 3, frame), bordered_rows(x, 1, frame)
+    ring, slopes = ring_buffer(x, 3 * K, frame), ring_buffer(x, 3 * K, frame)
     reach = 0 if products is None else REACH  # rows beyond the range that are differentiated
     lead = reach + REACH if loss.structural != 0 else 0
     for channel in range(3):
@@ -310,14 +305,11 @@ def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, means, u
         for ahead in rows_ahead:
             row = ahead - REACH
             if loss.structural != 0:
-                feed(None, 0, x, y, top, ahead, frame, rows, own, 0)
                 inside = first - reach <= row < last + reach and 0 <= row < frame.height
-                if inside:
-                    seconds_row(own, row, top, frame, loss.margin, target, second)
                 for k in range(K):
                     feed(V[k], means[k, channel], x, y, top, ahead, frame, rows, ring, 3 * k)
                     if products is not None and inside:
-                        curve(second, ring, 3 * k, row, frame, rows, slopes)
+                        curve(seconds, top + row * frame.stride, ring, 3 * k, row, frame, rows, slopes)
                     elif products is not None:
                         clear(slopes, 3 * k, 3, row, frame)
             row = ahead - lead
@@ -332,12 +324,12 @@ def product_rows(start, stop, frame, loss, x, y, target, blurred_sp, V, means, u
                 if forms is not None:
                     place = channel * frame.height + row
                     forms[0, k, place], forms[1, k, place] = finish_forms(
-                        V[k], x, y, at, row, 3 * k, frame, ring, second, loss, blurred_sp, diagonal, values, rows
+                        V[k], x, y, at, row, 3 * k, frame, ring, seconds, loss, blurred_sp, diagonal, values, rows
                     )
 
 
 @kernel
-def uniform_rows(start, stop, frame, loss, x, y, target, blurred_sp, columns, lines, uniform):
+def uniform_rows(start, stop, frame, loss, x, y, target, columns, lines, uniform):
     """The Hessian of a loss with SSIM times an image of ones.
 
     columns, lines: the weights of the window beyond the image's left and right edges, (stride,), and beyond the others.
@@ -372,22 +364,20 @@ def uniform_rows(start, stop, frame, loss, x, y, target, blurred_sp, columns, li
 
 
 @kernel
-def diagonal_rows(start, stop, frame, loss, x, y, target, blurred_sp, squared, diagonal):
+def diagonal_rows(start, stop, frame, loss, x, y, blurred_sp, seconds, squared, diagonal):
     """The diagonal of the loss's Hessian.  squared: the frame with the window's weights squared."""
-    rows, second = bordered_rows(x, 3, frame), bordered_rows(x, SECONDS, frame)
-    own, bends = ring_buffer(x, 3, frame), ring_buffer(x, SECONDS, frame)
-    lead = 2 * REACH if loss.structural != 0 else 0
+    rows, bends = bordered_rows(x, SECONDS, frame), ring_buffer(x, SECONDS, frame)
+    lead = REACH if loss.structural != 0 else 0
     for channel in range(3):
         top, first, _last, rows_ahead = part_of(start, stop, channel, lead, frame)
         for ahead in rows_ahead:
             if loss.structural != 0:
-                feed(None, 0, x, y, top, ahead, frame, rows, own, 0)
-                row = ahead - REACH
-                if 0 <= row < frame.height and row >= first - REACH:
-                    seconds_row(own, row, top, frame, loss.margin, target, second)
-                    blur_along(second, SECONDS, squared, bends, 0, row)
+                if 0 <= ahead < frame.height:
+                    for i in range(0, frame.stride, lanes(x)):
+                        put(rows, i, frame, seconds_at(seconds, top + ahead * frame.stride + i, frame))
+                    blur_along(rows, SECONDS, squared, bends, 0, ahead)
                 else:
-                    clear(bends, 0, SECONDS, row, frame)
+                    clear(bends, 0, SECONDS, ahead, frame)
             row = ahead - lead
             if row < first:
                 continue
@@ -397,9 +387,24 @@ def diagonal_rows(start, stop, frame, loss, x, y, target, blurred_sp, squared, d
                 total = pixel_curvature(residual, loss.kind, loss.eps, broadcast(x, loss.pixel))
                 if loss.structural != 0:
                     mm, mp, mq = blur_down_three(bends, 0, row, i, squared)
-                    pp, pq, qq = blur_down_three(bends, 3, row, i, squared)
-                    own_second = (mm, mp, mq, pp, pq, qq)
-                    total -= loss.structural * ssim_diag_hessian(own_second, load(blurred_sp, at + i), residual, aim)
+                    own = mm, mp, mq, blur_down(bends, 3, row, i, squared), blur_down(bends, 4, row, i, squared)
+                    total -= loss.structural * ssim_diag_hessian(own, load(blurred_sp, at + i), residual, aim)
                 store(diagonal, at + i, total)
             for i in range(frame.width, frame.stride):
                 diagonal[at + i] = 0
+
+
+@kernel
+def uncoupled_rows(start, stop, frame, loss, x, y, blurred_sp, seconds, uncoupled):
+    """What a loss with SSIM adds to v . l'' v for a pixel's v^2: its pixel loss's curvature, and SSIM's by blur(S_p)."""
+    for channel in range(3):
+        top, first, last, _ahead = part_of(start, stop, channel, 0, frame)
+        for row in range(first, last):
+            at = top + row * frame.stride
+            for i in range(0, frame.stride, lanes(x)):
+                curvature = pixel_curvature(
+                    load(x, at + i) - load(y, at + i), loss.kind, loss.eps, broadcast(x, loss.pixel)
+                )
+                store(uncoupled, at + i, curvature - 2.0 * loss.structural * load(blurred_sp, at + i))
+            for i in range(frame.width, frame.stride):
+                uncoupled[at + i] = 0

@@ -287,7 +287,7 @@ def add_windows(params, splat, row, left, window, frame, planes, pitch, work):
         p = top + row * frame.stride + left + x
         second = (
             load(seconds, p), load(seconds, p + size), load(seconds, p + 2 * size),
-            load(seconds, p + 3 * size), load(seconds, p + 4 * size), load(seconds, p + 5 * size),
+            load(seconds, p + 3 * size), load(seconds, p + 4 * size),
         )  # fmt: skip
         add_pairs(moved, second, sums, L)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from splat.backend.cpu.planes import TILE_ROWS, aligned
 from splat.backend.cpu.simd import lanes_of
 from splat.backend.cpu.threads import over_range, over_tiles
-from splat.losses.cpu.seconds import Coupling
+from splat.losses.cpu.loss import Coupling
 from splat.model.settings import RenderSettings
 from splat.raster.cpu import binning, blocks, compositing, coupling, footprints, packing, tangents, tile
 from splat.raster.formulas import SPLAT, thresholds_of
@@ -159,7 +159,7 @@ class CpuRaster:
             over_tiles(
                 coupling.coupled_blocks, splats[heaviest], self.params, self.frame, size, layout, first, found, *loss[:3], part
             )  # fmt: skip
-            blocks[heaviest] = part
+            blocks[heaviest] = loss.weight * part
             done = stop
         return torch.from_numpy(blocks)
 
