@@ -8,7 +8,6 @@ sections' losses, which hold the start's too: a slope is not cut off where it fa
 """
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -116,11 +115,7 @@ def command_line(figure, name: str) -> None:
     )
     parser.add_argument("--out", type=Path, default=Path(f"{name}.png"), help="PNG, PDF or SVG, by its suffix")
     arguments = parser.parse_args()
-    try:
-        print(save(figure(arguments.runs), arguments.out))
-    except (FileNotFoundError, ValueError) as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    print(save(figure(arguments.runs), arguments.out))
 
 
 if __name__ == "__main__":

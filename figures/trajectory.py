@@ -61,6 +61,9 @@ def draw(table: pd.DataFrame) -> Figure:
         for axes in panels.flat:
             axes.grid(True)
             axes.xaxis.set_major_locator(step_ticks())
+            if not any(np.isfinite(line.get_ydata()).any() for line in axes.lines):
+                axes.set(xticks=[], yticks=[], xlabel="")
+                axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center")
         handles = [Line2D([], [], color=colour, label=literal(name)) for name, colour in runs.items()]
         handles += marker_words(measured, *INDICES)
         handles.append(Line2D([], [], linestyle="none", label=UNITS))

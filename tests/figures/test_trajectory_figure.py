@@ -72,6 +72,13 @@ def test_what_is_drawn_is_what_was_recorded(tmp_path):
     assert list(np.asarray(gaussians.get_ydata())) == [1000, 2000, 3000, 4000]
 
 
+def test_an_index_that_coarse_records_lack_is_said_to_be_so():
+    coarse = rows().assign(run="a", effective_rank=math.nan, effective_rank_low=math.nan)
+    panels = {axes.get_title(): axes for axes in trajectory.draw(coarse).axes}
+    assert [text.get_text() for text in panels["effective rank"].texts] == ["not measured"]
+    assert not panels["effective rank"].get_xticks().size and not panels["|λmax / λmin|"].texts
+
+
 def test_ticks_are_at_steps_such_as_are_recorded():
     assert list(trajectory.step_ticks().tick_values(90, 310)) == [0, 100, 200, 300, 400]
 
