@@ -21,7 +21,7 @@ from splat.model.files.tensor_files import gsplat_bytes
 from splat.model.settings import RenderSettings
 from splat.projection.antialias import baked
 from splat.render.render import render_depth
-from splat.training.checkpoint import load_checkpoint, save_checkpoint, write_atomically
+from splat.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
 from splat.training.origin.presets import PRESETS, render_of
 
 OURS = ("splat-landscape", "splat-landscape-mip")
@@ -68,7 +68,7 @@ def _to_own(options: ConvertOptions) -> list[str]:
 
 
 def _to_tool(options: ConvertOptions, to: str) -> list[str]:
-    found, seen = _foreign(options) if is_foreign(options.source) else _own(options)
+    found, seen = _foreign(options) if is_foreign(options.source) else own_file(load_checkpoint(options.source))
     extra: Mapping[str, np.ndarray] = found.extra
     if to == "graphdeco":
         gaussians = found.gaussians
@@ -135,8 +135,8 @@ def _foreign(options: ConvertOptions) -> tuple[SplatFile, Seen | None]:
     return found, Seen(render, preset.centred, preset.world != "scene")
 
 
-def _own(options: ConvertOptions) -> tuple[SplatFile, Seen]:
-    checkpoint = load_checkpoint(options.source)
+def own_file(checkpoint: Checkpoint) -> tuple[SplatFile, Seen]:
+    """A checkpoint of ours as a file of splats, with the tool whose conventions are those it was trained with, if any."""
     training, scene = checkpoint.training, checkpoint.scene
     seen = Seen(training.config.render, scene.centred, scene.similarity is not None)
     antialiased = seen.render.antialias != "none"

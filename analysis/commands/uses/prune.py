@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from analysis.commands.convert import own_file
 from analysis.commands.uses.options import PruneOptions
 from analysis.console.drawing import draw_or_say
 from analysis.console.kept import Kept
@@ -96,7 +97,9 @@ def run_prune(options: PruneOptions, command: Sequence[str]) -> int:
             refine(training, objective.views, options.refine, options.seed)
             reference = replace(checkpoint.scene, relative=os.path.relpath(scene.root, out.resolve()))
             save_checkpoint(folder / "checkpoint.pt", training, reference)
-            (folder / "pruned.ply").write_bytes(splat_ply(training.gaussians))
+            file, _ = own_file(replace(checkpoint, training=training))
+            ply = splat_ply(file.gaussians, tool=file.tool, antialiased=file.antialiased)
+            (folder / "pruned.ply").write_bytes(ply)
         made = provenance_of(options.seed, options.checkpoint, command, options, checkpoint, scene)
         (folder / RECORD).write_text(json_text(plain(made)), encoding="utf-8")
         notes = draw_or_say("uses", folder) if curve is not None else []

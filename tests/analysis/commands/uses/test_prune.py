@@ -48,7 +48,8 @@ def test_the_highest_scores_are_kept_in_both_files(curved, folder):
     chosen = np.sort(table.sort_values("opacity", ascending=False).gaussian[: round(0.4 * len(before))])
     assert len(before) - 1 not in chosen  # opaque, but no view sees it
     expected = before.select(torch.from_numpy(chosen))
-    assert torch.equal(read_splats(curved / "pruned.ply").gaussians.flat, expected.flat)
+    written = read_splats(curved / "pruned.ply")
+    assert torch.equal(written.gaussians.flat, expected.flat) and written.tool == "splat-landscape"
     loaded = load_checkpoint(curved / "checkpoint.pt")
     assert torch.equal(loaded.training.gaussians.flat, expected.flat)
     assert loaded.load_scene(curved / "checkpoint.pt").root == (folder / "scene").resolve()
