@@ -43,6 +43,7 @@ ONLY = {  # one way to move a viewpoint, beside the probes of attributes
 # the paper's gains over 3DGS on LLFF with three views, dB: Tables 2, 4 and 6
 AXES: tuple[tuple[str, str, float | None], ...] = (
     ("all probes", STABLE, 4.73),
+    ("all probes, one viewpoint", f"{STABLE} viewpoints=one", None),
     ("attributes", ATTRIBUTES_ALONE, 2.92),
     ("  positions", AXIS.format("means"), 2.46),
     ("  opacities", AXIS.format("opacity_logits"), 1.39),
@@ -92,9 +93,14 @@ def captions(rows: pd.DataFrame, drawn: Sequence[str]) -> str:
     return "\n\n".join(lines) + "\n"
 
 
-def _plain(method: str) -> str:
-    """Its name; a method that runs in its publication's own code is told by the protocol."""
-    return method.replace(" protocol=llff", " (own code)")
+def method_words(method: str) -> str:
+    """A method of the study in words; one that runs in its publication's own code is told by the protocol.
+
+    >>> method_words("stablegs vsp_weight=0 probe.attributes=means"), method_words("sam protocol=llff")
+    ('stablegs: positions', 'sam (own code)')
+    """
+    axis = next((name.strip() for name, axis, _ in AXES if axis == method != STABLE), None)
+    return f"{STABLE}: {axis}" if axis else method.replace(" protocol=llff", " (own code)")
 
 
 def draw_budget(rows: pd.DataFrame) -> Figure:
@@ -148,7 +154,7 @@ def _label(
     taken: list[tuple[float, ...]] = [(x - 3, y - 3, x + 3, y + 3) for x, y in points]
     taken += [(*place(x0, y0), *(end + 1 for end in place(x1, y1))) for x0, y0, x1, y1 in lines]
     for (px, py), (x, y, name, colour) in zip(points, places, strict=True):
-        words = _plain(name)
+        words = method_words(name)
         size = len(words) * LETTER
         options = [
             (dx if side > 0 else -dx - size, dy)
@@ -257,7 +263,7 @@ def _of_budget(rows: pd.DataFrame, short: bool = False) -> str:
     if short:
         over = {name: Interval.of(gains(rows, name)).value for name in times}
         return "; ".join(
-            f"{_plain(name)} {over[name]:+.1f} dB in {time.value:.2g} × the time" for name, time in times.items()
+            f"{method_words(name)} {over[name]:+.1f} dB in {time.value:.2g} × the time" for name, time in times.items()
         )
     words = [f"{name} {scores[name].text(' dB')} in {time.text(' times')} its time" for name, time in times.items()]
     return f"3DGS scores {scores[BASE].text(' dB')}; {'; '.join(words)}."
