@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from matplotlib.text import Text
 
-from figures.paper import AXES, captions, draw_axes, draw_budget, draw_index, main
+from figures.paper import AXES, captions, draw_axes, draw_budget, draw_index, main, method_words
 from tests.analysis.runs.test_claims import OTHERWISE, PAPER, made_up
 from tests.figures.test_figures import laid_out
 
@@ -40,7 +40,7 @@ def test_the_budget_shows_each_seed_and_the_mean_of_each_method():
     rows = made_up(PAPER)
     axes = draw_budget(rows).axes[0]
     methods = list(dict.fromkeys(rows["method"]))
-    assert {text.get_text() for text in axes.texts} == set(methods)
+    assert {text.get_text() for text in axes.texts} == set(map(method_words, methods))
     renderer = laid_out(axes.figure)
     boxes = [Text.get_window_extent(text, renderer) for text in axes.texts]  # without their lines
     assert not any(a.shrunk(0.95, 0.7).overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
