@@ -215,7 +215,7 @@ class SceneObjective:
         gaussians.require_finite()
         losses, pieces = zip(*(self.evaluate_view(index, gaussians) for index in range(len(self.views))), strict=True)
         mean = self.mean_over_views(torch.tensor(sum(losses), dtype=torch.float64))
-        return float(mean), self.gather_pieces(hash(pieces))
+        return float(mean), tuple(int(piece) for piece in self.ranks.gather(torch.tensor(hash(pieces))))
 
     def evaluate_view(self, index: int, gaussians: Gaussians) -> tuple[float, Hashable]:
         """(l + R, smooth piece) of one view of this rank, at finite Gaussians in place of the active ones."""
@@ -255,10 +255,6 @@ class SceneObjective:
         padded = torch.nn.functional.pad(rows, (0, 0, 0, max(counts) - rows.shape[1]))
         parts = self.ranks.gather(padded)
         return torch.cat([part[:, :count] for part, count in zip(parts, counts, strict=True)], dim=1)
-
-    def gather_pieces(self, piece: int) -> Hashable:
-        """The smooth piece of L over all views, from that over this rank's views."""
-        return tuple(int(each) for each in self.ranks.gather(torch.tensor(piece)))
 
     @cached_property
     def linearized(self) -> KeptViews:

@@ -179,6 +179,16 @@ def gather_tangent(u, i, k, d_means, d_log_scales, d_quats):
         u[6 + j] = d_quats[i, j, k]
 
 
+@formula
+def unpack_curvature(packed, curvature):
+    """Fill the symmetric curvature (10, 10) from its lower triangle; see `pack_curvature`."""
+    place = 0
+    for j in range(GEOMETRY):
+        for l in range(j + 1):
+            curvature[j, l] = curvature[l, j] = packed[place + l]
+        place += j + 1
+
+
 @kernel
 def push_forward(start, stop, jac, d_means, d_log_scales, d_quats, d_logits, d_sh, out):
     """Write P' u of K vectors to out (n, K, 9); rows of other Gaussians stay as they are."""
@@ -216,15 +226,11 @@ def pull_back(
     """
     K, bands = cotangents.shape[1], out_sh.shape[1]
     u, h, bar = np.empty(GEOMETRY, out_means.dtype), np.empty(GEOMETRY, out_means.dtype), np.empty(3, out_means.dtype)
-    curvature = np.empty((GEOMETRY, GEOMETRY), out_means.dtype)
+    curvature = np.empty((GEOMETRY, GEOMETRY), out_means.dtype)  # h: the result in a Gaussian's geometry
     for e in range(start, stop):
         i = jac.index[e]
         if second_order:
-            place = 0
-            for j in range(GEOMETRY):
-                for l in range(j + 1):
-                    curvature[j, l] = curvature[l, j] = jac.curvature[e, place + l]
-                place += j + 1
+            unpack_curvature(jac.curvature[e], curvature)
         for k in range(K):
             y = cotangents[i, k]
             gather_tangent(u, i, k, d_means, d_log_scales, d_quats)

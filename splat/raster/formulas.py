@@ -285,19 +285,19 @@ def _block_index() -> np.ndarray:
     return index
 
 
-def _bends() -> np.ndarray:
+def _d2q() -> np.ndarray:
     """Factors (3, 9, 9) of the moments S, Su, Sv in sum s d2q, the curvature of q in its coefficients (`second_order`)."""
-    bends = np.zeros((3, 9, 9))
+    factors = np.zeros((3, 9, 9))
     terms = (
         (0, Q0, Q0, -1.0), (0, QU, QU, -1 / ROUND), (0, QV, QV, -1 / ROUND), (1, QU, QUU, -2 / ROUND),
         (2, QU, QUV, -1 / ROUND), (1, QV, QUV, -1 / ROUND), (2, QV, QVV, -2 / ROUND),
     )  # fmt: skip
     for moment, p, r, factor in terms:
-        bends[moment, p, r] = bends[moment, r, p] = factor
-    return bends
+        factors[moment, p, r] = factors[moment, r, p] = factor
+    return factors
 
 
-BLOCK_INDEX, BENDS = _block_index(), _bends()
+BLOCK_INDEX, D2Q = _block_index(), _d2q()
 
 
 @formula
