@@ -169,13 +169,14 @@ class LinearizedView:
         self, *, approximate: bool = False, parts: Sequence[bool] = (False, True)
     ) -> list[PerGaussianBlocks]:
         """`block_diagonal` for each of parts (True: Gauss-Newton); they share the pass for the coupling of pixels."""
+        raster, index = self._raster, self._index
         if approximate or not self._couples:
             curvature, coupled = self._loss.diagonal, 0.0
-        elif isinstance(self._raster, CpuRaster):
+        elif isinstance(raster, CpuRaster):
             assert isinstance(self._loss, CpuLinearLoss)
             coupling = self._loss.coupling()
             curvature = torch.from_numpy(coupling.uncoupled).view_as(self._adjoint.cotangent[:3])
-            coupled = self._raster.coupled_blocks(coupling, self._index)
+            coupled = raster.coupled_blocks(coupling, index)
         else:
             raise InputError(
                 "expected Gaussians on the CPU for exact blocks of a loss with SSIM, got them on a GPU; move them there or ask "
@@ -183,7 +184,7 @@ class LinearizedView:
             )
         found = []
         for gauss_newton in parts:
-            blocks = self._raster.gaussian_blocks(self._adjoint, curvature, self._index, gauss_newton) + coupled
+            blocks = self._raster.gaussian_blocks(self._adjoint, curvature, index, gauss_newton) + coupled
             found.append(PerGaussianBlocks(*self._projection.blocks(blocks, not gauss_newton)))
             if not gauss_newton:
                 found[-1].add_diagonal(self._regularizers.second)

@@ -113,7 +113,7 @@ def seen_colours(
         sizes.index_add_(0, index, terms.flatten(1).norm(dim=1))
     rows, sums, sizes = gather_rows(rows), gather_sums(sums)[:, : 3 if slopes else 0], gather_sums(sizes)
     chunks, tolerance = zip(*(x.split(CHUNK) for x in (rows, sums, sizes)), strict=True), TOLERANCE[like.dtype]
-    return _joined([_colours_of(*(x.double() for x in chunk), tolerance).to(like.dtype) for chunk in chunks])
+    return _joined([_colours_of(r.double(), s.double(), a.double(), tolerance).to(like.dtype) for r, s, a in chunks])
 
 
 def _colours_of(
